@@ -1,0 +1,64 @@
+# A thin front door; everything here also works without make:
+#   bash envs/setup.sh && .venv/bin/snakemake --cores 2 scenes/kitchen
+#   bash envs/setup.sh && .venv/bin/python -m pytest
+.DEFAULT_GOAL := help
+CORES ?= all
+PYTHON_BIN := .venv/bin/python
+SNAKEMAKE := .venv/bin/snakemake
+# QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
+CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
+
+.PHONY: help setup scenes verify test doctor lint format lock clean always
+
+help:
+	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
+	@echo 'make scenes           every scene of the batch table'
+	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
+	@echo 'make verify           re-hash every artefact against its manifest'
+	@echo 'make test             the whole test suite (PYTEST_ARGS="-k laplace" for a part)'
+	@echo 'make doctor           what this machine offers and lacks'
+	@echo 'make setup            only the environment, .venv'
+	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
+	@echo 'make lock             resolve envs/requirements.in again (needs uv)'
+	@echo 'make clean            remove caches; results/ and scenes/ stay'
+
+setup:
+	@bash envs/setup.sh
+
+# The folders exist once made, and Snakemake alone knows whether they are up to date: `always` asks it every time.
+scenes/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+scenes verify: setup
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+always:
+
+test: setup
+	$(PYTHON_BIN) -m pytest $(PYTEST_ARGS)
+
+# Needs nothing installed: it tells what is missing.
+doctor:
+	@if [ -x $(PYTHON_BIN) ]; then $(PYTHON_BIN) -m workflow.doctor; else python3 -m workflow.doctor; fi
+
+lint: setup
+	$(PYTHON_BIN) -m ruff check .
+	$(PYTHON_BIN) -m snakefmt --check Snakefile workflow/rules
+	$(SNAKEMAKE) --lint
+
+format: setup
+	$(PYTHON_BIN) -m ruff check --fix .
+	$(PYTHON_BIN) -m snakefmt Snakefile workflow/rules
+
+# One lock serves CPU and CUDA machines: torch and what only its CUDA builds need stay out (see envs/README.md).
+OUTSIDE_LOCK := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-cublas nvidia-cuda-cupti \
+  nvidia-cuda-nvrtc nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft nvidia-cufile nvidia-curand nvidia-cusolver \
+  nvidia-cusparse nvidia-cusparselt-cu13 nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
+
+lock:
+	cd envs && uv pip compile --generate-hashes --python-version 3.11 --python-platform x86_64-manylinux_2_36 \
+	  $(addprefix --no-emit-package ,$(OUTSIDE_LOCK)) requirements.in -o requirements.lock
+
+clean:
+	rm -rf .pytest_cache .ruff_cache .hypothesis .benchmarks
+	find . -name .venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,39 @@
+# Intrinsic Image Fusion: photographs, cameras and a mesh -> scenes/<name>/ with materials, lights and camera response.
+#   snakemake --cores 2 scenes/kitchen
+#   snakemake --cores 2 scenes/kitchen --config quality=standard
+# What depends on what is in workflow/rules/, what is computed in iif_core/. docs/architecture.md is the map.
+from snakemake.utils import min_version
+
+min_version("9.0")
+
+
+configfile: f"{workflow.basedir}/config/config.yaml"
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/capture.smk"
+include: "workflow/rules/prior.smk"
+include: "workflow/rules/segmentation.smk"
+include: "workflow/rules/base.smk"
+include: "workflow/rules/emission.smk"
+include: "workflow/rules/shading.smk"
+include: "workflow/rules/affines.smk"
+include: "workflow/rules/deliver.smk"
+
+
+localrules:
+    scenes,
+    verify,
+
+
+rule scenes:
+    default_target: True
+    input:
+        expand("scenes/{scene}", scene=scene_names()),
+
+
+rule verify:
+    params:
+        python=sys.executable,
+    shell:
+        "{params.python:q} -m workflow verify"

@@ -1,0 +1,1 @@
+"""Mathematics of Intrinsic Image Fusion: arrays in, arrays out; opens no file, picks no device."""

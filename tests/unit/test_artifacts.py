@@ -1,0 +1,111 @@
+"""Artefacts: what is written is read back; what changed on disk is found and named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from workflow.artifacts import DamagedArtefact, StageReader, StageWriter
+from workflow.artifacts.store import ids_from_disk, ids_to_disk, rgb, split_rgb
+from workflow.artifacts.verify import damaged
+
+
+def provenance():
+    return {"scene": "s", "stage": "base", "fingerprint": "0" * 16, "settings": {}, "inputs": {}, "versions": {}}
+
+
+@pytest.fixture
+def stage(tmp_path):
+    folder = tmp_path / "results/s/base"
+    writer = StageWriter(folder, provenance())
+    rng = np.random.default_rng(0)
+    channels = {
+        **split_rgb(rng.random((5, 7, 3)), "albedo"),
+        "half": rng.random((5, 7)).astype(np.float16),
+        "object.id": ids_to_disk(np.array([[-1, 70000, 4] + [0] * 4] * 5, np.int32)),
+    }
+    writer.exr("maps/v.exr", channels)
+    columns = {"cell_id": np.arange(3, dtype=np.int32), "T": np.arange(12.0).reshape(3, 4), "name": ["a", "b", "c"]}
+    writer.table("cells.parquet", columns)
+    writer.json("base.json", {"edge": 0.01})
+    writer.finish()
+    return folder, channels, columns
+
+
+def test_round_trip(stage):
+    folder, channels, columns = stage
+    reader = StageReader(folder, "base", "s")
+    got = reader.exr("maps/v.exr")
+    assert set(got) == set(channels)
+    for name in channels:
+        assert got[name].dtype == channels[name].dtype
+        np.testing.assert_array_equal(got[name], channels[name])
+    assert ids_from_disk(got["object.id"])[0].tolist()[:3] == [-1, 70000, 4]
+    assert rgb(got, "albedo").shape == (5, 7, 3)
+    table = reader.table("cells.parquet")
+    np.testing.assert_array_equal(table["T"], columns["T"])
+    assert table["name"].tolist() == ["a", "b", "c"]
+    assert reader.json("base.json") == {"edge": 0.01}
+
+
+def test_same_content_same_bytes(stage, tmp_path):
+    folder, channels, columns = stage
+    other = tmp_path / "again"
+    writer = StageWriter(other, provenance())
+    writer.exr("maps/v.exr", channels)
+    writer.table("cells.parquet", columns)
+    writer.json("base.json", {"edge": 0.01})
+    writer.finish()
+    assert (other / "manifest.json").read_bytes() == (folder / "manifest.json").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["maps/v.exr", "cells.parquet", "base.json"])
+@pytest.mark.parametrize("harm", ["flip", "truncate", "delete"])
+def test_damage_is_found_and_named(stage, tmp_path, name, harm):
+    folder = stage[0]
+    path = folder / name
+    data = bytearray(path.read_bytes())
+    if harm == "flip":  # same length, so only the hash can tell
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+    elif harm == "truncate":
+        path.write_bytes(data[: len(data) // 2])
+    else:
+        path.unlink()
+    with pytest.raises(DamagedArtefact, match=r"made by rule base; rebuild with: snakemake"):
+        StageReader(folder, "base", "s").path(name)
+    lines = list(damaged(tmp_path))
+    assert len(lines) == 1 and name in lines[0]
+
+
+def test_unknown_schema_is_refused(stage):
+    manifest = stage[0] / "manifest.json"
+    document = json.loads(manifest.read_text()) | {"schema": "iif.stage/99"}
+    manifest.write_text(json.dumps(document))
+    with pytest.raises(DamagedArtefact, match="iif.stage/99"):
+        StageReader(stage[0], "base", "s")
+
+
+def test_unfinished_stage_is_refused(tmp_path):
+    writer = StageWriter(tmp_path / "results/s/base", provenance())
+    writer.json("base.json", {})
+    with pytest.raises(DamagedArtefact, match="not finished"):
+        StageReader(tmp_path / "results/s/base", "base", "s")
+
+
+def test_stale_files_of_an_earlier_run_are_removed(stage):
+    folder = stage[0]
+    writer = StageWriter(folder, provenance())
+    writer.json("base.json", {})
+    writer.finish()
+    assert sorted(p.name for p in folder.rglob("*") if p.is_file()) == ["base.json", "manifest.json"]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_non_finite_values_are_not_written(tmp_path, bad):
+    writer = StageWriter(tmp_path, provenance())
+    with pytest.raises(ValueError, match="non-finite"):
+        writer.exr("x.exr", {"a": np.array([[bad]], np.float32)})
+    with pytest.raises(ValueError, match="non-finite"):
+        writer.table("x.parquet", {"a": np.array([bad])})
+    assert not list(tmp_path.glob("*.exr")) and not list(tmp_path.glob("*.parquet"))

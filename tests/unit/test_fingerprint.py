@@ -1,0 +1,126 @@
+"""Fingerprints: they change when, and only when, a result may."""
+
+import json
+import shutil
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+from workflow import fingerprint as fp
+from workflow.registry import STAGES, downstream_order
+
+SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n"
+
+
+def fingerprints(root, folder, quality="draft"):
+    """Fingerprints of all stages, computed by the code in `root`, run in `folder`, in a fresh process."""
+    code = (
+        "import json; from workflow import fingerprint as f; from workflow.registry import STAGES;"
+        f"print(json.dumps({{s: f.fingerprint(s, 't', {quality!r}) for s in STAGES}}))"
+    )
+    environment = {"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"}
+    out = subprocess.run([sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr
+    return json.loads(out.stdout)
+
+
+@pytest.fixture
+def checkout(repository, tmp_path):
+    """A copy of the code and a folder with one scene."""
+    for name in ("iif_core", "workflow", "config"):
+        shutil.copytree(repository / name, tmp_path / "code" / name, ignore=shutil.ignore_patterns("__pycache__"))
+    scenes = tmp_path / "run/config/scenes"
+    scenes.mkdir(parents=True)
+    (scenes / "t.yaml").write_text(SCENE)
+    return tmp_path / "code", tmp_path / "run"
+
+
+def changed(before, after):
+    return {stage for stage in before if before[stage] != after[stage]}
+
+
+def below(stage):
+    out = {stage}
+    for name in downstream_order():
+        if out & set(STAGES[name].upstream):
+            out.add(name)
+    return out
+
+
+def test_code_edit_changes_only_the_stage_and_below(checkout):
+    code, run = checkout
+    before = fingerprints(code, run)
+    metrics = code / "iif_core/metrics.py"
+    metrics.write_text(metrics.read_text() + "\nEXTRA = 1\n")
+    after = fingerprints(code, run)
+    assert "metrics" in changed(before, after)
+    assert "affines" not in changed(before, after) and "render" not in changed(before, after)
+
+
+def test_touch_and_comments_change_nothing(checkout):
+    code, run = checkout
+    before = fingerprints(code, run)
+    for path in code.rglob("*.py"):
+        path.write_text(path.read_text() + "\n# a remark\n")
+    assert changed(before, fingerprints(code, run)) == set()
+
+
+def test_setting_changes_stage_and_below(checkout):
+    code, run = checkout
+    before = fingerprints(code, run)
+    (run / "config/scenes/t.yaml").write_text(SCENE + "shading: {samples: 6}\n")
+    assert changed(before, fingerprints(code, run)) == below("shading")
+
+
+def test_unrelated_comment_in_scene_file_changes_nothing(checkout):
+    code, run = checkout
+    before = fingerprints(code, run)
+    (run / "config/scenes/t.yaml").write_text("# hello\n" + SCENE)
+    assert changed(before, fingerprints(code, run)) == set()
+
+
+def test_closure_covers_what_a_stage_really_imports(repository):
+    """Import every stage (with every plug-in) in a fresh interpreter; nothing of ours may be loaded that the digest misses."""
+    probe = textwrap.dedent(
+        """
+        import importlib, json, sys
+        from iif_core import native
+        native.prepare()
+        import mitsuba as mi
+        mi.set_variant("llvm_ad_rgb")
+        infrastructure = set(sys.modules)
+        names = sys.argv[1:]
+        for name in names: importlib.import_module(name)
+        print(json.dumps(sorted(m for m in sys.modules if m.split(".")[0] in ("iif_core", "workflow"))))
+        """
+    )
+    plugins = {"capture": ("source", ("builtin", "mitsuba", "folder")), "prior": ("prior", ("simulated", "files", "retinex"))}
+    for stage in STAGES:
+        section, kinds = plugins.get(stage, (None, (None,)))
+        for kind in kinds:
+            document = {section: {"kind": kind}} if section else {}
+            modules = fp.stage_modules(stage, document)
+            roots = [STAGES[stage].module] + [p.format(kind) for _, _, p in fp.PLUGINS.get(stage, ())]
+            out = subprocess.run([sys.executable, "-c", probe, *roots], cwd=repository, capture_output=True, text=True)
+            assert out.returncode == 0, out.stderr
+            loaded = json.loads(out.stdout.splitlines()[-1])
+            missed = [m for m in loaded if m not in modules and not fp.is_infrastructure(m) and m != "workflow"]
+            assert not [m for m in missed if m not in ("iif_core", "workflow.stages")], (stage, kind, missed)
+
+
+def test_function_level_imports_are_in_the_closure():
+    """The static walk sees imports inside functions, which a runtime probe of module imports would not."""
+    assert "iif_core.camera" in fp.import_closure("workflow.normal_form")
+
+
+def test_raw_digest_follows_content_not_time(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    photo = tmp_path / "a.png"
+    photo.write_bytes(b"one")
+    first = fp.raw_digest([photo])
+    photo.touch()
+    assert fp.raw_digest([photo]) == first
+    photo.write_bytes(b"two")
+    assert fp.raw_digest([photo]) != first

@@ -1,0 +1,161 @@
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from iif_core.errors import InputError
+from iif_core.nnls import EmissionRows, block_rows, solve_emission
+
+TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
+
+
+def _rows(a1, a2, target, weight=None, bound=None):
+    weight = np.ones_like(target) if weight is None else weight
+    bound = np.zeros(target.shape, bool) if bound is None else bound
+    return EmissionRows(a1.astype(np.float32), a2.astype(np.float32), target, weight, bound)
+
+
+def _random(n=500, groups=3, seed=0):
+    a = np.random.default_rng(seed).random((n, groups, 3)).astype(np.float32)
+    return a, np.einsum("ngc,gc->nc", a.astype(np.float64), TRUE[:groups])
+
+
+def test_planted_emission_is_recovered():
+    a, y = _random()
+    for cross in (True, False):
+        out = solve_emission(_rows(a, a, y), np.ones((3, 3)), cross=cross, ridge=1e-12)
+        np.testing.assert_allclose(out.radiance, TRUE, rtol=1e-6)
+        assert out.residual < 1e-6 and out.converged and (out.determined > 0.999).all()
+
+
+def test_noise_in_a_attenuates_and_two_estimates_cure_it():
+    """METHOD 7a: (7.3, 9.8, 14.8) against (4.98, 9.97, 20.05); the first follows in closed form for uniform A."""
+    rng = np.random.default_rng(1)
+    a, y = _random(200_000, seed=2)
+    a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))
+    single = solve_emission(_rows(a1, a1, y), np.ones((3, 3)), cross=False, ridge=1e-9)
+    both = solve_emission(_rows(a1, a2, y), np.ones((3, 3)), cross=True, ridge=1e-9)
+    # E[A'A] = J/4 + I/12 for uniform A; the noise adds I/12 on the diagonal: x = (J/4 + I/6)^-1 (J/4 + I/12) (5, 10, 20).
+    np.testing.assert_allclose(single.radiance[:, 0], [7.27, 9.77, 14.77], atol=0.15)
+    np.testing.assert_allclose(both.radiance[:, 0], [5, 10, 20], atol=0.15)
+    assert (np.abs(both.radiance - TRUE) < 5 * both.error + 1e-9).all()
+
+
+def test_against_bounded_least_squares():
+    rng = np.random.default_rng(3)
+    a = rng.random((80, 6, 3)).astype(np.float32)
+    y, w = rng.normal(1, 2, (80, 3)), rng.uniform(0.2, 3, (80, 3))
+    out = solve_emission(_rows(a, a, y, w), np.zeros((6, 3)), cross=False, ridge=1e-13)
+    for c in range(3):
+        s = np.sqrt(w[:, c])
+        oracle = lsq_linear(a[:, :, c] * s[:, None], y[:, c] * s, (0, np.inf), tol=1e-14).x
+        np.testing.assert_allclose(out.radiance[:, c], oracle, atol=1e-5)
+    assert (out.radiance == 0).any()  # the bound was at work
+
+
+def test_column_of_zeros_stays_at_the_initial_value():
+    a, _ = _random()
+    a[:, 1] = 0
+    y = np.einsum("ngc,gc->nc", a.astype(float), TRUE)
+    out = solve_emission(_rows(a, a, y), np.full((3, 3), 3.3), ridge=1e-10)
+    np.testing.assert_allclose(out.radiance[1], 3.3)
+    np.testing.assert_allclose(out.radiance[[0, 2]], TRUE[[0, 2]], rtol=1e-5)
+    assert out.determined.tolist()[1] == 0 and (out.error[1] == 3.3).all()
+
+
+def test_duplicate_columns_share_evenly():
+    a, _ = _random()
+    a[:, 1] = a[:, 0]
+    y = np.einsum("ngc,gc->nc", a.astype(float), TRUE)
+    out = solve_emission(_rows(a, a, y), np.ones((3, 3)))
+    np.testing.assert_allclose(out.radiance[0], out.radiance[1], rtol=1e-6)
+    np.testing.assert_allclose(out.radiance[:2].sum(0), TRUE[:2].sum(0), rtol=2e-3)
+    assert out.condition > 1e3 and (out.determined[:2] < 0.9).all() and np.isfinite(out.error).all()
+
+
+def test_indefinite_cross_moment_is_no_danger():
+    """Two rows of pure noise: the cross moment is indefinite; the answer stays near the initial value."""
+    rng = np.random.default_rng(5)
+    a1, a2 = rng.random((2, 4, 3)), rng.random((2, 4, 3))
+    out = solve_emission(_rows(a1, a2, rng.random((2, 3))), np.full((4, 3), 2.0))
+    assert np.isfinite(out.radiance).all() and (out.radiance >= 0).all() and out.radiance.max() < 20
+
+
+def test_saturated_rows_are_one_sided():
+    a, y = _random(400)
+    level = np.quantile(y, 0.6)
+    bound = y > level
+    target = np.minimum(y, level)
+    out = solve_emission(_rows(a, a, target, bound=bound), np.ones((3, 3)), ridge=1e-12)
+    np.testing.assert_allclose(out.radiance, TRUE, rtol=1e-5)
+    naive = solve_emission(_rows(a, a, target), np.ones((3, 3)), ridge=1e-12)
+    assert np.abs(naive.radiance / TRUE - 1).max() > 0.1  # treating them as equalities is plainly wrong
+    assert out.violated == 0
+
+
+def test_all_saturated_rises_to_the_bound_and_no_further():
+    a = np.ones((50, 1, 3), np.float32)
+    rows = _rows(a, a, np.full((50, 3), 7.0), bound=np.ones((50, 3), bool))
+    low = solve_emission(rows, np.ones((1, 3)), ridge=1e-9)
+    np.testing.assert_allclose(low.radiance, 7, rtol=1e-4)
+    high = solve_emission(rows, np.full((1, 3), 9.0))
+    np.testing.assert_array_equal(high.radiance, 9.0)  # already above: nothing to do
+    assert high.converged
+
+
+def test_no_rows_and_no_groups():
+    none = _rows(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 3)))
+    out = solve_emission(none, np.full((2, 3), 4.0))
+    assert (out.radiance == 4).all() and (out.determined == 0).all()
+    empty = _rows(np.zeros((5, 0, 3)), np.zeros((5, 0, 3)), np.ones((5, 3)))
+    assert solve_emission(empty, np.zeros((0, 3))).radiance.shape == (0, 3)
+
+
+def test_blocks_average_and_keep_bounds_apart():
+    a, y = _random(64)
+    block = np.repeat(np.arange(16), 4)
+    bound = np.zeros((64, 3), bool)
+    bound[3] = True
+    weight = np.ones((64, 3))
+    weight[1] = 3
+    out = block_rows(_rows(a, a, y, weight, bound), block)
+    assert len(out.target) == 17 and out.lower_bound.any(1).sum() == 1
+    np.testing.assert_allclose(out.weight.sum(0), weight.sum(0))
+    np.testing.assert_allclose(out.target[0], (y[0] + 3 * y[1] + y[2]) / 5, rtol=1e-6)
+    np.testing.assert_allclose(out.first[1], a[3], rtol=1e-6)
+    solution = solve_emission(out, np.ones((3, 3)), ridge=1e-12)
+    np.testing.assert_allclose(solution.radiance, TRUE, rtol=1e-4)
+
+
+def test_blocks_with_zero_weight_are_harmless():
+    a, y = _random(8)
+    out = block_rows(_rows(a, a, y, np.zeros((8, 3))), np.zeros(8, int))
+    assert (out.weight == 0).all() and np.isfinite(out.target).all()
+    assert (solve_emission(out, np.ones((3, 3))).radiance == 1).all()
+
+
+def test_blocks_cut_the_attenuation():
+    rng = np.random.default_rng(7)
+    tiles = rng.random((400, 3, 3))
+    a = np.repeat(tiles, 64, 0)
+    y = np.einsum("ngc,gc->nc", a, TRUE)
+    noisy = a * (1 + rng.standard_normal(a.shape))
+    pixel = _rows(noisy, noisy, y)
+    blocks = block_rows(pixel, np.repeat(np.arange(400), 64))
+    error = [np.abs(solve_emission(r, np.ones((3, 3)), cross=False).radiance - TRUE).max() for r in (pixel, blocks)]
+    assert error[1] < 0.1 * error[0]
+
+
+@pytest.mark.parametrize("initial", [np.ones((2, 3)), -np.ones((3, 3)), np.full((3, 3), np.nan)])
+def test_refused(initial):
+    a, y = _random(10)
+    with pytest.raises(InputError):
+        solve_emission(_rows(a, a, y), initial)
+
+
+def test_non_finite_rows_are_refused():
+    a, y = _random(10)
+    y[3, 1] = np.nan
+    with pytest.raises(InputError, match="target"):
+        solve_emission(_rows(a, a, y), np.ones((3, 3)))
+    with pytest.raises(InputError, match="weight"):
+        EmissionRows(a, a, y, np.ones(3), np.zeros((10, 3), bool))

@@ -1,0 +1,76 @@
+"""Settings: defaults, precedence, and errors that name file, key, what was found and what is allowed."""
+
+import pytest
+
+from iif_core.errors import InputError
+from workflow import settings
+from workflow.registry import STAGES, downstream_order
+
+GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
+
+
+@pytest.fixture
+def scene(tmp_path):
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    (tmp_path / "config/quality").mkdir()
+
+    def write(text, quality=""):
+        (tmp_path / "config/scenes/x.yaml").write_text(text)
+        (tmp_path / "config/quality/draft.yaml").write_text(quality)
+        return tmp_path
+
+    return write
+
+
+def test_scene_over_preset_over_default(scene):
+    root = scene(GOOD + "shading: {samples: 7}\n", "shading: {samples: 5, levels: 4}\n")
+    got = settings.load("x", "draft", root)
+    assert (got.shading.samples, got.shading.levels, got.shading.max_bounces) == (7, 4, 6)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (GOOD + "capture: {veiws: 3}\n", ["x.yaml", "capture.veiws", "unknown key", "Did you mean `views`?", "Allowed here"]),
+        (GOOD + "colour: 3\n", ["colour", "unknown key", "capture"]),
+        (GOOD + "capture: {views: 0}\n", ["capture.views", "found 0", "greater than or equal to 1"]),
+        (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
+        ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", "found 0"]),
+        ("source: {kind: buildin}\nprior: {kind: simulated}\n", ["source.kind", "'buildin'", "builtin, mitsuba, folder"]),
+        ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "missing"]),
+        ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", "found 3"]),
+        ("prior: {kind: simulated}\n", ["`source`: missing"]),
+        ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
+        ("- a\n- b\n", ["found list", "key: value"]),
+    ],
+)
+def test_errors_tell_what_to_do(scene, text, words):
+    root = scene(text)
+    with pytest.raises(InputError) as caught:
+        settings.load("x", "draft", root)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_unknown_scene_suggests(scene):
+    root = scene(GOOD)
+    with pytest.raises(InputError, match="Did you mean scenes/x"):
+        settings.load("xx", "draft", root)
+
+
+def test_shipped_scenes_load_at_every_quality(repository):
+    for name in settings.scene_names(repository):
+        for quality in settings.QUALITIES:
+            settings.load(name, quality, repository)
+
+
+def test_generated_files_are_current(repository):
+    assert (repository / "config/scene.schema.json").read_text() == settings.schema_json()
+    assert (repository / "docs/settings.md").read_text() == settings.reference_markdown()
+
+
+def test_registry_is_ordered_and_its_settings_exist(repository):
+    assert downstream_order()[0] == "capture"
+    document = settings.dump(settings.load("kitchen", "draft", repository))
+    for stage in STAGES.values():
+        settings.select(document, stage.settings)

@@ -1,0 +1,69 @@
+"""`python -m workflow <stage> <scene>`: what the rules call, and what a person calls in a debugger.
+
+Also `python -m workflow verify [scene ...]`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+from iif_core.errors import InputError
+from workflow.registry import STAGES
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m workflow", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    for stage in STAGES:
+        sub = commands.add_parser(stage)
+        sub.add_argument("scene")
+        sub.add_argument("--quality", default="draft")
+        sub.add_argument("--threads", type=int, default=2)
+        sub.add_argument("--fingerprint", help="refuse to run when it differs")
+        sub.add_argument("--log", type=Path)
+    verify = commands.add_parser("verify")
+    verify.add_argument("scenes", nargs="*")
+    return parser.parse_args()
+
+
+def _verify(scenes: list[str]) -> int:
+    from workflow.artifacts.verify import damaged
+
+    problems = list(damaged(Path("."), scenes or None))
+    for line in problems:
+        print(line)
+    print(f"{len(problems)} damaged" if problems else "all artefacts are as they were written")
+    return 1 if problems else 0
+
+
+def main() -> int:
+    """Exit code 0, or 1 with one line on stderr."""
+    arguments = _arguments()
+    if arguments.command == "verify":
+        return _verify(arguments.scenes)
+    from iif_core import native
+    from workflow.job import configure_logging, run_stage
+
+    configure_logging(arguments.log)
+    try:
+        native.prepare()
+        native.limit_threads(arguments.threads)
+        run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint)
+    except InputError as error:
+        logging.getLogger("error").error("%s", error)
+        return 1
+    except Exception:
+        logging.getLogger("error").exception(
+            "%s of %s stopped on an unexpected error (a bug: please report it with this log)",
+            arguments.command,
+            arguments.scene,
+        )
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

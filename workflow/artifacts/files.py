@@ -1,0 +1,113 @@
+"""Atomic writes, hashes, and the two formats (EXR, Parquet) as plain dictionaries of arrays."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_DTYPES = {"float16": np.float16, "float32": np.float32, "uint32": np.uint32}
+
+
+def sha256_of(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with open(path, "rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
+    """Call `write(temporary)` beside `path`, flush it to disk, rename it to `path`: readers never see half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    try:
+        write(temporary)
+        with open(temporary, "rb") as handle:
+            os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> dict[str, str]:
+    """Write (H, W) arrays as one EXR, ZIP-compressed; float16, float32 and uint32 are kept. Returns channel -> dtype."""
+    import OpenEXR
+
+    shapes = {a.shape for a in channels.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise ValueError(f"{path}: channels must share one (H, W) shape, found {sorted(shapes)}")
+    for name, array in channels.items():
+        if array.dtype.name not in _DTYPES:
+            raise ValueError(f"{path}: channel {name} has dtype {array.dtype}; allowed: {', '.join(_DTYPES)}")
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{path}: channel {name} holds {np.size(array) - np.isfinite(array).sum()} non-finite values")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    data = {name: np.ascontiguousarray(array) for name, array in channels.items()}
+
+    def write(temporary: Path) -> None:
+        with OpenEXR.File(header, data) as file:
+            file.write(str(temporary))
+
+    write_atomically(path, write)
+    return {name: array.dtype.name for name, array in channels.items()}
+
+
+def read_exr(path: Path) -> dict[str, np.ndarray]:
+    """All channels of a single-part EXR as (H, W) arrays, names as stored."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str]) -> dict[str, str]:
+    """Write named columns; (n, k) arrays become fixed-size lists. Returns column -> type. Same input, same bytes."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays: dict[str, pa.Array] = {}
+    for name, values in columns.items():
+        array = np.asarray(values)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{path}: column {name} holds non-finite values")
+        if array.ndim == 2:
+            flat = pa.array(np.ascontiguousarray(array).ravel())
+            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, array.shape[1])
+        elif array.dtype.kind in "UO":
+            arrays[name] = pa.array([str(v) for v in array.tolist()], pa.string())
+        else:
+            arrays[name] = pa.array(array)
+    lengths = {len(a) for a in arrays.values()}
+    if len(lengths) > 1:
+        raise ValueError(f"{path}: columns of different length { {k: len(a) for k, a in arrays.items()} }")
+    table = pa.table(arrays).replace_schema_metadata({k: v for k, v in metadata.items()})
+    write_atomically(path, lambda temporary: pq.write_table(table, temporary, compression="zstd", row_group_size=1 << 20))
+    return {name: str(array.type) for name, array in arrays.items()}
+
+
+def read_parquet(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a table as numpy arrays; fixed-size lists become (n, k)."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    out: dict[str, np.ndarray] = {}
+    table = pq.read_table(path)
+    for name in table.column_names:
+        column = table[name].combine_chunks()
+        if isinstance(column, pa.ChunkedArray):
+            column = column.chunk(0) if column.num_chunks else pa.array([], column.type)
+        if pa.types.is_fixed_size_list(column.type):
+            out[name] = column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), column.type.list_size)
+        else:
+            out[name] = column.to_numpy(zero_copy_only=False)
+    return out
+
+
+def write_json(path: Path, document: Any) -> None:
+    """Write JSON with sorted keys."""
+    text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    write_atomically(path, lambda temporary: temporary.write_text(text))

@@ -1,0 +1,183 @@
+"""A stage's folder on disk: written by `StageWriter`, sealed by its manifest, read strictly by `StageReader`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.artifacts import files as io
+
+SCHEMA = "iif.stage/1"
+MANIFEST = "manifest.json"
+
+
+class DamagedArtefact(InputError):
+    """A file on disk is not what its stage wrote: missing, changed, of another schema, or not finite."""
+
+    def __init__(self, path: Path, stage: str, scene: str, problem: str):
+        self.path, self.stage, self.scene = path, stage, scene
+        super().__init__(
+            f"{path}: {problem}. It was made by rule {stage};"
+            f" rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
+        )
+
+
+class StageWriter:
+    """Writes the files of one stage and, when it is finished, the manifest that makes them count.
+
+    The old manifest goes first and the new one comes last, so a killed job leaves a stage that is plainly not done.
+    """
+
+    def __init__(self, directory: Path, provenance: dict[str, Any]):
+        self.directory = directory
+        self.provenance = provenance
+        self.files: dict[str, dict[str, Any]] = {}
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / MANIFEST).unlink(missing_ok=True)
+
+    def exr(self, name: str, channels: dict[str, np.ndarray], units: str = "", colour_space: str = "linear") -> None:
+        """Write one raster: (H, W) float16/float32/uint32 channels; bool becomes half."""
+        channels = {k: a.astype(np.float16) if a.dtype == bool else a for k, a in channels.items()}
+        types = io.write_exr(self.directory / name, channels)
+        shape = list(next(iter(channels.values())).shape)
+        self._record(name, kind="exr", shape=shape, channels=types, units=units, colour_space=colour_space)
+
+    def table(self, name: str, columns: dict[str, Any], units: dict[str, str] | None = None) -> None:
+        """Write one table; (n, k) arrays become fixed-size lists."""
+        metadata = {"iif.schema": SCHEMA, "iif.stage": self.provenance["stage"]}
+        types = io.write_parquet(self.directory / name, columns, metadata)
+        rows = len(np.asarray(next(iter(columns.values()))))
+        self._record(name, kind="parquet", shape=[rows], channels=types, units=units or {}, colour_space="linear")
+
+    def json(self, name: str, document: Any) -> None:
+        """Write a small document."""
+        io.write_json(self.directory / name, document)
+        self._record(name, kind="json")
+
+    def bytes(self, name: str, data: bytes) -> None:
+        """Write a file of any other kind."""
+        io.write_atomically(self.directory / name, lambda temporary: _write_bytes(temporary, data))
+        self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
+
+    def foreign(self, name: str, write: Callable[[Path], None]) -> None:
+        """Let a library write a file: `write(temporary_path)`."""
+        io.write_atomically(self.directory / name, write)
+        self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
+
+    def _record(self, name: str, **facts: Any) -> None:
+        path = self.directory / name
+        self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}
+
+    def finish(self) -> None:
+        """Remove what an earlier run left, then write the manifest."""
+        kept = set(self.files) | {MANIFEST}
+        for path in sorted(self.directory.rglob("*"), reverse=True):
+            if path.is_dir():
+                if not any(path.iterdir()):
+                    path.rmdir()
+            elif str(path.relative_to(self.directory)) not in kept:
+                path.unlink()
+        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
+
+
+def _write_bytes(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+class StageReader:
+    """Reads a finished stage; every file is checked against the manifest when it is opened.
+
+    Raises:
+        DamagedArtefact: manifest missing or of another schema, file missing, hash differs, non-finite value.
+    """
+
+    def __init__(self, directory: Path, stage: str, scene: str):
+        self.directory, self.stage, self.scene = directory, stage, scene
+        path = directory / MANIFEST
+        if not path.is_file():
+            raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished")
+        try:
+            self.manifest: dict[str, Any] = json.loads(path.read_text())
+        except ValueError as error:
+            raise DamagedArtefact(path, stage, scene, f"not readable as JSON ({error})") from None
+        found = self.manifest.get("schema")
+        if found != SCHEMA:
+            raise DamagedArtefact(path, stage, scene, f"schema {found!r}, this version reads {SCHEMA!r}")
+
+    @property
+    def fingerprint(self) -> str:
+        return self.manifest["fingerprint"]
+
+    def has(self, name: str) -> bool:
+        """Whether the stage wrote this file."""
+        return name in self.manifest["files"]
+
+    def names(self, prefix: str = "") -> list[str]:
+        """Files of the stage whose name starts with `prefix`."""
+        return sorted(n for n in self.manifest["files"] if n.startswith(prefix))
+
+    def path(self, name: str) -> Path:
+        """Verified path of a file, for readers of foreign formats."""
+        facts = self.manifest["files"].get(name)
+        path = self.directory / name
+        if facts is None:
+            known = ", ".join(list(self.manifest["files"])[:8])
+            raise DamagedArtefact(path, self.stage, self.scene, f"not in the manifest (it lists {known}, ...)")
+        if not path.is_file():
+            raise DamagedArtefact(path, self.stage, self.scene, "missing")
+        size = path.stat().st_size
+        if size != facts["bytes"]:
+            raise DamagedArtefact(path, self.stage, self.scene, f"{size} bytes on disk, {facts['bytes']} were written")
+        if io.sha256_of(path) != facts["sha256"]:
+            raise DamagedArtefact(path, self.stage, self.scene, "its content changed since it was written (sha256 differs)")
+        return path
+
+    def exr(self, name: str) -> dict[str, np.ndarray]:
+        """Channels of a raster as (H, W) arrays."""
+        channels = io.read_exr(self.path(name))
+        facts = self.manifest["files"][name]
+        for channel, array in channels.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise DamagedArtefact(self.directory / name, self.stage, self.scene, f"channel {channel} is not finite")
+            if list(array.shape) != facts["shape"]:
+                problem = f"channel {channel} has shape {array.shape}, manifest says {facts['shape']}"
+                raise DamagedArtefact(self.directory / name, self.stage, self.scene, problem)
+        return channels
+
+    def table(self, name: str) -> dict[str, np.ndarray]:
+        """Columns of a table as numpy arrays; fixed-size lists are (n, k)."""
+        return io.read_parquet(self.path(name))
+
+    def json(self, name: str) -> Any:
+        """A small document."""
+        return json.loads(self.path(name).read_text())
+
+
+def rgb(channels: dict[str, np.ndarray], layer: str = "") -> np.ndarray:
+    """(H, W, 3) float32 of `layer.R/G/B` (or `R G B`)."""
+    prefix = f"{layer}." if layer else ""
+    return np.stack([channels[f"{prefix}{c}"].astype(np.float32) for c in "RGB"], -1)
+
+
+def split_rgb(array: np.ndarray, layer: str = "", dtype: type = np.float32) -> dict[str, np.ndarray]:
+    """Channels `layer.R/G/B` (or `R G B`) of an (H, W, 3) array."""
+    prefix = f"{layer}." if layer else ""
+    return {f"{prefix}{c}": array[..., i].astype(dtype) for i, c in enumerate("RGB")}
+
+
+NO_ID = np.uint32(0xFFFFFFFF)
+
+
+def ids_to_disk(ids: np.ndarray) -> np.ndarray:
+    """int32 with -1 = none -> uint32 with 4294967295 = none."""
+    return np.where(ids < 0, NO_ID, ids.astype(np.int64)).astype(np.uint32)
+
+
+def ids_from_disk(ids: np.ndarray) -> np.ndarray:
+    """uint32 with 4294967295 = none -> int32 with -1 = none."""
+    return np.where(ids == NO_ID, -1, ids.astype(np.int64)).astype(np.int32)

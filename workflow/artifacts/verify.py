@@ -1,0 +1,56 @@
+"""Re-hash every artefact under `results/` and `scenes/` against its manifest and name what is damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+from iif_core.errors import InputError
+from workflow.artifacts import files as io
+from workflow.artifacts.store import MANIFEST, StageReader
+
+
+def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
+    """One line for each damaged, missing or unlisted file; nothing when all is well."""
+    for manifest in sorted(root.glob(f"results/*/*/{MANIFEST}")):
+        stage, scene = manifest.parent.name, manifest.parent.parent.name
+        if scenes and scene not in scenes:
+            continue
+        try:
+            reader = StageReader(manifest.parent, stage, scene)
+        except InputError as error:
+            yield str(error)
+            continue
+        for name in reader.names():
+            try:
+                reader.path(name)
+            except InputError as error:
+                yield str(error)
+        listed = set(reader.names()) | {MANIFEST}
+        for path in sorted(manifest.parent.rglob("*")):
+            if path.is_file() and str(path.relative_to(manifest.parent)) not in listed:
+                yield f"{path}: not written by rule {stage} (not in its manifest); remove it"
+    for manifest in sorted(root.glob(f"scenes/*/{MANIFEST}")):
+        scene = manifest.parent.name
+        if scenes and scene not in scenes:
+            continue
+        yield from _deliverable(manifest, scene)
+    for folder in sorted(root.glob("scenes/*")):
+        if folder.is_dir() and (not scenes or folder.name in scenes) and not (folder / MANIFEST).is_file():
+            yield f"{folder / MANIFEST}: missing; rebuild with: snakemake --cores 2 scenes/{folder.name} --forcerun publish"
+
+
+def _deliverable(manifest: Path, scene: str) -> Iterator[str]:
+    again = f"rebuild with: snakemake --cores 2 scenes/{scene} --forcerun publish"
+    try:
+        listed = json.loads(manifest.read_text())["files"]
+    except (ValueError, KeyError) as error:
+        yield f"{manifest}: not readable ({error}); {again}"
+        return
+    for name, facts in sorted(listed.items()):
+        path = manifest.parent / name
+        if not path.is_file():
+            yield f"{path}: missing; {again}"
+        elif io.sha256_of(path) != facts["sha256"]:
+            yield f"{path}: its content changed since it was published (sha256 differs); {again}"

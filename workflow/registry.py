@@ -1,0 +1,63 @@
+"""The stages, in one table: what each needs and which settings it reads. Imports nothing heavy (the Snakefile reads it).
+
+`settings` are dotted paths into the settings tree; a stage can see no others (`Job.settings` refuses), so its fingerprint
+covers whatever it can depend on.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One rule: name, upstream stages, settings that it reads, whether raw input files enter here."""
+
+    name: str
+    upstream: tuple[str, ...]
+    settings: tuple[str, ...]
+    reads_raw: bool = False
+
+    @property
+    def module(self) -> str:
+        return f"workflow.stages.{self.name}"
+
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage("capture", (), ("source", "capture", "seed"), reads_raw=True),
+        Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
+        Stage("segmentation", ("capture",), ("segmentation",)),
+        Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
+        Stage("emission", ("capture", "segmentation", "base"), ("emission", "capture.dynamic_range", "affines.response", "seed")),
+        Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
+        Stage(
+            "affines",
+            ("capture", "segmentation", "base", "emission", "shading"),
+            ("affines", "capture.dynamic_range", "seed"),
+        ),
+        Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),
+        Stage("metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",)),
+        Stage("export", ("capture", "segmentation", "emission", "affines"), ("export",)),
+        Stage(
+            "report",
+            ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
+            ("report",),
+        ),
+        Stage(
+            "publish",
+            ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export", "report"),
+            (),
+        ),
+    )
+}
+
+
+def downstream_order() -> list[str]:
+    """Stage names so that every stage comes after what it needs (the table is written in that order; checked)."""
+    seen: set[str] = set()
+    for stage in STAGES.values():
+        missing = set(stage.upstream) - seen
+        if missing:
+            raise AssertionError(f"stage {stage.name} is listed before {sorted(missing)}")
+        seen.add(stage.name)
+    return list(STAGES)

@@ -1,0 +1,60 @@
+# Shared by all rules: the import path, the fingerprint of a stage, and the command of a job. Nothing is computed here.
+import sys
+
+sys.path.insert(0, workflow.basedir)
+
+from iif_core import native
+from iif_core.errors import InputError
+from workflow import fingerprint as fingerprints
+from workflow.settings import QUALITIES, scene_names
+
+native.process_environment()
+
+
+
+def stop(message):
+    """End with one message for the user instead of a traceback through Snakemake."""
+    print(f"\nerror: {message}\n", file=sys.stderr)
+    sys.exit(1)
+
+
+QUALITY = str(config.get("quality", "draft"))
+if QUALITY not in QUALITIES:
+    stop(
+        f"--config quality={QUALITY}: unknown quality; allowed: {', '.join(QUALITIES)}"
+    )
+if set(config) - {"quality"}:
+    stop(
+        f"--config {', '.join(sorted(set(config) - {'quality'}))}: unknown key; allowed: quality."
+        " Everything else belongs into config/scenes/<scene>.yaml (docs/settings.md)."
+    )
+
+
+wildcard_constraints:
+    scene=r"[A-Za-z0-9][A-Za-z0-9_-]*",
+
+
+def upstream(stage):
+    """Manifests of the stages that `stage` reads. Checks the scene first, so that bad input stops before any job."""
+
+    def inputs(wildcards):
+        try:
+            fingerprints.fingerprint(stage, wildcards.scene, QUALITY)
+        except InputError as error:
+            stop(error)
+        return [
+            f"results/{wildcards.scene}/{name}/manifest.json"
+            for name in fingerprints.STAGES[stage].upstream
+        ]
+
+    return inputs
+
+
+def job(stage):
+    """Arguments of `python -m workflow` for a stage; the fingerprint makes Snakemake rerun what changed, and only that."""
+
+    def arguments(wildcards):
+        mark = fingerprints.fingerprint(stage, wildcards.scene, QUALITY)
+        return f"{stage} {wildcards.scene} --quality {QUALITY} --fingerprint {mark}"
+
+    return arguments

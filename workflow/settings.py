@@ -1,0 +1,437 @@
+"""The settings of a scene: one typed model that validates, documents and generates (schema, defaults, reference page).
+
+Order of precedence: defaults here < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`.
+Nothing else is consulted: no environment variables, no hidden files.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from iif_core.errors import InputError
+
+QUALITIES = ("draft", "standard", "paper")
+
+
+class Section(BaseModel):
+    """A part of the settings; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+
+# ---------------------------------------------------------------------------------------------------------------- sources
+
+
+class BuiltinSource(Section):
+    """The room that the project makes itself; needs nothing from outside."""
+
+    kind: Literal["builtin"]
+    scene: Literal["kitchen", "tiny"] = "kitchen"
+    """`kitchen`: a furnished room; `tiny`: a few boxes for tests."""
+
+
+class MitsubaSource(Section):
+    """Any Mitsuba 3 scene XML; the workflow renders photographs, G-buffers and ground truth itself."""
+
+    kind: Literal["mitsuba"]
+    path: Path
+    """The scene's XML file."""
+    max_bounces: int = Field(16, ge=1, le=64)
+    """Path length of the rendered photographs."""
+    drop_transparent: bool = True
+    """Leave dielectric surfaces out of the mesh (a scan has none either); recorded, pixels behind them are not scored."""
+
+
+class FolderSource(Section):
+    """Your own scene: `transforms.json`, images and a mesh in one folder (docs/own-data.md)."""
+
+    kind: Literal["folder"]
+    path: Path
+    """The folder."""
+    mesh: str | None = None
+    """Mesh file inside the folder; default: the only one of mesh.ply, mesh.obj, mesh.glb."""
+    unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
+    """Unit of mesh and camera positions (a number = metres per unit)."""
+    axes: Literal["opengl", "opencv"] = "opengl"
+    """Camera axes of `transform_matrix`."""
+    pixel_centre: Literal["auto", "half", "integer"] = "auto"
+    """Where principal points count from: centres at (u+0.5) or at integers; auto reads `pixel_centres_at` of the file."""
+    frames: str | None = None
+    """Keep only images whose file path matches this glob."""
+    alignment: Literal["check", "warn", "off"] = "check"
+    """Reproject the mesh against depth or image edges; `check` refuses a mismatch with the measured disagreement."""
+    alignment_tolerance: float = Field(0.05, gt=0)
+    """Largest accepted median relative depth disagreement, where depth images exist."""
+
+
+Source = Annotated[BuiltinSource | MitsubaSource | FolderSource, Field(discriminator="kind")]
+
+
+class Capture(Section):
+    """How the photographs encode radiance, and how many are taken."""
+
+    dynamic_range: Literal["ldr", "hdr"] = "ldr"
+    """`ldr`: 8-bit through an unknown response; `hdr`: linear radiance."""
+    views: int = Field(16, ge=1)
+    """Photographs to render, or the largest number to take (evenly spread) from those that exist."""
+    width: int = Field(160, ge=16, le=8192)
+    """Image width in pixels (existing photographs are reduced to fit width x height, aspect kept)."""
+    height: int = Field(160, ge=16, le=8192)
+    """Image height in pixels."""
+    samples: int = Field(128, ge=1)
+    """Paths a pixel for rendered photographs."""
+    exposure: Literal["given", "estimate"] = "given"
+    """`estimate`: gains of the views from surface that they share."""
+    denoise: bool = False
+    """Denoise rendered photographs (needs the optional package pyoidn)."""
+    test_every: int = Field(0, ge=0)
+    """Every n-th view is kept for testing and never used (0 = none)."""
+
+
+# ------------------------------------------------------------------------------------------------------------------ prior
+
+
+class PriorBase(Section):
+    samples: int = Field(8, ge=1, le=256)
+    """Predictions a photograph, K."""
+
+
+class SimulatedPrior(PriorBase):
+    """Ground truth, spoilt the way RGB-X fails (needs a source with truth)."""
+
+    kind: Literal["simulated"]
+    strength: float = Field(1.0, ge=0, le=4)
+    """0 = truth; 1 = the raw errors that the paper reports for RGB-X."""
+
+
+class FilesPrior(PriorBase):
+    """Maps of any model: `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`."""
+
+    kind: Literal["files"]
+    path: Path | None = None
+    """Folder that holds `predictions/`; default: the source's folder."""
+    albedo_space: Literal["linear", "srgb"] = "linear"
+    """Encoding of the albedo files."""
+    roughness_is: Literal["perceptual", "alpha"] = "perceptual"
+    """`alpha` = r^2 (microfacet)."""
+
+
+class RetinexPrior(PriorBase):
+    """No weights: photograph / smooth shading with varied smoothness. A baseline, not a learned prior."""
+
+    kind: Literal["retinex"]
+    mean_albedo: float = Field(0.4, gt=0, lt=1)
+    """Mean albedo that each hypothesis is scaled to."""
+
+
+Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior, Field(discriminator="kind")]
+
+# ----------------------------------------------------------------------------------------------------------------- stages
+
+
+class Segmentation(Section):
+    """Which surface belongs to which object."""
+
+    kind: Literal["given", "geometry"] = "given"
+    """`given`: ids of faces or views; `geometry`: Felzenszwalb on the mesh graph."""
+    border_erosion: int = Field(1, ge=0, le=16)
+    """Pixels next to another object that count as border."""
+    scale: float = Field(0.05, gt=0)
+    """`geometry`: larger gives fewer, larger pieces."""
+    min_faces: int = Field(100, ge=1)
+    """`geometry`: smaller pieces are merged into a neighbour."""
+
+
+class Base(Section):
+    """Fusing the K predictions of all views into one 3D base texture."""
+
+    solver: Literal["direct"] = "direct"
+    """`direct`: alternating closed forms on surface cells."""
+    variant: Literal["full", "uniform", "texel_mean", "object_mean"] = "full"
+    """`full`: affines and selection; `uniform`: affines, no selection; the means: baselines."""
+    cell_edge: float | None = Field(None, gt=0)
+    """Edge of a surface cell in metres; default: `cell_footprints` pixel footprints."""
+    cell_footprints: float = Field(1.0, gt=0)
+    """Cell edge in median pixel footprints."""
+    sweeps: int = Field(12, ge=1, le=200)
+    """Alternations."""
+    ridge: float = Field(0.01, gt=0)
+    """Pull of the affines towards identity, per pixel."""
+    anneal: float = Field(0.6, gt=0, lt=1)
+    """Factor on the selection temperature per sweep."""
+
+
+class Emission(Section):
+    """Emitters: which faces, how bright."""
+
+    saturation: float = Field(0.99, gt=0, le=1)
+    """Sensor value at which a pixel counts as saturated."""
+    min_observations: int = Field(8, ge=1)
+    """Pixels that must have seen a face (or patch) before it can be an emitter."""
+    cache_edge: float = Field(0.06, gt=0)
+    """Edge of a radiance-cache voxel in metres."""
+    max_bounces: int = Field(6, ge=1, le=64)
+    """Path length where the cache does not answer."""
+    rows: int = Field(40000, ge=100)
+    """Pixels whose transport rows are traced."""
+    samples: int = Field(16, ge=2)
+    """Paths a row (two independent halves)."""
+    prune: float = Field(0.01, ge=0, lt=1)
+    """Groups below this share of the total power are dropped."""
+    environment: Literal["auto", "on", "off"] = "auto"
+    """Constant environment light for rays that escape; `auto`: when enough of them do."""
+
+
+class Shading(Section):
+    """Cached incident shading: diffuse and split specular."""
+
+    samples: int = Field(32, ge=2)
+    """Paths a pixel, over both halves."""
+    levels: int = Field(10, ge=3, le=32)
+    """Roughness levels."""
+    max_bounces: int = Field(6, ge=1, le=64)
+    """Path length where the radiance cache does not answer."""
+    indirect: Literal["cache", "path"] = "cache"
+    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials."""
+
+
+class Affines(Section):
+    """One affine per object and the camera response."""
+
+    response: Literal["auto", "identity", "srgb", "gamma", "ggcm"] = "auto"
+    """Family of the camera response; `auto`: identity for HDR, ggcm for LDR."""
+    iterations: int = Field(12, ge=1, le=200)
+    """Gauss-Newton steps."""
+    pixels: int = Field(200000, ge=100)
+    """Pixels in the fit (drawn evenly over objects)."""
+    ridge: float = Field(0.002, gt=0)
+    """Pull towards identity, per pixel."""
+    robust_width: float = Field(0.1, gt=0)
+    """Cauchy width of the residual in sensor units."""
+    scale: Literal["prior", "none"] = "prior"
+    """LDR leaves emission x albedo undetermined; `prior` keeps the prior's mean albedo."""
+
+
+class Render(Section):
+    """Re-rendering of the views from the recovered scene."""
+
+    samples: int = Field(32, ge=1)
+    """Paths a pixel."""
+    max_bounces: int = Field(8, ge=1, le=64)
+    """Path length."""
+
+
+class Metrics(Section):
+    """What is compared."""
+
+    views: Literal["all"] = "all"
+    """Views that are scored."""
+
+
+class Export(Section):
+    """Files for other programs."""
+
+    max_faces_glb: int = Field(2_000_000, ge=1000)
+    """Faces in scene.glb; above, it is refused with a note rather than written for minutes."""
+
+
+class Report(Section):
+    """The page."""
+
+    views: int = Field(6, ge=1)
+    """Views shown."""
+    credit: str = ""
+    """Line under the title (artist, licence)."""
+
+
+class SceneSettings(Section):
+    """Everything about one scene."""
+
+    source: Source
+    """Where photographs, cameras and mesh come from."""
+    capture: Capture = Capture()
+    prior: Prior
+    """Where the K material predictions come from."""
+    segmentation: Segmentation = Segmentation()
+    base: Base = Base()
+    emission: Emission = Emission()
+    shading: Shading = Shading()
+    affines: Affines = Affines()
+    render: Render = Render()
+    metrics: Metrics = Metrics()
+    export: Export = Export()
+    report: Report = Report()
+    seed: int = Field(0, ge=0, lt=2**31)
+    """Seed of everything random."""
+
+
+# ---------------------------------------------------------------------------------------------------------------- loading
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        document = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise InputError(f"{path}{where}: not valid YAML ({getattr(error, 'problem', error)})") from None
+    if document is None:
+        return {}
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: found {type(document).__name__}, expected `key: value` lines; see config/scenes/kitchen.yaml")
+    return document
+
+
+def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
+    """`upper` over `lower`, key by key; a different `kind` replaces the whole section."""
+    out = dict(lower)
+    for key, value in upper.items():
+        below = out.get(key)
+        if isinstance(value, dict) and isinstance(below, dict):
+            replaced = "kind" in value and "kind" in below and value["kind"] != below["kind"]
+            out[key] = value if replaced else merge(below, value)
+        else:
+            out[key] = value
+    return out
+
+
+def scene_names(root: Path = Path(".")) -> list[str]:
+    """Every scene that has a file."""
+    return sorted(path.stem for path in (root / "config/scenes").glob("*.yaml"))
+
+
+def scene_file(scene: str, root: Path = Path(".")) -> Path:
+    """Path of a scene's file; an unknown scene is an error that suggests the nearest name."""
+    path = root / "config/scenes" / f"{scene}.yaml"
+    if not path.is_file():
+        names = scene_names(root)
+        near = difflib.get_close_matches(scene, names, 1)
+        hint = f" Did you mean scenes/{near[0]}?" if near else ""
+        raise InputError(
+            f"config/scenes/{scene}.yaml: not found.{hint} Known scenes: {', '.join(names) or 'none'}."
+            " Add a file there to add a scene (docs/own-data.md)."
+        )
+    return path
+
+
+_UNIONS: dict[str, dict[str, type[Section]]] = {
+    "source": {"builtin": BuiltinSource, "mitsuba": MitsubaSource, "folder": FolderSource},
+    "prior": {"simulated": SimulatedPrior, "files": FilesPrior, "retinex": RetinexPrior},
+}
+
+def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
+    model: Any = SceneSettings
+    parts = [str(p) for p in where]
+    for part in parts[:-1]:
+        if part in _UNIONS and model is SceneSettings:
+            model = _UNIONS[part]
+        elif isinstance(model, dict):
+            model = model.get(part, model)
+        else:
+            field = getattr(model, "model_fields", {}).get(part)
+            model = field.annotation if field else model
+    return model if isinstance(model, type) else None
+
+
+def _explain(error: ValidationError, path: Path) -> str:
+    lines = []
+    for problem in error.errors():
+        where = problem["loc"]
+        tags = {tag for union in _UNIONS.values() for tag in union}
+        dotted = ".".join(str(p) for i, p in enumerate(where) if not (i == 1 and str(p) in tags))
+        found = problem.get("input")
+        kind = problem["type"]
+        if kind == "extra_forbidden":
+            section = _section_of(where)
+            allowed = sorted(section.model_fields) if section else []
+            near = difflib.get_close_matches(str(where[-1]), allowed, 1)
+            hint = f" Did you mean `{near[0]}`?" if near else ""
+            lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
+        elif kind == "missing":
+            lines.append(f"{path}: `{dotted}`: missing. Add it; config/scenes/kitchen.yaml is a complete example.")
+        elif kind in ("union_tag_invalid", "union_tag_not_found"):
+            union = _UNIONS.get(str(where[0]), {})
+            got = found.get("kind") if isinstance(found, dict) else found
+            lines.append(f"{path}: `{dotted}.kind`: found {got!r}, allowed: {', '.join(union)}.")
+        else:
+            shown = found if not isinstance(found, dict) else "a mapping"
+            lines.append(f"{path}: `{dotted}`: found {shown!r}. {problem['msg']}.")
+    return "\n".join(lines)
+
+
+def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSettings:
+    """Settings of `scene` at `quality`; an `InputError` names file, key, what was found and what is allowed."""
+    if quality not in QUALITIES:
+        raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
+    path = scene_file(scene, root)
+    own = _read_yaml(path)
+    preset_file = root / "config/quality" / f"{quality}.yaml"
+    preset = _read_yaml(preset_file) if preset_file.is_file() else {}
+    try:
+        return SceneSettings.model_validate(merge(preset, own))
+    except ValidationError as error:
+        raise InputError(_explain(error, path.relative_to(root) if path.is_absolute() else path)) from None
+
+
+def dump(settings: SceneSettings) -> dict[str, Any]:
+    """Plain JSON values of the settings."""
+    return settings.model_dump(mode="json")
+
+
+def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """The parts of a dumped settings tree named by dotted `keys`."""
+    out: dict[str, Any] = {}
+    for key in keys:
+        value: Any = document
+        for part in key.split("."):
+            value = value[part]
+        out[key] = value
+    return out
+
+
+def schema_json() -> str:
+    """JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
+    schema = SceneSettings.model_json_schema()
+    return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
+
+
+def reference_markdown() -> str:
+    """The settings as a page: key, default, allowed values, meaning (docs/settings.md)."""
+    lines = ["# Settings", "", "Made from `workflow/settings.py` by `python -m workflow.settings`; do not edit.", ""]
+
+    def rows(model: type[Section], prefix: str) -> None:
+        lines.extend(["| key | default | meaning |", "|---|---|---|"])
+        for name, field in model.model_fields.items():
+            if name == "kind":
+                continue
+            default = "required" if field.is_required() else f"`{field.get_default()}`"
+            text = " ".join((field.description or "").split())
+            bounds = ", ".join(str(m) for m in field.metadata)
+            literal = getattr(field.annotation, "__args__", ())
+            if literal and all(isinstance(v, str) for v in literal):
+                text += f" One of {', '.join(f'`{v}`' for v in literal)}."
+            lines.append(f"| `{prefix}{name}` | {default} | {text}{f' ({bounds})' if bounds else ''} |")
+        lines.append("")
+
+    for name, field in SceneSettings.model_fields.items():
+        if name in _UNIONS:
+            for kind, model in _UNIONS[name].items():
+                lines.extend([f"## `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
+                rows(model, f"{name}.")
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            lines.extend([f"## `{name}`", "", " ".join((field.annotation.__doc__ or "").split()), ""])
+            rows(field.annotation, f"{name}.")
+        else:
+            lines.extend([f"## `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    Path("config/scene.schema.json").write_text(schema_json())
+    Path("docs/settings.md").write_text(reference_markdown())

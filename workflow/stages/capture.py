@@ -1,0 +1,13 @@
+"""capture: photographs, cameras and mesh of any source -> the normal form."""
+
+from __future__ import annotations
+
+import importlib
+
+from workflow.job import Job
+
+
+def run(job: Job) -> None:
+    """Let the source that the scene names write its capture (`workflow/sources/<kind>.py`)."""
+    source = importlib.import_module(f"workflow.sources.{job.settings.source.kind}")
+    source.capture(job)
