@@ -78,14 +78,13 @@ if [ $installed = no ]; then
     # ones. So a .venv without a stamp of this folder (interrupted, moved, made by hand) is made anew; one with the
     # stamp of another lock is brought up to date in place.
     if [ "$folder" != "$root" ]; then
-        [ ! -e $venv/pyvenv.cfg ] || say "$venv is incomplete, moved or of another Python: making it anew"
         candidates=(python3 python3.11 python3.12 python3.13 python3.14)
         [ -z "${PYTHON:-}" ] || candidates=("$PYTHON")
         python='' tried=''
         for candidate in "${candidates[@]}"; do
             found=$("$candidate" -c "$version" 2>/dev/null) || continue
             if "$candidate" -c "$recent"; then python=$candidate && break; fi
-            tried="$tried${tried:+, }$candidate is Python $found"
+            tried="$tried${tried:+, }Python $found ($candidate)"
         done
         [ -n "$python" ] || fail "Python 3.11 or newer is needed, found ${tried:-none (tried: ${candidates[*]})}; install one and choose it with PYTHON=/path/to/python3"
         "$python" -c 'import venv, ensurepip' 2>/dev/null ||
@@ -96,6 +95,7 @@ if [ $installed = no ]; then
         if [ -e $venv ]; then free_mb=$(($(df -Pk $venv/ | awk 'NR == 2 {print $4}') / 1024 + $(du -sm $venv/ | cut -f1))); fi
         [ "$free_mb" -ge $needed_mb ] ||
             fail "$free_mb MB of disk are free for $root/$venv, about $needed_mb are needed; free some, or make .venv a link to a folder elsewhere"
+        [ ! -e $venv/pyvenv.cfg ] || say "$venv is incomplete, moved or of another Python: making it anew"
         say "making $venv with Python $found (3 GB, some minutes; progress: $log) ..."
         "$python" -m venv --clear $venv >&2 || fail "$python -m venv $venv failed; choose another Python with PYTHON=..."
     else

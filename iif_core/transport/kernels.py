@@ -105,9 +105,86 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     wi = offset / dr.maximum(distance, 1e-20)
     cos_front = -dr.dot(light_normal, wi)
     radiance, pdf_area, emits, _ = emitters.surface(face, cos_front, active)
-    candidate = active & (pdf_area > 0) if world.collector_ignores_radiance else emits
     pdf = pdf_area * distance2 / dr.abs(cos_front)
-    valid = candidate & (dr.abs(cos_front) > 1e-7) & (dr.dot(normal, wi) > 0) & (pdf > 0)
+    valid = emits & (dr.abs(cos_front) > 1e-7) & (dr.dot(normal, wi) > 0) & (pdf > 0)
     # Up to 1e-3 of the distance in front of the emitter counts as the emitter (METHOD H23).
     valid &= ~geometry.occluded(point, wi, distance * (1 - 1e-3), valid)
     return LightSample(valid, face, radiance, wi, pdf)
+
+
+def direct_light(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any,
+                 weight: Any, active: Any) -> Any:
+    """Gain of next-event estimation at a vertex whose path weight so far is `weight`."""
+    if not world.emitters.can_be_sampled:
+        return mi.Color3f(0)
+    light = sample_light(world, rng, point, normal, active)
+    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness)
+    f = reflectance(kd, ks, diffuse, spec, fc)
+    share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
+    return world.collector.emitter(light.face, light.radiance, weight * f * share, light.valid)
+
+
+def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
+    choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
+    wi = sample_lobe(choice < 0.5, u1, u2, wo, normal, roughness)
+    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness)
+    goes_on = active & (dr.dot(normal, wi) > 0) & (pdf > 0)
+    return goes_on, wi, dr.select(goes_on, reflectance(kd, ks, diffuse, spec, fc) / pdf, 0), pdf
+
+
+def roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
+    """(survives, 1 / survival probability) from the fourth bounce on; before that everyone survives."""
+    chance = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)
+    chance = dr.select(bounce >= ROULETTE_START, chance, 1)
+    survives = active & (uniform(rng) < chance) & (dr.max(throughput) > 0)
+    return survives, dr.select(survives, 1 / chance, 0)
+
+
+def take_from_cache(world: World, point: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
+    """(found, gain) of ending the path with the cached radiance."""
+    if world.cache is None or world.cache.count == 0:
+        return mi.Bool(False), mi.Color3f(0)
+    found, radiance = world.cache.radiance(point, active)
+    return found, dr.select(found, throughput * radiance, 0)
+
+
+@dr.syntax
+def incoming(world: World, rng: Any, origin: Any, direction: Any, pdf: Any, bounce: Any, max_bounces: Any,
+             active: Any, throughput: Any = 1.0) -> tuple[Any, Any]:
+    """(gain, rng) along `direction` from `origin`: radiance times `throughput`, when the collector collects radiance.
+
+    `pdf` is the density with which the direction was drawn where emitters were sampled as well, inf where they were
+    not; `bounce` counts the surface interactions so far. The path ends at the environment, in the radiance cache (only
+    for bounce >= 1 and never on an emitting face), after `max_bounces` interactions, or by Russian roulette.
+    """
+    gain = mi.Color3f(0)
+    throughput = mi.Color3f(throughput)
+    origin = mi.Point3f(origin)
+    direction = mi.Vector3f(direction)
+    pdf = mi.Float(pdf)
+    bounce = mi.UInt32(bounce)
+    active = mi.Bool(active)
+    while active:
+        hit = nearest_hit(world.geometry, origin, direction, active)
+        gain += world.collector.environment(world.emitters.environment_radiance(), throughput, active & ~hit.valid)
+        cos_front = -dr.dot(hit.normal, direction)
+        radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
+        weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))
+        gain += world.collector.emitter(hit.face, radiance, throughput * weight, emits)
+        found, cached = take_from_cache(world, hit.point, throughput, hit.valid & ~is_emitter & (bounce >= 1))
+        gain += cached
+
+        active &= hit.valid & ~found & (bounce < max_bounces) & (cos_front != 0)
+        normal = dr.select(cos_front < 0, -hit.normal, hit.normal)
+        wo = -direction
+        base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, active)
+        kd, ks = brdf.kd_ks(base_color, metallic)
+        origin = offset_from(hit.point, normal)
+        gain += direct_light(world, rng, origin, normal, wo, kd, ks, roughness, throughput, active)
+        active, direction, factor, pdf = scatter(rng, normal, wo, kd, ks, roughness, active)
+        throughput *= factor
+        bounce += 1
+        active, boost = roulette(rng, bounce, throughput, active)
+        throughput *= boost
+    return gain, rng

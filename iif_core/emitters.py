@@ -1,0 +1,367 @@
+"""Which surface shines by itself, in which groups, and the radiance cache of everything that does not.
+
+A face is a candidate when nearly all of its pixels in all views are saturated (LDR) or far brighter than the room (HDR). That
+is generous on purpose: the linear solve that follows gives a surface which merely reflects an emission near zero, and such
+groups are dropped again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.errors import InputError
+
+_HALF = 1 << 20  # voxel indices lie in [-2^20, 2^20)
+
+
+@dataclass(frozen=True)
+class FaceStatistics:
+    """What the photographs say about every face.
+
+    Attributes:
+        count: (F,) int32 observations.
+        low: (F,) float32, lower quantile over the observations of the largest channel; 0 where unobserved.
+        mean: (F, 3) float32 mean value; 0 where unobserved.
+        front: (F,) float32 in [0, 1]: share of the observations from the side of the face normal.
+    """
+
+    count: np.ndarray
+    low: np.ndarray
+    mean: np.ndarray
+    front: np.ndarray
+
+
+def face_statistics(
+    face: np.ndarray, value: np.ndarray, from_front: np.ndarray, n_faces: int, quantile: float = 0.05
+) -> FaceStatistics:
+    """Statistics of the pixels that see each face (METHOD 2.4, quantile form).
+
+    Args:
+        face: (n,) int, -1 = no face.
+        value: (n, 3) sensor value (LDR) or radiance (HDR); rows with non-finite values are left out.
+        from_front: (n,) bool, the camera is on the side of the face normal.
+        n_faces: F.
+        quantile: lower quantile; the observation of rank floor(quantile * count), so the minimum below 1 / quantile pixels.
+    """
+    good = (face >= 0) & np.isfinite(value).all(-1)
+    face, value, from_front = face[good], np.asarray(value)[good], from_front[good]
+    count = np.bincount(face, minlength=n_faces)
+    divisor = np.maximum(count, 1)
+    brightest = value.max(-1) if len(value) else np.zeros(0)
+    order = np.lexsort((brightest, face))
+    first = np.cumsum(count) - count
+    low = np.zeros(n_faces, np.float32)
+    seen = count > 0
+    low[seen] = brightest[order][(first + np.floor(quantile * count).astype(np.int64))[seen]]
+    mean = np.stack([np.bincount(face, value[:, c], n_faces) / divisor for c in range(3)], -1)
+    front = np.bincount(face, from_front.astype(np.float64), n_faces) / divisor
+    return FaceStatistics(count.astype(np.int32), low, mean.astype(np.float32), front.astype(np.float32))
+
+
+def face_adjacency(faces: np.ndarray) -> np.ndarray:
+    """Pairs of faces that share an edge (two vertex ids): (m, 2) int32, first < second; edges of more faces are chained."""
+    faces = np.asarray(faces, np.int64)
+    if not len(faces):
+        return np.zeros((0, 2), np.int32)
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    order = np.lexsort((owner, key))
+    same = (key[order][1:] == key[order][:-1]) & (owner[order][1:] != owner[order][:-1])
+    pairs = np.stack([owner[order][:-1][same], owner[order][1:][same]], 1)
+    return np.unique(pairs, axis=0).astype(np.int32)
+
+
+def face_geometry(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit normals (F, 3) by the right-hand rule (0 for degenerate faces) and areas (F,) in m^2; float64."""
+    p = np.asarray(vertices, np.float64)[faces]
+    cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    length = np.linalg.norm(cross, axis=-1)
+    return cross / np.maximum(length, 1e-30)[:, None], 0.5 * length
+
+
+def hdr_threshold(statistics: FaceStatistics, ratio: float = 5.0) -> float:
+    """Radiance above which a face may be an emitter: `ratio` times the median over pixels.
+
+    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may fill up to
+    half of the pixels. A white diffuse surface in a room reflects at most a few times the median; lamps and windows exceed it
+    by 10 to 50. Infinite when nothing was seen.
+    """
+    seen = statistics.count > 0
+    if not seen.any():
+        return float("inf")
+    low, weight = statistics.low[seen], statistics.count[seen]
+    order = np.argsort(low, kind="stable")
+    cumulative = np.cumsum(weight[order])
+    median = float(low[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
+    positive = low[low > 0]
+    floor = float(positive.min()) if len(positive) else 0.0
+    return ratio * max(median, floor) if max(median, floor) > 0 else float("inf")
+
+
+def emitter_candidates(
+    statistics: FaceStatistics, adjacency: np.ndarray, areas: np.ndarray, threshold: float, min_observations: int = 8
+) -> np.ndarray:
+    """Faces that may shine by themselves: (F,) bool (METHOD 2.4).
+
+    A face counts when its low quantile reaches `threshold` over at least `min_observations` pixels. Faces seen by fewer
+    pixels are pooled: connected ones that all reach the threshold count when together they were seen often enough (finely
+    tessellated lamps). A mesh component whose observed area is candidate to 90 % is taken whole (the far side of a lamp).
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n_faces = len(statistics.count)
+    bright = (statistics.count > 0) & (statistics.low >= threshold) & (areas > 1e-12)
+    candidate = bright & (statistics.count >= min_observations)
+
+    def components(mask: np.ndarray) -> np.ndarray:
+        pair = adjacency[mask[adjacency[:, 0]] & mask[adjacency[:, 1]]]
+        graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n_faces, n_faces))
+        return connected_components(graph, directed=False)[1]
+
+    if not bright.any():
+        return candidate
+    label = components(bright)
+    pooled = np.bincount(label, np.where(bright, statistics.count, 0), label.max() + 1)
+    candidate = bright & (pooled[label] >= min_observations)
+    if not candidate.any():
+        return candidate
+    whole = components(np.ones(n_faces, bool))
+    observed = np.bincount(whole, np.where(statistics.count > 0, areas, 0.0))
+    shining = np.bincount(whole, np.where(candidate, areas, 0.0), len(observed))
+    complete = (observed > 0) & (shining >= 0.9 * observed)
+    return candidate | (complete[whole] & (statistics.count == 0) & (areas > 1e-12))
+
+
+@dataclass(frozen=True)
+class EmitterGroups:
+    """Emitter groups; group g is row g of the arrays.
+
+    Attributes:
+        of_face: (F,) int32 group of every face, -1 = none.
+        side: (F,) int32: +1 shines to the side of the normal, -1 to the other, 0 to both; 0 where `of_face` is -1.
+        faces: (G,) int32; area: (G,) m^2; observed: (G, 3) mean observed value, weighted by pixels; count: (G,) pixels.
+        dropped: [(faces, area, reason)] candidates that were left out.
+    """
+
+    of_face: np.ndarray
+    side: np.ndarray
+    faces: np.ndarray
+    area: np.ndarray
+    observed: np.ndarray
+    count: np.ndarray
+    dropped: list[tuple[int, float, str]]
+
+    @property
+    def size(self) -> int:
+        return len(self.faces)
+
+
+def group_emitters(
+    candidate: np.ndarray,
+    statistics: FaceStatistics,
+    adjacency: np.ndarray,
+    normals: np.ndarray,
+    areas: np.ndarray,
+    max_angle: float = 15.0,
+    max_ratio: float = 1.5,
+    small_area: float = 0.25,
+    min_faces: int = 3,
+    min_area: float = 1e-4,
+    max_groups: int = 64,
+) -> EmitterGroups:
+    """Candidates in groups that share one radiance (METHOD 8): connected, normals within `max_angle`, colours within
+    `max_ratio`, same side. A connected piece below `small_area` is one group whatever its normals (bulbs, shades).
+
+    Merging is greedy from the most similar neighbours on and compares the means of the groups, so that a gradient is cut
+    into steps instead of being chained into one group.
+
+    Args:
+        candidate: (F,) bool; statistics, adjacency, normals (F, 3), areas (F,): of the same mesh.
+        max_angle: degrees; max_ratio: of any channel between two groups; small_area, min_area: m^2.
+        min_faces, min_area: a group needs one of the two.
+        max_groups: the strongest (area x radiance) are kept.
+    """
+    n_faces = len(candidate)
+    ids = np.flatnonzero(candidate)
+    side = np.zeros(n_faces, np.int32)
+    front = statistics.front[ids]
+    side[ids] = np.where(front > 0.9, 1, np.where(front < 0.1, -1, 0))
+    # Unseen faces (far sides) follow the majority of what was seen; the normal's side when nothing was.
+    unseen = statistics.count[ids] == 0
+    seen_sides = side[ids[~unseen]]
+    side[ids[unseen]] = (1 if (seen_sides >= 0).mean() >= 0.5 else -1) if len(seen_sides) else 1
+
+    pair = adjacency[candidate[adjacency[:, 0]] & candidate[adjacency[:, 1]]]
+    pair = pair[side[pair[:, 0]] == side[pair[:, 1]]]
+    local = np.full(n_faces, -1, np.int64)
+    local[ids] = np.arange(len(ids))
+    piece_area = _piece_areas(local[pair], areas[ids])
+    weight = np.maximum(statistics.count[ids], 1e-3).astype(np.float64)
+    colour = np.where(unseen[:, None], 0.0, statistics.mean[ids]) * weight[:, None]
+    parent = _merge(
+        local[pair], normals[ids], areas[ids], colour, np.where(unseen, 0.0, weight), piece_area < small_area,
+        np.cos(np.radians(max_angle)), max_ratio,
+    )
+    label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
+    count = np.bincount(label)
+    area = np.bincount(label, areas[ids])
+    pixels = np.bincount(label, statistics.count[ids])
+    observed = np.stack([np.bincount(label, statistics.mean[ids, c] * statistics.count[ids]) for c in range(3)], -1)
+    observed = observed / np.maximum(pixels, 1)[:, None]
+    solid = (count >= min_faces) | (area >= min_area)
+    power = area * observed.sum(-1)
+    order = np.lexsort((np.arange(len(count)), -power))
+    kept = [g for g in order if solid[g]][:max_groups]
+    dropped = [
+        (int(count[g]), float(area[g]), "too small" if not solid[g] else f"not among the {max_groups} strongest")
+        for g in order
+        if g not in set(kept)
+    ]
+    number = np.full(len(count), -1, np.int64)
+    number[kept] = np.arange(len(kept))
+    of_face = np.full(n_faces, -1, np.int32)
+    of_face[ids] = number[label]
+    side[of_face < 0] = 0
+    kept_index = np.array(kept, np.int64)
+    return EmitterGroups(
+        of_face, side, count[kept_index].astype(np.int32), area[kept_index], observed[kept_index].astype(np.float64),
+        pixels[kept_index].astype(np.int64), dropped,
+    )
+
+
+def _piece_areas(pair: np.ndarray, areas: np.ndarray) -> np.ndarray:
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(areas)
+    if not n:
+        return np.zeros(0)
+    graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n, n))
+    label = connected_components(graph, directed=False)[1]
+    return np.bincount(label, areas)[label]
+
+
+def _merge(
+    pair: np.ndarray, normals: np.ndarray, areas: np.ndarray, colour: np.ndarray, weight: np.ndarray, small: np.ndarray,
+    min_cosine: float, max_ratio: float,
+) -> np.ndarray:
+    """Union-find over neighbouring faces; returns the root of each."""
+    n = len(areas)
+    parent = np.arange(n)
+    normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()
+
+    def root(i: int) -> int:
+        while parent[i] != i:
+            parent[i] = parent[parent[i]]
+            i = parent[i]
+        return i
+
+    def ratio(i: int, j: int) -> float:
+        if weight_sum[i] == 0 or weight_sum[j] == 0:
+            return 1.0
+        a, b = colour_sum[i] / weight_sum[i] + 1e-6, colour_sum[j] / weight_sum[j] + 1e-6
+        return float(np.max(np.maximum(a / b, b / a)))
+
+    first = np.array([ratio(i, j) for i, j in pair]) if len(pair) else np.zeros(0)
+    for e in np.argsort(first, kind="stable"):
+        i, j = root(int(pair[e, 0])), root(int(pair[e, 1]))
+        if i == j or ratio(i, j) >= max_ratio:
+            continue
+        if not small[i]:
+            a, b = normal_sum[i], normal_sum[j]
+            if a @ b < min_cosine * np.sqrt((a @ a) * (b @ b)):
+                continue
+        i, j = min(i, j), max(i, j)
+        parent[j] = i
+        normal_sum[i] += normal_sum[j]
+        colour_sum[i] += colour_sum[j]
+        weight_sum[i] += weight_sum[j]
+    return np.array([root(i) for i in range(n)])
+
+
+@dataclass(frozen=True)
+class RadianceVoxels:
+    """A sparse voxel radiance cache.
+
+    Attributes:
+        edge: m; origin: (3,) corner of voxel (0, 0, 0).
+        ijk: (n, 3) int32, sorted; a voxel that is not listed is unknown, not black (METHOD H27).
+        radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored one, a lower
+            bound (H60).
+        samples: (n,) int32 observations behind `radiance`.
+        censored: (n,) bool, `radiance` is a lower bound.
+    """
+
+    edge: float
+    origin: np.ndarray
+    ijk: np.ndarray
+    radiance: np.ndarray
+    samples: np.ndarray
+    censored: np.ndarray
+
+
+class RadianceSums:
+    """Running sums per voxel: `add` the pixels of one view after another, then `finish` (METHOD 2.0).
+
+    Args:
+        edge: voxel edge in m.
+        origin: (3,) corner of voxel (0, 0, 0).
+
+    Raises:
+        InputError: edge not positive, or so small that indices overflow (2^20 voxels from the origin).
+    """
+
+    def __init__(self, edge: float, origin: np.ndarray):
+        if not edge > 0:
+            raise InputError(f"radiance cache: edge {edge} m, must be positive")
+        self.edge, self.origin = float(edge), np.asarray(origin, np.float64)
+        self._key = np.zeros(0, np.int64)
+        # columns: sum R G B, count, largest censored R G B, censored count
+        self._value = np.zeros((0, 8))
+
+    def add(self, points: np.ndarray, radiance: np.ndarray, censored: np.ndarray) -> None:
+        """Add pixels: points (n, 3) in m, radiance (n, 3) linear, censored (n,) bool; non-finite rows are left out.
+
+        The caller leaves out pixels on emitters (METHOD H28).
+        """
+        good = np.isfinite(radiance).all(-1) & np.isfinite(points).all(-1)
+        ijk = np.floor((points[good] - self.origin) / self.edge)
+        if len(ijk) and np.abs(ijk).max() >= _HALF:
+            raise InputError(f"radiance cache: a point is {np.abs(ijk).max():.0f} voxels from the origin; use a larger edge")
+        index = ijk.astype(np.int64) + _HALF
+        key = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        value, clipped = np.asarray(radiance, np.float64)[good], np.asarray(censored)[good]
+        row = np.concatenate(
+            [
+                np.where(clipped[:, None], 0.0, value), (~clipped)[:, None],
+                np.where(clipped[:, None], value, 0.0), clipped[:, None],
+            ],
+            1,
+        )
+        key = np.concatenate([self._key, key])
+        row = np.concatenate([self._value, row])
+        if not len(key):
+            return
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
+        self._key = key[order][starts]
+        sums = np.add.reduceat(row[order], starts, 0)
+        sums[:, 4:7] = np.maximum.reduceat(row[order][:, 4:7], starts, 0)
+        self._value = sums
+
+    def finish(self) -> RadianceVoxels:
+        """The cache of what was added so far."""
+        count, clipped = self._value[:, 3], self._value[:, 7]
+        bound = count == 0
+        mean = self._value[:, :3] / np.maximum(count, 1)[:, None]
+        radiance = np.where(bound[:, None], self._value[:, 4:7], mean)
+        mask = (1 << 21) - 1
+        ijk = np.stack([self._key >> 42, (self._key >> 21) & mask, self._key & mask], -1) - _HALF
+        samples = np.where(bound, clipped, count).astype(np.int32)
+        return RadianceVoxels(
+            self.edge, self.origin.astype(np.float32), ijk.astype(np.int32), radiance.astype(np.float32), samples, bound
+        )

@@ -1,0 +1,133 @@
+"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one set of paths."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .. import brdf
+from ..errors import InputError
+from .arrays import chunks, lane_streams, rows_of, to_numpy, vectors
+from .cache import RadianceCache
+from .emitters import Emitters
+from .geometry import Geometry, offset_from
+from .kernels import World, direct_light, incoming, scatter
+from .render import check_counts
+from .shading import surface_points
+
+Array = np.ndarray
+
+MATRIX_FLOATS = 1 << 26
+"""Entries of the matrix held on the device at once (256 MiB)."""
+
+
+class _ColumnCollector:
+    """Deposits path weights in the row of the lane and the column of the emitter's group; only cached light is returned.
+
+    A lane writes to its own row alone, so plain (non-atomic) additions are safe and their order is fixed.
+    """
+
+    def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, environment_group: int | None):
+        self.rows, self.lane, self.groups = rows, lane, groups
+        self.group_of_face, self.environment_group = group_of_face, environment_group
+
+    def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        group = dr.gather(mi.Int32, self.group_of_face, face, active)
+        return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
+
+    def environment(self, radiance: Any, weight: Any, active: Any) -> Any:
+        if self.environment_group is None:
+            return mi.Color3f(0)
+        return self._deposit(mi.UInt32(self.environment_group), weight, active)
+
+    def _deposit(self, group: Any, weight: Any, active: Any) -> Any:
+        entry = (self.lane * self.groups + group) * 3
+        for channel in range(3):
+            dr.scatter_reduce(dr.ReduceOp.Add, self.rows, weight[channel], entry + channel, active,
+                              mode=dr.ReduceMode.NoConflicts)
+        return mi.Color3f(0)
+
+
+@dr.syntax
+def _deposit_paths(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any,
+                   samples: Any, max_bounces: Any) -> Any:
+    cached = mi.Color3f(0)
+    origin = offset_from(point, normal)
+    visible = dr.dot(normal, wo) > 0
+    sample = mi.UInt32(0)
+    while sample < samples:
+        cached += direct_light(world, rng, origin, normal, wo, kd, ks, roughness, mi.Color3f(1), visible)
+        goes_on, wi, factor, pdf = scatter(rng, normal, wo, kd, ks, roughness, visible)
+        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, goes_on, factor)
+        cached += gain
+        sample += 1
+    return cached
+
+
+def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, normals: ArrayLike, wo: ArrayLike,
+                     base_color: ArrayLike, roughness: ArrayLike, metallic: ArrayLike, emitter_of_face: ArrayLike,
+                     n_groups: int, side: ArrayLike | None, samples: int, max_bounces: int, seed: int,
+                     cache: RadianceCache | None = None, environment_group: int | None = None,
+                     sampling_weight: ArrayLike | None = None, chunk: int | None = None) -> tuple[Array, Array]:
+    """(A (n, G, 3), h (n, 3)) float32: radiance reflected at each point is A @ E + h for emitter radiances E (G, 3).
+
+    points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own materials;
+    `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in `Emitters`; faces of a
+    group emit its unknown radiance. h is what paths take from `cache` (0 without). Escaping paths are deposited in column
+    environment_group when given. The point's own, directly visible emission is not included. sampling_weight (m,)
+    overrides the default, half by area and half the same for every group. max_bounces counts surface interactions including
+    the point. chunk: points on the device at once, by default what keeps A there within 256 MiB.
+    Source: METHOD 7a (multi-bounce, or one bounce and the cache); COMPUTE 4.
+    """
+    check_counts(samples, max_bounces)
+    points, normals, wo = surface_points(points, normals, wo)
+    count = len(points)
+    base_color = np.clip(rows_of(base_color, count, 3, "base_color"), 0, 1)
+    roughness = np.clip(rows_of(roughness, count, None, "roughness"), brdf.R_MIN, 1)
+    metallic = np.clip(rows_of(metallic, count, None, "metallic"), 0, 1)
+    groups = np.ascontiguousarray(emitter_of_face, np.int32)
+    if groups.shape != (len(geometry.faces),) or groups.min() < -1 or groups.max() >= n_groups:
+        raise InputError(f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
+                         f"({len(geometry.faces)},) in -1 ... {n_groups - 1}")
+    if environment_group is not None and not 0 <= environment_group < n_groups:
+        raise InputError(f"environment_group is {environment_group}; expected 0 ... {n_groups - 1}")
+    matrix, cached = np.zeros((count, n_groups, 3), np.float32), np.zeros((count, 3), np.float32)
+    if max_bounces == 0 or n_groups == 0 and cache is None:
+        return matrix, cached
+    if sampling_weight is None:
+        sampling_weight = _group_weights(geometry.areas, groups, n_groups)
+    emitters = Emitters(geometry, np.zeros((len(groups), 3)), side, sampling_weight=sampling_weight)
+    group_of_face = mi.Int32(groups)
+    if chunk is None:
+        chunk = max(1, min(1 << 17, MATRIX_FLOATS // (3 * max(n_groups, 1))))
+    for part in chunks(count, chunk):
+        lanes = part.stop - part.start
+        rows = dr.zeros(mi.Float, lanes * max(n_groups, 1) * 3)
+        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, lanes), n_groups, group_of_face, environment_group)
+        kd, ks = brdf.kd_ks(base_color[part], metallic[part, None])
+        gain = _deposit_paths(
+            World(geometry, material, emitters, cache, collector), lane_streams(seed, part.start, lanes),
+            vectors(mi.Point3f, points[part]), vectors(mi.Vector3f, normals[part]), vectors(mi.Vector3f, wo[part]),
+            vectors(mi.Color3f, kd), vectors(mi.Color3f, ks), mi.Float(roughness[part]),
+            dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, max_bounces))
+        dr.eval(gain, rows)
+        cached[part] = to_numpy(gain) / samples
+        if n_groups:
+            matrix[part] = to_numpy(rows).reshape(lanes, n_groups, 3) / samples
+    return matrix, cached
+
+
+def _group_weights(areas: Array, groups: Array, n_groups: int) -> Array:
+    """Half by area, half the same for every group with area: small emitters are not starved by large ones."""
+    member = groups >= 0
+    area = np.where(member, areas, 0.0)
+    total = np.bincount(groups[member], area[member], minlength=n_groups)
+    filled = np.count_nonzero(total)
+    if not filled:
+        return np.zeros(len(areas))
+    share = np.divide(1.0, total, out=np.zeros(n_groups), where=total > 0)
+    return 0.5 * area / total.sum() + 0.5 * area * np.where(member, share[groups], 0.0) / filled

@@ -1,0 +1,206 @@
+"""The reflectance: against the published furnace table, float64, sampling statistics, and across array libraries."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from iif_core import brdf, native
+from iif_core.xp import NUMPY
+
+RNG = np.random.default_rng(7)
+Z = (0.0, 0.0, 1.0)
+FURNACE = {  # roughness: (S0, S1) at NoV = 1, 0.7, 0.4, 0.2, 0.1 for incident radiance 1
+    0.02: [(1.000, 0.000), (0.895, 0.002), (0.646, 0.054), (0.291, 0.142), (0.087, 0.125)],
+    0.216: [(0.993, 0.000), (0.849, 0.002), (0.564, 0.045), (0.249, 0.096), (0.104, 0.080)],
+    0.412: [(0.927, 0.000), (0.758, 0.003), (0.509, 0.028), (0.319, 0.052), (0.241, 0.055)],
+    0.608: [(0.748, 0.000), (0.628, 0.003), (0.501, 0.015), (0.426, 0.028), (0.396, 0.035)],
+    0.804: [(0.510, 0.000), (0.491, 0.002), (0.485, 0.007), (0.492, 0.016), (0.504, 0.022)],
+    1.0: [(0.306, 0.000), (0.360, 0.001), (0.435, 0.004), (0.503, 0.009), (0.544, 0.014)],
+}
+
+
+def view(NoV):
+    return (np.sqrt(1 - NoV * NoV), 0.0, NoV)
+
+
+def uniform_grid(n):
+    u = (np.arange(n) + 0.5) / n
+    return (part.ravel() for part in np.meshgrid(u, u, indexing="ij"))
+
+
+def unit_vectors(n, dtype=np.float64):
+    v = RNG.normal(size=(3, n))
+    v[2] = np.abs(v[2]) + 1e-3
+    return tuple((v / np.linalg.norm(v, axis=0)).astype(dtype))
+
+
+@pytest.mark.parametrize("r", FURNACE)
+def test_furnace_table(r):
+    u1, u2 = uniform_grid(700)
+    for NoV, (s0, s1) in zip((1, 0.7, 0.4, 0.2, 0.1), FURNACE[r], strict=True):
+        wo = view(NoV)
+        wi = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
+        NoL, _, NoH, VoH, sin2 = angles = brdf.half_angles(NUMPY, Z, wi, wo)
+        _, spec, fc = brdf.lobes(NUMPY, *angles, r)
+        weight = spec / brdf.specular_pdf(NUMPY, NoH, VoH, sin2, r)
+        assert np.mean(weight * (1 - fc)) == pytest.approx(s0, abs=1.2e-3)
+        assert np.mean(weight * fc) == pytest.approx(s1, abs=1.2e-3)
+
+
+def test_diffuse_lobe_integrates_to_one():
+    u1, u2 = uniform_grid(200)
+    wi = brdf.sample_cosine(NUMPY, u1, u2)
+    diffuse, _, _ = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, wi, view(0.6)), 0.5)
+    assert np.mean(diffuse * np.pi / wi[2]) == pytest.approx(1, abs=1e-9)
+
+
+def textbook(NoL, NoV, sin2_h, VoH, r):
+    """The formulae of the paper, in float64 and without any rearrangement."""
+    NoH = np.sqrt(1 - sin2_h)
+    alpha2 = r**4
+    d = alpha2 / (np.pi * (NoH**2 * (alpha2 - 1) + 1) ** 2)
+    k = (r + 1) ** 2 / 8
+    geometric = NoL / (NoL * (1 - k) + k) * NoV / (NoV * (1 - k) + k)
+    return d * geometric / (4 * NoL * NoV) * NoL, (1 - VoH) ** 5
+
+
+@pytest.mark.parametrize("r", [0.02, 0.05, 0.3, 1.0])
+def test_float32_keeps_its_digits_at_the_peak(r):
+    tan2 = r**4 * np.geomspace(1e-4, 1e4, 200)
+    sin2 = (tan2 / (1 + tan2)).astype(np.float32)
+    NoH = np.sqrt(1 - sin2.astype(np.float64)).astype(np.float32)
+    NoL, NoV, VoH = (np.full(200, x, np.float32) for x in (0.7, 0.45, 0.8))
+    _, spec, fc = brdf.lobes(NUMPY, NoL, NoV, NoH, VoH, sin2, np.float32(r))
+    oracle, schlick = textbook(*(x.astype(np.float64) for x in (NoL, NoV, sin2, VoH)), np.float64(np.float32(r)))
+    assert spec.dtype == np.float32
+    np.testing.assert_allclose(spec, oracle, rtol=3e-6)
+    np.testing.assert_allclose(fc, schlick, rtol=1e-5)
+
+
+def test_float32_from_vectors_at_the_sharpest_lobe():
+    wo = unit_vectors(2000)
+    u1, u2 = RNG.random(2000) * 0.99, RNG.random(2000)
+    wi = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, 0.02))
+    single = [tuple(x.astype(np.float32) for x in v) for v in (wi, wo)]
+    double = [tuple(x.astype(np.float64) for x in v) for v in single]
+    z = tuple(np.float32(x) for x in Z)
+    _, spec, _ = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, z, *single), np.float32(0.02))
+    _, oracle, _ = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, *double), np.float64(np.float32(0.02)))
+    assert np.max(np.abs(spec - oracle) / (oracle + 1e-3)) < 5e-3  # h itself is known to 6e-8 of 4e-4
+
+
+def test_compose_is_the_fresnel_form():
+    wo, wi = unit_vectors(50), unit_vectors(50)
+    a, r, m = RNG.random((3, 50)), 0.02 + 0.98 * RNG.random(50), RNG.random(50)
+    kd, ks = brdf.kd_ks(a, m)
+    diffuse, spec, fc = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, wi, wo), r)
+    np.testing.assert_allclose(brdf.compose(kd, ks, diffuse, spec * (1 - fc), spec * fc),
+                               kd * wi[2] / np.pi + (ks + (1 - ks) * fc) * spec, rtol=1e-12)
+    np.testing.assert_allclose(kd + ks, 0.04 * (1 - m) + a, rtol=1e-12)
+
+
+def test_reflectance_is_reciprocal():
+    wo, wi = unit_vectors(200), unit_vectors(200)
+    r = 0.02 + 0.98 * RNG.random(200)
+    _, there, fc_there = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, wi, wo), r)
+    _, back, fc_back = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, wo, wi), r)
+    np.testing.assert_allclose(there / wi[2], back / wo[2], rtol=1e-6)
+    np.testing.assert_allclose(fc_there, fc_back, rtol=1e-9)
+
+
+@pytest.mark.parametrize("r", [0.02, 0.2, 1.0])
+def test_half_vectors_follow_ggx(r):
+    """tan^2(theta_h) has the distribution function t / (alpha^2 + t), phi is uniform: chi-squared over 20 x 10 cells."""
+    n = 100_000
+    h = brdf.sample_ggx_half(NUMPY, RNG.random(n), RNG.random(n), r)
+    np.testing.assert_allclose(sum(x * x for x in h), 1, rtol=1e-6)
+    tan2 = (h[0] ** 2 + h[1] ** 2) / h[2] ** 2
+    level = np.minimum((20 * tan2 / (r**4 + tan2)).astype(int), 19)
+    sector = ((np.arctan2(h[1], h[0]) / (2 * np.pi) % 1) * 10).astype(int) % 10
+    counts = np.bincount(level * 10 + sector, minlength=200)
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("r", "NoV"), [(0.25, 0.8), (0.5, 0.3), (1.0, 0.05)])
+def test_directions_follow_mixture_pdf(r, NoV):
+    """Chi-squared of sampled directions against the integrated density; directions below the surface are one cell."""
+    wo, n = view(NoV), 200_000
+    u0, u1, u2 = RNG.random((3, n))
+    specular = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
+    cosine = brdf.sample_cosine(NUMPY, u1, u2)
+    wi = [np.where(u0 < 0.5, s, c) for s, c in zip(specular, cosine, strict=True)]
+    rows, columns, fine = 12, 16, 60
+    above = wi[2] > 0
+    cell = np.minimum((wi[2] * rows).astype(int), rows - 1) * columns + (
+        (np.arctan2(wi[1], wi[0]) / (2 * np.pi) % 1) * columns).astype(int) % columns
+    counts = np.append(np.bincount(cell[above], minlength=rows * columns), np.count_nonzero(~above))
+
+    z = (np.arange(rows * fine) + 0.5) / (rows * fine)
+    phi = 2 * np.pi * (np.arange(columns * fine) + 0.5) / (columns * fine)
+    z, phi = np.meshgrid(z, phi, indexing="ij")
+    sine = np.sqrt(1 - z * z)
+    NoL, _, NoH, VoH, sin2 = brdf.half_angles(NUMPY, Z, (sine * np.cos(phi), sine * np.sin(phi), z), wo)
+    density = brdf.mixture_pdf(NUMPY, NoL, NoH, VoH, sin2, r)
+    share = density.reshape(rows, fine, columns, fine).mean((1, 3)).ravel() * 2 * np.pi / (rows * columns)
+    expected = n * np.append(share, max(1 - share.sum(), 0))
+    big = expected > 5
+    statistic = np.sum((counts - expected)[big] ** 2 / expected[big])
+    assert stats.chi2.sf(statistic, big.sum() - 1) > 1e-3
+    assert counts[~big].sum() <= expected[~big].sum() + 6 * np.sqrt(expected[~big].sum() + 1)
+
+
+def test_extremes_are_finite_and_one_sided():
+    zero, one = np.float32(0), np.float32(1)
+    edge = [zero, np.float32(1e-7), np.float32(1e-3), one]
+    grid = [g.ravel() for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")]
+    for value in (*brdf.lobes(NUMPY, *grid), brdf.specular_pdf(NUMPY, grid[2], grid[3], grid[4] + np.float32(1e-9), grid[5])):
+        assert np.isfinite(value).all() and (value >= 0).all()
+    diffuse, spec, _ = brdf.lobes(NUMPY, *grid)
+    dark = (grid[0] == 0) | (grid[1] == 0)
+    assert not diffuse[dark].any() and not spec[dark].any()
+    opposite = brdf.half_angles(NUMPY, Z, (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    assert np.isfinite(opposite).all()
+    for u in (0.0, 1.0 - 2**-24):
+        assert np.isfinite(brdf.sample_ggx_half(NUMPY, np.float32(u), np.float32(u), np.float32(0.0))).all()
+        assert np.isfinite(brdf.sample_cosine(NUMPY, np.float32(u), np.float32(u))).all()
+
+
+def test_three_libraries_agree():
+    native.prepare()
+    import drjit as dr
+    import torch
+    from drjit.llvm import Float
+
+    from iif_core.xp import DRJIT, TORCH
+
+    wo, wi = unit_vectors(3000, np.float32), unit_vectors(3000, np.float32)
+    r = (0.02 + 0.98 * RNG.random(3000)).astype(np.float32)
+    u1, u2 = RNG.random((2, 3000)).astype(np.float32)
+
+    def everything(xp, convert):
+        a, b, rough, v1, v2 = [convert(x) for x in wi], [convert(x) for x in wo], convert(r), convert(u1), convert(u2)
+        normal = [convert(np.full(3000, x, np.float32)) for x in Z]
+        NoL, NoV, NoH, VoH, sin2 = brdf.half_angles(xp, normal, a, b)
+        return [*brdf.lobes(xp, NoL, NoV, NoH, VoH, sin2, rough), brdf.mixture_pdf(xp, NoL, NoH, VoH, sin2, rough),
+                *brdf.sample_ggx_half(xp, v1, v2, rough), *brdf.sample_cosine(xp, v1, v2)]
+
+    reference = everything(NUMPY, lambda x: x)
+    assert all(value.dtype == np.float32 for value in reference)
+    for result in (everything(DRJIT, Float), everything(TORCH, torch.from_numpy)):
+        for value, expected in zip(result, reference, strict=True):
+            np.testing.assert_allclose(np.array(value), expected, rtol=2e-4, atol=2e-6)
+    assert dr.__version__
+
+
+def test_torch_gradients_are_finite_at_the_edges():
+    torch = pytest.importorskip("torch")
+    from iif_core.xp import TORCH
+
+    r = torch.tensor([0.02, 0.02, 1.0, 1.0], requires_grad=True)
+    NoL = torch.tensor([0.0, 1.0, 0.0, 1.0])
+    one = torch.ones(4)
+    diffuse, spec, fc = brdf.lobes(TORCH, NoL, one, one, one, torch.zeros(4), r)
+    (diffuse + spec + fc).sum().backward()
+    assert torch.isfinite(r.grad).all()

@@ -1,0 +1,97 @@
+"""Voxel keys and their hash table, against a dictionary."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iif_core import cells
+from iif_core.errors import InputError
+
+index = st.integers(0, cells.INDEX_LIMIT - 1)
+key_parts = st.tuples(index, index, index, st.integers(-1, cells.INDEX_LIMIT - 2))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(key_parts, max_size=200))
+def test_keys_are_unique_and_reversible(parts):
+    parts = np.array(parts, np.int64).reshape(-1, 4)
+    keys = cells.pack_keys(parts[:, :3], parts[:, 3])
+    assert keys.dtype == np.uint64
+    ijk, objects = cells.unpack_keys(keys)
+    assert (ijk == parts[:, :3]).all() and (objects == parts[:, 3]).all()
+    assert len(np.unique(keys)) == len(np.unique(parts, axis=0))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(0, 2**64 - 1), max_size=300, unique=True), st.lists(st.integers(0, 2**64 - 1), max_size=50))
+def test_table_is_a_dictionary(present, asked):
+    table = cells.CellTable.build(np.array(present, np.uint64))
+    rows = {key: row for row, key in enumerate(present)}
+    found = table.lookup(np.array(present + asked, np.uint64))
+    assert found.dtype == np.int32
+    assert found.tolist() == [rows.get(key, -1) for key in present + asked]
+    size = len(table.slots)
+    assert size & (size - 1) == 0 and table.probes <= cells.MAX_PROBES
+
+
+def test_large_dense_grid_and_reproducible_bytes():
+    axis = np.arange(47)
+    ijk = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    keys = cells.pack_keys(ijk, 5)
+    table = cells.CellTable.build(keys)
+    assert (table.lookup(keys) == np.arange(len(keys))).all()
+    assert (table.lookup(cells.pack_keys(ijk, 6)) == -1).all()
+    assert len(table.slots) <= 16 * len(keys)
+    assert table.slots.tobytes() == cells.CellTable.build(keys).slots.tobytes()
+
+
+def test_one_object_many_neighbours_do_not_collide_too_often():
+    ijk = np.stack([np.arange(60000) % 300, np.arange(60000) // 300, np.full(60000, 1)], -1)
+    table = cells.CellTable.build(cells.pack_keys(ijk, 0))
+    h = cells.hash_words(*(x for x in cells._words(cells.pack_keys(ijk, 0))))
+    used = len(np.unique(h & np.uint32(len(table.slots) - 1)))
+    expected = len(table.slots) * (1 - np.exp(-60000 / len(table.slots)))
+    assert used == pytest.approx(expected, rel=0.02)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.tuples(*[st.floats(-100, 100, width=32)] * 3), st.floats(0.003, 1))
+def test_point_lies_in_its_voxel(point, edge):
+    origin = np.array([-100.5, -100.25, -101], np.float32)
+    ijk = cells.voxel_indices([point], edge, origin)
+    assert ijk.dtype == np.int32
+    low = origin.astype(np.float64) + ijk[0] * edge
+    slack = 1e-6 * (np.abs(point) + 101) * 2 + 1e-6 * np.abs(ijk[0]) * edge
+    assert (low - slack <= point).all() and (point <= low + edge + slack).all()
+
+
+def test_grid_origin_keeps_round_walls_off_voxel_faces():
+    corners = np.array([[0, 0, 0], [5, 4, 2.5]])
+    origin = cells.grid_origin(corners, 0.025)
+    walls = np.repeat(corners, 2, axis=0) + np.array([[-1e-5], [1e-5], [-1e-5], [1e-5]])
+    ijk = cells.voxel_indices(walls, 0.025, origin)
+    assert ijk.min() >= 1 and (ijk[0] == ijk[1]).all() and (ijk[2] == ijk[3]).all()
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match="voxel indices span -1"):
+        cells.pack_keys([[-1, 0, 0]])
+    with pytest.raises(InputError, match="65536"):
+        cells.pack_keys([[0, 65536, 0]])
+    with pytest.raises(InputError, match="object ids"):
+        cells.pack_keys([[0, 0, 0]], 65535)
+    with pytest.raises(InputError, match="edge"):
+        cells.voxel_indices([[0, 0, 0]], 0, (0, 0, 0))
+    with pytest.raises(InputError, match="NaN"):
+        cells.voxel_indices([[np.nan, 0, 0]], 1, (0, 0, 0))
+    with pytest.raises(InputError, match="too small"):
+        cells.voxel_indices([[1e6, 0, 0]], 1e-5, (0, 0, 0))
+    with pytest.raises(InputError, match="repeat"):
+        cells.CellTable.build([3, 3])
+    with pytest.raises(InputError, match="point"):
+        cells.grid_origin(np.zeros((0, 3)), 1)
+    assert cells.CellTable.build([]).lookup([1, 2]).tolist() == [-1, -1]
+    assert cells.voxel_indices(np.zeros((0, 3)), 1, (0, 0, 0)).shape == (0, 3)

@@ -1,0 +1,198 @@
+import numpy as np
+import pytest
+
+from iif_core.emitters import (
+    FaceStatistics,
+    RadianceSums,
+    emitter_candidates,
+    face_adjacency,
+    face_geometry,
+    face_statistics,
+    group_emitters,
+    hdr_threshold,
+)
+from iif_core.errors import InputError
+
+
+def _strip(n, start=(0.0, 0.0, 0.0)):
+    """n quads of 1 x 1 m in a row along x, normal +z: vertices, faces (2 n)."""
+    x = np.arange(n + 1)
+    vertices = np.concatenate([np.stack([x, np.full(n + 1, y), np.zeros(n + 1)], 1) for y in (0, 1)]) + np.array(start)
+    quads = [(i, i + 1, i + n + 2, i, i + n + 2, i + n + 1) for i in range(n)]
+    return vertices.astype(float), np.array(quads).reshape(-1, 3)
+
+
+def _sphere(subdivisions=2, radius=0.1):
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(subdivisions, radius)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
+
+
+def _statistics(count, low, mean=None, front=1.0):
+    count = np.asarray(count, np.int32)
+    low = np.asarray(low, np.float32)
+    mean = np.repeat(low[:, None], 3, 1) if mean is None else np.asarray(mean, np.float32)
+    return FaceStatistics(count, low, mean, np.full(len(count), front, np.float32))
+
+
+def test_face_statistics_by_hand():
+    face = np.array([0] * 40 + [2] * 3 + [-1])
+    value = np.zeros((44, 3))
+    value[:40, 1] = np.arange(40)[::-1] / 100  # green: 0.39 ... 0
+    value[40:43] = [[0.5, 0, 0], [0.2, 0.7, 0], [0, 0, np.nan]]
+    out = face_statistics(face, value, np.arange(44) % 2 == 0, 4)
+    assert out.count.tolist() == [40, 0, 2, 0]
+    np.testing.assert_allclose(out.low, [0.02, 0, 0.5, 0], atol=1e-7)  # rank floor(0.05 * 40) = 2
+    np.testing.assert_allclose(out.mean[2], [0.35, 0.35, 0], atol=1e-7)
+    np.testing.assert_allclose(out.front, [0.5, 0, 0.5, 0])
+
+
+def test_quantile_forgives_a_few_dark_pixels_but_not_many():
+    for dark, expected in ((1, True), (4, False)):
+        value = np.ones((40, 3))
+        value[:dark] = 0.3
+        stats = face_statistics(np.zeros(40, int), value, np.ones(40, bool), 1)
+        got = emitter_candidates(stats, np.zeros((0, 2), int), np.ones(1), 0.99)
+        assert got.tolist() == [expected]
+
+
+def test_adjacency():
+    _, faces = _strip(3)
+    pairs = face_adjacency(faces)
+    assert pairs.tolist() == [[0, 1], [0, 3], [2, 3], [2, 5], [4, 5]]
+    assert face_adjacency(np.zeros((0, 3), int)).shape == (0, 2)
+    fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])  # three faces on one edge
+    assert face_adjacency(fan).tolist() == [[0, 1], [1, 2]]
+
+
+def test_sphere_adjacency_and_geometry():
+    vertices, faces = _sphere()
+    normals, areas = face_geometry(vertices, faces)
+    assert len(face_adjacency(faces)) == 1.5 * len(faces)
+    np.testing.assert_allclose(areas.sum(), 4 * np.pi * 0.01, rtol=0.05)
+    assert (np.sum(normals * vertices[faces].mean(1), -1) > 0).all()
+    zero = face_geometry(np.zeros((3, 3)), np.array([[0, 1, 2]]))
+    assert np.isfinite(zero[0]).all() and zero[1][0] == 0
+
+
+def test_finely_tessellated_lamp_is_found_by_pooling():
+    vertices, faces = _sphere()
+    adjacency, (_, areas) = face_adjacency(faces), face_geometry(vertices, faces)
+    count = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 0)  # the upper half was seen, one pixel a face
+    stats = _statistics(count, count * 1.0)
+    assert (emitter_candidates(stats, adjacency, areas, 0.99)).all()  # far side included
+    few = np.zeros(len(faces))
+    few[:5] = 1
+    assert not emitter_candidates(_statistics(few, few), adjacency, areas, 0.99).any()
+
+
+def test_dark_neighbour_is_not_pooled_and_degenerate_faces_never_shine():
+    _, faces = _strip(4)
+    adjacency = face_adjacency(faces)
+    stats = _statistics([3] * 8, [1, 1, 1, 1, 0.5, 1, 1, 1])
+    areas = np.full(8, 0.5)
+    got = emitter_candidates(stats, adjacency, areas, 0.99)
+    assert got.tolist() == [True] * 4 + [False, True, False, False]  # beyond the dark face only 6 pixels are left
+    areas[0] = 0
+    assert not emitter_candidates(stats, adjacency, areas, 0.99)[0]
+
+
+def test_groups_by_plane_colour_and_side():
+    flat, faces = _strip(6)
+    vertices = flat.copy()
+    vertices[vertices[:, 0] > 3, 2] = vertices[vertices[:, 0] > 3, 0] - 3  # bent by 45 degrees at x = 3
+    normals, areas = face_geometry(vertices, faces)
+    adjacency = face_adjacency(faces)
+    everything = np.ones(12, bool)
+    stats = _statistics([50] * 12, [1.0] * 12)
+    out = group_emitters(everything, stats, adjacency, normals, areas)
+    assert out.size == 2 and set(out.of_face[:6]) != set(out.of_face[6:])
+    assert group_emitters(everything, stats, adjacency, normals, areas, small_area=100).size == 1
+
+    colour = np.repeat([1.0, 1.0, 2.0], 4)
+    stats = _statistics([50] * 12, colour)
+    flat_normals, flat_areas = face_geometry(flat, faces)
+    assert group_emitters(everything, stats, adjacency, flat_normals, flat_areas).size == 2
+
+    back = FaceStatistics(stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4"))
+    out = group_emitters(everything, back, adjacency, flat_normals, flat_areas)
+    assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
+
+
+def test_gradient_is_cut_into_steps():
+    vertices, faces = _strip(20)
+    normals, areas = face_geometry(vertices, faces)
+    brightness = np.repeat(1.15 ** np.arange(20), 2)  # neighbours differ by 15 %, the ends by a factor 14
+    out = group_emitters(
+        np.ones(40, bool), _statistics([30] * 40, brightness), face_adjacency(faces), normals, areas
+    )
+    assert 4 <= out.size <= 14
+    for g in range(out.size):
+        inside = brightness[out.of_face == g]
+        assert inside.max() / inside.min() < 2.3
+    assert out.area.sum() == pytest.approx(20) and (np.diff(out.area * out.observed.sum(1)) <= 1e-9).all()
+
+
+def test_small_and_surplus_groups_are_dropped_with_a_reason():
+    vertices, faces = _strip(6)
+    normals, areas = face_geometry(vertices * 1e-3, faces)
+    colour = np.repeat(2.0 ** np.arange(6), 2)  # six groups of two faces, 1 mm^2
+    stats = _statistics([30] * 12, colour)
+    out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas)
+    assert out.size == 0 and len(out.dropped) == 6 and out.dropped[0][2] == "too small"
+    assert (out.of_face == -1).all() and (out.side == 0).all()
+    normals, areas = face_geometry(vertices, faces)
+    out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas, max_groups=2)
+    assert out.size == 2 and len(out.dropped) == 4 and out.observed[0, 0] == 32
+
+
+def test_no_candidates():
+    _, faces = _strip(2)
+    stats = _statistics([0] * 4, [0] * 4)
+    candidate = emitter_candidates(stats, face_adjacency(faces), np.ones(4), 0.99)
+    assert not candidate.any()
+    assert group_emitters(candidate, stats, face_adjacency(faces), np.ones((4, 3)), np.ones(4)).size == 0
+    assert hdr_threshold(stats) == float("inf")
+
+
+def test_hdr_threshold_ignores_emitters_and_finds_them():
+    rng = np.random.default_rng(0)
+    wall = np.exp(rng.normal(np.log(0.3), 0.5, 400))
+    lamp = np.full(30, 12.0)
+    stats = _statistics(np.r_[np.full(400, 20), np.full(30, 100)], np.r_[wall, lamp])
+    threshold = hdr_threshold(stats)
+    assert 1.0 < threshold < 6.0
+    np.testing.assert_allclose(hdr_threshold(_statistics([5, 5], [7, 7])) / 7, 5)
+
+
+def test_radiance_voxels_against_a_dictionary():
+    rng = np.random.default_rng(1)
+    points, value = rng.uniform(-1, 1, (3000, 3)), rng.random((3000, 3))
+    censored = rng.random(3000) < 0.3
+    sums = RadianceSums(0.25, np.array([0.1, 0.0, -0.2]))
+    for part in np.array_split(np.arange(3000), 7):
+        sums.add(points[part], value[part], censored[part])
+    out = sums.finish()
+    expected: dict = {}
+    for p, v, c in zip(points, value, censored, strict=True):
+        expected.setdefault(tuple(np.floor((p - [0.1, 0.0, -0.2]) / 0.25).astype(int)), []).append((v, c))
+    assert len(out.ijk) == len(expected) and (np.diff(np.lexsort(out.ijk.T[::-1])) > 0).all()
+    for key, radiance, samples, bound in zip(out.ijk, out.radiance, out.samples, out.censored, strict=True):
+        rows = expected[tuple(key)]
+        clear = [v for v, c in rows if not c]
+        want = np.mean(clear, 0) if clear else np.max([v for v, _ in rows], 0)
+        np.testing.assert_allclose(radiance, want, rtol=1e-5)
+        assert bound == (not clear) and samples == len(clear or rows)
+
+
+def test_radiance_voxels_extremes():
+    empty = RadianceSums(0.1, np.zeros(3)).finish()
+    assert empty.ijk.shape == (0, 3) and empty.radiance.shape == (0, 3)
+    sums = RadianceSums(0.1, np.zeros(3))
+    sums.add(np.full((2, 3), 0.05), np.array([[np.nan, 0, 0], [0.0, 0.0, 0.0]]), np.zeros(2, bool))
+    black = sums.finish()
+    assert len(black.ijk) == 1 and black.samples[0] == 1 and (black.radiance == 0).all()  # black, but known
+    with pytest.raises(InputError):
+        sums.add(np.full((1, 3), 1e6), np.ones((1, 3)), np.zeros(1, bool))
+    with pytest.raises(InputError):
+        RadianceSums(0.0, np.zeros(3))

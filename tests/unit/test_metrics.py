@@ -1,0 +1,188 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iif_core import metrics as m
+from iif_core.errors import InputError
+
+ALL = np.ones((24, 32), bool)
+
+
+def image(seed=0, channels=3):
+    shape = (24, 32, channels) if channels > 1 else (24, 32)
+    return np.random.default_rng(seed).uniform(0.1, 0.9, shape)
+
+
+def values(scores):
+    return {(s.protocol, s.metric): s.value for s in scores}
+
+
+def test_l2_and_psnr_known_values():
+    truth = np.full((24, 32, 3), 0.4)
+    assert m.l2(truth + 0.1, truth, ALL) == pytest.approx(0.01)
+    assert m.psnr(truth + 0.1, truth, ALL) == pytest.approx(20.0)
+    assert m.psnr(truth, truth, ALL) == 100.0
+    half = truth.copy()
+    half[:12] += 0.2
+    assert m.psnr(half, truth, ALL) == pytest.approx(10 * np.log10(1 / 0.02))
+
+
+def test_excluded_pixels_change_nothing():
+    truth, prediction = image(0), image(1)
+    mask = ALL.copy()
+    mask[3:9, 4:20] = False
+    spoilt = prediction.copy()
+    spoilt[~mask] = 1e3
+    for function in (m.l2, m.psnr, m.ssim, m.log_l2, m.iou):
+        assert function(spoilt, truth, mask) == function(prediction, truth, mask)
+
+
+def ssim_oracle(a, b):
+    """Wang et al. 2004, window by window, in float64."""
+    x = np.arange(11) - 5
+    g = np.exp(-(x**2) / (2 * 1.5**2))
+    window = np.outer(g, g) / g.sum() ** 2
+    out = []
+    for i in range(5, a.shape[0] - 5):
+        for j in range(5, a.shape[1] - 5):
+            p, q = a[i - 5 : i + 6, j - 5 : j + 6], b[i - 5 : i + 6, j - 5 : j + 6]
+            mp, mq = (window * p).sum(), (window * q).sum()
+            vp, vq = (window * p * p).sum() - mp**2, (window * q * q).sum() - mq**2
+            cov = (window * p * q).sum() - mp * mq
+            out.append((2 * mp * mq + 1e-4) * (2 * cov + 9e-4) / ((mp**2 + mq**2 + 1e-4) * (vp + vq + 9e-4)))
+    return np.mean(out)
+
+
+def test_ssim_is_the_published_formula():
+    a, b = image(2, 1), image(3, 1) * 0.5 + image(2, 1) * 0.5
+    assert m.ssim(b, a, ALL) == pytest.approx(ssim_oracle(b, a), abs=2e-5)
+    assert m.ssim(a, a, ALL) == pytest.approx(1.0)
+
+
+def test_small_image_is_a_named_result():
+    small = np.full((8, 40), 0.5)
+    scores = values(m.score_map("roughness", small, small, np.ones((8, 40), bool)))
+    assert scores["raw", "ssim"] is None and scores["raw", "psnr"] == 100.0
+    reason = next(s.reason for s in m.score_map("roughness", small, small, np.ones((8, 40), bool)) if s.metric == "ssim")
+    assert "at least 11" in reason
+
+
+def test_one_masked_pixel_in_a_corner():
+    mask = np.zeros((24, 32), bool)
+    mask[0, 0] = True
+    assert np.isfinite([s.value for s in m.score_map("albedo", image(0), image(1), mask, mask.astype(int))]).all()
+
+
+def test_empty_mask_and_nan_are_named_results():
+    truth = image(0)
+    empty = m.score_map("albedo", truth, truth, np.zeros_like(ALL), np.zeros((24, 32), int))
+    assert {s.value for s in empty} == {None} and {s.reason for s in empty} == {"no pixel counts"}
+    broken = truth.copy()
+    broken[2, 3, 1] = np.nan
+    scores = m.score_map("albedo", broken, truth, ALL)
+    assert {s.value for s in scores} == {None} and "prediction is not finite in 1 " in scores[0].reason
+    outside = ALL.copy()
+    outside[2, 3] = False
+    assert all(s.value is not None for s in m.score_map("albedo", broken, truth, outside))
+
+
+def test_log_l2_and_iou():
+    truth = np.zeros((24, 32, 3))
+    truth[:4] = 10.0
+    prediction = np.zeros_like(truth)
+    prediction[2:6] = 10.0
+    assert m.iou(prediction, truth, ALL) == pytest.approx(2 / 6)
+    assert m.iou(truth * 0, truth * 0, ALL) == 1.0
+    assert m.iou(truth, truth, ALL) == 1.0
+    assert m.log_l2(truth, truth * 0, ALL) == pytest.approx(np.log(11.0) ** 2 * 4 / 24)
+
+
+@given(st.lists(st.floats(0.05, 1.0), min_size=3, max_size=3))
+def test_scaled_undoes_a_gain_per_channel(gain):
+    truth = image(4)
+    np.testing.assert_allclose(m.scaled(truth * gain, truth, ALL), truth, rtol=1e-12)
+
+
+def test_scaled_ignores_excluded_pixels_and_black():
+    truth = image(5)
+    mask = ALL.copy()
+    mask[:6] = False
+    prediction = truth * 0.5
+    prediction[:6] = 1e4
+    assert m.l2(m.scaled(prediction, truth, mask), truth, mask) < 1e-20
+    np.testing.assert_array_equal(m.scaled(truth * 0, truth, ALL), 0)
+    assert m.scaled(truth * 0.5, truth * 40, ALL).max() == 1.0
+    assert m.scaled(truth * 0.5, truth * 40, ALL, None).max() > 30
+
+
+def test_oracle_affine_recovers_one_map_per_object():
+    rng = np.random.default_rng(6)
+    truth, objects = image(7), rng.integers(-1, 4, (24, 32))
+    prediction = np.zeros_like(truth)
+    for o in range(-1, 4):
+        a, b = rng.normal(0, 0.5, (3, 3)) + np.eye(3), rng.normal(0, 0.3, 3)
+        prediction[objects == o] = (truth[objects == o] - b) @ np.linalg.inv(a).T
+    assert m.psnr(m.oracle_affine(prediction, truth, ALL, objects), truth, ALL) > 60
+    assert m.psnr(m.oracle_affine(prediction, truth, ALL, objects * 0), truth, ALL) < 30
+
+
+def test_oracle_affine_agrees_with_least_squares():
+    rng = np.random.default_rng(8)
+    x, y = rng.uniform(0.4, 0.6, (24, 32)), rng.uniform(0.4, 0.6, (24, 32))
+    slope, offset = np.polyfit(x.ravel(), y.ravel(), 1)
+    np.testing.assert_allclose(
+        m.oracle_affine(x, y, ALL, np.zeros((24, 32), int), ridge=1e-12), slope * x + offset, atol=1e-8
+    )
+
+
+def test_oracle_affine_of_a_constant_is_the_mean():
+    truth = image(9)
+    mapped = m.oracle_affine(np.full_like(truth, 0.3), truth, ALL, np.zeros((24, 32), int))
+    np.testing.assert_allclose(mapped, np.broadcast_to(truth.mean((0, 1)), truth.shape), atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([1e-9, 1e-3, 1.0]))
+def test_oracle_never_loses_to_raw(seed, spread):
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0, 1, (24, 32, 3))
+    prediction = np.clip(0.5 + spread * rng.normal(size=truth.shape), 0, 1)
+    objects = rng.integers(0, 40, (24, 32))
+    assert m.l2(m.oracle_affine(prediction, truth, ALL, objects), truth, ALL) <= m.l2(prediction, truth, ALL) + 1e-9
+
+
+def test_masks_follow_the_truth():
+    valid, hit = np.ones((4, 4), bool), np.ones((4, 4), bool)
+    emission, roughness = np.zeros((4, 4, 3)), np.full((4, 4), 0.5)
+    valid[0, 0] = hit[0, 1] = False
+    emission[1, 0, 2] = 3.0
+    roughness[2, 0] = 0.02
+    masks = m.material_masks(valid, hit, emission, roughness)
+    assert masks["emission"].sum() == 14
+    assert masks["roughness"].sum() == masks["metallic"].sum() == 13
+    assert masks["albedo"].sum() == 12 and not masks["albedo"][2, 0]
+
+
+def test_score_map_protocols():
+    truth, objects = image(10), np.zeros((24, 32), int)
+    scores = values(m.score_map("albedo", truth * 0.5, truth, ALL, objects))
+    assert {p for p, _ in scores} == {"raw", "scaled", "oracle_affine"}
+    assert scores["raw", "psnr"] < 15 and scores["scaled", "psnr"] == 100.0 and scores["oracle_affine", "psnr"] > 60
+    emission = values(m.score_map("emission", truth * 0.5, truth * 50, ALL))
+    assert emission["scaled", "l2"] < 1e-12 < emission["raw", "l2"]
+    assert emission["raw", "iou"] == 1.0
+
+
+def test_wrong_input_is_refused():
+    with pytest.raises(InputError, match="unknown quantity"):
+        m.score_map("normal", image(), image(), ALL)
+    with pytest.raises(InputError, match="must share"):
+        m.score_map("albedo", image(), image(channels=1), ALL)
+
+
+@pytest.mark.skipif(not m.has_flip(), reason="flip-evaluator is not installed")
+def test_flip_of_equal_images_is_zero():
+    truth = image(11)
+    assert m.flip(truth, truth, ALL) == 0.0
+    assert m.flip(1 - truth, truth, ALL) > 0.2

@@ -1,0 +1,73 @@
+"""The deliverable of the tiny scene: contract files, and a snapshot in three tiers (exact, tolerance, structure).
+
+`python tests/workflow/snapshot.py <folder>` rewrites the snapshot from a finished run; read the diff before you commit it.
+"""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from snapshot import PATH, take
+
+FILES = """scene.glb mitsuba/scene.xml objects.parquet emitters.parquet plan.yaml metrics.parquet timings.parquet
+report.html manifest.json""".split()
+
+
+@pytest.fixture(scope="module")
+def scene(finished):
+    return finished.folder / "scenes/tiny"
+
+
+def test_contract_files_exist_and_are_listed(scene):
+    listed = json.loads((scene / "manifest.json").read_text())["files"]
+    for name in FILES:
+        assert (scene / name).is_file(), name
+        assert name == "manifest.json" or name in listed
+    assert len(list((scene / "maps").glob("*.exr"))) == 4
+
+
+def test_contract_columns(scene):
+    columns = {p.stem: pq.read_schema(p).names for p in scene.glob("*.parquet")}
+    assert columns["metrics"] == ["scene", "view", "quantity", "metric", "protocol", "value"]
+    assert columns["timings"][:6] == ["rule", "wildcards", "seconds", "cpu_seconds", "max_rss_mb", "threads"]
+    assert {"object_id", "pixels", "T_albedo", "T_roughness", "T_metallic", "residual"} <= set(columns["objects"])
+    assert {"emitter_id", "faces", "area_m2", "radiance_r"} <= set(columns["emitters"])
+
+
+def test_metrics_cover_quantities_and_protocols(scene):
+    table = pq.read_table(scene / "metrics.parquet").to_pandas()
+    assert {"albedo", "roughness", "metallic", "emission", "rgb"} <= set(table["quantity"])
+    assert {"raw", "scaled", "oracle_affine"} <= set(table["protocol"])
+    assert np.isfinite(table["value"]).all()
+
+
+def test_plan_gives_reasons(scene):
+    plan = yaml.safe_load((scene / "plan.yaml").read_text())
+    items = plan["components"] if isinstance(plan, dict) and "components" in plan else plan
+    assert len(items) >= 4
+    for item in items:
+        assert {"component", "included", "reason"} <= set(item)
+
+
+def test_report_is_self_contained(scene):
+    page = (scene / "report.html").read_text()
+    for word in ('src="http', "src='http", 'href="http', "url(http"):
+        assert word not in page
+    assert page.count("data:image/") >= 10
+
+
+def test_timings_name_every_job(scene):
+    table = pq.read_table(scene / "timings.parquet").to_pandas()
+    assert {"capture", "prior", "base", "emission", "shading", "affines", "render"} <= set(table["rule"])
+    assert (table["seconds"] > 0).all()
+
+
+def test_snapshot(finished):
+    """Exact: counts, ids, columns. Tolerance: means of maps within the Monte Carlo spread of another machine. Structure: channels."""
+    want, got = json.loads(PATH.read_text()), take(finished.folder)
+    assert got["exact"] == want["exact"]
+    assert got["structure"] == want["structure"]
+    for name, (value, tolerance) in want["tolerance"].items():
+        assert abs(got["tolerance"][name][0] - value) <= tolerance, (name, got["tolerance"][name][0], value)

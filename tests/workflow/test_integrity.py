@@ -1,0 +1,119 @@
+"""What plain Snakemake gets wrong and this workflow must not: stale deliverables, unnoticed damage, killed jobs."""
+
+import json
+import os
+import signal
+import subprocess
+import time
+
+from support import manifests, planned
+from workflow.registry import STAGES
+
+NOTHING = "Nothing to be done"
+
+
+def test_second_run_does_nothing(workflow):
+    assert NOTHING in workflow.run("scenes/tiny").stderr
+
+
+def test_touched_code_inputs_and_scene_file_rerun_nothing(workflow):
+    (workflow.folder / "config/scenes/tiny.yaml").touch()
+    assert NOTHING in workflow.run("scenes/tiny").stderr
+
+
+def test_a_setting_reruns_its_stage_and_those_below(workflow):
+    path = workflow.folder / "config/scenes/tiny.yaml"
+    path.write_text(path.read_text().replace("render: {samples: 8}", "render: {samples: 9}"))
+    rules = planned(workflow.run("scenes/tiny", "-n").stderr)
+    assert rules == {"render", "metrics", "report", "publish"}
+
+
+def test_failed_run_does_not_leave_the_old_deliverable_as_up_to_date(workflow):
+    """A parameter changes, the first affected job fails, the same command comes again: everything below must be rebuilt."""
+    path = workflow.folder / "config/scenes/tiny.yaml"
+    before = json.loads((workflow.folder / "scenes/tiny/manifest.json").read_text())
+    path.write_text(path.read_text() + "base: {sweeps: 3}\n")
+    prior = workflow.folder / "results/tiny/prior/manifest.json"
+    kept = prior.read_bytes()
+    prior.write_bytes(kept.replace(b'"iif.stage/1"', b'"iif.stage/0"'))  # base cannot read its input
+    stamp = prior.stat()
+    failed = workflow.run("scenes/tiny")
+    assert failed.returncode != 0 and "iif.stage/0" in failed.stderr
+    prior.write_bytes(kept)
+    os.utime(prior, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    again = workflow.run("scenes/tiny")
+    assert again.returncode == 0 and NOTHING not in again.stderr, again.stderr[-2000:]
+    after = json.loads((workflow.folder / "scenes/tiny/manifest.json").read_text())
+    assert after != before
+    for stage in ("base", "emission", "shading", "affines", "render"):
+        manifest = json.loads((workflow.folder / f"results/tiny/{stage}/manifest.json").read_text())
+        assert manifest["fingerprint"] != "" and manifest["stage"] == stage
+    base = json.loads((workflow.folder / "results/tiny/base/manifest.json").read_text())
+    assert base["settings"]["base"]["sweeps"] == 3
+
+
+def test_damage_with_unchanged_time_stamp_is_found_named_and_rebuilt(workflow):
+    victim = workflow.folder / "results/tiny/base/cells.parquet"
+    status, data = victim.stat(), bytearray(victim.read_bytes())
+    whole = bytes(data)
+    data[len(data) // 2] ^= 1
+    victim.write_bytes(data)
+    os.utime(victim, ns=(status.st_atime_ns, status.st_mtime_ns))
+    verify = workflow.run("verify")
+    assert verify.returncode != 0
+    assert "results/tiny/base/cells.parquet" in verify.stdout + verify.stderr
+    refused = workflow.run("scenes/tiny", "--forcerun", "shading")
+    assert refused.returncode != 0 and "cells.parquet" in refused.stderr and "--forcerun base" in refused.stderr
+    rebuilt = workflow.run("scenes/tiny", "--forcerun", "base")
+    assert rebuilt.returncode == 0, rebuilt.stderr[-2000:]
+    assert victim.read_bytes() == whole
+    assert workflow.run("verify").returncode == 0
+
+
+def test_edited_deliverable_is_found(workflow):
+    page = workflow.folder / "scenes/tiny/plan.yaml"
+    text = page.read_text() + "\n# edited\n"
+    page.unlink()  # the published file is a hard link
+    page.write_text(text)
+    verify = workflow.run("verify")
+    assert verify.returncode != 0 and "scenes/tiny/plan.yaml" in verify.stdout + verify.stderr
+
+
+def test_killed_job_resumes_to_the_same_result(finished, workflow):
+    """kill -9 on a running job; the same command then completes, and every manifest equals the undisturbed run's."""
+    process = subprocess.Popen(
+        workflow.command("scenes/tiny", "--forceall"), stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    victim = None
+    while victim is None and time.monotonic() < deadline:
+        out = subprocess.run(["pgrep", "-f", "-m workflow (shading|affines|base) tiny"], capture_output=True, text=True)
+        mine = [int(pid) for pid in out.stdout.split() if _works_in(int(pid), workflow.folder)]
+        victim = mine[0] if mine else None
+        time.sleep(0.02)
+    assert victim, "no job was seen running"
+    os.kill(victim, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode != 0
+    again = workflow.run("scenes/tiny")
+    assert again.returncode == 0, again.stderr[-2000:]
+    assert manifests(workflow.folder) == manifests(finished.folder)
+
+
+def _works_in(pid, folder):
+    try:
+        return os.path.realpath(f"/proc/{pid}/cwd") == os.path.realpath(folder)
+    except OSError:
+        return False
+
+
+def test_every_stage_has_a_manifest_that_chains(finished):
+    import hashlib
+
+    for stage in STAGES.values():
+        path = finished.folder / f"results/tiny/{stage.name}/manifest.json"
+        document = json.loads(path.read_text())
+        assert set(document["inputs"]) == set(stage.upstream)
+        for name, facts in document["inputs"].items():
+            data = (finished.folder / f"results/tiny/{name}/manifest.json").read_bytes()
+            assert hashlib.sha256(data).hexdigest() == facts["manifest_sha256"]

@@ -1,0 +1,211 @@
+"""Shapes as (vertices (n, 3) float64 in metres, faces (m, 3) int64), counter-clockwise seen from outside; z is up.
+
+Everything but `sheet` is closed, so that its signed volume is positive.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+Shape = tuple[np.ndarray, np.ndarray]
+Point = Sequence[float]
+
+
+def merge(*shapes: Shape) -> Shape:
+    """Several shapes as one."""
+    offsets = np.cumsum([0] + [len(v) for v, _ in shapes])
+    return (
+        np.concatenate([v for v, _ in shapes]),
+        np.concatenate([f + o for (_, f), o in zip(shapes, offsets[:-1], strict=True)]),
+    )
+
+
+def move(shape: Shape, offset: Point, turn: float = 0.0, tilt: float = 0.0) -> Shape:
+    """Turned about z by `turn` after a tilt about x (degrees), then moved."""
+    a, b = np.radians([turn, tilt])
+    about_x = np.array([[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]])
+    about_z = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+    return shape[0] @ (about_z @ about_x).T + np.asarray(offset, float), shape[1]
+
+
+def sheet(origin: Point, edge_u: Point, edge_v: Point, step: float = 0.5) -> Shape:
+    """A rectangle that faces edge_u x edge_v, in squares of about `step`; open."""
+    origin, edge_u, edge_v = (np.asarray(p, float) for p in (origin, edge_u, edge_v))
+    nu, nv = (max(1, round(np.linalg.norm(e) / step)) for e in (edge_u, edge_v))
+    return grid_sheet(origin, edge_u, edge_v, np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
+
+
+def grid_sheet(origin: Point, edge_u: Point, edge_v: Point, u: np.ndarray, v: np.ndarray,
+               hole: tuple[float, float, float, float] | None = None) -> Shape:
+    """A rectangle with grid lines at fractions u and v; `hole` = (u0, u1, v0, v1) on grid lines is left out."""
+    origin, edge_u, edge_v = (np.asarray(p, float) for p in (origin, edge_u, edge_v))
+    gu, gv = np.meshgrid(u, v, indexing="ij")
+    vertices = origin + gu.reshape(-1, 1) * edge_u + gv.reshape(-1, 1) * edge_v
+    i, j = np.meshgrid(np.arange(len(u) - 1), np.arange(len(v) - 1), indexing="ij")
+    if hole is not None:
+        cu, cv = (u[:-1] + u[1:])[i] / 2, (v[:-1] + v[1:])[j] / 2
+        keep = ~((cu > hole[0]) & (cu < hole[1]) & (cv > hole[2]) & (cv < hole[3]))
+        i, j = i[keep], j[keep]
+    a = (i * len(v) + j).ravel()
+    b = a + len(v)
+    faces = np.concatenate([np.stack([a, b, b + 1], 1), np.stack([a, b + 1, a + 1], 1)])
+    used, faces = np.unique(faces, return_inverse=True)
+    return vertices[used], faces.reshape(-1, 3)
+
+
+def box(low: Point, high: Point, bevel: float = 0.0) -> Shape:
+    """An axis-parallel box; `bevel` metres are cut off every edge."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    if not (high - low > 2 * bevel).all():
+        raise ValueError(f"box from {low} to {high} is too thin for a bevel of {bevel}")
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    centre, half = (low + high) / 2, (high - low) / 2
+    if bevel == 0:
+        return _hull(centre + signs * half)
+    insets = [np.where(np.arange(3) == axis, 0, bevel) for axis in range(3)]
+    return _hull(np.concatenate([centre + signs * (half - inset) for inset in insets]))
+
+
+def _hull(points: np.ndarray) -> Shape:
+    """Convex hull, outward, in an order that does not depend on the library's version."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    normals = hull.equations[:, :3].round(6) + 0.0
+    faces, middle = [], points.mean(0)
+    for normal in np.unique(normals, axis=0):  # each flat side again as a fan about its lowest vertex
+        ring = np.unique(hull.simplices[(normals == normal).all(1)])
+        axis = np.eye(3)[np.argmin(np.abs(normal))]
+        right = np.cross(axis, normal)
+        spokes = points[ring] - points[ring].mean(0)
+        ring = ring[np.argsort(np.arctan2(spokes @ np.cross(normal, right), spokes @ right))]
+        ring = np.roll(ring, -int(np.argmin(ring)))
+        faces += [(ring[0], ring[i], ring[i + 1]) for i in range(1, len(ring) - 1)]
+    faces = np.array(faces)
+    corner = points[faces]
+    outward = np.einsum("ij,ij->i", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
+                        corner.mean(1) - middle)
+    assert (outward > 0).all()
+    return points, faces
+
+
+def wedge(base_low: Point, base_high: Point, top_low: Point, top_high: Point) -> Shape:
+    """A frustum: rectangle (x0, y0)-(x1, y1) at z below, another above; points are (x, y, z)."""
+    (x0, y0, z0), (x1, y1, _), (u0, v0, z1), (u1, v1, _) = base_low, base_high, top_low, top_high
+    return _hull(np.array([
+        [x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0], [u0, v0, z1], [u1, v0, z1], [u1, v1, z1], [u0, v1, z1],
+    ], float))
+
+
+def tub(low: Point, high: Point, wall: float, floor: float) -> Shape:
+    """An open box with walls `wall` and a floor `floor` thick, closed as a solid."""
+    low, high = np.asarray(low, float), np.asarray(high, float)
+    xi, yi = [low[0], low[0] + wall, high[0] - wall, high[0]], [low[1], low[1] + wall, high[1] - wall, high[1]]
+    around = [(0, 0), (3, 0), (3, 3), (0, 3)]
+    inner = [(1, 1), (2, 1), (2, 2), (1, 2)]
+    rings = [(around, low[2]), (around, high[2]), (inner, high[2]), (inner, low[2] + floor)]
+    vertices = np.array([[xi[i], yi[j], z] for ring, z in rings for i, j in ring])
+    faces = [(0, 2, 1), (0, 3, 2), (12, 13, 14), (12, 14, 15)]
+    for ring in range(3):
+        for k in range(4):
+            a, b = 4 * ring + k, 4 * ring + (k + 1) % 4
+            faces += [(a, b, b + 4), (a, b + 4, a + 4)]
+    return vertices, np.array(faces)
+
+
+def lathe(profile: Sequence[tuple[float, float]], centre: Point = (0, 0, 0), segments: int = 28) -> Shape:
+    """A profile of (radius, z) turned about the vertical through `centre`.
+
+    The profile starts and ends on the axis (radius 0), between them radius > 0, and walks up the outside (solid), or up
+    the outside and down the inside (bowl).
+    """
+    profile = np.asarray(profile, float)
+    angle = 2 * np.pi * np.arange(segments) / segments
+    rim = profile[1:-1]
+    rings = np.stack([
+        np.cos(angle) * rim[:, :1], np.sin(angle) * rim[:, :1], np.broadcast_to(rim[:, 1:], (len(rim), segments))
+    ], -1)
+    vertices = np.concatenate([[[0, 0, profile[0, 1]]], rings.reshape(-1, 3), [[0, 0, profile[-1, 1]]]])
+    k, after = np.arange(segments), (np.arange(segments) + 1) % segments
+    last = len(vertices) - 1
+    faces = [np.stack([np.zeros_like(k), 1 + after, 1 + k], 1)]
+    for ring in range(len(rim) - 1):
+        a, b = 1 + ring * segments + k, 1 + ring * segments + after
+        faces += [np.stack([a, b, b + segments], 1), np.stack([a, b + segments, a + segments], 1)]
+    top = 1 + (len(rim) - 1) * segments
+    faces.append(np.stack([top + k, top + after, np.full_like(k, last)], 1))
+    return vertices + np.asarray(centre, float), np.concatenate(faces)
+
+
+def cylinder(base: Point, radius: float, height: float, bevel: float = 0.0, segments: int = 28) -> Shape:
+    """An upright cylinder on `base`."""
+    if bevel:
+        profile = [(0, 0), (radius - bevel, 0), (radius, bevel), (radius, height - bevel), (radius - bevel, height),
+                   (0, height)]
+    else:
+        profile = [(0, 0), (radius, 0), (radius, height), (0, height)]
+    return lathe(profile, base, segments)
+
+
+def sphere(centre: Point, radius: float, segments: int = 20, flatten: float = 1.0) -> Shape:
+    """A sphere; `flatten` scales its height."""
+    polar = np.pi * np.arange(1, segments // 2) / (segments // 2)
+    rings = [(radius * np.sin(t), -radius * flatten * np.cos(t)) for t in polar]
+    return lathe([(0, -radius * flatten), *rings, (0, radius * flatten)], centre, segments)
+
+
+def tube(path: Sequence[Point], radius: float | Sequence[float], segments: int = 12) -> Shape:
+    """A round rod along a polyline; `radius` may change from point to point."""
+    path = np.asarray(path, float)
+    radii = np.broadcast_to(np.asarray(radius, float), len(path))
+    steps = np.diff(path, axis=0)
+    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+    along = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    side = np.cross(along[0], np.eye(3)[np.argmin(np.abs(along[0]))])
+    angle = 2 * np.pi * np.arange(segments) / segments
+    rings = []
+    for point, tangent, r in zip(path, along, radii, strict=True):
+        side = side - (side @ tangent) * tangent  # carried along without twist
+        side /= np.linalg.norm(side)
+        rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(tangent, side)))
+    vertices = np.concatenate([*rings, path[:1], path[-1:]])
+    k, after = np.arange(segments), (np.arange(segments) + 1) % segments
+    first, last = len(vertices) - 2, len(vertices) - 1
+    faces = [np.stack([np.full_like(k, first), after, k], 1)]
+    for ring in range(len(path) - 1):
+        a, b = ring * segments + k, ring * segments + after
+        faces += [np.stack([a, b, b + segments], 1), np.stack([a, b + segments, a + segments], 1)]
+    top = (len(path) - 1) * segments
+    faces.append(np.stack([top + k, top + after, np.full_like(k, last)], 1))
+    return vertices, np.concatenate(faces)
+
+
+def arc(centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8) -> list:
+    """Points on a circle from `start` to `stop` degrees, in the plane of two unit axes."""
+    angle = np.radians(np.linspace(start, stop, count))
+    centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
+    return list(centre + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v))
+
+
+def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28) -> Shape:
+    """A torus about `centre` in the plane of two unit axes."""
+    centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
+    around, across = 2 * np.pi * np.arange(segments) / segments, 2 * np.pi * np.arange(10) / 10
+    spoke = np.cos(around)[:, None] * u + np.sin(around)[:, None] * v
+    vertices = (
+        centre + spoke[:, None] * (radius + thickness * np.cos(across))[None, :, None]
+        + np.cross(u, v) * (thickness * np.sin(across))[None, :, None]
+    ).reshape(-1, 3)
+    i, j = (g.ravel() for g in np.meshgrid(np.arange(segments), np.arange(10), indexing="ij"))
+    a, b = i * 10 + j, (i + 1) % segments * 10 + j
+    c, d = (i + 1) % segments * 10 + (j + 1) % 10, i * 10 + (j + 1) % 10
+    return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+
+
+def volume(shape: Shape) -> float:
+    """Signed volume; positive when closed and outward."""
+    a, b, c = (shape[0][shape[1][:, k]] for k in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
