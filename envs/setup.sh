@@ -56,6 +56,8 @@ explain() { # the reason of a failed pip in one line
         reason="a downloaded file is not the one that the lock names; empty pip's cache, or ask whoever runs the package index"
     elif grep -qiE 'connection broken|NewConnectionError|ConnectTimeout|ReadTimeout|name resolution|Network is unreachable|ProxyError|SSLError|timed out' $log; then
         reason="the package index cannot be reached: check network, proxy and pip's configuration (pip config list)"
+    elif grep -qF '(from versions: none)' $log; then
+        reason="the package index cannot be reached or is not a full one: check network, proxy and pip's configuration (pip config list)"
     elif grep -qE 'No matching distribution|Could not find a version' $log; then
         reason="the package index has no build for $("$venv/bin/python" -V 2>&1) on $(uname -sm): $(grep -m1 -oE 'No matching distribution found for .*' $log || true)"
     else

@@ -63,11 +63,12 @@ def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, A
 def normal_distribution(xp: Namespace, NoH: Any, sin2_h: Any, r: Any) -> Any:
     """GGX normal distribution D, 1/sr, in the stable form alpha^2 / (pi (alpha^2 NoH^2 + sin2_h)^2), alpha = r^2.
 
-    r is clamped to [R_MIN, inf). Source: METHOD 3.4.
+    r is clamped to [R_MIN, inf). The bracket is at least alpha^2 for any real angle; it is held there, so that opposite
+    directions (h = 0) stay finite. Source: METHOD 3.4.
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
-    spread = alpha2 * NoH * NoH + sin2_h
+    spread = xp.maximum(alpha2 * NoH * NoH + sin2_h, alpha2)
     return alpha2 / (xp.pi * spread * spread)
 
 
@@ -85,7 +86,7 @@ def lobes(xp: Namespace, NoL: Any, NoV: Any, NoH: Any, VoH: Any, sin2_h: Any, r:
     facing = (NoL > 0) & (NoV > 0)
     x = xp.maximum(1 - VoH, 0)
     x2 = x * x
-    return xp.where(facing, NoL * (1 / xp.pi), 0 * NoL), xp.where(facing, spec, 0 * spec), x2 * x2 * x
+    return xp.where(facing, NoL * (1 / xp.pi), 0.0), xp.where(facing, spec, 0.0), x2 * x2 * x
 
 
 def specular_pdf(xp: Namespace, NoH: Any, VoH: Any, sin2_h: Any, r: Any) -> Any:

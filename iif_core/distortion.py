@@ -1,13 +1,15 @@
 """Lens distortion: from a distorted photograph to the pinhole camera that the rest of the method assumes.
 
-Points are normalised camera coordinates (x, y) = (X/Z, Y/Z), OpenCV axes; r = |(x, y)|. Two models, both of OpenCV:
+Points are normalised camera coordinates (x, y) = (X/Z, Y/Z), OpenCV axes; r = |(x, y)|. Both models are
+OpenCV's:
 
     radial_tangential   x_d = x c + 2 p1 x y + p2 (r^2 + 2 x^2)      c = 1 + k1 r^2 + k2 r^4 + k3 r^6
                         y_d = y c + p1 (r^2 + 2 y^2) + 2 p2 x y
-    fisheye             (x_d, y_d) = t_d / r (x, y)                  t = atan r,  t_d = t (1 + k1 t^2 + ... + k4 t^8)
+    fisheye             (x_d, y_d) = t_d / r (x, y)      t = atan r,  t_d = t (1 + k1 t^2 + ... + k4 t^8)
 
-A polynomial that fits the picture may turn back outside it: two directions then land on one pixel. Directions beyond the
-first turning point are reported as not visible instead of showing a mirrored piece of the picture.
+A polynomial that fits the picture may turn back outside it: two directions then land on one pixel.
+Directions beyond the first turning point are reported as not visible instead of showing a mirrored piece of
+the picture.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ BAND_PIXELS = 1 << 19
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens: `kind`, radial coefficients k1 ... k4 (radial_tangential: k4 = 0) and tangential p1, p2 (fisheye: 0).
+    """A lens: `kind`, radial coefficients k1 ... k4 (radial_tangential: k4 = 0), tangential p1, p2 (fisheye: 0).
 
     Raises InputError for a non-finite coefficient or one that the model does not have.
     """
@@ -61,7 +63,8 @@ class Distortion:
         """r from which on r_d falls again, inf if it never does. Tangential terms are left out."""
         k1, k2, k3, k4 = self.k
         # d/dr of r c(r^2) (or of t c(t^2)) as a polynomial in s = r^2 (t^2), highest power first.
-        slope = np.trim_zeros([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0], "f")
+        slope = np.array([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
+        slope[np.abs(slope) < 1e-12] = 0.0  # no effect below r = 100, and roots would divide by it
         roots = np.roots(slope)
         real = roots[np.abs(roots.imag) <= 1e-9 * np.maximum(np.abs(roots.real), 1e-300)].real
         first = math.sqrt(real[real > 0].min()) if (real > 0).any() else math.inf
@@ -109,19 +112,19 @@ def distort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
 def undistort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
     """Pinhole position (..., 2) float64 of distorted points (..., 2), and whether there is one (...), bool.
 
-    The radius by bisection below the turning point (always converges), then Newton in (x, y) where p1, p2 are set.
-    Points without a solution (beyond the turning point, or 90 degrees and more off the axis) are returned as (0, 0).
+    The radius by bisection below the turning point (always converges), then Newton in (x, y) if p1, p2 are
+    set. Points without a solution (beyond the turning point, or 90 degrees and more off the axis) become
+    (0, 0).
     """
     points = np.asarray(points, np.float64)
     r_d = np.hypot(points[..., 0], points[..., 1])
     r = _invert_radial(lens, r_d)
     safe = np.where(r_d > 0, r_d, 1.0)
-    q = points * np.where(r_d > 0, r / safe, 1.0)[..., None]
+    gain = np.where(np.isfinite(r), np.where(r_d > 0, r / safe, 1.0), 0.0)
+    q = points * gain[..., None]
     if any(lens.p):
         for _ in range(20):
-            error = distort(lens, q)[0] - points
-            q = q - np.einsum("...ij,...j->...i", np.linalg.pinv(_jacobian(lens, q)), error)
-            q = np.where(np.isfinite(q), q, 0.0)
+            q = _newton_step(lens, q, points)
     again, unique = distort(lens, q)
     found = np.isfinite(r) & unique & (np.abs(again - points).max(-1, initial=0) <= 1e-9 * (1 + r_d))
     return np.where(found[..., None], q, 0.0), found
@@ -138,33 +141,38 @@ def _invert_radial(lens: Distortion, r_d: Array) -> Array:
         below = _radial(lens, np.tan(middle)) < r_d
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     r = np.tan(0.5 * (low + high))
-    # Newton's last step restores the digits that tan loses.
-    for _ in range(2):
-        step = 1e-6 * (1 + r)
-        slope = (_radial(lens, r + step) - _radial(lens, np.maximum(r - step, 0))) / (r + step - np.maximum(r - step, 0))
-        better = r - (_radial(lens, r) - r_d) / np.where(slope > 1e-9, slope, 1.0)
-        r = np.where((slope > 1e-9) & (better >= 0), better, r)
     return np.where(r_d < limit, r, np.nan)
 
 
-def _jacobian(lens: Distortion, q: Array) -> Array:
-    """d distort / d (x, y), (..., 2, 2), radial_tangential."""
+def _newton_step(lens: Distortion, q: Array, target: Array) -> Array:
+    """One step towards distort(q) = target, radial_tangential; q stays where the Jacobian is singular."""
     k1, k2, k3, _ = lens.k
     p1, p2 = lens.p
     x, y = q[..., 0], q[..., 1]
     s = x * x + y * y
     c = 1 + s * (k1 + s * (k2 + s * k3))
     slope = k1 + s * (2 * k2 + s * 3 * k3)  # dc/ds
-    cross = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    rows = [[c + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, cross], [cross, c + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x]]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
+    xx = c + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    yy = c + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    determinant = xx * yy - xy * xy
+    regular = np.abs(determinant) > 1e-9
+    by = np.where(regular, determinant, 1.0)
+    error = distort(lens, q)[0] - target
+    step = np.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], -1)
+    step = step / by[..., None]
+    # Far steps mean that the start was near a turning point: no solution there, and squares must not
+    # overflow.
+    small = regular & (np.abs(step).max(-1) <= 1 + np.sqrt(s))
+    return np.where(small[..., None], q - step, q)
 
 
 def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
     """Pinhole camera of the same focal length over the largest upright rectangle that the photograph covers.
 
-    The rectangle lies inside the undistorted border of the picture (OpenCV: `alpha = 0`) and within MAX_ANGLE of the axis;
-    its size in pixels is free, so nothing is lost in the centre. An undistorted picture comes back unchanged.
+    The rectangle lies inside the undistorted border of the picture (OpenCV: `alpha = 0`) and within
+    MAX_ANGLE of the axis; its size in pixels is free, so nothing is lost in the centre. A pinhole picture
+    comes back unchanged.
 
     Raises InputError when nothing is left.
     """
@@ -172,7 +180,7 @@ def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
     left, right = (source.width * edge - source.cx for edge in (0.0, 1.0))
     top, bottom = (source.height * edge - source.cy for edge in (0.0, 1.0))
     along_x, along_y = left + (right - left) * steps, top + (bottom - top) * steps
-    reach = min(math.tan(MAX_ANGLE), lens.turning_radius)
+    reach = min(lens.turning_radius, 1e9)
 
     def border(u: Array | float, v: Array | float) -> Array:
         at = np.stack(np.broadcast_arrays(u / source.fx, v / source.fy), -1).astype(np.float64)
@@ -188,18 +196,23 @@ def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
     width, height = (int(math.floor(v + 1e-6)) for v in ((x1 - x0) * source.fx, (y1 - y0) * source.fy))
     if width < 1 or height < 1:
         raise InputError(
-            f"lens {lens.kind} with k={lens.k}, p={lens.p}: no upright picture fits inside the undistorted photograph;"
-            " the coefficients do not belong to this camera"
+            f"lens {lens.kind} with k={lens.k}, p={lens.p}: no upright picture fits inside the undistorted"
+            " photograph; the coefficients do not belong to this camera"
         )
     spare_x, spare_y = (x1 - x0) * source.fx - width, (y1 - y0) * source.fy - height
-    cx, cy = -x0 * source.fx - spare_x / 2, -y0 * source.fy - spare_y / 2
+    cx, cy = float(-x0 * source.fx - spare_x / 2), float(-y0 * source.fy - spare_y / 2)
     return Pinhole(source.fx, source.fy, cx, cy, width, height)
 
 
 def undistort_image(
-    image: ArrayLike, lens: Distortion, source: Pinhole, target: Pinhole, valid: ArrayLike | None = None, nearest: bool = False
+    image: ArrayLike,
+    lens: Distortion,
+    source: Pinhole,
+    target: Pinhole,
+    valid: ArrayLike | None = None,
+    nearest: bool = False,
 ) -> tuple[Array, Array]:
-    """The photograph as the `target` camera at the same place sees it, and which pixels the photograph covers.
+    """The photograph as the `target` camera at the same place sees it, and which pixels it covers.
 
     Args:
         image: (H, W) or (H, W, C), any dtype; kept.
@@ -213,7 +226,8 @@ def undistort_image(
     """
     image = np.asarray(image)
     if image.shape[:2] != (source.height, source.width):
-        raise InputError(f"image of {image.shape[1]}x{image.shape[0]} pixels, its camera has {source.width}x{source.height}")
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        raise InputError(f"image of {size} pixels, its camera has {source.width}x{source.height}")
     known = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
     out = np.zeros((target.height, target.width, *image.shape[2:]), image.dtype)
     seen = np.zeros((target.height, target.width), bool)
@@ -231,7 +245,7 @@ def undistort_image(
 
 
 def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tuple[Array, Array]:
-    """Image at pixel positions (u, v), and whether all pixels that count are known; the outer half pixel is repeated."""
+    """Image at pixel positions (u, v) and whether all pixels that count are known; repeats the outer half pixel."""
     height, width = known.shape
     inside = (u > -1e-6) & (u < width + 1e-6) & (v > -1e-6) & (v < height + 1e-6)
     u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
@@ -243,7 +257,8 @@ def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tu
     a, b = a - i, b - j
     i1, j1 = np.minimum(i + 1, width - 1), np.minimum(j + 1, height - 1)
     value, complete = 0.0, inside
-    for weight, row, column in (((1 - a) * (1 - b), j, i), (a * (1 - b), j, i1), ((1 - a) * b, j1, i), (a * b, j1, i1)):
+    corners = (((1 - a) * (1 - b), j, i), (a * (1 - b), j, i1), ((1 - a) * b, j1, i), (a * b, j1, i1))
+    for weight, row, column in corners:
         shaped = weight.astype(np.float32).reshape(weight.shape + (1,) * (image.ndim - 2))
         value = value + np.where(shaped > 0, image[row, column] * shaped, 0)
         complete = complete & (known[row, column] | (weight <= 1e-6))

@@ -1,9 +1,10 @@
 """Native libraries and the process environment: what must be right before `mitsuba` or `open3d` is imported.
 
-Dr.Jit compiles through a shared libLLVM. With LLVM 15 it does not raise: it aborts the whole process in the first
-kernel ("Cannot select fminimum"), and with none it fails only when a variant is chosen. So the library is looked for
-and asked for its version here, in a child process, before Dr.Jit is imported. Open3D needs libusb although no camera
-is ever opened; where the system has none, the one of the `libusb-package` wheel is loaded under its soname.
+Dr.Jit compiles through a shared libLLVM. With LLVM 15 it does not raise: it aborts the whole process in the
+first kernel ("Cannot select fminimum"), and with none it fails only when a variant is chosen. So the
+library is looked for and asked for its version here, in a child process, before Dr.Jit is imported. Open3D
+needs libusb although no camera is ever opened; where the system has none, the one of the `libusb-package`
+wheel is loaded under its soname.
 
 Standard library only; importing this module changes nothing.
 """
@@ -64,8 +65,9 @@ else: print(major.value)
 class LlvmReport:
     """The LLVM library that Dr.Jit shall load, or the reason why there is none.
 
-    path: absolute path of the usable library, None if there is none.  version: its major version, 0 if path is None.
-    candidates: every library found as (path, major version), best first; version 0 = the file name does not say.
+    path: absolute path of the usable library, None if there is none.
+    version: its major version, 0 if path is None.
+    candidates: every library found as (path, major version by its file name or 0), best first.
     problem: one line (what was found, what is needed, what to do), None if path is usable.
     """
 
@@ -75,16 +77,21 @@ class LlvmReport:
     problem: str | None
 
 
-def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None) -> LlvmReport:
+def find_llvm(
+    environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None
+) -> LlvmReport:
     """Find an LLVM >= 16: `DRJIT_LIBLLVM_PATH` if set, else this environment's lib folder, else the system's.
 
-    A variable that names an unusable library is a problem even where another library would do: it was set on purpose
-    and every child process inherits it.  environment: default `os.environ`.  folders: glob patterns of library
-    folders, best first; default `<sys.prefix>/lib`, `<sys.base_prefix>/lib`, SYSTEM_FOLDERS.  Never raises.
+    A variable that names an unusable library is a problem even where another library would do: it was set
+    on purpose and every child process inherits it.  Never raises.
+
+    environment: default `os.environ`.
+    folders: glob patterns of library folders, best first; default `<sys.prefix>/lib`,
+    `<sys.base_prefix>/lib`, SYSTEM_FOLDERS.
     """
     environment = os.environ if environment is None else environment
     if folders is None:
-        own = dict.fromkeys((f"{glob.escape(p)}/lib" for p in (sys.prefix, sys.base_prefix)))
+        own = dict.fromkeys(f"{glob.escape(p)}/lib" for p in (sys.prefix, sys.base_prefix))
         folders = (*own, *SYSTEM_FOLDERS)
     candidates = _libraries(folders)
 
@@ -109,13 +116,13 @@ def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[st
         None,
         0,
         candidates,
-        f"{found}. Dr.Jit needs LLVM {OLDEST_LLVM} or newer (older ones abort the process): run `bash envs/setup.sh`, "
-        f"which installs one without root, or set {LLVM_VARIABLE} to a libLLVM.so",
+        f"{found}. Dr.Jit needs LLVM {OLDEST_LLVM} or newer (older ones abort the process): "
+        f"run `bash envs/setup.sh`, which installs one without root, or set {LLVM_VARIABLE} to a libLLVM.so",
     )
 
 
 def load_libusb() -> bool:
-    """Make libusb-1.0 resolvable for a later `import open3d`; False where neither the system nor the wheel has it."""
+    """Make libusb-1.0 resolvable for a later `import open3d`; False where neither system nor wheel has it."""
     try:
         ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
         return True
@@ -132,10 +139,11 @@ def load_libusb() -> bool:
 
 
 def prepare() -> LlvmReport:
-    """Set `DRJIT_LIBLLVM_PATH` to a usable LLVM and make libusb loadable; call before `mitsuba`, `drjit`, `open3d`.
+    """Set `DRJIT_LIBLLVM_PATH` to a usable LLVM and make libusb loadable; call before importing Mitsuba.
 
-    Idempotent (about 20 ms the first time).  Raises InputError with one line when there is no usable LLVM, and
-    RuntimeError if Dr.Jit was imported without it: it reads the variable at its import, so it may hold a wrong LLVM.
+    Idempotent (about 20 ms the first time).  Raises InputError with one line when there is no usable LLVM,
+    and RuntimeError if Dr.Jit was imported without it: it reads the variable at its import, so it may hold
+    a wrong LLVM.
     """
     if "drjit" in sys.modules and not os.environ.get(LLVM_VARIABLE):
         raise RuntimeError("drjit was imported before native.prepare(); call prepare() first")
@@ -150,12 +158,15 @@ def prepare() -> LlvmReport:
 def process_environment() -> None:
     """Put this interpreter first on PATH and the repository first on PYTHONPATH, for this process's children.
 
-    So `.venv/bin/snakemake` works from an environment that was never activated, or is empty.  HOME is filled in from
-    the user database where it is unset: Dr.Jit and Snakemake keep their caches there.  Idempotent.
+    So `.venv/bin/snakemake` works from an environment that was never activated, or is empty.  HOME is
+    filled in from the user database where it is unset: Dr.Jit and Snakemake keep their caches there.
+    Idempotent.
     """
     repository = Path(__file__).resolve().parents[1]
     for variable, first in (("PATH", Path(sys.executable).parent), ("PYTHONPATH", repository)):
-        rest = [part for part in os.environ.get(variable, "").split(os.pathsep) if part and part != str(first)]
+        rest = [
+            part for part in os.environ.get(variable, "").split(os.pathsep) if part and part != str(first)
+        ]
         os.environ[variable] = os.pathsep.join([str(first), *rest])
     home = os.path.expanduser("~")
     if "HOME" not in os.environ and os.path.isabs(home):
@@ -165,9 +176,10 @@ def process_environment() -> None:
 def limit_threads(count: int) -> None:
     """Let numerical libraries use `count` >= 1 threads, the calling one included.
 
-    Libraries not yet imported read it from environment variables, as do child processes; torch and pyarrow are told
-    if they are imported already.  Dr.Jit reads no variable, so after prepare() it is imported here and told.  An
-    OpenBLAS that NumPy has already started keeps its threads.  Raises InputError for count < 1.
+    Libraries not yet imported read it from environment variables, as do child processes; torch and pyarrow
+    are told if they are imported already.  Dr.Jit reads no variable, so after prepare() it is imported here
+    and told.  An OpenBLAS that NumPy has already started keeps its threads.  Raises InputError if
+    count < 1.
     """
     if count < 1:
         raise InputError(f"threads: found {count}, allowed is 1 or more")
@@ -183,7 +195,7 @@ def limit_threads(count: int) -> None:
 
 
 def _libraries(folders: Sequence[str]) -> tuple[tuple[str, int], ...]:
-    """(path, version by name) of every libLLVM in the folders: folder by folder, newest first, links resolved."""
+    """(path, version by name) of every libLLVM: folder by folder, newest first, links resolved."""
     found: dict[str, int] = {}
     for folder in folders:
         here: dict[str, int] = {}

@@ -2,8 +2,9 @@
 
     ok|warn|FAIL  what: found - what to do
 
-Exit code 1 if any check FAILs. Only the standard library is imported here: libraries that can abort the process
-(Dr.Jit on a wrong LLVM) or lack a system library (Open3D) are tried in child processes, so that an abort gets a name.
+Exit code 1 if any check FAILs. Only the standard library is imported here: libraries that can abort the
+process (Dr.Jit on a wrong LLVM) or lack a system library (Open3D) are tried in child processes, so that an
+abort gets a name.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ NEWEST_PYTHON = (3, 14)  # the newest one with wheels for every pin
 GIB = 1 << 30
 CHILD_TIMEOUT_S = 300
 
-# `minimum` is the instruction that LLVM < 16 cannot select; the other two are a gradient and a ray-traced image.
+# `minimum` is what LLVM < 16 cannot select; the other two answers are a gradient and a ray-traced image.
 DRJIT_PROBE = """
 import drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -71,7 +72,9 @@ class Finding:
 def check_python() -> Iterator[Finding]:
     found = f"{'.'.join(map(str, sys.version_info[:3]))} at {sys.executable}"
     if sys.version_info < OLDEST_PYTHON:
-        yield Finding("FAIL", "python", found, "3.11 or newer is needed: run `PYTHON=python3.11 bash envs/setup.sh`")
+        yield Finding(
+            "FAIL", "python", found, "3.11 or newer is needed: run `PYTHON=python3.11 bash envs/setup.sh`"
+        )
     elif sys.version_info[:2] > NEWEST_PYTHON:
         yield Finding("warn", "python", found, "tried with 3.11 to 3.14 only")
     else:
@@ -79,7 +82,7 @@ def check_python() -> Iterator[Finding]:
 
 
 def check_packages(pins: Path = PINS) -> Iterator[Finding]:
-    """Every requirement of the pin file is installed, in the pinned version (a local suffix such as +cpu is free)."""
+    """Every requirement of the pin file is installed, as pinned (a local suffix such as +cpu is free)."""
     missing, differing, count = [], [], 0
     for line in pins.read_text().splitlines():
         match = re.match(r"([A-Za-z0-9._-]+)(?:==([^\s;#]+))?", line)
@@ -97,7 +100,9 @@ def check_packages(pins: Path = PINS) -> Iterator[Finding]:
     if missing:
         yield Finding("FAIL", "packages", "missing " + ", ".join(missing), INSTALL)
     if differing:
-        yield Finding("warn", "packages", ", ".join(differing), f"results may differ from those of the lock: {INSTALL}")
+        yield Finding(
+            "warn", "packages", ", ".join(differing), f"results may differ from those of the lock: {INSTALL}"
+        )
     if not missing and not differing:
         yield Finding("ok", "packages", f"all {count} of {pins.name} are installed as pinned")
 
@@ -109,7 +114,9 @@ def check_llvm() -> Iterator[Finding]:
         yield Finding("FAIL", "llvm", report.problem)
         return
     yield Finding("ok", "llvm", f"{report.version} at {report.path}")
-    yield _tried("drjit", DRJIT_PROBE, DRJIT_ANSWER, "kernel, gradient and render agree with closed forms", report.path)
+    yield _tried(
+        "drjit", DRJIT_PROBE, DRJIT_ANSWER, "kernel, gradient and render agree with closed forms", report.path
+    )
 
 
 def check_open3d() -> Iterator[Finding]:
@@ -133,14 +140,21 @@ def check_gpu() -> Iterator[Finding]:
 
 def check_disk(repository: Path = REPOSITORY) -> Iterator[Finding]:
     """Space and write permission where results and temporary files go."""
-    for what, folder, plenty_gib in (("disk", repository, 5.0), ("scratch", Path(tempfile.gettempdir()), 2.0)):
+    for what, folder, plenty_gib in (
+        ("disk", repository, 5.0),
+        ("scratch", Path(tempfile.gettempdir()), 2.0),
+    ):
         advice = "free some" if what == "disk" else "free some, or set TMPDIR to a folder on a larger disk"
         free = shutil.disk_usage(folder).free / GIB
         found = f"{free:.1f} GiB free in {folder}"
         if error := _write_error(folder):
-            yield Finding("FAIL", what, f"{folder} cannot be written ({error})", advice.replace("free some, or ", ""))
+            yield Finding(
+                "FAIL", what, f"{folder} cannot be written ({error})", advice.replace("free some, or ", "")
+            )
         elif free < plenty_gib:
-            yield Finding("FAIL" if free < 0.2 else "warn", what, found, f"{plenty_gib:.0f} GiB are advisable: {advice}")
+            yield Finding(
+                "FAIL" if free < 0.2 else "warn", what, found, f"{plenty_gib:.0f} GiB are advisable: {advice}"
+            )
         else:
             yield Finding("ok", what, found)
 
@@ -164,7 +178,7 @@ def check_compute() -> Iterator[Finding]:
 
 
 def check_kernel_cache() -> Iterator[Finding]:
-    """Dr.Jit keeps compiled kernels in `$DRJIT_CACHE_DIR`, else `~/.drjit`; without it every process compiles anew."""
+    """Compiled kernels lie in `$DRJIT_CACHE_DIR`, else `~/.drjit`; without it every process compiles anew."""
     named = os.environ.get("DRJIT_CACHE_DIR", "")
     folder = Path(named or os.path.expanduser("~/.drjit"))
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
@@ -208,14 +222,19 @@ def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> F
         return Finding("ok", what, success)
     if child.returncode == 0:
         return Finding("FAIL", what, f"computed {child.stdout.strip()!r} instead of {answer!r}", INSTALL)
-    errors = [line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)]
+    errors = [
+        line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)
+    ]
     reason = (errors or child.stderr.strip().splitlines() or [""])[-1].strip()[:300]
     if child.returncode < 0:
         first = (errors or [reason])[0].strip()[:120]
-        reason = f"the process was ended by {signal.Signals(-child.returncode).name}" + (f" ({first})" if first else "")
+        reason = f"the process was ended by {signal.Signals(-child.returncode).name}" + (
+            f" ({first})" if first else ""
+        )
     advice = INSTALL
     if library := re.search(r"(lib[\w+.-]+\.so[.\d]*): cannot open shared object", reason):
-        advice = f"install the system library {library[1]} (Debian and Ubuntu: libgl1 libegl1 libx11-6 libusb-1.0-0)"
+        packages = "libgl1 libegl1 libx11-6 libusb-1.0-0"
+        advice = f"install the system library {library[1]} (Debian and Ubuntu: {packages})"
     return Finding("FAIL", what, reason or f"ended with code {child.returncode}", advice)
 
 
@@ -257,7 +276,9 @@ def main() -> int:
         try:
             findings = list(check())
         except Exception as error:  # a check that breaks must not hide the others
-            findings = [Finding("FAIL", check.__name__.removeprefix("check_"), repr(error), "please report this bug")]
+            findings = [
+                Finding("FAIL", check.__name__.removeprefix("check_"), repr(error), "please report this bug")
+            ]
         for finding in findings:
             print(finding, flush=True)
             failed |= finding.level == "FAIL"

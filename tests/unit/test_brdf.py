@@ -11,6 +11,7 @@ from iif_core.xp import NUMPY
 
 RNG = np.random.default_rng(7)
 Z = (0.0, 0.0, 1.0)
+# Published to three digits from sampling, so good to about 1.5e-3.
 FURNACE = {  # roughness: (S0, S1) at NoV = 1, 0.7, 0.4, 0.2, 0.1 for incident radiance 1
     0.02: [(1.000, 0.000), (0.895, 0.002), (0.646, 0.054), (0.291, 0.142), (0.087, 0.125)],
     0.216: [(0.993, 0.000), (0.849, 0.002), (0.564, 0.045), (0.249, 0.096), (0.104, 0.080)],
@@ -36,17 +37,33 @@ def unit_vectors(n, dtype=np.float64):
     return tuple((v / np.linalg.norm(v, axis=0)).astype(dtype))
 
 
+def sampled_albedo(r, NoV):
+    """(S0, S1) for incident radiance 1 by drawing half vectors on a regular grid of uniforms."""
+    wo = view(NoV)
+    wi = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, *uniform_grid(700), r))
+    _, _, NoH, VoH, sin2 = angles = brdf.half_angles(NUMPY, Z, wi, wo)
+    _, spec, fc = brdf.lobes(NUMPY, *angles, r)
+    pdf = brdf.specular_pdf(NUMPY, NoH, VoH, sin2, r)
+    weight = np.divide(spec, pdf, out=np.zeros_like(spec), where=pdf > 0)
+    return np.mean(weight * (1 - fc)), np.mean(weight * fc)
+
+
 @pytest.mark.parametrize("r", FURNACE)
 def test_furnace_table(r):
-    u1, u2 = uniform_grid(700)
-    for NoV, (s0, s1) in zip((1, 0.7, 0.4, 0.2, 0.1), FURNACE[r], strict=True):
-        wo = view(NoV)
-        wi = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
-        NoL, _, NoH, VoH, sin2 = angles = brdf.half_angles(NUMPY, Z, wi, wo)
-        _, spec, fc = brdf.lobes(NUMPY, *angles, r)
-        weight = spec / brdf.specular_pdf(NUMPY, NoH, VoH, sin2, r)
-        assert np.mean(weight * (1 - fc)) == pytest.approx(s0, abs=1.2e-3)
-        assert np.mean(weight * fc) == pytest.approx(s1, abs=1.2e-3)
+    for NoV, expected in zip((1, 0.7, 0.4, 0.2, 0.1), FURNACE[r], strict=True):
+        assert sampled_albedo(r, NoV) == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize(("r", "NoV"), [(0.608, 0.1), (0.804, 0.2), (1.0, 1.0)])
+def test_furnace_by_integrating_the_textbook_form(r, NoV):
+    z, turn = uniform_grid(1200)
+    sine = np.sqrt(1 - z * z)
+    wi, wo = np.array([sine * np.cos(2 * np.pi * turn), sine * np.sin(2 * np.pi * turn), z]), np.array(view(NoV))
+    h = wi + wo[:, None]
+    h /= np.linalg.norm(h, axis=0)
+    spec, fc = textbook(z, NoV, 1 - h[2] ** 2, wo @ h, r)
+    expected = 2 * np.pi * np.mean(spec * (1 - fc)), 2 * np.pi * np.mean(spec * fc)
+    assert sampled_albedo(r, NoV) == pytest.approx(expected, abs=3e-4)
 
 
 def test_diffuse_lobe_integrates_to_one():
@@ -155,7 +172,8 @@ def test_extremes_are_finite_and_one_sided():
     zero, one = np.float32(0), np.float32(1)
     edge = [zero, np.float32(1e-7), np.float32(1e-3), one]
     grid = [g.ravel() for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")]
-    for value in (*brdf.lobes(NUMPY, *grid), brdf.specular_pdf(NUMPY, grid[2], grid[3], grid[4] + np.float32(1e-9), grid[5])):
+    for value in (*brdf.lobes(NUMPY, *grid),
+                  brdf.specular_pdf(NUMPY, *grid[2:])):
         assert np.isfinite(value).all() and (value >= 0).all()
     diffuse, spec, _ = brdf.lobes(NUMPY, *grid)
     dark = (grid[0] == 0) | (grid[1] == 0)
@@ -169,7 +187,6 @@ def test_extremes_are_finite_and_one_sided():
 
 def test_three_libraries_agree():
     native.prepare()
-    import drjit as dr
     import torch
     from drjit.llvm import Float
 
@@ -190,8 +207,7 @@ def test_three_libraries_agree():
     assert all(value.dtype == np.float32 for value in reference)
     for result in (everything(DRJIT, Float), everything(TORCH, torch.from_numpy)):
         for value, expected in zip(result, reference, strict=True):
-            np.testing.assert_allclose(np.array(value), expected, rtol=2e-4, atol=2e-6)
-    assert dr.__version__
+            np.testing.assert_allclose(value.numpy(), expected, rtol=2e-4, atol=2e-6)
 
 
 def test_torch_gradients_are_finite_at_the_edges():

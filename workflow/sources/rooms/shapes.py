@@ -30,6 +30,11 @@ def move(shape: Shape, offset: Point, turn: float = 0.0, tilt: float = 0.0) -> S
     return shape[0] @ (about_z @ about_x).T + np.asarray(offset, float), shape[1]
 
 
+def stretch(shape: Shape, factors: Point) -> Shape:
+    """Scaled along x, y, z about the origin (positive factors)."""
+    return shape[0] * np.asarray(factors, float), shape[1]
+
+
 def sheet(origin: Point, edge_u: Point, edge_v: Point, step: float = 0.5) -> Shape:
     """A rectangle that faces edge_u x edge_v, in squares of about `step`; open."""
     origin, edge_u, edge_v = (np.asarray(p, float) for p in (origin, edge_u, edge_v))

@@ -1,0 +1,75 @@
+"""Fixtures for all tests. Native libraries are prepared here, before any test module imports Mitsuba."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from iif_core import native
+from iif_core.errors import InputError
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+THREADS = 2
+
+try:
+    native.prepare()
+    _llvm_problem = None
+except InputError as error:  # only the tests that need LLVM shall fail
+    _llvm_problem = str(error)
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """Root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def llvm():
+    """Mitsuba with `llvm_ad_rgb` on two threads; the value is the `mitsuba` module."""
+    if _llvm_problem:
+        pytest.fail(_llvm_problem, pytrace=False)
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_rgb")
+    native.limit_threads(THREADS)
+    return mitsuba
+
+
+@pytest.fixture(scope="session")
+def test_scene() -> Callable[[str], Path]:
+    """`test_scene(name)`: folder of a scene from outside; skips where no place has it.
+
+    Places: $IIF_TEST_SCENES alone if it is set, else data/, else ../shared/scenes, relative to the checkout.
+    """
+
+    def find(name: str) -> Path:
+        named = os.environ.get("IIF_TEST_SCENES")
+        places = [Path(named)] if named else [REPOSITORY / "data", REPOSITORY.parent / "shared" / "scenes"]
+        for place in places:
+            if (place / name).is_dir():
+                return (place / name).resolve()
+        pytest.skip(f"no scene {name} in {' or '.join(map(str, places))}; set IIF_TEST_SCENES")
+
+    return find
+
+
+@pytest.fixture
+def clean_environment(tmp_path: Path) -> dict[str, str]:
+    """Variables of a stranger who has just logged in (`env -i`): an empty HOME, pip's own configuration."""
+    passed = {
+        name: value
+        for name, value in os.environ.items()
+        if name.startswith("PIP_")
+        or name in ("SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
+        or name.lower() in ("http_proxy", "https_proxy", "no_proxy", "all_proxy")
+    }
+    home = tmp_path / "home"
+    home.mkdir()
+    configuration = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "pip" / "pip.conf"
+    if configuration.is_file():
+        passed.setdefault("PIP_CONFIG_FILE", str(configuration))
+    return {**passed, "PATH": "/usr/bin:/bin", "HOME": str(home)}

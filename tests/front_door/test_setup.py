@@ -1,0 +1,222 @@
+"""The first commands of a stranger: set up, ask the doctor, make. Nothing is downloaded here.
+
+What setup.sh does before pip is tried in copies of the checkout, with stand-ins for python and df on PATH.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from iif_core import native
+from workflow import doctor
+
+pytestmark = pytest.mark.front_door
+
+
+def run(command, folder, environment, **variables):
+    return subprocess.run(
+        command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True, timeout=120
+    )
+
+
+@pytest.fixture
+def copy(tmp_path, repository):
+    """A checkout (in a folder with a space in its name) that was never set up."""
+    folder = tmp_path / "a copy"
+    for part in ("envs", "iif_core", "workflow"):
+        shutil.copytree(repository / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+@pytest.fixture
+def stand_in(tmp_path, clean_environment):
+    """`stand_in("df", script)` puts a shell script before the system's command of that name."""
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    clean_environment["PATH"] = f"{tools}:{clean_environment['PATH']}"
+
+    def make(name, script):
+        (tools / name).write_text("#!/bin/sh\n" + script)
+        (tools / name).chmod(0o755)
+        return str(tools / name)
+
+    return make
+
+
+def needs_own_venv(repository):
+    if not (repository / ".venv" / ".setup").is_file():
+        pytest.skip("this environment was not made by envs/setup.sh")
+
+
+def last_line(text):
+    return text.strip().splitlines()[-1]
+
+
+@pytest.mark.parametrize("script", ["envs/setup.sh", ".ci/run"])
+def test_scripts_are_executable_bash(script, repository, clean_environment):
+    assert os.access(repository / script, os.X_OK)
+    assert run(["bash", "-n", script], repository, clean_environment).returncode == 0
+
+
+def test_second_setup_does_nothing(repository, clean_environment):
+    """From any folder, without a word, without touching anything."""
+    needs_own_venv(repository)
+    stamp = repository / ".venv" / ".setup"
+    before = stamp.stat().st_mtime_ns, stamp.read_text()
+    torch = {name: os.environ[name] for name in ("TORCH", "TORCH_INDEX") if name in os.environ}
+    result = run(["bash", str(repository / "envs/setup.sh")], "/", clean_environment, **torch)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+    assert (stamp.stat().st_mtime_ns, stamp.read_text()) == before
+
+
+def test_too_old_python(copy, stand_in, clean_environment):
+    old = stand_in("oldpython", 'case "$2" in *exit*) exit 1;; *) echo 3.9;; esac\n')
+    result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=old)
+    assert result.returncode == 1
+    assert len(result.stderr.strip().splitlines()) == 1
+    for text in ("Python 3.11 or newer", f"Python 3.9 ({old})", "PYTHON="):
+        assert text in result.stderr
+    assert not (copy / ".venv").exists()
+
+
+def test_absent_python(copy, clean_environment):
+    result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON="/nowhere/python3")
+    assert result.returncode == 1 and "found none (tried: /nowhere/python3)" in result.stderr
+
+
+def test_python_without_venv(copy, stand_in, clean_environment):
+    stand_in("python3", 'case "$2" in *ensurepip*) exit 1;; *print*) echo 3.12;; esac\n')
+    result = run(["bash", "envs/setup.sh"], copy, clean_environment)
+    assert result.returncode == 1
+    assert "python3 (3.12) has no venv module" in result.stderr and "python3.12-venv" in result.stderr
+
+
+def test_small_disk(copy, stand_in, clean_environment):
+    stand_in("df", "echo header; echo /dev/x 9999999 0 1048576 99% /\n")
+    result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=sys.executable)
+    assert result.returncode == 1
+    assert "1024 MB of disk are free" in result.stderr and "4000 are needed" in result.stderr
+
+
+def test_no_network(copy, clean_environment):
+    """Port 9 of this machine refuses connections. Afterwards .venv counts as incomplete."""
+    quick = {"PIP_RETRIES": "1", "PIP_TIMEOUT": "2", "PIP_CONFIG_FILE": os.devnull, "PIP_NO_CACHE_DIR": "1"}
+    environment = {k: v for k, v in clean_environment.items() if not k.startswith("PIP_")} | quick
+    for _ in range(2):
+        result = run(
+            ["bash", "envs/setup.sh"],
+            copy,
+            environment,
+            PYTHON=sys.executable,
+            PIP_INDEX_URL="http://127.0.0.1:9/simple",
+        )
+        assert result.returncode == 1
+        assert "the package index cannot be reached" in last_line(result.stderr)
+        assert not (copy / ".venv" / ".setup").exists()
+    assert "incomplete" in result.stderr
+
+
+def test_doctor_passes_here(repository, clean_environment):
+    """In an empty environment; every line has the promised form."""
+    result = run([sys.executable, "-m", "workflow.doctor"], repository, clean_environment)
+    lines = result.stdout.splitlines()
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert all(line[:6] in ("ok    ", "warn  ") and ": " in line for line in lines)
+    for what in (
+        "python",
+        "packages",
+        "llvm",
+        "drjit",
+        "open3d",
+        "gpu",
+        "disk",
+        "scratch",
+        "cores",
+        "kernel cache",
+    ):
+        assert any(line[6:].startswith(f"{what}: ") for line in lines), what
+
+
+def test_doctor_names_a_bad_llvm(repository, clean_environment):
+    result = run(
+        [sys.executable, "-m", "workflow.doctor"],
+        repository,
+        clean_environment,
+        **{native.LLVM_VARIABLE: "/nowhere.so"},
+    )
+    assert result.returncode == 1
+    failed = [line for line in result.stdout.splitlines() if line.startswith("FAIL")]
+    assert len(failed) == 1
+    assert f"{native.LLVM_VARIABLE} names /nowhere.so, which does not exist; unset it" in failed[0]
+
+
+def test_doctor_survives_and_names_an_abort():
+    finding = doctor._tried(
+        "drjit", "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select\\n'); os.abort()", "1", ""
+    )
+    assert finding.level == "FAIL" and "SIGABRT (LLVM ERROR: Cannot select)" in finding.found
+
+
+def test_doctor_names_a_wrong_result_and_a_missing_system_library():
+    assert "computed '2' instead of '1'" in doctor._tried("x", "print(2)", "1", "").found
+    error = "raise ImportError('libGL.so.1: cannot open shared object file: No such file or directory')"
+    assert "libGL.so.1 (Debian and Ubuntu: libgl1" in doctor._tried("x", error, "1", "").advice
+
+
+def test_doctor_compares_packages_with_the_pins(tmp_path):
+    pins = tmp_path / "requirements.in"
+    pins.write_text("# comment\nnumpy==0.1\nno-such-package-here==1\ntorch\n")
+    missing, differing = doctor.check_packages(pins)
+    assert (
+        missing.level == "FAIL" and "no-such-package-here" in missing.found and "numpy" not in missing.found
+    )
+    assert differing.level == "warn" and "instead of 0.1" in differing.found
+
+
+def test_doctor_warns_where_kernels_cannot_be_kept(monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("DRJIT_CACHE_DIR", "/proc/drjit")
+    (finding,) = doctor.check_kernel_cache()
+    assert finding.level == "warn" and "DRJIT_CACHE_DIR" in finding.advice
+    monkeypatch.setenv("DRJIT_CACHE_DIR", str(tmp_path / "new" / "folder"))
+    (finding,) = doctor.check_kernel_cache()
+    assert finding.level == "ok" and not (tmp_path / "new").exists()
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
+class TestMake:
+    def commands(self, repository, environment, *arguments):
+        result = run(["make", "-n", *arguments], repository, environment)
+        assert result.returncode == 0, result.stderr
+        return [" ".join(line.split()) for line in result.stdout.splitlines()]
+
+    def test_scene(self, repository, clean_environment):
+        assert self.commands(repository, clean_environment, "scenes/kitchen", "CORES=2") == [
+            "bash envs/setup.sh",
+            ".venv/bin/snakemake --cores 2 scenes/kitchen",
+        ]
+
+    def test_quality(self, repository, clean_environment):
+        lines = self.commands(repository, clean_environment, "scenes/kitchen", "QUALITY=standard", "CORES=2")
+        assert lines[1] == ".venv/bin/snakemake --cores 2 scenes/kitchen --config quality=standard"
+
+    def test_a_scene_that_exists_is_still_given_to_snakemake(self, tmp_path, repository, clean_environment):
+        shutil.copy(repository / "Makefile", tmp_path)
+        (tmp_path / "scenes" / "kitchen").mkdir(parents=True)
+        for target in ("scenes/kitchen", "scenes"):
+            assert any(
+                f"snakemake --cores all {target}" in line
+                for line in self.commands(tmp_path, clean_environment, target)
+            )
+
+    def test_suite_and_continuous_integration(self, repository, clean_environment):
+        lines = self.commands(repository, clean_environment, "test")
+        assert lines == ["bash envs/setup.sh", ".venv/bin/python -m pytest"]
+        assert "make test" in (repository / ".ci" / "run").read_text().splitlines()
+
+    def test_no_goal_prints_help_and_does_nothing(self, repository, clean_environment):
+        result = run(["make"], repository, clean_environment)
+        assert result.returncode == 0 and "make scenes/<name>" in result.stdout

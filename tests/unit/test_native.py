@@ -1,0 +1,220 @@
+"""Which LLVM is taken and which is refused; threads and environment of child processes.
+
+Libraries are made up as files: only their names and what `_ask_version` hears from them count. The real
+ones of this machine are asked at the end.
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from iif_core import native
+from iif_core.errors import InputError
+
+
+@pytest.fixture
+def library(tmp_path, monkeypatch):
+    """`library("lib/libLLVM.so.19.1", 19)` makes a file that answers 19; None: it cannot be loaded."""
+    answers = {}
+
+    def ask(path, _mtime, _size):
+        answer = answers[os.path.realpath(path)]
+        return (0, "file too short") if answer is None else (answer, None)
+
+    def make(name, answer):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        answers[os.path.realpath(path)] = answer if answer is None or answer >= native.OLDEST_LLVM else 0
+        return str(path)
+
+    monkeypatch.setattr(native, "_ask_version", ask)
+    return make
+
+
+def find(tmp_path, *folders, variable=None):
+    environment = {} if variable is None else {native.LLVM_VARIABLE: variable}
+    return native.find_llvm(environment, [str(tmp_path / folder) for folder in folders])
+
+
+def test_own_folder_wins_over_a_newer_system_library(tmp_path, library):
+    own = library("own/libLLVM.so.19.1", 19)
+    newer = library("system/libLLVM.so.21.1", 21)
+    report = find(tmp_path, "own", "system")
+    assert (report.path, report.version, report.problem) == (own, 19, None)
+    assert report.candidates == ((own, 19), (newer, 21))
+
+
+def test_newest_of_a_folder_wins_and_links_count_once(tmp_path, library):
+    library("system/libLLVM-15.so.1", 15)
+    newest = library("system/libLLVM-17.so.1", 17)
+    os.symlink("libLLVM-17.so.1", tmp_path / "system/libLLVM-17.so")
+    os.symlink("libLLVM-17.so.1", tmp_path / "system/libLLVM.so")
+    library("system/libLLVMgold.so", 20)  # another library of the same family
+    report = find(tmp_path, "system")
+    assert (report.path, report.version) == (newest, 17)
+    assert [version for _, version in report.candidates] == [17, 15]
+
+
+def test_only_old_ones_are_named_with_what_to_do(tmp_path, library):
+    old = [library("system/libLLVM-15.so.1", 15), library("system/libLLVM-14.so.1", 14)]
+    report = find(tmp_path, "system")
+    assert report.path is None and report.version == 0
+    assert "\n" not in report.problem
+    for text in (*old, "LLVM 15", "LLVM 14", "needs LLVM 16", "bash envs/setup.sh", native.LLVM_VARIABLE):
+        assert text in report.problem
+
+
+def test_none_at_all(tmp_path):
+    report = find(tmp_path, "empty")
+    assert report.candidates == ()
+    assert "found no LLVM library" in report.problem and "bash envs/setup.sh" in report.problem
+
+
+def test_a_name_is_not_believed(tmp_path, library):
+    """A file called 19 that answers as an older one, and one that cannot be loaded, are passed over."""
+    library("own/libLLVM.so.19.1", 15)
+    library("own/libLLVM.so.18.1", None)
+    good = library("own/libLLVM.so.17", 17)
+    assert find(tmp_path, "own").path == good
+    os.remove(good)
+    assert "file too short" in find(tmp_path, "own").problem
+
+
+def test_a_file_without_version_in_its_name_is_asked(tmp_path, library):
+    path = library("opt/libLLVM.so", 20)
+    report = find(tmp_path, "opt")
+    assert (report.path, report.version, report.candidates) == (path, 20, ((path, 0),))
+
+
+def test_variable_wins_when_usable(tmp_path, library):
+    library("own/libLLVM.so.19.1", 19)
+    chosen = library("elsewhere/libLLVM.so.18.1", 18)
+    assert find(tmp_path, "own", variable=chosen).path == chosen
+    assert find(tmp_path, "own", variable="").version == 19
+
+
+@pytest.mark.parametrize(
+    ("name", "answer", "reason"),
+    [
+        ("gone/libLLVM.so.19", "absent", "does not exist"),
+        ("old/libLLVM-14.so.1", 14, "LLVM 14"),
+        ("broken/libLLVM.so.19", None, "cannot be loaded"),
+        (".", "absent", "is not a file"),
+    ],
+)
+def test_variable_that_names_an_unusable_library_is_a_problem(tmp_path, library, name, answer, reason):
+    """Even where another library would do: child processes inherit the variable."""
+    usable = library("own/libLLVM.so.19.1", 19)
+    path = os.path.abspath(tmp_path / name) if answer == "absent" else library(name, answer)
+    report = find(tmp_path, "own", variable=path)
+    assert report.path is None
+    for text in (native.LLVM_VARIABLE, path, reason, "LLVM 16 or newer", usable):
+        assert text in report.problem
+
+
+def test_relative_variable_becomes_absolute(tmp_path, library, monkeypatch):
+    """Jobs run in other folders."""
+    path = library("own/libLLVM.so.19.1", 19)
+    monkeypatch.chdir(tmp_path)
+    assert find(tmp_path, variable="own/libLLVM.so.19.1").path == path
+
+
+def test_prepare_sets_the_variable_and_is_idempotent(monkeypatch):
+    monkeypatch.setenv(native.LLVM_VARIABLE, os.environ.get(native.LLVM_VARIABLE, ""))
+    first = native.prepare()
+    assert os.environ[native.LLVM_VARIABLE] == first.path
+    assert native.prepare() == first
+    assert native.load_libusb()
+
+
+def test_prepare_raises_one_line(monkeypatch, tmp_path):
+    monkeypatch.setenv(native.LLVM_VARIABLE, str(tmp_path / "libLLVM.so.19"))
+    with pytest.raises(
+        InputError, match=f"^{native.LLVM_VARIABLE} names .*libLLVM.so.19, which does not exist"
+    ):
+        native.prepare()
+    assert os.environ[native.LLVM_VARIABLE] == str(tmp_path / "libLLVM.so.19")
+
+
+def python(code, repository, **environment):
+    command = [sys.executable, "-c", code]
+    variables = {"PATH": "/usr/bin:/bin", **environment}
+    return subprocess.run(command, cwd=repository, env=variables, capture_output=True, text=True)
+
+
+def test_prepare_after_drjit_is_refused(repository):
+    child = python("import drjit\nfrom iif_core import native\nnative.prepare()", repository)
+    assert child.returncode == 1 and "call prepare() first" in child.stderr
+
+
+def test_import_has_no_effect(repository):
+    code = (
+        "import os, sys; before = dict(os.environ)\n"
+        "from iif_core import native\n"
+        "assert dict(os.environ) == before\n"
+        "third_party = {'numpy', 'torch', 'drjit', 'mitsuba', 'open3d'} & set(sys.modules)\n"
+        "assert not third_party, third_party"
+    )
+    assert python(code, repository).stderr == ""
+
+
+def test_process_environment_of_an_empty_environment(repository):
+    code = (
+        "import os, subprocess, sys\n"
+        "from iif_core import native\n"
+        "native.process_environment(); once = dict(os.environ); native.process_environment()\n"
+        "assert dict(os.environ) == once\n"
+        "os.chdir('/')\n"
+        "print(subprocess.check_output(['python', '-c', 'import sys, os, iif_core.native, numpy;'\n"
+        '      \'print(sys.prefix, os.environ["PATH"], os.environ.get("HOME"))\'], text=True))'
+    )
+    child = python(code, repository, PATH=f"/usr/bin:{Path(sys.executable).parent}:/bin")
+    prefix, path, home = child.stdout.split()
+    assert prefix == sys.prefix
+    assert path.split(os.pathsep) == [str(Path(sys.executable).parent), "/usr/bin", "/bin"]
+    assert os.path.isabs(home)
+
+
+def test_limit_threads_reaches_libraries_imported_before_and_after(repository):
+    code = (
+        "import os, torch\n"
+        "from iif_core import native\n"
+        "native.prepare(); native.limit_threads(1)\n"
+        "import mitsuba, drjit, pyarrow\n"
+        "mitsuba.set_variant('llvm_ad_rgb')\n"
+        "counts = [torch.get_num_threads(), drjit.thread_count(), pyarrow.cpu_count()]\n"
+        "print(os.environ['OMP_NUM_THREADS'], end=' ')\n"
+        "native.limit_threads(3)\n"
+        "print(counts, torch.get_num_threads(), drjit.thread_count(), pyarrow.cpu_count())"
+    )
+    assert python(code, repository).stdout.strip() == "1 [1, 1, 1] 3 3 3"
+
+
+def test_limit_threads_refuses_none():
+    with pytest.raises(InputError, match="found 0"):
+        native.limit_threads(0)
+
+
+def test_this_environment_has_its_own_llvm():
+    """The wheel of the lock is found without help, and it is what it says."""
+    report = native.find_llvm({})
+    assert report.problem is None and report.version >= native.OLDEST_LLVM
+    assert Path(report.path).is_relative_to(Path(sys.prefix).resolve())
+
+
+def test_old_llvm_of_the_system_is_refused():
+    old = [
+        path for path, version in native.find_llvm({}, native.SYSTEM_FOLDERS).candidates if 0 < version < 16
+    ]
+    if not old:
+        pytest.skip("the system has no LLVM older than 16")
+    for path in old:
+        report = native.find_llvm({native.LLVM_VARIABLE: path})
+        assert report.path is None and path in report.problem
+        assert native._version(path)[1] is not None, (
+            "the library itself says that it is older, whatever its name"
+        )
