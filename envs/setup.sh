@@ -51,7 +51,7 @@ if [ $installed = yes ] && [ "$checked" = checked ]; then exit 0; fi
 explain() { # the reason of a failed pip in one line
     local what=$1 reason
     if grep -qiE 'No space left|Disk quota exceeded' $log; then
-        reason="the disk is full: about $needed_mb MB are needed here, and 1 GB in ${TMPDIR:-/tmp} (TMPDIR=... chooses another)"
+        reason="the disk is full: about $needed_mb MB are needed here, twice that for a CUDA build of torch"
     elif grep -qE 'DO NOT MATCH THE HASHES' $log; then
         reason="a downloaded file is not the one that the lock names; empty pip's cache, or ask whoever runs the package index"
     elif grep -qiE 'connection broken|NewConnectionError|ConnectTimeout|ReadTimeout|name resolution|Network is unreachable|ProxyError|SSLError|timed out' $log; then
@@ -69,7 +69,7 @@ pip_install() { # what, arguments of pip install
     local what=$1
     shift
     say "installing $what ..."
-    "$venv/bin/python" -m pip install --no-input --disable-pip-version-check --progress-bar off "$@" >>$log 2>&1 || explain "$what"
+    TMPDIR=$root/$venv/tmp "$venv/bin/python" -m pip install --no-input --disable-pip-version-check --progress-bar off "$@" >>$log 2>&1 || explain "$what"
 }
 
 if [ $installed = no ]; then
@@ -106,11 +106,13 @@ if [ $installed = no ]; then
         [ "$torch_found" = "$torch_wanted" ] || "$venv/bin/python" -m pip uninstall --yes torch >/dev/null 2>&1 || true
     fi
     : >$log
+    mkdir -p $venv/tmp # pip unpacks here: the same disk, and what an interruption leaves goes with .venv
 
     # torch comes last and apart: one lock cannot name both its CPU and its CUDA builds. Its dependencies are in the lock.
     pip_install "the locked packages" --require-hashes -r envs/requirements.lock
     pip_install "$torch" ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$torch"
     "$venv/bin/python" -c pass # the first start makes the links of the LLVM wheel
+    rm -rf $venv/tmp
     echo "$lock_wanted $torch_wanted $root" >$stamp
     say "installed in $((SECONDS - started)) s"
 fi

@@ -34,7 +34,7 @@ BAND_PIXELS = 1 << 19
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens: `kind`, radial coefficients k1 ... k4 (radial_tangential: k4 = 0), tangential p1, p2 (fisheye: 0).
+    """A lens: `kind`, radial k1 ... k4 (radial_tangential: k4 = 0), tangential p1, p2 (fisheye: 0).
 
     Raises InputError for a non-finite coefficient or one that the model does not have.
     """
@@ -245,7 +245,7 @@ def undistort_image(
 
 
 def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tuple[Array, Array]:
-    """Image at pixel positions (u, v) and whether all pixels that count are known; repeats the outer half pixel."""
+    """Image at pixel positions (u, v), and whether all pixels that count there are known."""
     height, width = known.shape
     inside = (u > -1e-6) & (u < width + 1e-6) & (v > -1e-6) & (v < height + 1e-6)
     u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)

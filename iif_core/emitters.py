@@ -11,9 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.errors import InputError
-
-_HALF = 1 << 20  # voxel indices lie in [-2^20, 2^20)
+from iif_core.cells import pack_keys, unpack_keys, voxel_indices
 
 
 @dataclass(frozen=True)
@@ -289,7 +287,7 @@ class RadianceVoxels:
 
     Attributes:
         edge: m; origin: (3,) corner of voxel (0, 0, 0).
-        ijk: (n, 3) int32, sorted; a voxel that is not listed is unknown, not black (METHOD H27).
+        ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black (METHOD H27).
         radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored one, a lower
             bound (H60).
         samples: (n,) int32 observations behind `radiance`.
@@ -309,17 +307,12 @@ class RadianceSums:
 
     Args:
         edge: voxel edge in m.
-        origin: (3,) corner of voxel (0, 0, 0).
-
-    Raises:
-        InputError: edge not positive, or so small that indices overflow (2^20 voxels from the origin).
+        origin: (3,) corner of voxel (0, 0, 0), below all points: `cells.grid_origin` of the mesh.
     """
 
     def __init__(self, edge: float, origin: np.ndarray):
-        if not edge > 0:
-            raise InputError(f"radiance cache: edge {edge} m, must be positive")
-        self.edge, self.origin = float(edge), np.asarray(origin, np.float64)
-        self._key = np.zeros(0, np.int64)
+        self.edge, self.origin = float(edge), np.asarray(origin, np.float32)
+        self._key = np.zeros(0, np.uint64)
         # columns: sum R G B, count, largest censored R G B, censored count
         self._value = np.zeros((0, 8))
 
@@ -327,13 +320,12 @@ class RadianceSums:
         """Add pixels: points (n, 3) in m, radiance (n, 3) linear, censored (n,) bool; non-finite rows are left out.
 
         The caller leaves out pixels on emitters (METHOD H28).
+
+        Raises:
+            InputError: edge not positive, or a point outside the 65536 voxels an axis from the origin.
         """
         good = np.isfinite(radiance).all(-1) & np.isfinite(points).all(-1)
-        ijk = np.floor((points[good] - self.origin) / self.edge)
-        if len(ijk) and np.abs(ijk).max() >= _HALF:
-            raise InputError(f"radiance cache: a point is {np.abs(ijk).max():.0f} voxels from the origin; use a larger edge")
-        index = ijk.astype(np.int64) + _HALF
-        key = (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+        key = pack_keys(voxel_indices(np.asarray(points)[good], self.edge, self.origin))
         value, clipped = np.asarray(radiance, np.float64)[good], np.asarray(censored)[good]
         row = np.concatenate(
             [
@@ -347,7 +339,7 @@ class RadianceSums:
         if not len(key):
             return
         order = np.argsort(key, kind="stable")
-        starts = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
+        starts = np.flatnonzero(np.r_[True, key[order][1:] != key[order][:-1]])
         self._key = key[order][starts]
         sums = np.add.reduceat(row[order], starts, 0)
         sums[:, 4:7] = np.maximum.reduceat(row[order][:, 4:7], starts, 0)
@@ -359,9 +351,8 @@ class RadianceSums:
         bound = count == 0
         mean = self._value[:, :3] / np.maximum(count, 1)[:, None]
         radiance = np.where(bound[:, None], self._value[:, 4:7], mean)
-        mask = (1 << 21) - 1
-        ijk = np.stack([self._key >> 42, (self._key >> 21) & mask, self._key & mask], -1) - _HALF
+        ijk = unpack_keys(self._key)[0]
         samples = np.where(bound, clipped, count).astype(np.int32)
         return RadianceVoxels(
-            self.edge, self.origin.astype(np.float32), ijk.astype(np.int32), radiance.astype(np.float32), samples, bound
+            self.edge, self.origin, ijk, radiance.astype(np.float32), samples, bound
         )

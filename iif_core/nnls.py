@@ -9,7 +9,7 @@ directions of H below that size are handed to the prior instead of being inverte
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,8 @@ class EmissionRows:
 
     Attributes:
         first, second: (n, G, 3) float32, two independent estimates of A (`second` may be `first` when A is exact).
-        target: (n, 3) observed radiance minus h.
+        target, target_second: (n, 3) observed radiance minus h of the same two estimates. h and A of one trace share their
+            noise, so the right-hand side crosses them too: b = (A1' W t2 + A2' W t1) / 2.
         weight: (n, 3) >= 0, weight of the squared residual.
         lower_bound: (n, 3) bool: the sensor was saturated, the target is a lower bound and only a prediction below it counts.
     """
@@ -32,19 +33,29 @@ class EmissionRows:
     first: np.ndarray
     second: np.ndarray
     target: np.ndarray
+    target_second: np.ndarray
     weight: np.ndarray
     lower_bound: np.ndarray
 
     def __post_init__(self) -> None:
         n, groups = self.first.shape[:2]
-        expected = {"first": (n, groups, 3), "second": (n, groups, 3), "target": (n, 3), "weight": (n, 3), "lower_bound": (n, 3)}
-        for name, shape in expected.items():
+        shapes = {"first": (n, groups, 3), "second": (n, groups, 3)}
+        shapes |= dict.fromkeys(("target", "target_second", "weight", "lower_bound"), (n, 3))
+        for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(f"emission rows: {name} has shape {getattr(self, name).shape}, needed {shape}")
 
     @property
     def groups(self) -> int:
         return self.first.shape[1]
+
+    @property
+    def mean_target(self) -> np.ndarray:
+        return 0.5 * (self.target + self.target_second)
+
+    def columns(self, keep: np.ndarray) -> EmissionRows:
+        """The system of a subset of the groups."""
+        return replace(self, first=self.first[:, keep], second=self.second[:, keep])
 
 
 @dataclass(frozen=True)
@@ -100,7 +111,10 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(values[order] * (share[:, None] if values.ndim == 3 else share), starts, 0)
 
-    return EmissionRows(mean(rows.first), mean(rows.second), mean(rows.target), total, rows.lower_bound[order][starts])
+    return EmissionRows(
+        mean(rows.first), mean(rows.second), mean(rows.target), mean(rows.target_second), total,
+        rows.lower_bound[order][starts],
+    )
 
 
 def solve_emission(
@@ -128,7 +142,7 @@ def solve_emission(
     initial = np.asarray(initial, np.float64)
     if initial.shape != (groups, 3) or not np.isfinite(initial).all() or (initial < 0).any():
         raise InputError(f"emission: initial radiance of shape {initial.shape}, needed ({groups}, 3), finite and >= 0")
-    for name in ("first", "second", "target", "weight"):
+    for name in ("first", "second", "target", "target_second", "weight"):
         if not np.isfinite(getattr(rows, name)).all():
             raise InputError(f"emission rows: {name} holds non-finite values; drop those pixels first")
     radiance, error, shares = initial.copy(), initial.copy(), np.zeros((groups, 3))
@@ -176,13 +190,15 @@ def _normal(
         a1 = rows.first[part, :, c].astype(np.float64)
         a2 = rows.second[part, :, c].astype(np.float64)
         mean = 0.5 * (a1 + a2)
-        b += mean.T @ (w[:, 0] * rows.target[part, c])
+        t1, t2 = rows.target[part, c], rows.target_second[part, c]
         diagonal += (w * mean * mean).sum(0)
         if cross:
+            b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
             product = a1.T @ (w * a2)
             h += 0.5 * (product + product.T)
             k += 0.5 * (product - product.T)
         else:
+            b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
             h += mean.T @ (w * mean)
     return h, k, b, diagonal
 
@@ -207,7 +223,7 @@ def _solve_channel(
 
     bound = rows.lower_bound[:, c]
     mean_a = 0.5 * (rows.first[:, :, c] + rows.second[:, :, c])
-    target, weight = rows.target[:, c], rows.weight[:, c]
+    target, weight = rows.mean_target[:, c], rows.weight[:, c]
     answer, error, share, condition = initial.copy(), initial.copy(), np.zeros(len(initial)), 1.0
     joined = bound & (mean_a @ answer < target)
     seen: list[bytes] = []
@@ -248,3 +264,67 @@ def _solve_channel(
         answer, error, share, condition, int(joined.sum()), rounds, converged,
         float((counted * difference**2).sum()), float((np.where(bound, counted, weight) * target**2).sum()),
     )
+
+
+@dataclass(frozen=True)
+class PrunedEmission:
+    """Result of `prune_groups`: the solution with dropped groups at 0, which were kept, and why not."""
+
+    solution: EmissionSolution
+    kept: np.ndarray
+    reason: list[str]
+
+
+def prune_groups(
+    rows: EmissionRows,
+    initial: np.ndarray,
+    area: np.ndarray,
+    observed: np.ndarray,
+    protected: np.ndarray,
+    share: float = 0.01,
+    residual_change: float = 1e-3,
+    emitted_share: float = 0.3,
+    cross: bool = True,
+) -> PrunedEmission:
+    """Solve, then drop groups that do not shine and solve again (METHOD 8).
+
+    A group goes when it carries less than `share` of the total power area x sum E and the residual grows by less than
+    `residual_change` without it, or when less than `emitted_share` of what was seen of it is its own (it reflects).
+
+    Args:
+        rows, initial, cross: as in `solve_emission`.
+        area: (G,) m^2; observed: (G, 3) mean radiance seen on the group, 0 = not seen or only bounded.
+        protected: (G,) bool, never dropped (environment).
+    """
+    groups = rows.groups
+    kept, reason = np.ones(groups, bool), [""] * groups
+    solution = solve_emission(rows, initial, cross)
+    for _ in range(groups):
+        power = area * solution.radiance.sum(1) * ~protected
+        seen = observed.sum(1)
+        reflects = kept & ~protected & (seen > 0) & (solution.radiance.sum(1) < emitted_share * seen)
+        weak = kept & ~protected & ~reflects & (power < share * max(power.sum(), 1e-300))
+        dark = kept & ~protected & (solution.radiance.sum(1) <= 0)
+        drop = reflects | dark
+        for g in np.flatnonzero(drop):
+            reason[g] = "no emission is left for it" if dark[g] else "reflects: little of its brightness is its own"
+        if not drop.any() and weak.any():
+            trial = _solve_subset(rows, initial, kept & ~weak, cross)
+            if trial.residual <= solution.residual * (1 + residual_change) + 1e-12:
+                drop = weak
+                for g in np.flatnonzero(weak):
+                    reason[g] = f"below {share:.1%} of the power and not missed"
+        if not drop.any():
+            break
+        kept &= ~drop
+        solution = _solve_subset(rows, initial, kept, cross)
+    return PrunedEmission(solution, kept, reason)
+
+
+def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, cross: bool) -> EmissionSolution:
+    """Solution over all groups, 0 outside `kept`."""
+    part = solve_emission(rows.columns(kept), initial[kept], cross)
+    radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
+    determined = np.zeros(len(initial))
+    radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
+    return replace(part, radiance=radiance, error=error, determined=determined)

@@ -1,8 +1,14 @@
-"""Moving arrays between NumPy and the device, in chunks, and the random stream of a lane."""
+"""Moving arrays between NumPy and the device, and cutting work into lanes with a random stream each.
+
+A lane owns a few samples of one point and adds them up itself; the lanes of a point are added in a fixed order. How a
+point is cut depends on the number of samples alone, so its result does not depend on its neighbours, on the chunks or on
+the threads.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -50,13 +56,61 @@ def rows_of(value: ArrayLike, count: int, width: int | None, name: str) -> Array
     return value
 
 
-def lane_streams(seed: int, first: int, count: int) -> Any:
-    """One PCG32 stream for each of the lanes first ... first + count - 1, a function of (seed, lane) alone.
+SAMPLES_PER_LANE = 8
+"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough that the start-up is paid off."""
 
-    The seed may be any integer >= 0 of any size; two lanes or two seeds share no state.
-    """
-    words = np.random.SeedSequence(seed).generate_state(4)
-    lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-    a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
-    c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
-    return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))
+LANES = 1 << 18
+"""Lanes on the device at once, unless their results would need more than DEVICE_FLOATS."""
+
+DEVICE_FLOATS = 1 << 26
+"""Entries of one result on the device at once (256 MiB)."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Points `part` of the caller's arrays, each worked on by `split` neighbouring lanes, numbered from `first_lane`."""
+
+    part: slice
+    split: int
+    first_lane: int
+
+    @property
+    def lanes(self) -> int:
+        return (self.part.stop - self.part.start) * self.split
+
+    def spread(self, kind: Any, rows: Array) -> Any:
+        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes of a point."""
+        rows = rows[self.part]
+        columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
+        parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
+        return kind(*parts)
+
+    def samples(self, count: int) -> tuple[Any, Any]:
+        """(first, end) sample number of every lane, so that the lanes of a point share `count` samples."""
+        lane = dr.arange(mi.UInt32, self.lanes) % dr.opaque(mi.UInt32, self.split)
+        each, left = (dr.opaque(mi.UInt32, value) for value in divmod(count, self.split))
+        first = lane * each + dr.minimum(lane, left)
+        return first, first + each + dr.select(lane < left, mi.UInt32(1), 0)
+
+    def collect(self, lane_sums: Any) -> Array:
+        """Sum over the lanes of every point, (points,) or (points, width)."""
+        return to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums)
+
+    def streams(self, seed: int) -> Any:
+        """One PCG32 stream a lane, a function of (seed, lane number) alone. The seed is any integer >= 0."""
+        words = np.random.SeedSequence(seed).generate_state(4)
+        lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
+        a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
+        c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
+        return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))
+
+
+def batches(points: int, samples: int, floats_per_lane: int, lanes: int | None = None) -> Iterator[Batch]:
+    """Cuts `points` x `samples` into batches of at most `lanes` lanes (at least one point)."""
+    split = -(-samples // SAMPLES_PER_LANE)
+    if points * split >= 1 << 32:
+        raise InputError(f"{points} points with {samples} samples are too many for one call; call with fewer points")
+    if lanes is None:
+        lanes = min(LANES, DEVICE_FLOATS // max(floats_per_lane, 1))
+    for part in chunks(points, max(1, lanes // split)):
+        yield Batch(part, split, part.start * split)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .. import brdf
 from ..errors import InputError
-from .arrays import chunks, lane_streams, rows_of, to_numpy, vectors
+from .arrays import batches, rows_of, to_numpy
 from .cache import RadianceCache
 from .emitters import Emitters
 from .geometry import Geometry, offset_from
@@ -20,9 +20,6 @@ from .render import check_counts
 from .shading import surface_points
 
 Array = np.ndarray
-
-MATRIX_FLOATS = 1 << 26
-"""Entries of the matrix held on the device at once (256 MiB)."""
 
 
 class _ColumnCollector:
@@ -54,12 +51,11 @@ class _ColumnCollector:
 
 @dr.syntax
 def _deposit_paths(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any,
-                   samples: Any, max_bounces: Any) -> Any:
+                   sample: Any, end: Any, max_bounces: Any) -> Any:
     cached = mi.Color3f(0)
     origin = offset_from(point, normal)
     visible = dr.dot(normal, wo) > 0
-    sample = mi.UInt32(0)
-    while sample < samples:
+    while sample < end:
         cached += direct_light(world, rng, origin, normal, wo, kd, ks, roughness, mi.Color3f(1), visible)
         goes_on, wi, factor, pdf = scatter(rng, normal, wo, kd, ks, roughness, visible)
         gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, goes_on, factor)
@@ -80,7 +76,8 @@ def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, norma
     group emit its unknown radiance. h is what paths take from `cache` (0 without). Escaping paths are deposited in column
     environment_group when given. The point's own, directly visible emission is not included. sampling_weight (m,)
     overrides the default, half by area and half the same for every group. max_bounces counts surface interactions including
-    the point. chunk: points on the device at once, by default what keeps A there within 256 MiB.
+    the point. chunk: lanes on the device at once, a lane being up to 8 samples of a point and a row of A (default: 2^18,
+    fewer when their rows would take more than 256 MiB).
     Source: METHOD 7a (multi-bounce, or one bounce and the cache); COMPUTE 4.
     """
     check_counts(samples, max_bounces)
@@ -102,22 +99,20 @@ def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, norma
         sampling_weight = _group_weights(geometry.areas, groups, n_groups)
     emitters = Emitters(geometry, np.zeros((len(groups), 3)), side, sampling_weight=sampling_weight)
     group_of_face = mi.Int32(groups)
-    if chunk is None:
-        chunk = max(1, min(1 << 17, MATRIX_FLOATS // (3 * max(n_groups, 1))))
-    for part in chunks(count, chunk):
-        lanes = part.stop - part.start
-        rows = dr.zeros(mi.Float, lanes * max(n_groups, 1) * 3)
-        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, lanes), n_groups, group_of_face, environment_group)
-        kd, ks = brdf.kd_ks(base_color[part], metallic[part, None])
+    kd, ks = brdf.kd_ks(base_color, metallic[:, None])
+    width = 3 * n_groups
+    for batch in batches(count, samples, width, chunk):
+        rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
+        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group)
         gain = _deposit_paths(
-            World(geometry, material, emitters, cache, collector), lane_streams(seed, part.start, lanes),
-            vectors(mi.Point3f, points[part]), vectors(mi.Vector3f, normals[part]), vectors(mi.Vector3f, wo[part]),
-            vectors(mi.Color3f, kd), vectors(mi.Color3f, ks), mi.Float(roughness[part]),
-            dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, max_bounces))
+            World(geometry, material, emitters, cache, collector), batch.streams(seed), batch.spread(mi.Point3f, points),
+            batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo), batch.spread(mi.Color3f, kd),
+            batch.spread(mi.Color3f, ks), batch.spread(mi.Float, roughness), *batch.samples(samples),
+            dr.opaque(mi.UInt32, max_bounces))
         dr.eval(gain, rows)
-        cached[part] = to_numpy(gain) / samples
+        cached[batch.part] = batch.collect(gain) / samples
         if n_groups:
-            matrix[part] = to_numpy(rows).reshape(lanes, n_groups, 3) / samples
+            matrix[batch.part] = to_numpy(rows).reshape(-1, batch.split, n_groups, 3).sum(axis=1) / samples
     return matrix, cached
 
 

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .arrays import chunks, lane_streams, rows_of, to_numpy, vectors
+from .arrays import batches, rows_of
 from .cache import RadianceCache
 from .emitters import Emitters
 from .geometry import Geometry
 from .kernels import RadianceCollector, World, incoming, uniform
 
 Array = np.ndarray
-
-CHUNK = 1 << 18
 
 
 def check_counts(samples: int, max_bounces: int) -> None:
@@ -28,29 +26,29 @@ def check_counts(samples: int, max_bounces: int) -> None:
 
 
 @dr.syntax
-def _mean_radiance(world: World, rng: Any, origin: Any, direction: Any, d_du: Any, d_dv: Any, samples: Any,
-                   max_bounces: Any) -> Any:
+def _radiance_sum(world: World, rng: Any, origin: Any, direction: Any, d_du: Any, d_dv: Any, sample: Any, end: Any,
+                  max_bounces: Any) -> Any:
     total = mi.Color3f(0)
-    sample = mi.UInt32(0)
-    while sample < samples:
+    while sample < end:
         du = uniform(rng) - 0.5
         dv = uniform(rng) - 0.5
         toward = dr.normalize(direction + du * d_du + dv * d_dv)
         radiance, rng = incoming(world, rng, origin, toward, dr.inf, 0, max_bounces, True)
         total += radiance
         sample += 1
-    return total / mi.Float(samples)
+    return total
 
 
 def render(geometry: Geometry, material: Any, emitters: Emitters, origins: ArrayLike, directions: ArrayLike, samples: int,
            max_bounces: int, seed: int, cache: RadianceCache | None = None,
-           jitter: tuple[ArrayLike, ArrayLike] | None = None, chunk: int = CHUNK) -> Array:
+           jitter: tuple[ArrayLike, ArrayLike] | None = None, chunk: int | None = None) -> Array:
     """Mean radiance (n, 3) float32, linear, of `samples` paths along each ray.
 
     origins (n, 3) or (3,) metres; directions (n, 3), any length. max_bounces counts surface interactions: 0 = visible
     emission only, 1 = direct light. jitter = (d_du, d_dv), (n, 3) or (3,) each: the direction becomes d + xi_1 d_du + xi_2 d_dv
     with xi uniform in [-1/2, 1/2) BEFORE it is normalised, a box filter over the pixel (METHOD 1.4). The first hit is
     always shaded with its material; from the second on a path ends in `cache` where it has a voxel.
+    chunk: lanes on the device at once, a lane being up to 8 samples of a ray (default 2^18).
     Unbiased but for the offset along the normal, the bounce limit and the cache. Source: METHOD 2.5, 3.
     """
     check_counts(samples, max_bounces)
@@ -64,11 +62,11 @@ def render(geometry: Geometry, material: Any, emitters: Emitters, origins: Array
                   for step in steps)
     world = World(geometry, material, emitters, cache, RadianceCollector())
     result = np.zeros(directions.shape, np.float32)
-    for part in chunks(len(directions), chunk):
-        radiance = _mean_radiance(
-            world, lane_streams(seed, part.start, part.stop - part.start), vectors(mi.Point3f, origins[part]),
-            vectors(mi.Vector3f, directions[part]), vectors(mi.Vector3f, d_du[part]), vectors(mi.Vector3f, d_dv[part]),
-            dr.opaque(mi.UInt32, samples), dr.opaque(mi.UInt32, max_bounces))
-        dr.eval(radiance)
-        result[part] = to_numpy(radiance)
+    for batch in batches(len(directions), samples, 3, chunk):
+        total = _radiance_sum(
+            world, batch.streams(seed), batch.spread(mi.Point3f, origins), batch.spread(mi.Vector3f, directions),
+            batch.spread(mi.Vector3f, d_du), batch.spread(mi.Vector3f, d_dv), *batch.samples(samples),
+            dr.opaque(mi.UInt32, max_bounces))
+        dr.eval(total)
+        result[batch.part] = batch.collect(total) / samples
     return result

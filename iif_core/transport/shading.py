@@ -13,7 +13,7 @@ from .. import brdf
 from ..brdf import R_MIN
 from ..errors import InputError
 from ..xp import DRJIT
-from .arrays import chunks, lane_streams, rows_of, to_numpy, vectors
+from .arrays import batches, rows_of
 from .cache import RadianceCache
 from .emitters import Emitters
 from .geometry import Geometry, offset_from
@@ -21,8 +21,6 @@ from .kernels import RadianceCollector, World, incoming, power_weight, sample_lo
 from .render import check_counts
 
 Array = np.ndarray
-
-CHUNK = 1 << 16
 
 
 class _Levels:
@@ -73,12 +71,11 @@ class _Levels:
 
 
 @dr.syntax
-def _lobe_sums(world: World, levels: _Levels, rng: Any, point: Any, normal: Any, wo: Any, samples: Any,
-               max_bounces: Any) -> Any:
+def _lobe_sums(world: World, levels: _Levels, rng: Any, point: Any, normal: Any, wo: Any, samples: Any, sample: Any,
+               end: Any, max_bounces: Any) -> Any:
     sums = [mi.Color3f(0) for _ in range(1 + 2 * len(levels.levels))]
     origin = offset_from(point, normal)
-    sample = mi.UInt32(0)
-    while sample < samples:
+    while sample < end:
         sums = levels.light(world, rng, origin, normal, wo, sums)
         # Stratified choice: over all samples every lobe is drawn equally often in expectation, whatever their number.
         lobe = mi.UInt32((mi.Float(sample) + uniform(rng)) / mi.Float(samples) * levels.count)
@@ -115,7 +112,7 @@ def surface_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tupl
 
 def shading_caches(geometry: Geometry, material: Any, emitters: Emitters, points: ArrayLike, normals: ArrayLike,
                    wo: ArrayLike, levels: ArrayLike, samples: int, max_bounces: int, seed: int,
-                   cache: RadianceCache | None = None, chunk: int = CHUNK) -> tuple[Array, Array, Array]:
+                   cache: RadianceCache | None = None, chunk: int | None = None) -> tuple[Array, Array, Array]:
     """(diffuse (n, 3), s0 (n, J, 3), s1 (n, J, 3)) float32 of points (n, 3) seen along wo (n, 3).
 
         diffuse = 1/pi int L cos,  s0(r) = int spec_r (1 - F_c) L,  s1(r) = int spec_r F_c L,
@@ -124,7 +121,8 @@ def shading_caches(geometry: Geometry, material: Any, emitters: Emitters, points
     is the radiance reflected at the point for ANY material of roughness r there. normals are flipped to the viewer.
     levels (J,) roughness in [0.02, 1], increasing (may be empty). max_bounces counts surface interactions including the
     point itself. All lobes share one path per sample, drawn from a mixture of the cosine and a few GGX lobes and
-    weighted with that mixture's density (balance heuristic). Memory: (1 + 2 J) x 12 bytes a point and chunk.
+    weighted with that mixture's density (balance heuristic). chunk: lanes on the device at once, a lane being up to 8
+    samples of a point (default: 2^18, fewer when the lobes would take more than 256 MiB).
     Source: METHOD 2.7; COMPUTE 5.
     """
     check_counts(samples, max_bounces)
@@ -138,16 +136,15 @@ def shading_caches(geometry: Geometry, material: Any, emitters: Emitters, points
     if max_bounces == 0:
         return diffuse, s0, s1
     world, lobes = World(geometry, material, emitters, cache, RadianceCollector()), _Levels(levels)
-    for part in chunks(len(points), chunk):
-        sums = _lobe_sums(world, lobes, lane_streams(seed, part.start, part.stop - part.start),
-                          vectors(mi.Point3f, points[part]), vectors(mi.Vector3f, normals[part]),
-                          vectors(mi.Vector3f, wo[part]), dr.opaque(mi.UInt32, samples),
-                          dr.opaque(mi.UInt32, max_bounces))
+    for batch in batches(len(points), samples, 3 * (1 + 2 * count), chunk):
+        sums = _lobe_sums(world, lobes, batch.streams(seed), batch.spread(mi.Point3f, points),
+                          batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo),
+                          dr.opaque(mi.UInt32, samples), *batch.samples(samples), dr.opaque(mi.UInt32, max_bounces))
         dr.eval(sums)
-        diffuse[part] = to_numpy(sums[0])
+        diffuse[batch.part] = batch.collect(sums[0])
         for number in range(count):
-            s0[part, number] = to_numpy(sums[1 + number])
-            s1[part, number] = to_numpy(sums[1 + count + number])
+            s0[batch.part, number] = batch.collect(sums[1 + number])
+            s1[batch.part, number] = batch.collect(sums[1 + count + number])
     for result in (diffuse, s0, s1):
         result /= samples
     return diffuse, s0, s1

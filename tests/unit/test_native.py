@@ -170,10 +170,10 @@ def test_process_environment_of_an_empty_environment(repository):
         "assert dict(os.environ) == once\n"
         "os.chdir('/')\n"
         "print(subprocess.check_output(['python', '-c', 'import sys, os, iif_core.native, numpy;'\n"
-        '      \'print(sys.prefix, os.environ["PATH"], os.environ.get("HOME"))\'], text=True))'
+        '      \'print(sys.prefix, os.environ["PATH"], os.environ.get("HOME"), sep=chr(10))\'], text=True))'
     )
     child = python(code, repository, PATH=f"/usr/bin:{Path(sys.executable).parent}:/bin")
-    prefix, path, home = child.stdout.split()
+    prefix, path, home = child.stdout.splitlines()[:3]
     assert prefix == sys.prefix
     assert path.split(os.pathsep) == [str(Path(sys.executable).parent), "/usr/bin", "/bin"]
     assert os.path.isabs(home)

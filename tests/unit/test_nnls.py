@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
-from iif_core.nnls import EmissionRows, block_rows, solve_emission
+from iif_core.nnls import EmissionRows, block_rows, prune_groups, solve_emission
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 
@@ -11,7 +11,7 @@ TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 def _rows(a1, a2, target, weight=None, bound=None):
     weight = np.ones_like(target) if weight is None else weight
     bound = np.zeros(target.shape, bool) if bound is None else bound
-    return EmissionRows(a1.astype(np.float32), a2.astype(np.float32), target, weight, bound)
+    return EmissionRows(a1.astype(np.float32), a2.astype(np.float32), target, target, weight, bound)
 
 
 def _random(n=500, groups=3, seed=0):
@@ -158,4 +158,36 @@ def test_non_finite_rows_are_refused():
     with pytest.raises(InputError, match="target"):
         solve_emission(_rows(a, a, y), np.ones((3, 3)))
     with pytest.raises(InputError, match="weight"):
-        EmissionRows(a, a, y, np.ones(3), np.zeros((10, 3), bool))
+        EmissionRows(a, a, y, y, np.ones(3), np.zeros((10, 3), bool))
+
+
+def test_right_hand_side_crosses_the_noise_of_one_trace():
+    """A path that reaches an emitter does not end in the cache: noise of A and h of one trace is anticorrelated."""
+    rng = np.random.default_rng(8)
+    a = rng.random((60_000, 2, 3))
+    y = np.einsum("ngc,gc->nc", a, TRUE[:2]) + 1.0
+    noise = [0.5 * rng.standard_normal(a.shape) * a for _ in range(2)]
+    targets = [y - (1.0 - n.sum(1)) for n in noise]
+    rows = EmissionRows(*(np.float32(a + n) for n in noise), *targets, np.ones(y.shape), np.zeros(y.shape, bool))
+    out = solve_emission(rows, np.ones((2, 3)), ridge=1e-9)
+    np.testing.assert_allclose(out.radiance, TRUE[:2], rtol=0.03)
+
+
+def test_pruning_keeps_what_shines():
+    rng = np.random.default_rng(9)
+    a = rng.random((2000, 5, 3)).astype(np.float32)
+    true = np.array([8.0, 0.0, 0.02, 0.005, 1.0])[:, None] * np.ones(3)
+    y = np.einsum("ngc,gc->nc", a, true) * (1 + 0.05 * rng.standard_normal((2000, 3)))
+    observed = np.array([8.0, 2.0, 2.0, 0.0, 0.0])[:, None] * np.ones(3)  # group 2 mostly reflects
+    out = prune_groups(
+        _rows(a, a, y), np.ones((5, 3)), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), observed, np.arange(5) == 4, cross=False
+    )
+    assert out.kept.tolist() == [True, False, False, False, True]
+    assert (out.solution.radiance[~out.kept] == 0).all() and [bool(r) for r in out.reason] == [False, True, True, True, False]
+    assert "reflects" in out.reason[2] and "power" in out.reason[3]
+
+
+def test_pruning_with_nothing():
+    rows = _rows(np.zeros((4, 0, 3)), np.zeros((4, 0, 3)), np.ones((4, 3)))
+    none = np.zeros((0, 3))
+    assert prune_groups(rows, none, np.zeros(0), none, np.zeros(0, bool)).kept.shape == (0,)

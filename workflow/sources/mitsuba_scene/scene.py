@@ -152,7 +152,8 @@ def _shapes(scene: Any, entries: dict[str, _Entry]) -> list[Shape]:
         out.append(Shape(plugin, unique, thing, placement))
 
     for thing in scene.shapes():
-        entry = entries[thing.id()]
+        name = thing.class_name().lower()
+        entry = entries.get(thing.id(), _Entry(name, thing.id() or name, ()))  # a `merge` shape is replaced by its result
         if entry.plugin != "instance":
             add(entry.plugin, entry.name, thing, None)
             continue

@@ -38,7 +38,7 @@ BIRCH, BIRCH_DARK = "#e6cfa6", "#c9a877"
 
 STEEL = Material((0.60, 0.59, 0.57), (0.53, 0.52, 0.51), roughness=(0.30, 0.10, 0.0), metallic=1.0,
                  grain=(1.0, 1.0, 14.0))
-CHROME = plain("#d6d8da", 0.10, metallic=1.0)
+CHROME = plain("#d6d8da", 0.15, metallic=1.0)
 COPPER = Material((0.93, 0.58, 0.43), (0.74, 0.40, 0.28), roughness=(0.20, 0.16, 0.0), metallic=1.0, grain=(9.0, 9.0, 9.0))
 BRASS = Material((0.88, 0.68, 0.36), (0.78, 0.57, 0.27), roughness=(0.28, 0.12, 0.0), metallic=1.0, grain=(12.0,) * 3)
 IRON = plain("#35353a", 0.55, metallic=1.0)

@@ -118,11 +118,19 @@ class MaterialTable:
 
         from iif_core.xp import DRJIT
 
-        tables = {name: mi.Float(values) for name, values in self._columns.items()}
+        # Rows padded to whole groups of four: one aligned read fetches four entries.
+        width = -(-len(_COLUMNS) // 4)
+        rows = np.zeros((len(self.materials), 4 * width), np.float32)
+        rows[:, : len(_COLUMNS)] = np.stack([self._columns[name] for name in _COLUMNS], 1)
+        table = mi.Float(rows.ravel())
 
         def material(point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
+            first = mi.UInt32(object_id) * width
+            groups = [dr.gather(mi.Vector4f, table, first + k, active) for k in range(width)]
+
             def column(name: str) -> Any:
-                return dr.gather(mi.Float, tables[name], object_id, active)
+                position = _COLUMNS.index(name)
+                return groups[position // 4][position % 4]
 
             albedo, roughness, metallic = evaluate(DRJIT, (point.x, point.y, point.z), column)
             return mi.Color3f(*albedo), roughness, metallic

@@ -61,10 +61,11 @@ def grid_sheet(origin: Point, edge_u: Point, edge_v: Point, u: np.ndarray, v: np
 
 
 def box(low: Point, high: Point, bevel: float = 0.0) -> Shape:
-    """An axis-parallel box; `bevel` metres are cut off every edge."""
+    """An axis-parallel box; `bevel` metres (at most 0.4 of the thinnest side) are cut off every edge."""
     low, high = np.asarray(low, float), np.asarray(high, float)
-    if not (high - low > 2 * bevel).all():
-        raise ValueError(f"box from {low} to {high} is too thin for a bevel of {bevel}")
+    if not (high > low).all():
+        raise ValueError(f"box from {low} to {high} has no volume")
+    bevel = min(bevel, 0.4 * float((high - low).min()))
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     centre, half = (low + high) / 2, (high - low) / 2
     if bevel == 0:

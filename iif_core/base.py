@@ -1,0 +1,600 @@
+"""The material base: K inconsistent predictions of every view fused into one value per surface cell (METHOD 2.3, 7c).
+
+Each segment i (one object in one view) and prediction k has an affine correction T_ik (albedo 3x4, roughness and
+metallic 1x2) and, per property, a selection weight alpha_ik. The solver alternates closed forms, one pass over the
+views a sweep:
+
+1. T: least squares of the corrected prediction against the texture of the sweep before, with a ridge to identity
+   that grows with the pixel count (without it, a constant texture would be a perfect fit);
+2. alpha: softmax over k of minus the segment's mean squared error, at a temperature that falls from sweep to sweep
+   and is 0 in the last one, where the best prediction is taken;
+3. texture: weighted mean (or M-estimate) in each cell of the mixture sum_k alpha_ik T_ik v_nk;
+4. gauge: an affine map of an object's texture and its inverse on all T cancel, so nothing but the ridge holds them,
+   and regression towards a noisy mean shrinks the texture a little every sweep. The object's texture is moved back
+   so that the mean correction has gain one and keeps the mean colour.
+
+Given T, errors follow from sums over the segment (Gram matrices, made once) and are not a pass of their own. A segment
+lies in one view, so T, alpha and the mixture of a view need only the previous texture: memory is one view's predictions
+plus the sums. Sums are float64. Last, the Laplace scale of a cell in closed form (laplace.closed_form_scale).
+
+Results do not depend on the order of the predictions, nor on threads.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import laplace
+from .errors import InputError
+
+CHANNELS = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
+PROPERTIES = ("albedo", "roughness", "metallic")
+VARIANTS = ("full", "uniform", "texel_mean", "object_mean")
+LOWEST = np.float32([0, 0, 0, 0.02, 0])
+"""Smallest value of each channel; the largest is 1."""
+NEUTRAL = np.float32([0.5, 0.5, 0.5, 0.9, 0.0])
+"""Material of surface that no prediction shows (METHOD H40)."""
+
+_PROPERTY_OF_CHANNEL = np.array([0, 0, 0, 1, 2])
+_ALBEDO = [0, 1, 2, 5]  # columns of phi = [albedo, roughness, metallic, 1] that each correction reads
+_ROUGHNESS = [3, 5]
+_METALLIC = [4, 5]
+
+Predictions = Callable[[int], NDArray] | Sequence[NDArray]
+
+
+@dataclass(frozen=True)
+class BaseProblem:
+    """Predictions on surface cells; what every base solver reads.
+
+    Attributes:
+        predictions: view -> (K, N, 5) or (K, H, W, 5) half or float: albedo R G B linear, perceptual roughness,
+            metallic, in [0, 1]; a sequence or a callable (then read once a sweep). Not-finite values are dropped.
+        cell_of_pixel: per view (N,) or (H, W) int32, -1 = no surface.
+        segment_of_pixel: per view, same shape, int32, -1 = none; a segment lies in one view.
+        n_cells: number of cells.
+        object_of_cell: (n_cells,) int32.
+        object_of_segment: (S,) int32.
+        weight: per view, same shape, >= 0: how much a pixel counts (low near object borders, 0 = ignore); default 1.
+    """
+
+    predictions: Predictions
+    cell_of_pixel: Sequence[NDArray]
+    segment_of_pixel: Sequence[NDArray]
+    n_cells: int
+    object_of_cell: NDArray
+    object_of_segment: NDArray
+    weight: Sequence[NDArray] | None = None
+
+    @property
+    def n_segments(self) -> int:
+        return len(self.object_of_segment)
+
+    def view(self, view: int) -> NDArray:
+        """Predictions of a view, (K, N, 5)."""
+        maps = self.predictions(view) if callable(self.predictions) else self.predictions[view]
+        if maps.ndim not in (3, 4) or maps.shape[-1] != 5 or maps.shape[0] == 0:
+            raise InputError(f"predictions of view {view} have shape {maps.shape}; (K, H, W, 5) with K >= 1 is needed")
+        maps = maps.reshape(maps.shape[0], -1, 5)
+        if maps.shape[1] != np.size(self.cell_of_pixel[view]):
+            raise InputError(f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has "
+                             f"{np.size(self.cell_of_pixel[view])}")
+        return maps
+
+
+@dataclass(frozen=True)
+class BaseOptions:
+    """How to solve.
+
+    Attributes:
+        variant: `full`; `uniform` = corrections, but all predictions alike (no selection); `texel_mean` = mean of all
+            predictions a cell; `object_mean` = mean of all predictions an object.
+        sweeps: alternations.
+        temperature, anneal: selection temperature of the first sweep, in units of the segment's median error, and its
+            factor per sweep; the last sweep is at 0.
+        ridge: pull of T to identity, times the segment's pixel weight (at least `ridge_pixels`).
+        robust: cells take the M-estimate of the Laplace divergence instead of the mean.
+        clip_share, clip_pixels: predicted albedo at exactly 0 or 1 is left out of the fit of T where at most this
+            share of the segment is, and at least so many pixels remain.
+        scale_floor: smallest Laplace scale.
+    """
+
+    variant: str = "full"
+    sweeps: int = 12
+    temperature: float = 1.0
+    anneal: float = 0.6
+    ridge: float = 0.01
+    ridge_pixels: float = 30.0
+    robust: bool = False
+    clip_share: float = 0.5
+    clip_pixels: int = 50
+    scale_floor: float = laplace.SCALE_FLOOR
+
+    def __post_init__(self) -> None:
+        if self.variant not in VARIANTS:
+            raise InputError(f"base variant {self.variant!r}; allowed: {', '.join(VARIANTS)}")
+        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1:
+            raise InputError(f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), "
+                             f"anneal {self.anneal} (between 0 and 1)")
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A prediction that was not used, and why; `k` = -1: the whole view."""
+
+    view: int
+    k: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class BaseResult:
+    """The base texture and how it came about.
+
+    Attributes:
+        value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells nobody saw have their object's mean,
+            objects nobody saw `NEUTRAL`.
+        scale: (n_cells, 5) float32 Laplace scales, same units.
+        observations: (n_cells,) int32 pixels; views: (n_cells,) int32 views that saw the cell.
+        object_value: (O, 5) float32 mean of each object id up to the largest; object_cells: (O,) int32 cells behind it.
+        weight: (S, K, 3) float32 selection weights of albedo, roughness, metallic; sum over k is 1 (0 where the
+            segment has no usable pixel).
+        affine_albedo: (S, K, 3, 4); affine_roughness, affine_metallic: (S, K, 2) = (gain, bias); float32.
+        error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture before the last
+            update.
+        dropped: predictions that were not used.
+        history: one entry a sweep: temperature, error of each property, entropy, gain, change.
+    """
+
+    value: NDArray
+    scale: NDArray
+    observations: NDArray
+    views: NDArray
+    object_value: NDArray
+    object_cells: NDArray
+    weight: NDArray
+    affine_albedo: NDArray
+    affine_roughness: NDArray
+    affine_metallic: NDArray
+    error: NDArray
+    dropped: list[Dropped]
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+# ------------------------------------------------------------------------------------------------------ predictions
+
+
+def prediction_faults(maps: NDArray, not_finite_share: float = 0.01) -> list[str]:
+    """Why each of the K predictions of a view cannot be used; "" for those that can.
+
+    `maps` (K, ..., 5). Faults (METHOD H51, half-precision overflow of a diffusion model): more than `not_finite_share`
+    of the pixels not finite; albedo constant over the picture while that of another prediction is not.
+    """
+    maps = maps.reshape(len(maps), -1, 5)
+    finite = np.isfinite(maps).all(-1)  # (K, N)
+    bad_share = 1 - finite.mean(1) if maps.shape[1] else np.zeros(len(maps))
+    spread = np.zeros(len(maps))
+    for k, prediction in enumerate(maps):
+        good = prediction[finite[k], :3]
+        spread[k] = good.astype(np.float32).std(0).max() if len(good) else 0.0
+    faults = []
+    for share, std in zip(bad_share, spread, strict=True):
+        if share > not_finite_share:
+            faults.append(f"{100 * share:.3g} % of its pixels are not finite")
+        elif std < 1e-4 and spread.max() > 1e-2:
+            faults.append("albedo is constant over the picture")
+        else:
+            faults.append("")
+    return faults
+
+
+def selection_weights(error: NDArray, temperature: float, usable: NDArray | None = None) -> NDArray:
+    """Weights of K predictions by their error: alpha_k ~ exp(-(E_k - min E) / (temperature * median E)).
+
+    `error` (..., K), K last, >= 0; `usable` (..., K) bool. Temperature 0 is the limit: the smallest error takes all,
+    equal ones share (so that the result does not depend on the order). Sum 1, or 0 where nothing is usable.
+    """
+    error = np.asarray(error, np.float64)
+    usable = np.ones(error.shape, bool) if usable is None else np.broadcast_to(usable, error.shape)
+    counted = np.where(usable, error, np.inf)
+    lowest = counted.min(-1, keepdims=True)
+    any_usable = np.isfinite(lowest)
+    excess = np.where(usable, error, 0.0) - np.where(any_usable, lowest, 0.0)
+    ranked = np.sort(counted, -1)
+    middle = np.maximum(usable.sum(-1, keepdims=True) - 1, 0) // 2
+    median = np.where(any_usable, np.take_along_axis(ranked, middle, -1), 0.0)
+    if temperature > 0:
+        weight = np.exp(-excess / (temperature * (median + 1e-6)))
+    else:
+        weight = (excess <= 1e-9 * median + 1e-15).astype(np.float64)
+    weight = np.where(usable, weight, 0.0)
+    total = weight.sum(-1, keepdims=True)
+    return weight / np.where(total > 0, total, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------------------- views
+
+
+@dataclass(frozen=True)
+class _Block:
+    """The usable pixels of one view in segment order, and the range of each segment."""
+
+    phi: NDArray  # (n, K, 6) float32: albedo, roughness, metallic, 1
+    cell: NDArray  # (n,) intp
+    weight: NDArray  # (n,) float64
+    segments: NDArray  # (s,)
+    start: NDArray  # (s + 1,)
+
+    def ranges(self) -> Iterator[tuple[int, slice]]:
+        for i, segment in enumerate(self.segments):
+            yield int(segment), slice(int(self.start[i]), int(self.start[i + 1]))
+
+
+def _block(problem: BaseProblem, view: int, usable: NDArray | None = None) -> tuple[_Block, NDArray, int]:
+    """A view's pixels, which predictions are usable (K,), and how many pixels had a value that is not finite."""
+    maps = problem.view(view)
+    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
+    weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
+    if usable is None:
+        usable = np.array([not fault for fault in prediction_faults(maps)])
+    finite = np.isfinite(maps[usable]).all((0, 2))
+    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
+    lost = int((keep & ~finite).sum())
+    keep = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
+    keep = keep[np.argsort(segment[keep], kind="stable")]
+    phi = np.ones((len(keep), len(maps), 6), np.float32)
+    phi[..., :5] = maps[:, keep].swapaxes(0, 1)
+    phi[:, ~usable, :5] = 0  # weight 0, but NaN x 0 is NaN
+    segments, start = np.unique(segment[keep], return_index=True)
+    return _Block(phi, cell[keep], weight[keep], segments, np.r_[start, len(keep)].astype(np.intp)), usable, lost
+
+
+def _unclipped(phi: NDArray, options: BaseOptions) -> NDArray | None:
+    """(m, K) pixels whose albedo is inside (0, 1), for predictions where leaving the others out is possible."""
+    inside = ((phi[..., :3] > 0) & (phi[..., :3] < 1)).all(-1)
+    if inside.all():
+        return None
+    remain = inside.sum(0)
+    possible = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * len(phi))
+    return inside | ~possible
+
+
+# ------------------------------------------------------------------------------------------------------------ sums
+
+
+class _Sums:
+    """Gram matrices of every (segment, prediction) and the regularised inverses, made in one pass."""
+
+    def __init__(self, n_segments: int, k: int):
+        self.weight = np.zeros(n_segments)
+        self.gram = np.zeros((n_segments, k, 6, 6))  # all pixels
+        self.fit = np.zeros((n_segments, k, 4, 4))  # albedo without clipped pixels
+        self.usable = np.zeros((n_segments, k), bool)
+
+    def add(self, segment: int, phi: NDArray, weight: NDArray, usable: NDArray, unclipped: NDArray | None) -> None:
+        if self.weight[segment] > 0:
+            raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
+        by_k = np.ascontiguousarray(phi.transpose(1, 0, 2))  # (K, m, 6) float64
+        self.weight[segment] = weight.sum()
+        self.usable[segment] = usable
+        self.gram[segment] = (by_k * weight[:, None]).swapaxes(1, 2) @ by_k
+        self.fit[segment] = self.gram[segment][:, _ALBEDO][:, :, _ALBEDO]
+        if unclipped is not None:
+            a = by_k[..., _ALBEDO] * unclipped.T[..., None]
+            self.fit[segment] = (a * weight[:, None]).swapaxes(1, 2) @ a
+
+    def invert(self, options: BaseOptions) -> None:
+        self.ridge = options.ridge * np.maximum(self.weight, options.ridge_pixels)
+        ridge = self.ridge[:, None, None, None]
+        self.inverse_albedo = np.linalg.inv(self.fit + ridge * np.eye(4))
+        self.inverse_roughness, self.inverse_metallic = (
+            np.linalg.inv(self.gram[:, :, rows][:, :, :, rows] + ridge * np.eye(2)) for rows in (_ROUGHNESS, _METALLIC))
+
+
+def _identity(n_segments: int, k: int) -> NDArray:
+    """Corrections as one matrix (S, K, 6, 5): phi @ T = corrected values."""
+    t = np.zeros((n_segments, k, 6, 5))
+    t[..., range(5), range(5)] = 1
+    return t
+
+
+# ---------------------------------------------------------------------------------------------------------- solver
+
+
+def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
+               progress: Callable[[int, int], None] | None = None) -> BaseResult:
+    """Base texture of a problem by alternating closed forms; deterministic, independent of the order of predictions.
+
+    `progress(done, total)` is called after every pass over the views.
+
+    Raises:
+        InputError: shapes that do not match, ids out of range, a segment in two views.
+    """
+    options = options or BaseOptions()
+    means = options.variant in ("texel_mean", "object_mean")
+    sweeps = 1 if means else options.sweeps
+    n_views = len(problem.cell_of_pixel)
+    total = sweeps + 2
+
+    sums, texture, usable, dropped, counts = _first_pass(problem, options)
+    k = sums.usable.shape[1]
+    _notify(progress, 1, total)
+    affine = _identity(problem.n_segments, k)
+    share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
+    alpha = np.repeat(share[:, :, None], 3, 2)
+    error = np.zeros((problem.n_segments, k, 3))
+    history: list[dict[str, float]] = []
+
+    for sweep in range(sweeps):
+        last = sweep == sweeps - 1
+        temperature = 0.0 if last else options.temperature * options.anneal**sweep
+        cells = _CellSums(problem.n_cells)
+        for view in range(n_views):
+            block, _, _ = _block(problem, view, usable[view])
+            for segment, rows in block.ranges():
+                phi = block.phi[rows].astype(np.float64)
+                weight, t = block.weight[rows], texture[block.cell[rows]]
+                weighted = phi * weight[:, None, None]
+                cross = (weighted.reshape(len(phi), -1).T @ t).reshape(k, 6, 5)
+                if not means:
+                    affine[segment] = _fit(sums, segment, phi, weighted, cross, t, options)
+                error[segment] = _errors(sums, segment, affine[segment], cross, (weight[:, None] * t * t).sum(0))
+                if options.variant == "full":
+                    alpha[segment] = selection_weights(error[segment].T, temperature, sums.usable[segment]).T
+                mixture = _mixture(phi, affine[segment], alpha[segment])
+                cells.add(block.cell[rows], mixture, weight, t if options.robust and sweep else None, options)
+        updated = cells.mean(texture)
+        gain = 1.0
+        if not means:
+            updated, affine, gain = _regauge(problem, sums, updated, affine, alpha)
+        change = float(np.sqrt(np.mean((updated - texture)[cells.seen] ** 2))) if cells.seen.any() else 0.0
+        texture = updated
+        history.append({"temperature": temperature, **_mean_errors(sums, alpha, error), "entropy": _entropy(sums, alpha),
+                        "gain": gain, "change": change})
+        _notify(progress, sweep + 2, total)
+
+    texture = np.clip(texture, LOWEST, 1.0)
+    if options.variant == "object_mean":
+        texture = object_means(texture, problem.object_of_cell, counts.weight)[0].astype(np.float64)[problem.object_of_cell]
+    scale = _scales(problem, options, texture, affine, alpha, usable)
+    _notify(progress, total, total)
+    value, object_value, object_cells = _filled(problem, texture, counts)
+    scale[counts.weight == 0] = _unseen_scale(scale, counts.weight > 0, options)
+    return BaseResult(
+        value, scale, counts.observations, counts.views, object_value, object_cells, alpha.astype(np.float32),
+        affine[..., _ALBEDO, :3].swapaxes(-1, -2).astype(np.float32),
+        affine[..., _ROUGHNESS, 3].astype(np.float32), affine[..., _METALLIC, 4].astype(np.float32),
+        error.astype(np.float32), dropped, history)
+
+
+@dataclass
+class _Counts:
+    observations: NDArray
+    views: NDArray
+    weight: NDArray
+
+
+def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
+    """Gram matrices, the first texture (cell mean of the predictions' median), usable predictions, counts."""
+    n_views = len(problem.cell_of_pixel)
+    counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
+    cells = _CellSums(problem.n_cells)
+    sums, usable_of_view, dropped = None, [], []
+    for view in range(n_views):
+        _check_ids(problem, view)
+        block, usable, lost = _block(problem, view)
+        if sums is None:
+            sums = _Sums(problem.n_segments, len(usable))
+        if len(usable) != sums.usable.shape[1]:
+            raise InputError(f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; "
+                             "give every view the same number")
+        usable_of_view.append(usable)
+        if not usable.all():
+            faults = prediction_faults(problem.view(view))
+            dropped += [Dropped(view, i, fault) for i, fault in enumerate(faults) if fault]
+        if lost and usable.any():
+            dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
+        for segment, rows in block.ranges():
+            phi = block.phi[rows].astype(np.float64)
+            sums.add(segment, phi, block.weight[rows], usable, _unclipped(phi, options))
+            if options.variant in ("texel_mean", "object_mean"):
+                start = phi[:, usable, :5].mean(1)
+            else:
+                start = np.median(phi[:, usable, :5], 1)
+            cells.add(block.cell[rows], start, block.weight[rows], None, options)
+        np.add.at(counts.observations, block.cell, 1)
+        counts.views[np.unique(block.cell)] += 1
+    if sums is None:
+        sums = _Sums(problem.n_segments, 1)
+    sums.invert(options)
+    counts.weight = cells.total[0]
+    return sums, cells.mean(np.broadcast_to(NEUTRAL, (problem.n_cells, 5))), usable_of_view, dropped, counts
+
+
+def _check_ids(problem: BaseProblem, view: int) -> None:
+    for name, ids, n in (("cell", problem.cell_of_pixel[view], problem.n_cells),
+                         ("segment", problem.segment_of_pixel[view], problem.n_segments)):
+        highest = int(np.max(ids, initial=-1))
+        if highest >= n:
+            raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
+
+
+def _fit(sums: _Sums, segment: int, phi: NDArray, weighted: NDArray, cross: NDArray, t: NDArray,
+         options: BaseOptions) -> NDArray:
+    """Corrections (K, 6, 5) of a segment: (G + lambda I)^-1 (phi' W t + lambda T_identity)."""
+    k = phi.shape[1]
+    ridge = sums.ridge[segment]
+    out = np.zeros((k, 6, 5))
+    albedo = cross[:, _ALBEDO, :3]
+    unclipped = _unclipped(phi, options)
+    if unclipped is not None:
+        inside = weighted[..., _ALBEDO] * unclipped[..., None]
+        albedo = (inside.reshape(len(phi), -1).T @ t[:, :3]).reshape(k, 4, 3)
+    out[:, _ALBEDO, :3] = sums.inverse_albedo[segment] @ (albedo + ridge * np.eye(4, 3))
+    for rows, inverse, channel in ((_ROUGHNESS, sums.inverse_roughness, 3), (_METALLIC, sums.inverse_metallic, 4)):
+        right = cross[:, rows, channel] + ridge * np.array([1.0, 0.0])
+        out[:, rows, channel] = (inverse[segment] @ right[..., None])[..., 0]
+    return out
+
+
+def _errors(sums: _Sums, segment: int, affine: NDArray, cross: NDArray, square: NDArray) -> NDArray:
+    """(K, 3) mean squared error per property of phi T - t from sums: (T' G T - 2 T' c + t't) / weight."""
+    quadratic = np.einsum("kic,kij,kjc->kc", affine, sums.gram[segment], affine, optimize=True)
+    by_channel = quadratic - 2 * np.einsum("kic,kic->kc", affine, cross) + square
+    by_channel = np.maximum(by_channel / sums.weight[segment], 0)
+    return np.stack([by_channel[:, :3].mean(1), by_channel[:, 3], by_channel[:, 4]], 1)
+
+
+def _mixture(phi: NDArray, affine: NDArray, alpha: NDArray) -> NDArray:
+    """(m, 5) sum_k alpha_k T_k v_k."""
+    blended = affine * alpha[:, None, _PROPERTY_OF_CHANNEL]
+    # predictions nobody chose need no product: after the last sweep that is all but one
+    active = np.flatnonzero((alpha > 0).any(1))
+    return phi[:, active].reshape(len(phi), -1) @ blended[active].reshape(-1, 5)
+
+
+class _CellSums:
+    """Weighted sums per cell, per channel; added in pixel order, so the result is the same every time."""
+
+    def __init__(self, n_cells: int):
+        self.sum = np.zeros((5, n_cells))
+        self.total = np.zeros((5, n_cells))
+
+    def add(self, cell: NDArray, value: NDArray, weight: NDArray, centre: NDArray | None, options: BaseOptions) -> None:
+        """`centre` (m, 5): the cell's value, for the weights of the M-estimate; None = mean."""
+        value = np.clip(value, LOWEST, 1.0)
+        for c in range(5):
+            w = weight
+            if centre is not None:
+                w = weight * laplace.kl_weight(value[:, c] - centre[:, c], options.scale_floor, 1.0)
+            np.add.at(self.sum[c], cell, w * value[:, c])
+            np.add.at(self.total[c], cell, w)
+
+    @property
+    def seen(self) -> NDArray:
+        return self.total[0] > 0
+
+    def mean(self, fallback: NDArray) -> NDArray:
+        """(n_cells, 5) float64; cells without weight keep the fallback."""
+        mean = self.sum / np.where(self.total > 0, self.total, 1.0)
+        return np.where(self.seen[:, None], mean.T, fallback)
+
+
+def _regauge(problem: BaseProblem, sums: _Sums, texture: NDArray, affine: NDArray,
+             alpha: NDArray) -> tuple[NDArray, NDArray, float]:
+    """Undo the shrinking of each object's contrast: divide by the mean gain of its selected corrections.
+
+    The map of a property p of object o is x -> (x - c) / g + c with g the weighted mean gain (albedo: trace of A / 3)
+    and c the object's mean, so the level stays where the data put it. Gains are limited to [0.5, 2]; out of that the
+    object is nearly constant and has no contrast to speak of. Returns texture, corrections, mean gain before.
+    """
+    n_objects = int(max(np.max(problem.object_of_segment, initial=-1), np.max(problem.object_of_cell, initial=-1))) + 1
+    seg_object = problem.object_of_segment
+    gains = np.stack([affine[..., range(3), range(3)].mean(-1), affine[..., 3, 3], affine[..., 4, 4]], -1)  # (S, K, 3)
+    weight = (sums.weight[:, None, None] * alpha).sum(1)  # (S, 3)
+    mean_gain = np.ones((n_objects, 3))
+    per_segment = (sums.weight[:, None, None] * alpha * gains).sum(1)
+    for p in range(3):
+        total = np.bincount(seg_object, weight[:, p], n_objects)
+        mean_gain[:, p] = np.where(total > 0, np.bincount(seg_object, per_segment[:, p], n_objects) /
+                                   np.where(total > 0, total, 1), 1.0)
+    overall = float(per_segment[:, 0].sum() / weight[:, 0].sum()) if weight[:, 0].sum() > 0 else 1.0
+    stretch = (1 / np.clip(mean_gain, 0.5, 2.0))[:, _PROPERTY_OF_CHANNEL]  # (O, 5)
+    cells = np.maximum(np.bincount(problem.object_of_cell, minlength=n_objects), 1)
+    centre = np.stack([np.bincount(problem.object_of_cell, texture[:, c], n_objects) / cells for c in range(5)], 1)
+    shift = centre * (1 - stretch)
+    o = problem.object_of_cell
+    texture = texture * stretch[o] + shift[o]
+    affine = affine * stretch[seg_object][:, None, None, :]
+    affine[..., 5, :] += shift[seg_object][:, None, :]
+    return texture, affine, overall
+
+
+def _scales(problem: BaseProblem, options: BaseOptions, texture: NDArray, affine: NDArray, alpha: NDArray,
+            usable: list[NDArray]) -> NDArray:
+    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels, b_r the spread of the K values."""
+    total = np.zeros(problem.n_cells)
+    summed = np.zeros((5, problem.n_cells))
+    for view in range(len(problem.cell_of_pixel)):
+        block, use, _ = _block(problem, view, usable[view])
+        for segment, rows in block.ranges():
+            phi = block.phi[rows]
+            cell, weight = block.cell[rows], block.weight[rows]
+            t = affine[segment][use].astype(np.float32)
+            corrected = np.clip(np.matmul(phi[:, use].swapaxes(0, 1), t), LOWEST, 1)  # (K, m, 5)
+            mixture = np.clip(_mixture(phi.astype(np.float64), affine[segment], alpha[segment]), LOWEST, 1)
+            b_ref = laplace.reference_scale(mixture.astype(np.float32), corrected, options.scale_floor)
+            part = laplace.scale_contribution(mixture - texture[cell], b_ref, options.scale_floor)
+            np.add.at(total, cell, weight)
+            for c in range(5):
+                np.add.at(summed[c], cell, weight * part[:, c])
+    return laplace.floored((summed / np.where(total > 0, total, 1.0)).T, options.scale_floor).astype(np.float32)
+
+
+def _unseen_scale(scale: NDArray, seen: NDArray, options: BaseOptions) -> NDArray:
+    """Scale of cells nobody saw: as unsure as the least sure tenth of those seen, or 0.5 where there are none."""
+    return np.quantile(scale[seen], 0.9, axis=0).astype(np.float32) if seen.any() else np.float32(0.5)
+
+
+def _filled(problem: BaseProblem, texture: NDArray, counts: _Counts) -> tuple[NDArray, NDArray, NDArray]:
+    object_value, object_cells = object_means(texture, problem.object_of_cell, counts.weight,
+                                              int(np.max(problem.object_of_segment, initial=-1)) + 1)
+    value = np.where((counts.weight > 0)[:, None], texture, object_value[problem.object_of_cell])
+    return value.astype(np.float32), object_value, object_cells
+
+
+def object_means(value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None,
+                 n_objects: int = 0) -> tuple[NDArray, NDArray]:
+    """Mean value of every object and the cells behind it: (O, 5) float32, (O,) int32.
+
+    O is the largest object id + 1, or `n_objects` if that is more. `weight` (n_cells,): pixels (0 = not seen, does not
+    count). Objects without a cell that counts get `NEUTRAL`: albedo 0.5, roughness 0.9, metallic 0.
+    """
+    weight = np.ones(len(value)) if weight is None else weight
+    n_objects = max(n_objects, int(np.max(object_of_cell, initial=-1)) + 1)
+    total = np.bincount(object_of_cell, weight, n_objects)
+    mean = np.stack([np.bincount(object_of_cell, weight * value[:, c], n_objects) for c in range(5)], 1)
+    mean = mean / np.where(total > 0, total, 1.0)[:, None]
+    cells = np.bincount(object_of_cell, weight > 0, n_objects)
+    return np.where((total > 0)[:, None], mean, NEUTRAL).astype(np.float32), cells.astype(np.int32)
+
+
+def covisible_parts(problem: BaseProblem) -> NDArray:
+    """Part of every segment, (S,) int32: segments are in one part when they share cells, directly or through others.
+
+    An object in n > 1 parts has n independent gauges that only the pull to identity ties together (METHOD 7c, G2):
+    its parts may differ in tone.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = [np.zeros(0, np.int64)]
+    for cell, segment in zip(problem.cell_of_pixel, problem.segment_of_pixel, strict=True):
+        cell, segment = np.ravel(cell), np.ravel(segment)
+        known = (cell >= 0) & (segment >= 0)
+        pairs.append(np.unique(segment[known].astype(np.int64) * problem.n_cells + cell[known]))
+    segment, cell = np.divmod(np.concatenate(pairs), max(problem.n_cells, 1))
+    size = problem.n_segments + problem.n_cells
+    graph = coo_matrix((np.ones(len(cell), np.int8), (segment, problem.n_segments + cell)), (size, size))
+    _, label = connected_components(graph, directed=False)
+    return np.unique(label[:problem.n_segments], return_inverse=True)[1].astype(np.int32)
+
+
+def _mean_errors(sums: _Sums, alpha: NDArray, error: NDArray) -> dict[str, float]:
+    total = max(sums.weight.sum(), 1e-30)
+    mixed = (alpha * error).sum(1)
+    return {f"error_{name}": float(sums.weight @ mixed[:, p] / total) for p, name in enumerate(PROPERTIES)}
+
+
+def _entropy(sums: _Sums, alpha: NDArray) -> float:
+    """Mean entropy of the selection in nats, weighted by pixels."""
+    log = np.log(np.where(alpha > 0, alpha, 1.0))
+    return float(sums.weight @ -(alpha * log).sum(1).mean(1) / max(sums.weight.sum(), 1e-30)) + 0.0
+
+
+def _notify(progress: Callable[[int, int], None] | None, done: int, total: int) -> None:
+    if progress is not None:
+        progress(done, total)

@@ -1,0 +1,133 @@
+"""What a scene requires, by measurement (METHOD 8): every function decides one component and says why.
+
+All return the same record, ready for `plan.yaml`:
+`{component, included, measure, value, threshold, reason}` with plain Python values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Decision = dict[str, Any]
+
+ESCAPE_PRIMARY = 1e-3
+ESCAPE_SECONDARY = 2e-3
+ESCAPE_BRIGHTNESS = 0.02
+EXPOSURE_LOG_RATIO = 0.05
+RESPONSE_EXPLAINED = 0.05
+METALLIC_PRIOR = 0.25
+SPECULAR_ROUGHNESS = 0.85
+SECOND_PASS_GAIN = 0.10
+
+
+def _decision(component: str, included: bool, measure: str, value: float, threshold: float, reason: str) -> Decision:
+    finite = float(value) if np.isfinite(value) else 0.0
+    return {
+        "component": component, "included": bool(included), "measure": measure, "value": round(finite, 6),
+        "threshold": float(threshold), "reason": reason,
+    }
+
+
+def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
+    """Constant light from outside: needed when rays leave the mesh and what they meet is not black.
+
+    Args:
+        setting: `on`, `off` or `auto`.
+        primary_escape: share of camera rays without a hit.
+        secondary_escape: share of cosine-distributed rays from the surface that leave.
+        relative_brightness: mean radiance of escaping camera rays / mean radiance of the photographs; None = none escaped.
+    """
+    measure = "share of cosine-distributed rays from the surface that leave the mesh"
+    if setting != "auto":
+        return _decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
+    leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
+    dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
+    if not leaves:
+        reason = f"the mesh is closed: {primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    elif dark:
+        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: nothing shines in from outside"
+    else:
+        reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
+
+
+def emitters(groups: int, dropped: int, candidates: int) -> Decision:
+    """Emitters: whether any group was found and survived the solve."""
+    if groups:
+        reason = f"{groups} groups shine ({dropped} candidates dropped)"
+    elif candidates:
+        reason = f"none of the {candidates} candidate groups shines by itself; light comes from cache and environment"
+    else:
+        reason = "no face was seen saturated often enough; light comes from cache and environment"
+    return _decision("emitters", groups > 0, "emitter groups", groups, 1, reason)
+
+
+def camera_response(dynamic_range: str, family: str, start_residual: float, fitted_residual: float) -> Decision:
+    """Camera response: never for linear radiance; for LDR its parameters count when they explain more than 5 % of the
+    squared residual (below that the starting curve would have done)."""
+    explained = 1.0 - (fitted_residual / start_residual) ** 2 if start_residual > 0 else 0.0
+    measure = "share of the squared residual that the fitted response explains"
+    if dynamic_range == "hdr":
+        return _decision("camera_response", False, measure, 0.0, RESPONSE_EXPLAINED, "photographs are linear radiance")
+    useful = explained > RESPONSE_EXPLAINED
+    verdict = "was needed" if useful else "changes little; the starting curve would have done"
+    return _decision("camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}")
+
+
+def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
+    """Exposure gains of the views: whether what overlapping views disagree by exceeds 5 %."""
+    spread = float(np.median(np.abs(log_gains))) if len(log_gains) else 0.0
+    measure = "median |log gain| between overlapping views"
+    if setting != "estimate":
+        return _decision("exposure", False, measure, spread, EXPOSURE_LOG_RATIO, "exposures taken as given")
+    if spread <= EXPOSURE_LOG_RATIO:
+        return _decision("exposure", False, measure, spread, EXPOSURE_LOG_RATIO, "overlapping views agree")
+    return _decision("exposure", True, measure, spread, EXPOSURE_LOG_RATIO, f"gains estimated for {estimated} views")
+
+
+def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
+    """Metalness: fitted for objects where it was predicted or where it removes residual; elsewhere the prior's stays.
+
+    Args:
+        free: (O,) bool, metalness was fitted; prior_median: (O,) median predicted metalness.
+    """
+    count = int(np.count_nonzero(free))
+    predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
+    value = float(np.max(prior_median)) if len(prior_median) else 0.0
+    reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {count - predicted} because it pays)"
+    return _decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
+
+
+def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
+    """Specular lobe: some object is glossier than 0.85 in 5 % of its cells, or metallic."""
+    value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
+    needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
+    reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
+    return _decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
+
+
+def affine_size(models: list[str]) -> Decision:
+    """Size of the per-object albedo map, from the colour directions of each object's texture."""
+    kinds = [m.split(",")[0].split(" (")[0] for m in models]
+    counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "identity")}
+    value = counts["full"] / len(kinds) if kinds else 0.0
+    reason = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number) or "no objects"
+    return _decision("affine_size", counts["full"] > 0, "share of objects with the full 3x4 map", value, 0.0, reason)
+
+
+def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
+    """Another round of light and materials: recommended when the fitted gains move the median pixel by more than 10 %.
+
+    Recorded, not done: each round multiplies the bias of the scale (COMPUTE 7).
+    """
+    values, weights = np.abs(np.asarray(gains) - 1.0), np.asarray(pixels, np.float64)
+    measure = "median |fitted albedo gain - 1| over pixels"
+    if not weights.sum():
+        return _decision("second_pass", False, measure, 0.0, SECOND_PASS_GAIN, "nothing was fitted")
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weights[order])
+    value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
+    reason = "would change the light noticeably; one pass is made" if value > SECOND_PASS_GAIN else "light would hardly change"
+    return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)

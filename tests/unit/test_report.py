@@ -1,0 +1,478 @@
+"""The last stages on a made-up scene: render, metrics, export, report and publish over artefacts written here."""
+
+import json
+import logging
+import os
+import re
+from html.parser import HTMLParser
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+
+from iif_core.camera import look_at, pixel_directions
+from iif_core.cells import grid_origin, voxel_indices
+from iif_core.errors import InputError
+from workflow.artifacts import StageReader, StageWriter
+from workflow.artifacts.files import read_exr, read_parquet
+from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
+from workflow.artifacts.verify import damaged
+from workflow.normal_form import CaptureReader, CaptureWriter, Truth, View
+from workflow.recovered import read_recovered, read_response, response_samples
+from workflow.registry import STAGES
+from workflow.report import pictures as pic
+from workflow.report.page import number, score_table
+from workflow.stages import export, metrics, publish, render, report
+from workflow.timings import read_timings
+
+BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
+OUTWARD = np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
+OUTWARD = np.concatenate([OUTWARD, [[2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]]])
+TRUE = np.array([[0.6, 0.5, 0.4, 0.8, 0.0], [0.2, 0.3, 0.7, 0.3, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0]])
+LAMP = np.array([6.0, 5.0, 4.0])
+WIDTH, HEIGHT, K = 40, 32, 3
+
+
+class FakeJob:
+    """A job without settings files and fingerprints: what a stage may touch, over one folder."""
+
+    quality, seed, threads, fingerprint = "draft", 3, 2, "0123456789abcdef"
+
+    def __init__(self, stage, root, scene="toy"):
+        self.scene, self.root = scene, root
+        self.stage = SimpleNamespace(name=stage, upstream=tuple(STAGES)[: tuple(STAGES).index(stage)])
+        self.settings = SimpleNamespace(
+            render=SimpleNamespace(samples=64, max_bounces=4),
+            export=SimpleNamespace(max_faces_glb=100_000),
+            report=SimpleNamespace(views=2, credit="by <nobody> & co"),
+            metrics=SimpleNamespace(views="all"),
+        )
+        self.document = {"seed": 3}
+        self.log = logging.getLogger("test")
+        self.readers = {}
+        self.writer = StageWriter(root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"})
+
+    def read(self, stage):
+        assert stage in self.stage.upstream
+        if stage not in self.readers:
+            self.readers[stage] = StageReader(self.root / "results" / self.scene / stage, stage, self.scene)
+        return self.readers[stage]
+
+    def progress(self, done, total, what):
+        assert 0 <= done <= total and what
+
+
+def material_columns(values):
+    names = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
+    return {name: values[:, i].astype(np.float32) for i, name in enumerate(names)}
+
+
+def material_channels(values, shape, prefix=""):
+    maps = values.reshape(*shape, 5)
+    rough, metal = (maps[..., i].astype(np.float32) for i in (3, 4))
+    return {**split_rgb(maps[..., :3], f"{prefix}albedo"), f"{prefix}roughness": rough, f"{prefix}metallic": metal}
+
+
+def make_scene(root, truth=True, dynamic_range="ldr"):
+    """Every artefact that the last stages read, of a room with a box and a lamp: materials known, base 20 % too dark."""
+    from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
+
+    rng = np.random.default_rng(0)
+    quad = np.array([[1.0, 0.7, 2.4], [2.0, 0.7, 2.4], [2.0, 1.3, 2.4], [1.0, 1.3, 2.4]])
+    vertices = np.concatenate([BOX * [3, 2, 2.5], BOX * 0.6 + [2.0, 1.1, 0.0], quad]).astype(np.float32)
+    faces = np.concatenate([OUTWARD, OUTWARD + 8, np.array([[0, 2, 1], [0, 3, 2]]) + 16]).astype(np.int32)
+    object_id = np.repeat([0, 1, 2], [12, 12, 2]).astype(np.int32)
+    lit = object_id == 2
+    radiance = np.where(lit[:, None], LAMP, 0)
+    geometry = build_geometry(vertices, faces, object_id)
+    emitters = Emitters(geometry, radiance, lit.astype(np.int8))
+
+    job = FakeJob("capture", root)
+    writer = CaptureWriter(job.writer)
+    poses = [look_at([0.3, 0.3, 1.6], [2.2, 1.3, 0.8], [0, 0, 1]), look_at([2.7, 0.4, 1.4], [0.8, 1.4, 1.9], [0, 0, 1])]
+    centre = (WIDTH / 2, HEIGHT / 2)
+    views = [View(i, f"v{i}", WIDTH, HEIGHT, 30.0, 30.0, *centre, pose, 0.5 + 0.5 * i) for i, pose in enumerate(poses)]
+    writer.cameras(views)
+    writer.mesh(vertices, faces, object_id, ["walls", "box", "lamp"], radiance)
+    seen = []
+    for view in views:
+        eye = view.world_from_camera[:3, 3]
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(-1, 3)
+        face, depth = trace(geometry, eye, rays)
+        image = render(geometry, FaceMaterials(TRUE[object_id]), emitters, eye, rays, 64, 4, 1).reshape(HEIGHT, WIDTH, 3)
+        exposed = np.clip(view.exposure * image, 0, 1)
+        photo = image if dynamic_range == "hdr" else exposed ** (1 / 2.2)
+        writer.photo(view.name, photo, np.ones((HEIGHT, WIDTH), bool), dynamic_range == "ldr")
+        writer.gbuffer(view.name, depth.reshape(HEIGHT, WIDTH), face.reshape(HEIGHT, WIDTH))
+        values = TRUE[object_id[face]]
+        maps = values.reshape(HEIGHT, WIDTH, 5)
+        emission = np.where(lit[face][:, None], LAMP, 0).reshape(HEIGHT, WIDTH, 3)
+        valid = np.ones((HEIGHT, WIDTH), bool)
+        if truth:
+            writer.truth(view.name, Truth(maps[..., :3], maps[..., 3], maps[..., 4], emission, image, valid))
+        seen.append((view, eye + depth[:, None] * rays, object_id[face], values))
+    curve = np.linspace(0, 1, 101) ** (1 / 2.2)
+    samples = np.stack([curve] * 3) if truth and dynamic_range == "ldr" else None
+    writer.finish("made up", dynamic_range, truth, ["a note with <angle> brackets"], samples)
+    job.writer.finish()
+
+    job = FakeJob("prior", root)
+    job.writer.provenance["settings"] = {"prior": {"kind": "simulated", "samples": K}}
+    for view, _, _, values in seen:
+        channels = {}
+        for k in range(K):
+            spoilt = np.clip(values * rng.uniform(0.5, 1.2, 5) + rng.normal(0, 0.05, values.shape), 0, 1)
+            channels |= material_channels(spoilt, (HEIGHT, WIDTH), f"prior.{k:03d}.")
+        job.writer.exr(f"maps/{view.name}.exr", channels)
+    job.writer.finish()
+
+    job = FakeJob("segmentation", root)
+    ids = np.arange(3, dtype=np.int32)
+    job.writer.table("faces.parquet", {"face_id": np.arange(26), "object_id": object_id})
+    job.writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"]})
+    for view, _, objects, _ in seen:
+        segment = (3 * view.view_id + objects).reshape(HEIGHT, WIDTH)
+        channels = {"object.id": ids_to_disk(objects.reshape(HEIGHT, WIDTH)), "segment.id": ids_to_disk(segment)}
+        job.writer.exr(f"maps/{view.name}.exr", channels)
+    job.writer.finish()
+
+    job = FakeJob("base", root)
+    edge = 0.1
+    points = np.concatenate([p for _, p, _, _ in seen])
+    owner = np.concatenate([o for _, _, o, _ in seen])
+    origin = grid_origin(points, edge)
+    ijk = voxel_indices(points, edge, origin)
+    cells, cell_of = np.unique(np.column_stack([ijk, owner]), axis=0, return_inverse=True)
+    cell_of = cell_of.ravel()
+    base = TRUE[cells[:, 3]] * [0.8, 0.8, 0.8, 1, 1]
+    centres = origin + (cells[:, :3] + 0.5) * edge
+    columns = {"cell_id": np.arange(len(cells)), **{c: cells[:, i] for i, c in enumerate("ijk")}, "object_id": cells[:, 3]}
+    columns |= {c: centres[:, i] for i, c in enumerate("xyz")}
+    job.writer.table("cells.parquet", {**columns, **material_columns(base)})
+    counts = np.bincount(cells[:, 3], minlength=3)
+    job.writer.table("objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])})
+    rows = {"segment_id": np.repeat(np.arange(6), K), "k": np.tile(np.arange(K), 6)}
+    job.writer.table("selection.parquet", {**rows, "weight_albedo": rng.uniform(0, 1, 6 * K)})
+    start = 0
+    for view, p, _, values in seen:
+        channels = {"cell.id": ids_to_disk(cell_of[start : start + len(p)].reshape(HEIGHT, WIDTH))}
+        channels |= material_channels(values * [0.8, 0.8, 0.8, 1, 1], (HEIGHT, WIDTH))
+        job.writer.exr(f"maps/{view.name}.exr", channels)
+        start += len(p)
+    plan = [{"component": "metallic", "included": False, "measure": "median predicted metalness", "value": 0.02}]
+    plan[0] |= {"threshold": 0.25, "reason": "no object looks like a <metal>"}
+    job.writer.json("base.json", {"cell_edge_m": edge, "origin": origin.tolist(), "plan": plan})
+    job.writer.finish()
+
+    job = FakeJob("emission", root)
+    rows = {"emitter_id": np.array([0, 1]), "kind": ["area", "area"], "faces": np.array([2, 0]), "area_m2": np.array([0.6, 0.1])}
+    rows |= {"side": np.array([1, 0]), "observations": np.array([40, 9]), "kept": np.array([True, False])}
+    rows |= {f"radiance_{c}": np.array([LAMP[i] / 2, 0.01]) for i, c in enumerate("rgb")}
+    rows |= {f"error_{c}": np.array([0.1, 0.1]) for c in "rgb"} | {"reason": ["", "below 1 % of the power"]}
+    job.writer.table("emitters.parquet", rows)
+    job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
+    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": []})
+    job.writer.finish()
+
+    job = FakeJob("shading", root)
+    job.writer.finish()
+
+    job = FakeJob("affines", root)
+    gain = np.concatenate([np.eye(3) / 0.8, np.zeros((3, 1))], 1).ravel()
+    tables = {"T_albedo": np.tile(gain, (3, 1)), "T_roughness": np.tile([1.0, 0.0], (3, 1))}
+    tables["T_metallic"] = np.tile([1.0, 0.0], (3, 1))
+    job.writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"], **tables})
+    fitted = {"cell_id": np.arange(len(cells)), **material_columns(TRUE[cells[:, 3]])}
+    job.writer.table("cells.parquet", {**fitted, "uncertainty": np.full(len(cells), 0.02)})
+    job.writer.json("affines.json", {"light_scale": 2.0})
+    if dynamic_range == "ldr":
+        n = np.repeat(["R", "G", "B"], 101)
+        response = {"channel": n, "kind": ["sample"] * 303, "name": [""] * 303, "x": np.tile(np.linspace(0, 1, 101), 3)}
+        job.writer.table("camera_response.parquet", {**response, "value": np.tile(curve, 3)})
+    for view, _, _, values in seen:
+        channels = material_channels(values, (HEIGHT, WIDTH))
+        job.writer.exr(f"maps/{view.name}.exr", {**channels, "uncertainty": np.full((HEIGHT, WIDTH), 0.02, np.float32)})
+    job.writer.finish()
+    benchmarks = root / "results/toy/benchmarks"
+    benchmarks.mkdir(parents=True)
+    old = {"s": 99.0, "cpu_time": 1, "max_rss": 1}
+    new = {"s": 12.5, "cpu_time": 20.25, "max_rss": 300.5, "threads": 2}
+    (benchmarks / "base.jsonl").write_text(f"{json.dumps(old)}\n{json.dumps(new)}\n")
+    (benchmarks / "affines.jsonl").write_text(json.dumps({"s": 0.2, "cpu_time": "NA", "max_rss": "NA"}) + "\n")
+
+
+def finish(root, upto="publish"):
+    for name, stage in (("render", render), ("metrics", metrics), ("export", export), ("report", report), ("publish", publish)):
+        job = FakeJob(name, root)
+        stage.run(job)
+        job.writer.finish()
+        if name == upto:
+            return
+
+
+@pytest.fixture(scope="module")
+def toy(llvm, tmp_path_factory):
+    root = tmp_path_factory.mktemp("toy")
+    make_scene(root)
+    here = os.getcwd()
+    os.chdir(root)
+    try:
+        finish(root)
+    finally:
+        os.chdir(here)
+    return root
+
+
+def test_recovered_scene(toy):
+    scene = read_recovered(FakeJob("publish", toy))
+    assert scene.object_names == ["walls", "box", "lamp"]
+    np.testing.assert_allclose(scene.emitter_radiance, [LAMP, [0, 0, 0]])  # light scale applied, dropped emitter is dark
+    np.testing.assert_array_equal(np.flatnonzero(scene.emitter_id >= 0), [24, 25])
+    np.testing.assert_allclose(scene.object_values[:2], TRUE[:2], atol=1e-6)  # base mean through T_o
+    np.testing.assert_allclose(scene.environment, 0)
+    below = scene.emission_map(np.array([[24, 0, -1]]), np.array([1.5, 1, 1]))
+    np.testing.assert_allclose(below[0], [LAMP, [0, 0, 0], [0, 0, 0]])
+    above = scene.emission_map(np.array([[24]]), np.array([1.5, 1, 2.45]))
+    assert (above == 0).all()
+
+
+def test_response_is_read_back(toy):
+    curve = read_response(FakeJob("publish", toy).read("affines"))
+    np.testing.assert_allclose(curve(np.array([0.0, 0.5, 1.0])), [0, 0.5 ** (1 / 2.2), 1], atol=1e-3)
+    assert curve(np.array([2.0, 2.0, 2.0]))[0] > 1.2  # goes on as a straight line
+
+
+def test_response_of_different_grids_is_refused():
+    table = {"channel": np.array(["R", "G", "B", "B"]), "kind": np.array(["sample"] * 4), "x": np.array([0, 0, 0, 1.0])}
+    with pytest.raises(InputError, match="different x"):
+        response_samples(table | {"value": np.zeros(4)})
+
+
+def test_rerendering_matches_the_photographs(toy):
+    """Materials and light are the true ones, so only noise is left."""
+    table = read_parquet(toy / "scenes/toy/metrics.parquet")
+    psnr = {
+        (q, p): v
+        for q, m, p, v in zip(table["quantity"], table["metric"], table["protocol"], table["value"], strict=True)
+        if m == "psnr"
+    }
+    assert psnr["rgb", "raw"] > 27
+    assert psnr["albedo", "raw"] > 60
+    assert list(table) == ["scene", "view", "quantity", "metric", "protocol", "value"]
+    assert set(table["quantity"]) == {"albedo", "roughness", "metallic", "emission", "rgb"}
+    assert np.isfinite(table["value"].astype(float)).all()
+
+
+def test_variants_and_gain(toy):
+    table = read_parquet(toy / "results/toy/metrics/variants.parquet")
+    assert set(table["variant"]) == {"prior_k0", "prior_mean_k", "object_mean", "texel_mean", "base", "result"}
+    summary = json.loads((toy / "results/toy/metrics/summary.json").read_text())
+    means = summary["means"]
+    assert means["base"]["albedo"]["scaled"]["psnr"]["mean"] > 60 > means["base"]["albedo"]["raw"]["psnr"]["mean"]
+    gain = means["result"]["albedo"]["raw"]["psnr"]["mean"] - means["prior_mean_k"]["albedo"]["raw"]["psnr"]["mean"]
+    assert summary["gain_over_raw_predictions"]["albedo"]["raw"]["psnr_db"] == pytest.approx(gain, abs=1e-3)
+    assert summary["not_scored"] == []
+    scores = [
+        v
+        for variant, q, m, p, v in zip(*(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True)
+        if (variant, q, m, p) == ("result", "emission", "iou", "raw")
+    ]
+    assert min(scores) > 0.99
+
+
+def test_object_mean_is_the_mean_of_the_predictions(toy):
+    job = FakeJob("metrics", toy / "again")
+    job.root = toy
+    capture = CaptureReader(job.read("capture"))
+    means = metrics._PredictionMeans(job, capture)
+    total, count = np.zeros(3), 0
+    for view in capture.views:
+        channels = job.read("prior").exr(f"maps/{view.name}.exr")
+        box = job.read("segmentation").exr(f"maps/{view.name}.exr")["object.id"] == 1
+        for k in range(K):
+            total += rgb(channels, f"prior.{k:03d}.albedo")[box].astype(np.float64).sum(0)
+        count += K * box.sum()
+    np.testing.assert_allclose(means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5)
+
+
+def test_maps_hold_everything(toy):
+    channels = read_exr(toy / "scenes/toy/maps/v0.exr")
+    assert set(channels) == {
+        *("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "roughness", "metallic"),
+        *("emission.R", "emission.G", "emission.B", "uncertainty", "instance.id"),
+    }
+    assert channels["instance.id"].dtype == np.uint32
+
+
+def test_deliverable_is_complete_and_verifies(toy):
+    scene = toy / "scenes/toy"
+    names = {p.relative_to(scene).as_posix() for p in scene.rglob("*") if p.is_file()}
+    expected = {"scene.glb", "mitsuba/scene.xml", "maps/v0.exr", "maps/v1.exr", "objects.parquet", "emitters.parquet"}
+    expected |= {"camera_response.parquet", "plan.yaml", "metrics.parquet", "timings.parquet", "report.html", "manifest.json"}
+    assert expected <= names and all(n in expected or n.startswith("mitsuba/meshes/") for n in names)
+    manifest = json.loads((scene / "manifest.json").read_text())
+    assert set(manifest["files"]) == names - {"manifest.json"}
+    assert manifest["settings"] == {"seed": 3} and manifest["fingerprints"]["base"] == "print of base"
+    assert not list((toy / "scenes").glob(".*"))
+    assert list(damaged(toy)) == []
+    emitters = read_parquet(scene / "emitters.parquet")
+    np.testing.assert_allclose(emitters["radiance_r"][0], LAMP[0])
+
+
+def test_damage_is_named(toy, tmp_path):
+    import shutil
+
+    copy = tmp_path / "toy"
+    shutil.copytree(toy, copy)
+    with open(copy / "scenes/toy/plan.yaml", "a") as handle:
+        handle.write("# edited\n")
+    assert [line.split(":")[0].rsplit("/", 1)[1] for line in damaged(copy)] == ["plan.yaml"]
+
+
+def test_publishing_again_replaces(toy, monkeypatch):
+    monkeypatch.chdir(toy)
+    (toy / "scenes/toy/stray.txt").write_text("left by a user")
+    publish.run(FakeJob("publish", toy))
+    assert not (toy / "scenes/toy/stray.txt").exists()
+    assert not list((toy / "scenes").glob(".*"))
+
+
+def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
+    monkeypatch.chdir(toy)
+    monkeypatch.setattr(publish, "place", lambda source, target: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        publish.run(FakeJob("publish", toy))
+    assert (toy / "scenes/toy/manifest.json").is_file() and not list((toy / "scenes").glob(".*"))
+
+
+def test_no_hard_links(toy, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", lambda *_: (_ for _ in ()).throw(OSError("not supported")))
+    publish.place(toy / "scenes/toy/plan.yaml", tmp_path / "deep" / "plan.yaml")
+    assert (tmp_path / "deep/plan.yaml").read_bytes() == (toy / "scenes/toy/plan.yaml").read_bytes()
+
+
+def test_timings(toy):
+    rows = read_timings("toy", toy)
+    assert [row["rule"] for row in rows] == ["base", "affines"]
+    assert rows[0]["seconds"] == 12.5 and rows[0]["cpu_seconds"] == 20.25 and rows[0]["threads"] == 2
+    assert rows[1]["cpu_seconds"] == 0.0 and rows[1]["threads"] == 0
+    table = read_parquet(toy / "scenes/toy/timings.parquet")
+    assert list(table) == ["rule", "wildcards", "seconds", "cpu_seconds", "max_rss_mb", "threads"]
+    assert read_timings("nothing", toy) == []
+
+
+def test_plan_is_collected(toy):
+    plan = yaml.safe_load((toy / "scenes/toy/plan.yaml").read_text())
+    assert plan["scene"] == "toy"
+    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [("metallic", False, "base")]
+
+
+# ------------------------------------------------------------------------------------------------------------------ page
+
+
+class Tags(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.addresses, self.open, self.text = [], [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.addresses += [value for name, value in attributes if name in ("src", "href", "action", "srcset")]
+        assert tag not in ("script", "link", "iframe", "object")
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        assert tag in ("path", "polyline")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def parsed(page):
+    tags = Tags()
+    tags.feed(page)
+    assert not tags.open
+    return tags
+
+
+def test_page_is_self_contained(toy):
+    page = (toy / "scenes/toy/report.html").read_text()
+    tags = parsed(page)
+    assert tags.addresses and all(a.startswith("data:image/") for a in tags.addresses)
+    assert "default-src 'none'" in page
+    assert not re.search(r"https?://|@import|url\(", page)
+
+
+def test_page_says_what_matters(toy):
+    text = "".join(parsed((toy / "scenes/toy/report.html").read_text()).text)
+    for wanted in ("by <nobody> & co", "a note with <angle> brackets", "no object looks like a <metal>", "below 1 % of the power"):
+        assert wanted in text
+    for wanted in ("raw predictions (mean score)", "base texture (fused)", "PSNR", "alignment", "selected prediction", "12.5"):
+        assert wanted in text
+    assert "Dashed: what the camera did; difference 0.0000" in text
+
+
+@pytest.mark.parametrize("dynamic_range", ["ldr", "hdr"])
+def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
+    monkeypatch.chdir(tmp_path)
+    make_scene(tmp_path, truth=False, dynamic_range=dynamic_range)
+    finish(tmp_path)
+    table = read_parquet(tmp_path / "scenes/toy/metrics.parquet")
+    assert set(table["quantity"]) == {"rgb"} and set(table["view"]) == {"v0", "v1"}
+    text = "".join(parsed((tmp_path / "scenes/toy/report.html").read_text()).text)
+    assert "no ground truth" in text and "albedo error" not in text
+    assert (tmp_path / "scenes/toy/camera_response.parquet").exists() == (dynamic_range == "ldr")
+    values = dict(zip(zip(table["metric"], table["protocol"], strict=True), table["value"], strict=True))
+    assert values["psnr", "raw"] > 27
+    assert (("log_l2", "raw") in values) == (dynamic_range == "hdr")
+
+
+def test_stages_write_the_same_bytes_again(toy):
+    for name, stage in (("render", render), ("export", export)):
+        job = FakeJob(name, toy / "twice")
+        job.root = toy
+        stage.run(job)
+        first = json.loads((toy / f"results/toy/{name}/manifest.json").read_text())["files"]
+        assert {n: f["sha256"] for n, f in job.writer.files.items()} == {n: f["sha256"] for n, f in first.items()}
+
+
+def test_number():
+    assert [number(v) for v in (None, "", True, False, 12345, 0.123456, 2.5e7, "x")] == [
+        *("–", "–", "yes", "no", "12 345", "0.123", "2.50e+07", "x")
+    ]
+
+
+def test_score_table_marks_the_best():
+    means = {
+        "prior_k0": {"albedo": {"raw": {"psnr": {"mean": 13.0}, "l2": {"mean": 0.05}}}},
+        "result": {"albedo": {"raw": {"psnr": {"mean": 20.0}, "l2": {"mean": 0.05}}}},
+    }
+    table = score_table("t", means, [("albedo", "raw", "l2"), ("albedo", "raw", "psnr"), ("albedo", "scaled", "psnr")])
+    assert table.heads == ["L2 ↓", "PSNR ↑"] and table.groups == [("albedo", 2)]
+    assert table.best == {(0, 0), (1, 0), (1, 1)}
+    assert table.rows == [["raw prediction (first)", "0.0500", "13.00"], ["result", "0.0500", "20.00"]]
+    assert score_table("t", {}, [("albedo", "raw", "l2")]) is None
+
+
+def test_edges_and_selection():
+    values = np.zeros((4, 5), int)
+    values[:, 3:] = 1
+    found = pic.edges(values)
+    assert found[:, 2].all() and found.sum() == 4
+    depth = np.array([[1.0, 1.02, 2.0, 0.0]])
+    np.testing.assert_array_equal(pic.edges(depth, 0.05), [[False, True, True, False]])
+    segment = np.array([[0, 1, 2, -1]])
+    rows = (np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.2, 0.8, 0.5, 0.5]))
+    np.testing.assert_array_equal(pic.selected_prediction(segment, *rows), [[1, 0, -1, -1]])
+    np.testing.assert_array_equal(pic.selected_prediction(segment, *(r[:0] for r in rows)), -np.ones((1, 4)))
+
+
+def test_pictures_are_bounded():
+    image = np.full((4, 4, 3), np.nan)
+    assert pic.linear(image).max() == 0
+    assert (pic.difference(image, image * 0, np.zeros((4, 4), bool)) == 89).all()
+    assert pic.data_uri(pic.linear(image)) == pic.data_uri(pic.linear(image))

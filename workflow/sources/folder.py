@@ -1,0 +1,370 @@
+"""Source `folder`: a scene of your own, in the form tools already write (docs/own-data.md).
+
+`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes distortion, reduces
+the photographs, traces the mesh and measures whether the two belong together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core import native
+from iif_core.color import linear_from_srgb
+from iif_core.distortion import Pinhole, pinhole_inside, undistort_image
+from iif_core.errors import InputError
+from workflow.job import Job
+from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.sources.folder_scene import alignment, exposure, images, mesh, transforms
+from workflow.sources.folder_scene.transforms import Frame
+
+MIN_COVERAGE = 0.01
+"""A view whose rays hit the mesh less often than this looks at nothing."""
+TRUTH = ("albedo", "roughness", "metallic", "emission")
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Every file that the capture of this scene reads."""
+
+    transforms: transforms.Transforms
+    mesh: Path
+    exposures: Path | None
+    instances: dict[str, Path]
+    truth: dict[str, dict[str, Path]]
+
+    def files(self) -> list[Path]:
+        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
+        for frame in self.transforms.frames:
+            out += [frame.image, *([frame.depth] if frame.depth else [])]
+        return out + [path for maps in self.truth.values() for path in maps.values()]
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Files that the capture reads; everything that can be checked without pixels is checked here.
+
+    Raises:
+        InputError: what is missing or does not fit, by name.
+    """
+    return find_inputs(document["source"], document["capture"]).files()
+
+
+def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
+    """The checked scene: cameras, and the files that belong to them."""
+    transforms.metres_per_unit(source["unit"])
+    listed = transforms.read(source, capture)
+    folder = Path(source["path"])
+    if capture["test_every"] == 1:
+        raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
+    mesh_path = mesh.find(folder, source.get("mesh"))
+    exposures = folder / "exposures.json"
+    has_exposures = exposures.is_file()
+    if has_exposures:
+        exposure.read_given(exposures, [(f.name, f.file_path) for f in listed.frames])
+    return Inputs(
+        listed,
+        mesh_path,
+        exposures if has_exposures else None,
+        _instances(folder, listed.frames),
+        _truth(folder, listed.frames),
+    )
+
+
+def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:
+    here = folder / "instances"
+    if not here.is_dir():
+        return {}
+    out = {}
+    for frame in frames:
+        found = [path for suffix in (".png", ".exr") if (path := here / f"{frame.name}{suffix}").is_file()]
+        if len(found) > 1:
+            raise InputError(f"{here}: {found[0].name} and {found[1].name} are the same view; remove one")
+        if found:
+            out[frame.name] = found[0]
+    if not out:
+        raise InputError(f"{here}: no file for any view; expected names such as {frames[0].name}.png")
+    return out
+
+
+def _truth(folder: Path, frames: tuple[Frame, ...]) -> dict[str, dict[str, Path]]:
+    here = folder / "truth"
+    if not here.is_dir():
+        return {}
+    out = {frame.name: {kind: here / kind / f"{frame.name}.exr" for kind in TRUTH} for frame in frames}
+    missing = [path for maps in out.values() for path in maps.values() if not path.is_file()]
+    if missing:
+        raise InputError(
+            f"{missing[0]}: not found ({len(missing)} of {4 * len(frames)} truth maps are missing); truth needs"
+            f" {', '.join(TRUTH)} for every view, or no `truth` folder"
+        )
+    for frame in frames:
+        radiance = here / "radiance" / f"{frame.name}.exr"
+        if radiance.is_file():
+            out[frame.name]["radiance"] = radiance
+    return out
+
+
+def capture(job: Job) -> None:
+    """Write the normal form of the folder.
+
+    Raises:
+        InputError: the mesh cannot be used, no view sees it, or photographs and mesh do not belong together.
+    """
+    _Capture(job).run()
+
+
+class _Capture:
+    """State of one capture: settings, mesh, notes."""
+
+    def __init__(self, job: Job):
+        self.job, self.source, self.settings = job, job.settings.source, job.settings.capture
+        self.inputs = find_inputs(vars(self.source), vars(self.settings))
+        self.writer = CaptureWriter(job.writer)
+        self.metres = transforms.metres_per_unit(self.source.unit)
+        self.conventions = alignment.Conventions(self.source.axes, self.metres)
+        self.encoded = self.settings.dynamic_range == "ldr"
+        self.notes: list[str] = []
+        self.counts = dict.fromkeys(("non_finite", "transparent", "negative"), 0)
+        self.alignment = alignment.Alignment.empty()
+
+    def run(self) -> None:
+        frames = self.inputs.transforms.frames
+        poses = [self.conventions.pose(f) for f in frames]
+        self.mesh = mesh.load(self.inputs.mesh, self.metres)
+        self.notes += self.mesh.notes
+        centres = np.array([pose[:3, 3] for pose in poses])
+        mesh.check_size(self.inputs.mesh, self.mesh, self.source.unit, self.metres, centres)
+        if self.mesh.from_nodes and self.inputs.instances:
+            self.mesh.instance = self.mesh.names = None
+        self._build()
+        self.normals = self._face_normals()
+        given = self._given_exposures()
+        shared = exposure.SharedSurface(len(frames), self.encoded)
+
+        views: list[View] = []
+        used: list[Frame] = []
+        dropped: dict[str, float] = {}
+        for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+            view = self._view(frame, pose, len(views), given[i])
+            depth, face = self._trace(view)
+            share = float((face >= 0).mean())
+            if share < MIN_COVERAGE:
+                dropped[frame.name] = share
+                continue
+            photo, valid = self._photo(frame, view, given[i])
+            self.writer.photo(view.name, photo, valid, self.encoded)
+            self.writer.gbuffer(view.name, depth, face)
+            self._extras(frame, view, photo, valid, face)
+            self._compare(frame, view, photo, valid, depth, face)
+            if self.settings.exposure == "estimate":
+                points = view.world_from_camera[:3, 3] + depth[..., None] * alignment.directions(_pinhole(view), pose)
+                footprint = float(np.median(depth[face >= 0])) / view.fx
+                shared.add(photo, valid & (face >= 0), points, footprint)
+            views.append(view)
+            used.append(frame)
+            self.job.progress(i + 1, len(frames), "photographs")
+
+        self._check_views(len(frames), dropped)
+        self._check_alignment(used, views)
+        if self.settings.exposure == "estimate":
+            views = self._estimated(shared, used, views)
+        self.writer.cameras(views)
+        self.writer.mesh(self.mesh.vertices, self.mesh.faces, self.mesh.instance, self.mesh.names)
+        self._note_pixels(frames, views)
+        facts = {"alignment": self.alignment.report(), "dropped_views": dropped}
+        has_truth = bool(self.inputs.truth)
+        self.writer.finish("folder", self.settings.dynamic_range, has_truth, self.notes, facts=facts)
+        for note in self.notes:
+            self.job.log.info("%s", note)
+
+    def _build(self) -> None:
+        native.prepare()
+        import mitsuba as mi
+
+        if mi.variant() is None:
+            mi.set_variant("llvm_ad_rgb")
+        native.limit_threads(self.job.threads)
+        from iif_core.transport import build_geometry
+
+        no_object = np.full(len(self.mesh.faces), -1, np.int32)
+        self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, no_object)
+
+    def _face_normals(self) -> np.ndarray:
+        corners = self.mesh.vertices[self.mesh.faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)).astype(np.float32)
+
+    def _target(self, frame: Frame) -> Pinhole:
+        """The pinhole camera at full size."""
+        return frame.camera if frame.lens.is_identity else pinhole_inside(frame.lens, frame.camera)
+
+    def _view(self, frame: Frame, pose: np.ndarray, view_id: int, gain: float) -> View:
+        full = self._target(frame)
+        size = images.fitted_size(full.width, full.height, self.settings.width, self.settings.height)
+        camera = alignment.scaled(full, *size)
+        every = self.settings.test_every
+        split = "test" if every and view_id % every == every - 1 else "train"
+        intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0, split)
+
+    def _trace(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """z-depth (0 = miss) and face ids of a view."""
+        from iif_core.transport import trace
+
+        rays = alignment.directions(_pinhole(view), view.world_from_camera)
+        face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
+        shape = rays.shape[:2]
+        return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape)
+
+    def _upright(self, frame: Frame, path: Path, pixels: np.ndarray) -> np.ndarray:
+        if pixels.shape[:2] != (frame.camera.height, frame.camera.width):
+            raise InputError(
+                f"{path}: {pixels.shape[1]}x{pixels.shape[0]} pixels, its photograph has"
+                f" {frame.camera.width}x{frame.camera.height}; give both in one size"
+            )
+        return pixels
+
+    def _resized(self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Undistorted and reduced by area."""
+        if not frame.lens.is_identity:
+            pixels, valid = undistort_image(pixels, frame.lens, frame.camera, self._target(frame), valid)
+        return images.reduce_area(pixels, valid, view.width, view.height)
+
+    def _photo(self, frame: Frame, view: View, gain: float) -> tuple[np.ndarray, np.ndarray]:
+        """Sensor values, or radiance (exposure divided out), of the size of `view`; and which pixels count."""
+        photo = images.load_photo(frame.image, frame.turn)
+        self._upright(frame, frame.image, photo.pixels)
+        for key in self.counts:
+            self.counts[key] += getattr(photo, key)
+        pixels, valid = self._resized(frame, view, photo.pixels, photo.valid)
+        pixels = pixels if self.encoded else pixels / np.float32(gain)
+        if not valid.any():
+            self.notes.append(f"view {view.name}: no usable pixel (all transparent or NaN)")
+        return pixels, valid
+
+    def _ids(self, frame: Frame, view: View, path: Path) -> np.ndarray:
+        ids = self._upright(frame, path, images.load_ids(path, frame.turn))
+        if not frame.lens.is_identity:
+            moved, seen = undistort_image(ids, frame.lens, frame.camera, self._target(frame), nearest=True)
+            ids = np.where(seen, moved, -1)
+        return images.reduce_nearest(ids, view.width, view.height)
+
+    def _extras(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray, face: np.ndarray) -> None:
+        if frame.name in self.inputs.instances:
+            self.writer.given_instances(view.name, self._ids(frame, view, self.inputs.instances[frame.name]))
+        if frame.name not in self.inputs.truth:
+            return
+        maps, known = {}, np.ones(face.shape, bool)
+        for kind, path in self.inputs.truth[frame.name].items():
+            channels = 1 if kind in ("roughness", "metallic") else 3
+            values = images.TURNS[frame.turn](images.load_map(path, channels))
+            values = self._upright(frame, path, values.reshape(*values.shape[:2], channels))
+            finite = np.isfinite(values).all(-1)
+            values, covered = self._resized(frame, view, np.where(finite[..., None], values, 0), finite)
+            maps[kind] = values if channels == 3 else values[..., 0]
+            known &= covered
+        if "radiance" not in maps:
+            maps["radiance"] = linear_from_srgb(photo) if self.encoded else photo
+        meaningful = known & valid & (face >= 0)
+        self.writer.truth(view.name, Truth(**maps, valid=meaningful))
+
+    def _compare(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
+        if self.source.alignment == "off":
+            return
+        if frame.depth is not None:
+            measured = images.load_depth(frame.depth, self.inputs.transforms.depth_unit)
+            ratio = alignment.depth_ratio(frame, self.conventions, _pinhole(view), depth, measured)
+            self.alignment.ratios[frame.name] = ratio
+        normal = np.where(face[..., None] >= 0, self.normals[face], 0)
+        self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
+
+    def _check_views(self, count: int, dropped: dict[str, float]) -> None:
+        if len(dropped) == count:
+            raise InputError(
+                f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that hit it:"
+                f" {max(dropped.values()):.1%} at most); mesh and poses are in different frames or units, or `source.axes:"
+                f" {self.source.axes}` is wrong (docs/own-data.md)"
+            )
+        for name, share in dropped.items():
+            self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the mesh)")
+        if count - len(dropped) == 1:
+            self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the prior alone")
+
+    def _check_alignment(self, used: list[Frame], views: list[View]) -> None:
+        if self.source.alignment == "off":
+            self.notes.append("alignment was not checked (`source.alignment: off`)")
+            return
+        self.notes += self.alignment.notes()
+
+        def traced(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+            from iif_core.transport import trace
+
+            face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
+            return np.where(face >= 0, t, 0).reshape(rays.shape[:2])
+
+        def advice() -> str:
+            pairs = [(f, _pinhole(v)) for f, v in zip(used, views, strict=True) if f.depth is not None]
+            unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
+            return alignment.explain(pairs, traced, self.source.axes, self.metres, unit, tolerance)
+
+        path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
+        alignment.raise_or_note(self.alignment.refuse(path, tolerance, advice), self.source.alignment, self.notes)
+        alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
+
+    def _given_exposures(self) -> list[float]:
+        frames = self.inputs.transforms.frames
+        if self.inputs.exposures is None:
+            return [1.0] * len(frames)
+        if self.settings.exposure == "estimate":
+            self.notes.append("exposures.json is not used: `capture.exposure` is estimate")
+            return [1.0] * len(frames)
+        return exposure.read_given(self.inputs.exposures, [(f.name, f.file_path) for f in frames])
+
+    def _estimated(self, shared: exposure.SharedSurface, used: list[Frame], views: list[View]) -> list[View]:
+        gains = shared.gains()
+        apart = int((~gains.estimated).sum())
+        groups = int(gains.group.max()) + 1
+        if apart:
+            self.notes.append(f"exposure: {apart} view(s) share no surface with others and keep exposure 1")
+        if groups > 1:
+            self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each has mean 1")
+        if gains.pairs:
+            low, high = gains.gain.min(), gains.gain.max()
+            self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})")
+        if self.encoded:
+            return [replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)]
+        counts = dict(self.counts)
+        for frame, view, gain in zip(used, views, gains.gain, strict=True):
+            photo, valid = self._photo(frame, view, float(gain))
+            self.writer.photo(view.name, photo, valid, encoded=False)
+            self._extras(frame, view, photo, valid, self._trace(view)[1])
+        self.counts = counts
+        return views
+
+    def _note_pixels(self, frames: tuple[Frame, ...], views: list[View]) -> None:
+        words = {
+            "non_finite": "NaN or infinite pixels are ignored",
+            "transparent": "transparent pixels are ignored (alpha < 0.5)",
+            "negative": "pixels with negative values were set to 0",
+        }
+        self.notes += [f"photographs: {self.counts[k]} {text}" for k, text in words.items() if self.counts[k]]
+        bent = [f for f in frames if not f.lens.is_identity]
+        if bent:
+            self.notes.append(f"lens distortion ({bent[0].lens.kind}) removed from {len(bent)} photographs")
+        first = frames[0].camera
+        if (views[0].width, views[0].height) != (first.width, first.height):
+            self.notes.append(
+                f"photographs of {first.width}x{first.height} reduced to {views[0].width}x{views[0].height} by the mean of"
+                f" {'sensor values' if self.encoded else 'radiance'} over each pixel's area"
+            )
+        if self.inputs.instances and len(self.inputs.instances) < len(frames):
+            self.notes.append(f"instances are given for {len(self.inputs.instances)} of {len(frames)} views")
+        if self.mesh.from_nodes and self.mesh.names is not None:
+            self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as instances")
+
+
+def _pinhole(view: View) -> Pinhole:
+    return Pinhole(view.fx, view.fy, view.cx, view.cy, view.width, view.height)

@@ -1,0 +1,1 @@
+"""Parts of the `folder` source: `transforms` (cameras), `images`, `mesh`, `alignment`, `exposure`."""

@@ -1,0 +1,76 @@
+"""`capture.exposure`: exposures.json, or gains estimated from surface that views share."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from iif_core.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.errors import InputError
+from iif_core.exposure import ExposureGains, estimate_gains
+from iif_core.response import response
+
+SAMPLES = 2_000_000
+"""Pixels of all views together that the estimate uses."""
+MIN_EDGE = 0.02
+"""Metres; finer cells would hold single pixels."""
+DARK, BRIGHT = 0.03, 0.97
+"""Sensor values outside say little about exposure: noise, saturation."""
+
+
+def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
+    """Exposure of every frame (name, file_path) from exposures.json: {file_path or name: factor on radiance}."""
+    try:
+        table = json.loads(path.read_text())
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{path}: found a {type(table).__name__}; expected {{file_path or name: exposure}}")
+    table = {key.removeprefix("./"): value for key, value in table.items()}
+    out = []
+    for name, file_path in frames:
+        value = table.get(file_path, table.get(name))
+        if value is None:
+            raise InputError(f"{path}: no entry for {file_path!r} (or {name!r}); every photograph needs one")
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not number or not (math.isfinite(value) and value > 0):
+            raise InputError(f"{path}: exposure of {name!r} is {value!r}; expected a positive number")
+        out.append(float(value))
+    return out
+
+
+class SharedSurface:
+    """Collects thinned pixels of the views, then estimates one gain a view."""
+
+    def __init__(self, views: int, encoded: bool):
+        self.limit, self.encoded = max(1, SAMPLES // max(views, 1)), encoded
+        self.points: list[np.ndarray] = []
+        self.values: list[np.ndarray] = []
+        self.footprints: list[float] = []
+
+    def add(self, photo: np.ndarray, usable: np.ndarray, points: np.ndarray, footprint: float) -> None:
+        """One view: (H, W, 3) sensor values or radiance, (H, W) bool hit and valid, (H, W, 3) metres, metres a pixel."""
+        if self.encoded:
+            usable = usable & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
+        else:
+            usable = usable & (photo > 0).all(-1)
+        rows = np.flatnonzero(usable)
+        rows = rows[:: max(1, math.ceil(len(rows) / self.limit))]
+        self.points.append(points.reshape(-1, 3)[rows].astype(np.float32))
+        self.values.append(photo.reshape(-1, 3)[rows].astype(np.float32))
+        self.footprints.append(footprint)
+
+    def gains(self) -> ExposureGains:
+        """Gains of the views in the order in which they were added; sensor values are linearised by x^0.449."""
+        points, values = np.concatenate(self.points), np.concatenate(self.values)
+        view = np.repeat(np.arange(len(self.points)), [len(p) for p in self.points])
+        if len(points) == 0:
+            return estimate_gains(np.zeros(0, int), view, values, len(self.points))
+        edge = max(3 * float(np.median(self.footprints)), MIN_EDGE)
+        keys = pack_keys(voxel_indices(points, edge, grid_origin(points, edge)))
+        cell = np.unique(keys, return_inverse=True)[1].ravel()
+        linear = response("ggcm").inverse(values) if self.encoded else values
+        return estimate_gains(cell, view, linear, len(self.points))

@@ -1,0 +1,273 @@
+"""Image files of a `folder` scene: headers for the checks, pixels as float, masks for what cannot be used."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
+MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B", "I")
+TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: a.swapaxes(0, 1)[:, ::-1],
+    7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
+    8: lambda a: a.swapaxes(0, 1)[::-1],
+}
+"""Stored pixels -> upright, by EXIF orientation."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """(width, height) as stored, and EXIF orientation 1 ... 8 (1 = upright)."""
+
+    size: tuple[int, int]
+    orientation: int = 1
+
+
+@dataclass
+class Photo:
+    """(H, W, 3) float32 sensor values in [0, 1] or radiance; (H, W) bool; counts of what was wrong with pixels."""
+
+    pixels: np.ndarray
+    valid: np.ndarray
+    non_finite: int = 0
+    transparent: int = 0
+    negative: int = 0
+
+
+@lru_cache(4096)
+def _header(path: Path, _stamp: tuple[int, int]) -> Header:
+    if path.suffix.lower() == ".exr":
+        import OpenEXR
+
+        try:
+            with OpenEXR.File(str(path), header_only=True) as file:
+                low, high = file.header()["dataWindow"]
+        except Exception as error:
+            raise InputError(f"{path}: not a readable EXR image ({error})") from None
+        return Header((int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1))
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            if image.mode not in MODES:
+                raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
+            orientation = int(image.getexif().get(274, 1) or 1)
+            return Header(image.size, orientation if 1 <= orientation <= 8 else 1)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: not a readable image ({error})") from None
+
+
+def header(path: Path) -> Header:
+    """Size and orientation from the file's header; an unreadable or CMYK image is refused by name."""
+    status = path.stat()
+    return _header(path, (status.st_size, status.st_mtime_ns))
+
+
+def _is_16_bit_png(path: Path) -> bool:
+    with open(path, "rb") as file:
+        start = file.read(25)
+    return start[:4] == b"\x89PNG" and len(start) == 25 and struct.unpack("B", start[24:25])[0] == 16
+
+
+def _stored(path: Path) -> np.ndarray:
+    """Pixels of a png or jpg, (H, W) or (H, W, C), integer; palettes resolved."""
+    try:
+        if _is_16_bit_png(path):  # Pillow cuts 16-bit colour to 8 bits
+            import mitsuba as mi
+
+            return np.array(mi.Bitmap(str(path)))
+        from PIL import Image
+
+        with Image.open(path) as image:
+            if image.mode in ("P", "PA"):
+                image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+            elif image.mode == "1":
+                image = image.convert("L")
+            return np.asarray(image)
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read ({error}); the file is damaged or cut short") from None
+
+
+def _exr(path: Path) -> dict[str, np.ndarray]:
+    from workflow.artifacts.files import read_exr
+
+    try:
+        return read_exr(path)
+    except Exception as error:
+        raise InputError(f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts") from None
+
+
+def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
+    """(H, W, 3) or (H, W, 4) float32 of R G B [A], or of one grey channel [and A]."""
+    if all(c in channels for c in "RGB"):
+        names = list("RGB")
+    else:
+        names = [c for c in channels if c != "A"] * 3
+        if len(names) != 3:
+            raise InputError(f"{path}: channels {', '.join(channels)}; expected R G B (and A), or one grey channel")
+    names += ["A"] if "A" in channels else []
+    return np.stack([channels[name].astype(np.float32) for name in names], -1)
+
+
+def load_photo(path: Path, turn: int = 1) -> Photo:
+    """A photograph: 8/16-bit to [0, 1], EXR as it is; grey becomes RGB.
+
+    Pixels with alpha < 0.5, and NaN or infinite ones, are not valid and become 0. EXR colour is divided by its alpha
+    (EXR stores it multiplied). Negative EXR values become 0.
+    """
+    if path.suffix.lower() == ".exr":
+        values = _exr_colour(path, _exr(path))
+        alpha = values[..., 3] if values.shape[-1] == 4 else None
+        colour = values[..., :3]
+        if alpha is not None:
+            colour = colour / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None]
+    else:
+        stored = _stored(path)
+        stored = stored[..., None] if stored.ndim == 2 else stored
+        values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+        alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
+        colour = values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, -1)
+    finite = np.isfinite(colour).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
+    opaque = np.ones(finite.shape, bool) if alpha is None else np.nan_to_num(alpha) >= 0.5
+    colour = np.where(finite[..., None], colour, 0)
+    negative = colour.min(-1) < 0
+    photo = Photo(
+        np.maximum(colour, 0).astype(np.float32),
+        finite & opaque,
+        int((~finite).sum()),
+        int((finite & ~opaque).sum()),
+        int(negative.sum()),
+    )
+    photo.pixels, photo.valid = TURNS[turn](photo.pixels), TURNS[turn](photo.valid)
+    return photo
+
+
+def load_map(path: Path, channels: int) -> np.ndarray:
+    """(H, W, 3) or (H, W) float32 of an EXR map; not-finite values are kept for the caller to mask."""
+    values = _exr_colour(path, found) if "R" in (found := _exr(path)) else _one_channel(path, found)[..., None]
+    if channels == 3:
+        return np.repeat(values, 3, -1) if values.shape[-1] == 1 else values[..., :3]
+    return values[..., 0]
+
+
+def _one_channel(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
+    if len(channels) != 1:
+        raise InputError(f"{path}: channels {', '.join(channels)}; expected exactly one")
+    return next(iter(channels.values()))
+
+
+def load_ids(path: Path, turn: int = 1) -> np.ndarray:
+    """(H, W) int32 ids of a one-channel png (8 or 16 bit) or EXR, -1 = none.
+
+    None is written as a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0 is an id.
+    Raises InputError for colour pictures and for ids between integers (anti-aliased, METHOD H44).
+    """
+    if path.suffix.lower() == ".exr":
+        stored = _one_channel(path, _exr(path))
+    else:
+        from PIL import Image
+
+        with Image.open(path) as image:
+            palette = image.mode == "P"
+            stored = np.asarray(image) if palette else _stored(path)
+        if stored.ndim == 3 and stored.shape[-1] == 1:
+            stored = stored[..., 0]
+        if stored.ndim != 2:
+            raise InputError(f"{path}: a colour picture; ids need one channel (16-bit grey png, or EXR)")
+    if stored.dtype.kind == "f":
+        known = np.isfinite(stored) & (stored >= -0.5)
+        whole = np.rint(np.where(known, stored, -1))
+        off = int((np.abs(stored - whole)[known] > 1e-3).sum())
+        if off:
+            raise InputError(f"{path}: {off} pixels lie between integers; ids must not be filtered or anti-aliased")
+        ids = whole.astype(np.int64)
+    else:
+        ids = stored.astype(np.int64)
+        none = {"uint16": 65535, "uint32": 4294967295}.get(stored.dtype.name)
+        ids = np.where((ids == none) | (ids < 0), -1, ids)
+    if ids.size and ids.max() >= 2**31 - 1:
+        raise InputError(f"{path}: id {ids.max()} is too large; ids must be below 2147483647")
+    return TURNS[turn](ids.astype(np.int32))
+
+
+def load_depth(path: Path, unit: float | None) -> np.ndarray:
+    """(H, W) float32 z-depth in metres, 0 = unknown. unit: metres per value; default 0.001 (png), 1 (EXR)."""
+    if path.suffix.lower() == ".exr":
+        found = _exr(path)
+        named = next((found[name] for name in ("Z", "depth.Z", "Y", "R") if name in found), None)
+        depth = (_one_channel(path, found) if named is None else named).astype(np.float32)
+        scale = 1.0 if unit is None else unit
+        known = np.isfinite(depth) & (depth > 0)
+    else:
+        stored = _stored(path)
+        if stored.ndim != 2:
+            stored = stored[..., 0]
+        if stored.dtype == np.uint8:
+            raise InputError(f"{path}: 8 bits are too few for depth; give 16-bit png or EXR, or remove `depth_file_path`")
+        depth = stored.astype(np.float32)
+        scale = 0.001 if unit is None else unit
+        known = (depth > 0) & (depth < 65535)
+    return np.where(known, depth * np.float32(scale), 0).astype(np.float32)
+
+
+def fitted_size(width: int, height: int, max_width: int, max_height: int) -> tuple[int, int]:
+    """Size within max_width x max_height, aspect kept, never enlarged."""
+    scale = min(max_width / width, max_height / height, 1.0)
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _overlap(size: int, wanted: int) -> Any:
+    """(wanted, size) sparse: share of target pixel i that source pixel j covers; rows sum to 1."""
+    from scipy.sparse import csr_matrix
+
+    step = size / wanted
+    edges = np.arange(wanted + 1) * step
+    first = np.floor(edges[:-1] + 1e-9).astype(int)
+    reach = int(np.ceil(step)) + 1
+    column = first[:, None] + np.arange(reach)
+    share = np.minimum(column + 1, edges[1:, None]) - np.maximum(column, edges[:-1, None])
+    share = np.where(column < size, np.clip(share, 0, None), 0)
+    rows = np.repeat(np.arange(wanted), reach)
+    flat = (share / share.sum(1, keepdims=True)).ravel()
+    return csr_matrix((flat, (rows, np.minimum(column, size - 1).ravel())), (wanted, size))
+
+
+def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mean of the valid part of every target pixel's area; valid where at least half of that area is.
+
+    image (H, W, C) float32 with finite values, valid (H, W) bool -> (height, width, C) float32, (height, width) bool.
+    """
+    if image.shape[:2] == (height, width):
+        return np.where(valid[..., None], image, 0), valid
+    rows, columns = _overlap(image.shape[0], height), _overlap(image.shape[1], width)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray((columns @ (rows @ values).T).T)
+
+    covered = mean(valid.astype(np.float64))
+    total = np.stack([mean(np.where(valid, image[..., c], 0).astype(np.float64)) for c in range(image.shape[2])], -1)
+    kept = covered >= 0.5 - 1e-9
+    out = np.where(kept[..., None], total / np.maximum(covered, 1e-9)[..., None], 0)
+    return out.astype(np.float32), kept
+
+
+def reduce_nearest(ids: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The value at every target pixel's centre."""
+    row = np.minimum(((np.arange(height) + 0.5) * ids.shape[0] / height).astype(int), ids.shape[0] - 1)
+    column = np.minimum(((np.arange(width) + 0.5) * ids.shape[1] / width).astype(int), ids.shape[1] - 1)
+    return ids[np.ix_(row, column)]

@@ -1,0 +1,284 @@
+"""Source `mitsuba`: any Mitsuba 3 XML -> photographs, cameras, mesh and ground truth.
+
+The photographs are Mitsuba's path tracing of the scene as it is (its own BSDFs, glass, bump maps); mesh and material truth
+are what the workflow's model can say about it (`mitsuba_scene.materials`). What lies between is in `capture.json` as notes.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.sources.mitsuba_scene.document import referenced_files
+
+if TYPE_CHECKING:
+    from workflow.job import Job
+
+Array = np.ndarray
+
+FIELD_OF_VIEW = 75.0
+"""Degrees across the wider side, of the views that are not the scene's own."""
+RESPONSE = "filmic"
+_METER = 4096  # pixels a view that set the exposure
+_OFF = 0.01
+"""Share of the depth by which the mesh may differ from the original surface (tessellation) before truth is void there."""
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """The XML and every file that it names; refuses what is missing or malformed before any job starts."""
+    return referenced_files(Path(document["source"]["path"]))
+
+
+def capture(job: Job) -> None:
+    """Write the whole capture of the scene that `source.path` names."""
+    from iif_core import native
+
+    native.prepare()
+    from workflow.sources.mitsuba_scene import render, scene
+
+    scene.choose_variant()
+    native.limit_threads(job.threads)
+    if job.settings.capture.denoise:
+        render.require_denoiser()
+    _Capture(job).run()
+
+
+class _Capture:
+    """The steps of one capture; holds the scene, its mesh and what is to be said about them."""
+
+    def __init__(self, job: Job):
+        self.job, self.settings, self.source = job, job.settings.capture, job.settings.source
+        self.writer = CaptureWriter(job.writer)
+
+    def run(self) -> None:
+        from workflow.sources.mitsuba_scene import flatten, materials, scene
+
+        xml = Path(self.source.path)
+        self.loaded = scene.load(xml)
+        everything = flatten.flatten(self.loaded)
+        self.table = materials.MaterialTable(everything.shapes)
+        self.notes = [*self.loaded.notes, *everything.notes, *self.table.notes(everything)]
+        self._environment()
+        transparent = self.table.of_faces(everything, "transparent")
+        keep = self.table.face_opacity(everything) >= materials.OPAQUE
+        self._note_faces(transparent, ~keep)
+        if self.source.drop_transparent:
+            self.mesh = flatten.compact(everything, keep & ~transparent)
+        else:
+            self.mesh = flatten.compact(everything, keep)
+        if not len(self.mesh.faces):
+            raise InputError(f"{xml}: every face is transparent; a capture needs opaque surface")
+        self.job.log.info("mesh: %d faces of %d shapes", len(self.mesh.faces), len(np.unique(self.mesh.shape)))
+
+        views = self._plan(flatten.compact(everything, keep), bool(transparent.any()) and self.source.drop_transparent)
+        del everything
+        shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
+        names = [self.mesh.shapes[i].name for i in shapes]
+        self.writer.mesh(self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission)
+        with tempfile.TemporaryFile() as scratch:
+            shape = (len(views), self.settings.height, self.settings.width, 3)
+            radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
+            self._views(views, radiance)
+            views = self._photographs(views, radiance)
+            del radiance
+        self.writer.cameras(views)
+        self._finish()
+
+    # ------------------------------------------------------------------------------------------------------ scene
+
+    def _environment(self) -> None:
+        from workflow.sources.mitsuba_scene.path import fibonacci_sphere
+
+        self.facts: dict[str, Any] = {}
+        loose: dict[str, int] = {}
+        for emitter in self.loaded.scene.emitters():
+            if emitter.is_environment():
+                self.facts["environment"] = {
+                    "kind": emitter.class_name(),
+                    "mean_radiance": _mean_radiance(emitter, fibonacci_sphere(4096)),
+                }
+            elif emitter.class_name() not in ("AreaLight", "DirectionalArea"):
+                loose[emitter.class_name()] = loose.get(emitter.class_name(), 0) + 1
+        self.notes += [f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()]
+
+    def _note_faces(self, transparent: Array, thin: Array) -> None:
+        if transparent.any():
+            what = "left out of the mesh" if self.source.drop_transparent else "kept in the mesh"
+            self.notes.append(f"{transparent.sum()} transparent faces {what}; no material truth where a ray meets one")
+        if thin.any():
+            self.notes.append(f"{thin.sum()} faces of low opacity left out of the mesh; no material truth where a ray meets one")
+
+    def _plan(self, solid_mesh: Any, glass: bool) -> list[View]:
+        """Geometry for tracing, and the views."""
+        from iif_core.transport.geometry import build_geometry, trace
+        from workflow.sources.mitsuba_scene import path
+
+        self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, self.mesh.shape)
+        solid = build_geometry(solid_mesh.vertices, solid_mesh.faces, solid_mesh.shape) if glass else self.geometry
+        width, height = self.settings.width, self.settings.height
+        sensors = self._sensors()
+        up = path.upright(-sensors[0][0][:3, 1])
+        wide = np.tan(np.radians(FIELD_OF_VIEW / 2)) / max(width, height)
+        given = [(pose, path.Lens(tangent, tangent * height / width)) for pose, tangent in sensors]
+        found = path.plan(
+            lambda o, d: trace(solid, o, d),
+            lambda o, d: trace(self.geometry, o, d),
+            self.mesh.vertices,
+            self.mesh.faces,
+            given,
+            path.Lens(wide * width, wide * height),
+            up,
+            self.settings.views,
+            self.job.seed,
+        )
+        self.notes += found.notes
+        self.facts["path"] = found.facts
+        views = []
+        for i, pose in enumerate(found.poses):
+            focal = width / 2 / sensors[i][1] if found.given[i] else 1 / (2 * wide)
+            test = self.settings.test_every and i % self.settings.test_every == self.settings.test_every - 1
+            split = "test" if test else "train"
+            views.append(View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split))
+        share = found.facts
+        self.job.log.info(
+            "%d views; of the reachable surface %.1f %% are seen, %.1f %% three times or more",
+            len(views), 100 * share["coverage_1"], 100 * share["coverage_3"],
+        )
+        return views
+
+    def _sensors(self) -> list[tuple[Array, float]]:
+        """(world_from_camera, tangent of half the horizontal field of view) of the XML's perspective sensors."""
+        import mitsuba as mi
+
+        from iif_core.camera import look_at
+
+        out = []
+        for sensor in self.loaded.scene.sensors():
+            parameters = mi.traverse(sensor)
+            if "x_fov" not in parameters:
+                self.notes.append(f"sensor {sensor.class_name()}: no pinhole, not used")
+                continue
+            matrix = np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4)
+            origin, forward, upward = matrix[:3, 3], matrix[:3, 2], matrix[:3, 1]
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                self.notes.append("a sensor's to_world mirrors the picture: the view is taken unmirrored")
+            tangent = float(np.tan(np.radians(np.array(parameters["x_fov"]).ravel()[0]) / 2))
+            out.append((look_at(origin, origin + forward, upward), tangent))
+        if not out:
+            raise InputError(f"{self.source.path}: no perspective sensor; add <sensor type='perspective'> inside the room")
+        return out
+
+    # ------------------------------------------------------------------------------------------------------ views
+
+    def _views(self, views: list[View], radiance: Array) -> None:
+        """G-buffer, render and truth of every view; radiance is kept for the photographs."""
+        from workflow.sources.mitsuba_scene import render
+
+        integrator = render.path_integrator(self.source.max_bounces)
+        self.dropped = 0
+        self.usable: list[Array] = []
+        self.meter: list[tuple[Array, Array]] = []
+        for i, view in enumerate(views):
+            depth, face, truth = self._gbuffer(view)
+            if i == 0 and not (face >= 0).any():
+                raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
+            image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
+            if self.settings.denoise:
+                image = render.denoise(image, truth.albedo, self._normals(view, face))
+            self.dropped += dropped
+            self.writer.gbuffer(view.name, depth, face)
+            self.writer.truth(view.name, replace(truth, radiance=image))
+            radiance[i] = image
+            self.usable.append(np.packbits(valid))
+            step = max(1, image.shape[0] * image.shape[1] // _METER)
+            dark = (valid & ~truth.emission.any(-1)).ravel()[::step]
+            self.meter.append((image.reshape(-1, 3)[::step], dark))
+            self.job.progress(i + 1, len(views), "rendered views")
+
+    def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
+        """z-depth, face ids and material truth at the pixel centres (radiance still to come)."""
+        from iif_core.camera import pixel_directions
+        from iif_core.transport.geometry import trace
+        from workflow.sources.mitsuba_scene import materials, render
+
+        origin = view.world_from_camera[:3, 3]
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = rays.reshape(-1, 3)
+        face, t = trace(self.geometry, origin, rays)
+        hit = np.flatnonzero(face >= 0)
+        on = face[hit]
+        point = origin + t[hit, None].astype(np.float64) * rays[hit]
+        surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
+        front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
+        original = render.original_distance(self.loaded.scene, origin, rays[hit])
+        undisturbed = np.abs(original - t[hit]) <= _OFF * t[hit]
+        two_sided = self.table.of_faces(self.mesh, "two_sided")[on]
+
+        def raster(values: Array) -> Array:
+            out = np.zeros((view.height * view.width, *values.shape[1:]), values.dtype)
+            out[hit] = values
+            return out.reshape(view.height, view.width, *values.shape[1:])
+
+        emission = np.where(front[:, None], self.mesh.emission[on], 0)
+        truth = Truth(
+            raster(surface.albedo),
+            raster(surface.roughness),
+            raster(surface.metallic),
+            raster(emission),
+            np.zeros((view.height, view.width, 3), np.float32),
+            raster(surface.truth & undisturbed & (front | two_sided)),
+        )
+        shape = (view.height, view.width)
+        return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
+
+    def _normals(self, view: View, face: Array) -> Array:
+        """World normals towards the camera (H, W, 3), 0 where nothing is hit."""
+        from iif_core.camera import pixel_directions
+
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
+        return np.where((normal * rays).sum(-1, keepdims=True) > 0, -normal, normal)
+
+    def _photographs(self, views: list[View], radiance: Array) -> list[View]:
+        """Sensor values (LDR) or radiance (HDR) of every view; the views with their exposures."""
+        from iif_core.photography import expose, exposures, response_curve
+
+        encoded = self.settings.dynamic_range == "ldr"
+        self.response = response_curve(RESPONSE) if encoded else None
+        if encoded:
+            metered, dark = zip(*self.meter, strict=True)
+            given = exposures(metered, dark)
+            views = [replace(view, exposure=float(e)) for view, e in zip(views, given, strict=True)]
+        for i, view in enumerate(views):
+            pixels = view.width * view.height
+            valid = np.unpackbits(self.usable[i], count=pixels).view(bool).reshape(view.height, view.width)
+            image = expose(radiance[i], view.exposure, self.response) if encoded else np.array(radiance[i])
+            self.writer.photo(view.name, image, valid, encoded)
+        return views
+
+    def _finish(self) -> None:
+        if self.dropped:
+            self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
+        if self.settings.denoise:
+            self.notes.append("photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth")
+        samples = None if self.response is None else self.response.samples()
+        self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
+        for note in self.notes:
+            self.job.log.info("%s", note)
+
+
+def _mean_radiance(emitter: Any, directions: Array) -> list[float]:
+    """Mean RGB radiance of an environment light over the sphere."""
+    import drjit as dr
+    import mitsuba as mi
+
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = mi.Vector3f(*(mi.Float(np.ascontiguousarray(-directions[:, i], np.float32)) for i in range(3)))
+    value = np.array(mi.Color3f(emitter.eval(si))).T
+    return [round(float(v), 6) for v in np.broadcast_to(value, (len(directions), 3)).mean(0)]

@@ -1,0 +1,308 @@
+"""What a Mitsuba BSDF is in terms of base colour, perceptual roughness and metallic; every approximation is said.
+
+    diffuse                    a = reflectance, r = 1, m = 0
+    plastic, roughplastic      a = diffuse_reflectance, r = sqrt(alpha) (smooth: alpha = 0), m = 0
+    conductor, roughconductor  a = F0(eta, k) specular_reflectance, F0 = ((eta - 1)^2 + k^2) / ((eta + 1)^2 + k^2), m = 1
+    principled                 a = base_color, r = roughness (Mitsuba's alpha = roughness^2), m = metallic
+    blendbsdf                  linear in its weight; twosided, bumpmap, normalmap, mask: the BSDF inside
+    dielectric, ...            transparent: no truth;  anything else: neutral grey, no truth
+
+Textures are evaluated by Mitsuba itself (linear values; `to_uv`, `raw`, wrapping and filter respected). Target model: METHOD 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .flatten import FlatMesh
+from .scene import Shape, children, parameter
+
+Array = np.ndarray
+
+MIN_ROUGHNESS = 0.02
+OPAQUE = 0.5
+"""Faces of a mask with less opacity than this are left out."""
+
+_TRANSPARENT = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
+_PLASTIC = {"SmoothPlastic", "RoughPlastic", "PolarizedPlastic"}
+_CONDUCTOR = {"SmoothConductor", "RoughConductor"}
+_WRAPPER = {"TwoSidedBRDF": "brdf_0", "MaskBSDF": "nested_bsdf", "BumpMap": "nested_bsdf", "NormalMap": "nested_bsdf"}
+_PRINCIPLED_EXTRAS = ("anisotropic", "spec_tint", "sheen", "clearcoat", "flatness", "diff_trans")
+_CHUNK = 1 << 22
+
+
+@dataclass
+class Surface:
+    """Materials of n points: albedo (n, 3) linear, roughness (n,) perceptual, metallic (n,), truth (n,) bool."""
+
+    albedo: Array
+    roughness: Array
+    metallic: Array
+    truth: Array
+
+    @staticmethod
+    def neutral(n: int) -> Surface:
+        """Grey of middle roughness that is no truth."""
+        return Surface(np.full((n, 3), 0.5, np.float32), np.full(n, 0.5, np.float32), np.zeros(n, np.float32), np.zeros(n, bool))
+
+
+class Points:
+    """Surface points that textures are evaluated at: uv (n, 2), positions (n, 3), and which primitive of which shape."""
+
+    def __init__(self, uv: Array, position: Array, primitive: Array, shape: Array, shapes: list[Shape]):
+        self.count = len(uv)
+        si = dr.zeros(mi.SurfaceInteraction3f, self.count)
+        si.uv = mi.Point2f(*(mi.Float(np.ascontiguousarray(uv[:, i], np.float32)) for i in range(2)))
+        si.p = mi.Point3f(*(mi.Float(np.ascontiguousarray(position[:, i], np.float32)) for i in range(3)))
+        si.prim_index = mi.UInt32(np.maximum(primitive, 0).astype(np.uint32))
+        si.wi = mi.Vector3f(0, 0, 1)
+        if self.count:
+            used, which = np.unique(shape, return_inverse=True)
+            ids = [int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[i].object)))[0]) for i in used]
+            si.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(np.array(ids, np.uint32)[which]))
+        self.si = si
+
+    def colour(self, texture: Any, default: float) -> Array:
+        """Linear RGB (n, 3) float32 of a texture; `default` where the BSDF has none."""
+        if texture is None:
+            return np.full((self.count, 3), default, np.float32)
+        value = np.array(mi.Color3f(texture.eval(self.si)), np.float32).T
+        return np.ascontiguousarray(np.broadcast_to(value, (self.count, 3)))
+
+    def scalar(self, value: Any, default: float) -> Array:
+        """(n,) float32 of a texture, a number or None."""
+        if value is None:
+            return np.full(self.count, default, np.float32)
+        if not isinstance(value, mi.Texture):
+            return np.full(self.count, float(np.asarray(value).ravel()[0]), np.float32)
+        try:
+            result = np.array(value.eval_1(self.si), np.float32)
+        except RuntimeError:  # spectra have no scalar form
+            result = self.colour(value, default).mean(1)
+        return np.ascontiguousarray(np.broadcast_to(result, (self.count,)))
+
+
+class Material:
+    """One BSDF, read once.
+
+    transparent: light goes through (glass).  two_sided: reflects on both sides.  masked: has an opacity.
+    notes: what the mapping leaves out, in words.
+    """
+
+    def __init__(self, bsdf: Any):
+        self.bsdf = bsdf
+        self.kind: str = bsdf.class_name()
+        below = children(bsdf)
+        self.textures = {name: thing for name, thing in below.items() if isinstance(thing, mi.Texture)}
+        self.inner = {name: Material(thing) for name, thing in below.items() if isinstance(thing, mi.BSDF)}
+        self.notes: set[str] = set().union(*(inner.notes for inner in self.inner.values()))
+        nested = [inner for name, inner in self.inner.items() if name != "brdf_1"]
+        self.masked = self.kind == "MaskBSDF" or any(inner.masked for inner in nested)
+        self.transparent = self.kind in _TRANSPARENT or (bool(nested) and all(inner.transparent for inner in nested))
+        self.two_sided = self.kind in ("TwoSidedBRDF", "Null") or self.transparent or any(i.two_sided for i in nested)
+        self.known = True
+        self._read_kind()
+
+    def _read_kind(self) -> None:
+        note = self.notes.add
+        if self.kind in _TRANSPARENT:
+            note("dielectric, thindielectric, roughdielectric: transparent, no material truth")
+        elif self.kind == "SmoothDiffuse":
+            note("diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack")
+        elif self.kind in _PLASTIC:
+            note("plastic, roughplastic: base colour = diffuse_reflectance; inner scattering and the loss under the coat are not in it")
+            eta = parameter(self.bsdf, "eta")
+            if eta is None and "eta" in self.textures:
+                eta = self._points_zero().scalar(self.textures["eta"], 1.5)
+            f0 = float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2) if eta is not None else 0.04
+            if abs(f0 - 0.04) > 0.004:
+                note("plastic, roughplastic of another index than 1.5: F0 = 0.04 stands in its place")
+            if "specular_reflectance" in self.textures:
+                note("plastic, roughplastic with specular_reflectance: left out")
+            if self.kind == "SmoothPlastic":
+                note(f"plastic: mirror-smooth coat, r = {MIN_ROUGHNESS}")
+        elif self.kind in _CONDUCTOR:
+            note("conductor, roughconductor: base colour = F0(eta, k) x specular_reflectance, r = sqrt(alpha), Schlick's Fresnel")
+        elif self.kind == "Principled":
+            zero = self._points_zero()
+            if any(zero.scalar(self.textures.get(name), 0).max() > 0 for name in _PRINCIPLED_EXTRAS):
+                note("principled with anisotropy, tint, sheen, clearcoat or flatness: those lobes are left out")
+            self.transparent = bool(zero.scalar(self.textures.get("spec_trans"), 0)[0] > 0.5)
+            self.two_sided |= self.transparent
+            note("principled: base_color, roughness, metallic as they are; its diffuse lobe is Disney's")
+        elif self.kind == "PrincipledThin":
+            zero = self._points_zero()
+            self.transparent = bool(zero.scalar(self.textures.get("spec_trans"), 0)[0] > 0.5)
+            self.two_sided = True
+            note("principledthin: base_color and roughness; light that goes through is left out")
+        elif self.kind == "MaskBSDF":
+            note(f"mask: faces of opacity below {OPAQUE} left out, the others opaque (the photographs see through them in part)")
+        elif self.kind == "Null":
+            note("null: no surface, left out")
+        elif self.kind in ("BumpMap", "NormalMap"):
+            note("bumpmap, normalmap: the geometric normal is kept")
+        elif self.kind == "BlendBSDF":
+            note("blendbsdf: parameters blended linearly")
+        elif self.kind == "TwoSidedBRDF":
+            if "brdf_1" in self.inner and self.inner["brdf_1"].bsdf is not self.inner["brdf_0"].bsdf:
+                note("twosided with two BSDFs: the front one is taken on both sides")
+        else:
+            self.known = False
+            note(f"{self.bsdf.class_name()}: unknown BSDF, grey in its place and no material truth")
+
+    def _points_zero(self) -> Points:
+        """One point in the middle of the texture, for what is asked once per BSDF."""
+        return Points(np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), [])
+
+    def opacity(self, points: Points) -> Array:
+        """(n,) in [0, 1]: product of the masks above the surface; 0 for `null`."""
+        if self.kind == "Null":
+            return np.zeros(points.count, np.float32)
+        own = points.scalar(self.textures.get("opacity"), 1) if self.kind == "MaskBSDF" else np.ones(points.count, np.float32)
+        name = _WRAPPER.get(self.kind)
+        return own * self.inner[name].opacity(points) if name in self.inner else own
+
+    def evaluate(self, points: Points) -> Surface:
+        """Albedo, roughness and metallic at points; roughness in [0.02, 1], the others clipped to [0, 1]."""
+        surface = self._evaluate(points)
+        surface.albedo = np.clip(np.nan_to_num(surface.albedo), 0, 1).astype(np.float32)
+        surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(np.float32)
+        surface.metallic = np.clip(np.nan_to_num(surface.metallic), 0, 1).astype(np.float32)
+        return surface
+
+    def _evaluate(self, points: Points) -> Surface:
+        n = points.count
+        sure, zero = np.ones(n, bool), np.zeros(n, np.float32)
+        colour = lambda name, default: points.colour(self.textures.get(name), default)  # noqa: E731
+        if self.kind in _WRAPPER:
+            return self.inner[_WRAPPER[self.kind]].evaluate(points)
+        if self.kind == "SmoothDiffuse":
+            return Surface(colour("reflectance", 0.5), np.ones(n, np.float32), zero, sure)
+        if self.kind in _PLASTIC:
+            return Surface(colour("diffuse_reflectance", 0.5), np.sqrt(self._alpha(points)), zero, sure)
+        if self.kind in _CONDUCTOR:
+            eta, k = colour("eta", 0), colour("k", 1)
+            f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
+            return Surface(f0 * colour("specular_reflectance", 1), np.sqrt(self._alpha(points)), zero + 1, sure)
+        if self.kind in ("Principled", "PrincipledThin"):
+            metallic = points.scalar(self.textures.get("metallic"), 0)
+            truth = sure & (not self.transparent)
+            return Surface(colour("base_color", 0.5), points.scalar(self.textures.get("roughness"), 0.5), metallic, truth)
+        if self.kind == "BlendBSDF":
+            w = np.clip(points.scalar(self.textures.get("weight"), 0.5), 0, 1)
+            a, b = self.inner["bsdf_0"].evaluate(points), self.inner["bsdf_1"].evaluate(points)
+            mix = lambda x, y: x + (w if x.ndim == 1 else w[:, None]) * (y - x)  # noqa: E731
+            truth = (a.truth | (w >= 1)) & (b.truth | (w <= 0))
+            return Surface(mix(a.albedo, b.albedo), mix(a.roughness, b.roughness), mix(a.metallic, b.metallic), truth)
+        surface = Surface.neutral(n)
+        if self.kind in _TRANSPARENT:
+            surface.albedo[:] = 1
+            surface.roughness = np.sqrt(self._alpha(points))
+        return surface
+
+    def _alpha(self, points: Points) -> Array:
+        """Microfacet alpha (n,) >= 0; geometric mean of an anisotropic pair, 0 for the smooth kinds."""
+        if self.kind in ("SmoothPlastic", "SmoothConductor", "SmoothDielectric", "ThinDielectric"):
+            return np.zeros(points.count, np.float32)
+        pair = []
+        for name in ("alpha_u", "alpha_v") if self._has("alpha_u") else ("alpha", "alpha"):
+            value = self.textures.get(name)
+            pair.append(np.maximum(points.scalar(parameter(self.bsdf, name) if value is None else value, 0.1), 0))
+        return np.sqrt(pair[0] * pair[1])
+
+    def _has(self, name: str) -> bool:
+        return name in self.textures or parameter(self.bsdf, name) is not None
+
+
+class MaterialTable:
+    """The materials of a mesh's shapes, and their evaluation at points on faces."""
+
+    def __init__(self, shapes: list[Shape]):
+        self.shapes = shapes
+        self.materials: list[Material] = []
+        known: dict[Any, int] = {}
+        of_shape = []
+        for shape in shapes:
+            bsdf = shape.object.bsdf()
+            if bsdf not in known:
+                known[bsdf] = len(self.materials)
+                self.materials.append(Material(bsdf))
+            of_shape.append(known[bsdf])
+        self.of_shape = np.array(of_shape, np.int32)
+
+    def of_faces(self, mesh: FlatMesh, name: str) -> Array:
+        """A flag (`transparent`, `two_sided`, `known`, `masked`) of every face's material, (m,) bool."""
+        flags = np.array([getattr(material, name) for material in self.materials], bool)
+        return flags[self.of_shape[mesh.shape]]
+
+    def face_opacity(self, mesh: FlatMesh) -> Array:
+        """Mean opacity of every face, (m,) float32; 1 without a mask."""
+        out = np.ones(len(mesh.faces), np.float32)
+        kinds = np.array([m.masked or m.kind == "Null" for m in self.materials], bool)
+        faces = np.flatnonzero(kinds[self.of_shape[mesh.shape]])
+        samples = np.array([[1 / 3, 1 / 3], [0.6, 0.2], [0.2, 0.6], [0.2, 0.2]])
+        total = np.zeros(len(faces))
+        for b in samples:
+            total += self._each(mesh, faces, np.tile(b, (len(faces), 1)), lambda material, points: material.opacity(points))
+        out[faces] = total / len(samples)
+        return out
+
+    def evaluate(self, mesh: FlatMesh, face: Array, barycentric: Array) -> Surface:
+        """Materials at points of faces (n,) with weights (n, 2) of their second and third corners."""
+        out = Surface.neutral(len(face))
+
+        def fill(material: Material, points: Points) -> Surface:
+            return material.evaluate(points)
+
+        for rows, part in self._groups(mesh, face, barycentric, fill):
+            out.albedo[rows], out.roughness[rows] = part.albedo, part.roughness
+            out.metallic[rows], out.truth[rows] = part.metallic, part.truth
+        return out
+
+    def _each(self, mesh: FlatMesh, face: Array, barycentric: Array, function: Any) -> Array:
+        out = np.zeros(len(face), np.float32)
+        for rows, part in self._groups(mesh, face, barycentric, function):
+            out[rows] = part
+        return out
+
+    def _groups(self, mesh: FlatMesh, face: Array, barycentric: Array, function: Any) -> Any:
+        material = self.of_shape[mesh.shape[face]]
+        order = np.argsort(material, kind="stable")
+        bounds = np.searchsorted(material[order], np.arange(len(self.materials) + 1))
+        for index in range(len(self.materials)):
+            for start in range(bounds[index], bounds[index + 1], _CHUNK):
+                rows = order[start : min(start + _CHUNK, bounds[index + 1])]
+                f, b = face[rows], barycentric[rows]
+                weights = np.column_stack([1 - b.sum(1), b])[:, :, None]
+                uv = (weights * mesh.uv[f]).sum(1)
+                position = (weights * mesh.vertices[mesh.faces[f]]).sum(1)
+                points = Points(uv, position, mesh.primitive[f], mesh.shape[f], self.shapes)
+                yield rows, function(self.materials[index], points)
+
+    def notes(self, mesh: FlatMesh) -> list[str]:
+        """Every approximation of the mapping, with the BSDFs and faces that it concerns."""
+        faces = np.bincount(self.of_shape[mesh.shape], minlength=len(self.materials))
+        lines: dict[str, list[int]] = {}
+        for material, count in zip(self.materials, faces.tolist(), strict=True):
+            for note in material.notes if count else ():
+                entry = lines.setdefault(note, [0, 0])
+                entry[0] += 1
+                entry[1] += count
+        return [f"{note} ({bsdfs} BSDFs, {count} faces)" for note, (bsdfs, count) in sorted(lines.items())]
+
+
+def barycentric_of(mesh: FlatMesh, face: Array, position: Array) -> Array:
+    """Weights (n, 2) of the second and third corner of points (n, 3) on faces (n,), clipped into the triangle."""
+    a, b, c = (mesh.vertices[mesh.faces[face, i]].astype(np.float64) for i in range(3))
+    u, v, w = b - a, c - a, position.astype(np.float64) - a
+    uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)
+    wu, wv = (w * u).sum(1), (w * v).sum(1)
+    determinant = np.maximum(uu * vv - uv * uv, np.finfo(np.float64).tiny)
+    weights = np.column_stack([vv * wu - uv * wv, uu * wv - uv * wu]) / determinant[:, None]
+    weights = np.clip(weights, 0, 1)
+    return weights / np.maximum(weights.sum(1, keepdims=True), 1)

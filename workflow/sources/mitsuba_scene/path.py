@@ -1,0 +1,325 @@
+"""Where a camera can stand in a room and which views of it together see the most: found from the mesh and one pose.
+
+    free space    positions that see each other, from the starting pose on, at eye height and with clearance all around
+    surface       points drawn evenly over the area; reachable = seen from some free position
+    selection     greedy: the (position, direction) that adds most, a point counting 1, 0.6, 0.4 for its first, second and
+                  third view and next to nothing after (the gain only ever shrinks, so a lazy queue gives the exact greedy choice)
+
+Lengths are scene units (metres); every limit shrinks with the room where it is too small for it. Deterministic in `seed`.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from iif_core.camera import look_at
+
+Array = np.ndarray
+Trace = Callable[[Array, Array], tuple[Array, Array]]
+"""(origins (n, 3), directions (n, 3)) -> (face (n,) int32, -1 = miss; t (n,) float32, inf = miss)."""
+
+CLEARANCE = 0.35
+EYE_HEIGHTS = (1.0, 1.9)
+NEAR = 1.0
+"""A view whose median distance is below this looks at a wall."""
+YAWS = 16
+PITCHES = (-30.0, -8.0, 14.0)
+CANDIDATES = 768
+POSITIONS = 128
+SPHERE = 384
+POINTS = 24000
+GRAZING = 0.15
+"""Cosine below which a surface is not counted as seen."""
+_GAIN = (1.0, 0.6, 0.4)
+_LATER = 0.02
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Half extents of the picture on the plane z = 1."""
+
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class Path:
+    """Chosen poses (v, 4, 4) OpenCV world_from_camera, whether each is one of the given ones, and what they see."""
+
+    poses: Array
+    given: Array
+    facts: dict[str, Any]
+    notes: list[str]
+
+
+def plan(
+    solid: Trace,
+    visible: Trace,
+    vertices: Array,
+    faces: Array,
+    given: list[tuple[Array, Lens]],
+    lens: Lens,
+    up: Array,
+    count: int,
+    seed: int,
+) -> Path:
+    """Choose `count` views of the room that the first given pose stands in; the given poses come first.
+
+    Args:
+        solid: traces everything that a camera cannot pass, glass included.
+        visible: traces what a camera sees.
+        vertices, faces: the visible mesh.
+        given: poses of the scene's own sensors with their lenses, at least one.
+        lens: of the chosen views.
+        up: (3,) unit vector.
+        count: views >= 1; surplus given poses are left out.
+        seed: of the positions and surface points.
+    """
+    given = given[:count]
+    rng = np.random.default_rng([seed, 0x9A7])
+    start = given[0][0][:3, 3]
+    sphere = fibonacci_sphere(SPHERE)
+    notes: list[str] = []
+
+    _, around = solid(np.broadcast_to(start, (4 * SPHERE, 3)), fibonacci_sphere(4 * SPHERE))
+    seen = np.isfinite(around)
+    reach = float(np.median(around[seen])) if seen.any() else 1.0
+    escape = float(1 - seen.mean())
+    positions, distances, room = _free_positions(solid, start, up, sphere, around, reach, escape, count, rng)
+    if room["clearance_m"] < CLEARANCE:
+        notes.append(f"cameras keep {room['clearance_m']:.2f} m from surfaces: fewer than enough places allow {CLEARANCE} m")
+    if not 0.3 <= reach <= 30:
+        notes.append(f"the median distance seen from the sensor is {reach:.3g} m: check that the scene's unit is the metre")
+
+    points, normals = _surface_points(vertices, faces, room["low"], room["high"], rng)
+    sees = _visibility(visible, positions, points, normals)
+    own = _visibility(visible, np.array([pose[:3, 3] for pose, _ in given]), points, normals)
+    reachable = own.any(0) | sees.any(0)
+    points, sees, own = points[reachable], sees[:, reachable], own[:, reachable]
+
+    counts = np.zeros(len(points), np.int64)
+    for (pose, own_lens), row in zip(given, own, strict=True):
+        counts += row & _in_frustum(pose, own_lens, points)
+    views, poses = _views(positions, distances, sphere, sees, points, lens, up, min(NEAR, 0.5 * reach), escape)
+    chosen = _greedy(views, counts, count - len(given))
+    if len(given) + len(chosen) < count:
+        notes.append(f"only {len(given) + len(chosen)} of {count} views: the free space allows no more")
+
+    area = max(len(points), 1)
+    facts = {
+        "up": up.tolist(),
+        "positions": len(positions),
+        "surface_points": len(points),
+        "escape_share": round(escape, 4),
+        "coverage_1": round(float((counts >= 1).sum() / area), 4),
+        "coverage_3": round(float((counts >= 3).sum() / area), 4),
+        **{key: value for key, value in room.items() if key not in ("low", "high")},
+    }
+    all_poses = np.concatenate([np.array([pose for pose, _ in given]), poses[chosen].reshape(-1, 4, 4)])
+    return Path(all_poses, np.arange(len(all_poses)) < len(given), facts, notes)
+
+
+def fibonacci_sphere(n: int) -> Array:
+    """n directions spread evenly over the sphere, (n, 3) float32."""
+    z = 1 - (2 * np.arange(n) + 1) / n
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    r = np.sqrt(1 - z * z)
+    return np.column_stack([r * np.cos(angle), r * np.sin(angle), z]).astype(np.float32)
+
+
+def upright(direction: Array) -> Array:
+    """The coordinate axis nearest to a direction, with its sign: which way a scene's sensor calls up."""
+    axis = int(np.argmax(np.abs(direction)))
+    return np.eye(3)[axis] * np.sign(direction[axis])
+
+
+def _basis(up: Array) -> tuple[Array, Array]:
+    """Two unit vectors across `up`."""
+    e1 = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    e1 /= np.linalg.norm(e1)
+    return e1, np.cross(up, e1)
+
+
+def _free_positions(
+    solid: Trace, start: Array, up: Array, sphere: Array, around: Array, reach: float, escape: float, count: int, rng: Any
+) -> tuple[Array, Array, dict[str, Any]]:
+    """Positions (n, 3) where a camera can stand, distances (n, SPHERE) of what surrounds each, and facts of the room."""
+    e1, e2 = _basis(up)
+    hit = np.isfinite(around)
+    directions = fibonacci_sphere(len(around))
+    seen = start + directions[hit] * around[hit, None] if hit.any() else start + directions
+    across = np.column_stack([seen @ e1, seen @ e2])
+    low, high = np.percentile(across, [1, 99], axis=0)
+    drop = _distance(solid, start[None], -up)[0]
+    if not np.isfinite(drop):
+        drop = 1.5 if hit.any() else 1.0
+    eye = _eye_heights(drop, _distance(solid, start[None], up)[0])
+
+    # Low-discrepancy across the room (Roberts' R3), the third coordinate over the eye heights.
+    ratio = 1.2207440846057596
+    sequence = (rng.random(3) + np.arange(1, CANDIDATES + 1)[:, None] * ratio ** -np.arange(1.0, 4.0)) % 1
+    flat = low + (high - low) * sequence[:, :2]
+    columns = flat[:, :1] * e1 + flat[:, 1:] * e2 + (start @ up) * up
+    below = _distance(solid, columns, -up)
+    reachable = _sees(solid, start, columns)
+    floors = (columns @ up - below)[reachable & np.isfinite(below)]
+    floor = min(float(np.percentile(floors, 10)) if len(floors) else np.inf, float(start @ up - drop))
+    height = floor + eye[0] + (eye[1] - eye[0]) * sequence[:, 2]
+    positions = columns + (height - start @ up)[:, None] * up
+
+    distances = _spheres(solid, positions, sphere)
+    finite = np.isfinite(distances)
+    nearest = np.where(finite, distances, np.inf).min(1)
+    inside = (1 - finite.mean(1)) <= escape + 0.15
+    clearance = min(CLEARANCE, 0.25 * reach)
+    enough = min(max(8, count), POSITIONS)
+    for _ in range(8):
+        roomy = np.flatnonzero(inside & (nearest >= clearance))
+        kept = roomy[_connected(solid, start, positions[roomy])]
+        if len(kept) >= enough:
+            break
+        clearance *= 0.75
+    kept = kept[:POSITIONS]
+    facts = {
+        "clearance_m": round(float(min(clearance, nearest[kept].min())) if len(kept) else 0.0, 4),
+        "floor_m": round(floor, 4),
+        "eye_heights_m": [round(e, 4) for e in eye],
+        "low": np.percentile(seen, 0.5, axis=0) - 0.05 * reach,
+        "high": np.percentile(seen, 99.5, axis=0) + 0.05 * reach,
+    }
+    return positions[kept], distances[kept], facts
+
+
+def _eye_heights(below: float, above: float) -> tuple[float, float]:
+    """Eye heights above the floor: 1.0 ... 1.9 m, less under a low ceiling, and the sensor's own height among them."""
+    low, high = EYE_HEIGHTS
+    if np.isfinite(above):
+        low, high = min(low, 0.4 * (below + above)), min(high, 0.75 * (below + above))
+    if not low <= below <= high:  # a room of another scale, or a sensor above a table or below a lamp
+        low, high = min(low, max(below, 0.3 * high)), max(high, min(below, 1.2 * high))
+    return float(low), float(high)
+
+
+def _distance(trace: Trace, origins: Array, direction: Array) -> Array:
+    return trace(origins, np.broadcast_to(direction, origins.shape))[1].astype(np.float64)
+
+
+def _sees(trace: Trace, origins: Array, targets: Array) -> Array:
+    """Whether nothing lies between origins and targets (n, 3), up to 0.1 % before the target."""
+    origins = np.broadcast_to(origins, targets.shape)
+    return trace(origins, targets - origins)[1] > 0.999
+
+
+def _spheres(trace: Trace, positions: Array, sphere: Array) -> Array:
+    """Distances (n, directions) from positions along the directions of a sphere."""
+    _, t = trace(np.repeat(positions, len(sphere), 0), np.tile(sphere, (len(positions), 1)))
+    return t.reshape(len(positions), len(sphere))
+
+
+def _connected(trace: Trace, start: Array, positions: Array) -> Array:
+    """Indices of the positions that can be reached from `start` along unobstructed straight lines, in their order."""
+    reached = np.zeros(len(positions), bool)
+    front = start[None]
+    while len(front) and not reached.all():
+        rest = np.flatnonzero(~reached)
+        pairs = np.repeat(front, len(rest), 0), np.tile(positions[rest], (len(front), 1))
+        new = rest[_sees(trace, *pairs).reshape(len(front), len(rest)).any(0)]
+        reached[new] = True
+        front = positions[new]
+    return np.flatnonzero(reached)
+
+
+def _surface_points(vertices: Array, faces: Array, low: Array, high: Array, rng: Any) -> tuple[Array, Array]:
+    """POINTS points drawn evenly over the area within a box, and unit normals (either side)."""
+    a, b, c = (vertices[faces[:, i]].astype(np.float32) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1).astype(np.float64)
+    cumulative = np.cumsum(area)
+    points = np.zeros((0, 3))
+    normals = np.zeros((0, 3))
+    for _ in range(8):  # faces may be larger than the box: draw, keep what lies within, draw again
+        face = np.searchsorted(cumulative, rng.random(POINTS) * cumulative[-1])
+        face = np.minimum(face, len(faces) - 1)
+        u, v = rng.random((2, POINTS))
+        outside = u + v > 1
+        u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
+        p = a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
+        inside = ((p >= low) & (p <= high)).all(1) & (area[face] > 0)
+        points = np.concatenate([points, p[inside]])
+        normals = np.concatenate([normals, normal[face[inside]] / area[face[inside], None]])
+        if len(points) >= POINTS:
+            break
+    return points[:POINTS], normals[:POINTS]
+
+
+def _visibility(trace: Trace, positions: Array, points: Array, normals: Array) -> Array:
+    """(positions, points) bool: seen at less than a grazing angle with nothing in between."""
+    out = np.zeros((len(positions), len(points)), bool)
+    for row, position in enumerate(positions):
+        toward = points - position
+        distance = np.linalg.norm(toward, axis=1)
+        facing = np.abs((toward * normals).sum(1)) > GRAZING * distance
+        index = np.flatnonzero(facing)
+        out[row, index] = _sees(trace, position, points[index])
+    return out
+
+
+def _in_frustum(pose: Array, lens: Lens, points: Array) -> Array:
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    z = local[:, 2]
+    return (z > 0) & (np.abs(local[:, 0]) <= lens.x * z) & (np.abs(local[:, 1]) <= lens.y * z)
+
+
+def _views(
+    positions: Array, distances: Array, sphere: Array, sees: Array, points: Array, lens: Lens, up: Array, near: float, escape: float
+) -> tuple[Array, Array]:
+    """Candidate views: seen points (packed bits) and pose; views of a near wall or of nothing are left out."""
+    e1, e2 = _basis(up)
+    packed, poses = [], []
+    for index, position in enumerate(positions):
+        turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # so that not all positions share their yaws
+        for yaw in turn + 2 * np.pi * np.arange(YAWS) / YAWS:
+            across = np.cos(yaw) * e1 + np.sin(yaw) * e2
+            for pitch in np.radians(PITCHES):
+                pose = look_at(position, position + np.cos(pitch) * across + np.sin(pitch) * up, up)
+                inside = _in_frustum(pose, lens, position + sphere)
+                distance = distances[index, inside]
+                hit = np.isfinite(distance)
+                if hit.mean() < 1 - escape - 0.35 or not hit.any() or np.median(distance[hit]) < near:
+                    continue
+                packed.append(np.packbits(sees[index] & _in_frustum(pose, lens, points)))
+                poses.append(pose)
+    if not poses:
+        return np.zeros((0, (len(points) + 7) // 8), np.uint8), np.zeros((0, 4, 4))
+    return np.array(packed), np.array(poses)
+
+
+def _greedy(views: Array, counts: Array, wanted: int) -> Array:
+    """Indices of `wanted` views, best first; `counts` is brought up to date in place."""
+    n = len(counts)
+
+    def worth() -> Array:
+        return np.where(counts < len(_GAIN), np.array(_GAIN)[np.minimum(counts, len(_GAIN) - 1)], _LATER / np.maximum(counts, 1))
+
+    def gain(view: int) -> float:
+        return float(weight[np.unpackbits(views[view], count=n).view(bool)].sum())
+
+    weight = worth()
+    queue = [(-gain(view), view) for view in range(len(views))]
+    heapq.heapify(queue)
+    chosen: list[int] = []
+    while queue and len(chosen) < wanted:
+        _, view = heapq.heappop(queue)
+        now = -gain(view)
+        if queue and (now, view) > queue[0]:
+            heapq.heappush(queue, (now, view))
+            continue
+        chosen.append(view)
+        counts += np.unpackbits(views[view], count=n)
+        weight = worth()
+    return np.array(chosen, int)

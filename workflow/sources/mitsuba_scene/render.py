@@ -1,0 +1,94 @@
+"""Photographs of the original scene by Mitsuba's own path tracer, along the capture's own rays.
+
+Every pixel is the mean of paths through uniformly jittered points of its square (a box filter). A launch holds several
+samples of some pixels side by side; each pixel's are summed in order, so the image is the same to the last bit whatever
+the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from iif_core.camera import direction_derivatives, pixel_directions
+from iif_core.errors import InputError
+from workflow.normal_form import View
+
+Array = np.ndarray
+
+LANES = 1 << 19
+"""Paths in flight at once; bounds the memory."""
+
+
+def path_integrator(max_bounces: int) -> Any:
+    """Mitsuba's `path` with that many surface interactions (its `max_depth` counts the camera's segment too)."""
+    return mi.load_dict({"type": "path", "max_depth": max_bounces + 1})
+
+
+def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int) -> tuple[Array, Array, int]:
+    """Radiance (H, W, 3) float32, valid (H, W) bool, number of samples that were not finite (left out of the mean).
+
+    A function of scene, view, samples and seed alone. Where no sample was finite: radiance 0, not valid.
+    """
+    directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+    directions = directions.reshape(-1, 3)
+    d_du, d_dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+    origin = mi.Point3f(*view.world_from_camera[:3, 3].astype(np.float32).tolist())
+    radiance = np.zeros((len(directions), 3), np.float64)
+    finite = np.zeros(len(directions), np.int64)
+    for first in range(0, len(directions), LANES):
+        rows = slice(first, min(first + LANES, len(directions)))
+        count = rows.stop - rows.start
+        device = [mi.Float(np.ascontiguousarray(directions[rows, axis])) for axis in range(3)]
+        done = 0
+        while done < samples:
+            repeat = min(max(1, LANES // count), samples - done)
+            sampler = mi.load_dict({"type": "independent"})
+            key = np.random.SeedSequence([seed, view.view_id, first, done]).generate_state(1)[0]
+            sampler.seed(int(key), count * repeat)
+            toward = mi.Vector3f(*(dr.repeat(axis, repeat) for axis in device))
+            du, dv = sampler.next_1d() - 0.5, sampler.next_1d() - 0.5
+            toward = dr.normalize(toward + du * mi.Vector3f(*d_du.tolist()) + dv * mi.Vector3f(*d_dv.tolist()))
+            value, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(mi.Ray3f(origin, toward)))
+            good = dr.all(dr.isfinite(value))
+            value = dr.select(good, value, 0)
+            good = dr.select(good, mi.UInt32(1), 0)
+            dr.eval(value, good)
+            radiance[rows] += np.array(value, np.float64).T.reshape(count, repeat, 3).sum(1)
+            finite[rows] += np.array(good).reshape(count, repeat).sum(1, dtype=np.int64)
+            done += repeat
+    valid = finite > 0
+    radiance[valid] /= finite[valid, None]
+    shape = (view.height, view.width)
+    image = np.maximum(radiance, 0).astype(np.float32).reshape(*shape, 3)
+    return image, valid.reshape(shape), int(len(finite) * samples - finite.sum())
+
+
+def original_distance(scene: Any, origin: Array, directions: Array) -> Array:
+    """z-depth (n,) of the first surface of the original scene along rays, inf = none: what the mesh may have left out."""
+    d = [mi.Float(np.ascontiguousarray(directions[:, axis], np.float32)) for axis in range(3)]
+    ray = mi.Ray3f(mi.Point3f(*np.asarray(origin, np.float32).tolist()), mi.Vector3f(*d))
+    found = scene.ray_intersect_preliminary(ray)
+    return np.array(dr.select(found.is_valid(), found.t, dr.inf))
+
+
+def require_denoiser() -> None:
+    """Raises InputError where the optional denoiser is not installed."""
+    try:
+        import pyoidn  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "capture.denoise: the package pyoidn (Intel Open Image Denoise) is not installed;"
+            " run `pip install pyoidn==2.5.1.0` in the environment, or set capture.denoise: false"
+        ) from None
+
+
+def denoise(radiance: Array, albedo: Array, normal: Array) -> Array:
+    """Intel Open Image Denoise of an HDR picture (H, W, 3) with noise-free albedo and world normals beside it."""
+    import pyoidn
+
+    images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]
+    return np.maximum(pyoidn.denoise(*images, hdr=True, clean_aux=True), 0)

@@ -1,0 +1,106 @@
+"""export: the recovered scene for other programs (glTF, Mitsuba) and as maps and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
+from workflow.exporters.glb import glb_bytes
+from workflow.exporters.mitsuba_scene import mitsuba_files
+from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, up_axis
+from workflow.job import Job
+from workflow.normal_form import CaptureReader
+from workflow.recovered import Recovered, read_recovered
+
+VERTEX_SPACING = 0.05
+"""Edges are halved until they are this short (metres), or two cells where cells are larger."""
+
+SPLIT_FACES = 200_000
+"""Splitting stops here; a mesh that has more faces is exported as it is."""
+
+MAX_SENSORS = 16
+
+
+def run(job: Job) -> None:
+    """Write scene.glb, mitsuba/, maps/<view>.exr and the tables of the deliverable."""
+    capture = CaptureReader(job.read("capture"))
+    recovered = read_recovered(job)
+    if len(recovered.faces) > job.settings.export.max_faces_glb:
+        raise InputError(
+            f"scene {job.scene}: the mesh has {len(recovered.faces)} faces, export.max_faces_glb allows"
+            f" {job.settings.export.max_faces_glb}. Raise it, or decimate the mesh."
+        )
+    scene = _with_observers(capture, recovered)
+    budget = max(len(recovered.faces), min(SPLIT_FACES, job.settings.export.max_faces_glb))
+    parts = build_parts(scene, max(VERTEX_SPACING, 2 * recovered.cell_edge), budget)
+    provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
+    job.writer.bytes("scene.glb", glb_bytes(parts, scene.up, provenance))
+    for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.environment).items():
+        job.writer.bytes(f"mitsuba/{name}", data)
+    _maps(job, capture)
+    _emitter_table(job, recovered)
+    facts = {
+        "up": scene.up.tolist(),
+        "parts": len(parts),
+        "faces": sum(len(part.faces) for part in parts),
+        "double_sided": [part.name for part in parts if part.double_sided],
+        "light_scale": recovered.light_scale,
+    }
+    job.writer.json("export.json", facts)
+
+
+def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredScene:
+    """The scene with what the exporters need to know about who looked at it."""
+    front, back = np.zeros((2, len(recovered.faces)), np.int64)
+    vertices = recovered.vertices.astype(np.float64)
+    for view in capture.views:
+        _, face_id = capture.gbuffer(view)
+        sides = seen_sides(vertices, recovered.faces, face_id, view.world_from_camera[:3, 3])
+        front += sides[0]
+        back += sides[1]
+    up = capture.facts.get("up")
+    poses = np.stack([view.world_from_camera for view in capture.views])
+    return RecoveredScene(
+        recovered.vertices,
+        recovered.faces,
+        recovered.object_id,
+        recovered.object_names,
+        recovered.cell_centres,
+        recovered.cell_object,
+        recovered.cell_values,
+        recovered.object_values,
+        recovered.emitter_id,
+        recovered.emitter_side,
+        recovered.emitter_radiance,
+        recovered.environment,
+        front,
+        back,
+        np.asarray(up, np.float64) if up else up_axis(poses),
+    )
+
+
+def _maps(job: Job, capture: CaptureReader) -> None:
+    """One EXR a view with everything; material channels half, radiance float, ids UINT."""
+    for done, view in enumerate(capture.views):
+        file = f"maps/{view.name}.exr"
+        rendered = job.read("render").exr(file)
+        channels = {**split_rgb(rgb(rendered)), **split_rgb(rgb(rendered, "emission"), "emission")}
+        if job.read("affines").has(file):
+            fitted = job.read("affines").exr(file)
+            channels |= split_rgb(rgb(fitted, "albedo"), "albedo", np.float16)
+            channels |= {name: fitted[name].astype(np.float16) for name in ("roughness", "metallic", "uncertainty")}
+        if job.read("segmentation").has(file):
+            channels["instance.id"] = job.read("segmentation").exr(file)["object.id"]
+        else:
+            channels["instance.id"] = ids_to_disk(np.full((view.height, view.width), -1))
+        job.writer.exr(file, channels, "relative")
+        job.progress(done + 1, len(capture.views), "views written")
+
+
+def _emitter_table(job: Job, recovered: Recovered) -> None:
+    """The emitters of stage emission with the light scale of the fit, so that they go with the published albedo."""
+    table = dict(job.read("emission").table("emitters.parquet"))
+    for name in [n for n in table if n.startswith(("radiance_", "error_"))]:
+        table[name] = (table[name] * recovered.light_scale).astype(np.float32)
+    job.writer.table("emitters.parquet", table, {"area_m2": "m^2", "radiance_r": "relative"})

@@ -1,0 +1,101 @@
+"""publish: the deliverable scenes/<scene>/, made of links to what the stages wrote. Tiny on purpose: it runs last and once."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from workflow.artifacts.files import sha256_of, write_json, write_parquet
+from workflow.artifacts.store import StageReader
+from workflow.job import Job, library_versions
+from workflow.timings import read_timings
+
+SCHEMA = "iif.scene/1"
+TIMING_COLUMNS: dict[str, Any] = {
+    "rule": object,
+    "wildcards": object,
+    "seconds": np.float64,
+    "cpu_seconds": np.float64,
+    "max_rss_mb": np.float64,
+    "threads": np.int32,
+}
+
+
+def run(job: Job) -> None:
+    """Build `scenes/.<scene>.tmp`, then rename it to `scenes/<scene>`: the folder is complete or not there.
+
+    Every upstream stage is opened first, so a stage that was built under other settings or code stops here.
+    """
+    readers = {stage: job.read(stage) for stage in job.stage.upstream}
+    target = Path("scenes") / job.scene
+    temporary = target.with_name(f".{job.scene}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        files = _build(job, readers, temporary)
+        _replace(temporary, target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    job.writer.json("published.json", {"files": {name: facts["sha256"] for name, facts in files.items()}})
+    job.log.info("%s: %d files, %.1f MB", target, len(files), sum(f["bytes"] for f in files.values()) / 1e6)
+
+
+def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[str, dict[str, Any]]:
+    """Fill the folder, its manifest last; returns the files of the manifest."""
+    temporary.mkdir(parents=True)
+    for stage, name in deliverables(readers):
+        place(readers[stage].path(name), temporary / name)
+    timings = read_timings(job.scene)
+    columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
+    write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCHEMA})
+    files = {}
+    for path in sorted(p for p in temporary.rglob("*") if p.is_file()):
+        files[path.relative_to(temporary).as_posix()] = {"sha256": sha256_of(path), "bytes": path.stat().st_size}
+    write_json(temporary / "manifest.json", _manifest(job, files))
+    return files
+
+
+def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
+    """(stage, file) of everything that is published under its own name; taken from manifests, never from a folder."""
+    export = readers["export"]
+    chosen = [("export", name) for name in export.names() if name != "export.json"]
+    chosen += [("report", "report.html"), ("report", "plan.yaml"), ("metrics", "metrics.parquet")]
+    chosen += [("affines", "objects.parquet")]
+    if readers["affines"].has("camera_response.parquet"):
+        chosen.append(("affines", "camera_response.parquet"))
+    return chosen
+
+
+def place(source: Path, destination: Path) -> None:
+    """Hard link, or a copy where the file system has none."""
+    destination.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, destination)
+    except OSError:
+        shutil.copyfile(source, destination)
+
+
+def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "scene": job.scene,
+        "quality": job.quality,
+        "fingerprint": job.fingerprint,
+        "fingerprints": {stage: job.read(stage).fingerprint for stage in job.stage.upstream},
+        "settings": job.document,
+        "versions": library_versions(),
+        "files": files,
+    }
+
+
+def _replace(temporary: Path, target: Path) -> None:
+    """Rename into place; Snakemake has usually removed the old folder, but not when the stage is run by hand."""
+    old = target.with_name(f".{target.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if target.exists():
+        os.rename(target, old)
+    os.rename(temporary, target)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,307 @@
+"""report: one page that a person can judge the result from, and the plan of the scene."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import yaml
+
+from iif_core import color
+from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.job import Job
+from workflow.normal_form import CaptureReader, View
+from workflow.recovered import Recovered, read_recovered, response_samples
+from workflow.report import pictures as pic
+from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
+from workflow.stages.metrics import material_maps, prediction_numbers
+from workflow.timings import read_timings
+
+PLAN_KEYS = ("component", "included", "measure", "value", "threshold", "reason")
+ERROR_RANGE = 0.25
+UNCERTAINTY_RANGE = 0.2
+CHANNEL_COLOURS = ("#c33", "#292", "#34c")
+
+
+def run(job: Job) -> None:
+    """Write report.html and plan.yaml."""
+    capture = CaptureReader(job.read("capture"))
+    recovered = read_recovered(job)
+    summary = job.read("metrics").json("summary.json")
+    plan = collect_plan(job)
+    job.writer.bytes("plan.yaml", plan_text(job, plan).encode())
+    response_svg, response_note = _response(job, capture)
+    emission = _document(job, "emission", "emission.json")
+    page = Page(
+        scene=job.scene,
+        credit=job.settings.report.credit or str(capture.facts.get("credit", "")),
+        headline=_headline(summary, capture),
+        facts=_facts(job, capture, recovered),
+        notes=[str(note) for note in capture.facts.get("notes", [])] + [str(n) for n in emission.get("notes", [])],
+        plan=plan,
+        tables=_tables(summary),
+        views=_views(job, capture, recovered),
+        emitters=_emitters(job, recovered),
+        emitter_note=_emitter_note(capture, recovered),
+        response_svg=response_svg,
+        response_note=response_note,
+        timings=read_timings(job.scene),
+        versions=sorted(job.read("export").manifest.get("versions", {}).items()),
+    )
+    job.writer.bytes("report.html", render_page(page).encode())
+
+
+# ------------------------------------------------------------------------------------------------------------------- plan
+
+
+def collect_plan(job: Job) -> list[dict[str, Any]]:
+    """Plan items that the stages left under `plan` in their JSON documents, in workflow order, with the stage's name."""
+    items = []
+    for stage in job.stage.upstream:
+        reader = job.read(stage)
+        for name in reader.names():
+            if "/" in name or not name.endswith(".json"):
+                continue
+            document = reader.json(name)
+            found = document.get("plan", []) if isinstance(document, dict) else []
+            for item in found if isinstance(found, list) else []:
+                items.append({**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage})
+    return items
+
+
+def plan_text(job: Job, plan: list[dict[str, Any]]) -> str:
+    """plan.yaml: what the scene was found to require, what was left out, and the measured reason for each."""
+    document = {"scene": job.scene, "quality": job.quality, "components": plan}
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+
+
+# ------------------------------------------------------------------------------------------------------------------- text
+
+
+def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
+    reader = job.read(stage)
+    return reader.json(name) if reader.has(name) else {}
+
+
+def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
+    means = summary["means"].get("result", {})
+    psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
+    text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
+    gains = summary.get("gain_over_raw_predictions", {})
+    parts = [f"{q} {g['raw']['psnr_db']:+.1f} dB" for q, g in gains.items() if "raw" in g]
+    if parts:
+        text += f" Against ground truth, compared with the raw predictions: {', '.join(parts)}."
+    elif not capture.has_truth:
+        text += " There is no ground truth for this scene: materials are judged by re-rendering alone."
+    return text.strip()
+
+
+def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple[str, str]]:
+    first = capture.views[0]
+    sizes = sorted({(v.width, v.height) for v in capture.views})
+    exposures = np.array([v.exposure for v in capture.views])
+    stops = np.log2(exposures.max() / exposures.min()) if exposures.min() > 0 else 0.0
+    held_out = sum(v.split == "test" for v in capture.views)
+    extent = np.ptp(recovered.vertices, axis=0)
+    prior = job.read("prior").manifest.get("settings", {}).get("prior", {})
+    size = f"{first.width} x {first.height}" if len(sizes) == 1 else f"{len(sizes)} sizes, first {first.width} x {first.height}"
+    facts = [
+        ("quality", job.quality),
+        ("source", str(capture.facts.get("source", ""))),
+        ("photographs", f"{len(capture.views)} of {size} pixels, {capture.facts['dynamic_range'].upper()}"),
+        ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
+        ("mesh", f"{len(recovered.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
+        ("objects", str(len(recovered.object_names))),
+        ("surface cells", f"{len(recovered.cell_ijk)} of {1000 * recovered.cell_edge:.1f} mm"),
+        ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
+    ]
+    if held_out:
+        facts.insert(3, ("held out", f"{held_out} photographs were not used"))
+    return facts
+
+
+def _tables(summary: dict[str, Any]) -> list[Table]:
+    means = summary["means"]
+    materials = [("albedo", "raw", m) for m in ("l2", "psnr", "ssim", "flip")]
+    materials += [("albedo", "scaled", m) for m in ("l2", "psnr", "ssim")]
+    materials += [(q, "raw", m) for q in ("roughness", "metallic") for m in ("l2", "psnr", "ssim")]
+    oracle = [(q, "oracle_affine", m) for q in ("albedo", "roughness", "metallic") for m in ("l2", "psnr", "ssim")]
+    light = [("rgb", "raw", m) for m in ("l2", "psnr", "ssim", "flip", "log_l2")] + [("rgb", "scaled", "log_l2")]
+    light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [("emission", "scaled", m) for m in ("l2", "log_l2")]
+    tables = [
+        score_table(
+            "Materials against ground truth, mean over the views",
+            means,
+            materials,
+            "Linear values. Emitters, pixels without meaningful truth and (albedo) mirrors are left out, by the truth."
+            " scaled = one gain per image and channel.",
+        ),
+        score_table("Light and re-rendering", means, light, "rgb: sensor values; its log L2: radiance, where known."),
+        score_table(
+            "With the best affine per image and object (an oracle)",
+            means,
+            oracle,
+            "Every variant may use the truth to correct each object: what remains is error inside objects. Not a result.",
+        ),
+    ]
+    return [table for table in tables if table]
+
+
+# ------------------------------------------------------------------------------------------------------------------ views
+
+
+def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewRows]:
+    count = min(job.settings.report.views, len(capture.views))
+    chosen = np.unique(np.linspace(0, len(capture.views) - 1, count).round().astype(int))
+    emission_exposure = 0.8 / max(float(recovered.emitter_radiance.max(initial=0)), 1e-6)
+    rows = []
+    for done, i in enumerate(chosen):
+        rows.append(_view(job, capture, recovered, capture.views[i], emission_exposure))
+        job.progress(done + 1, len(chosen), "views drawn")
+    return rows
+
+
+def _view(job: Job, capture: CaptureReader, recovered: Recovered, view: View, emission_exposure: float) -> ViewRows:
+    file = f"maps/{view.name}.exr"
+    photo, valid = capture.photo(view)
+    depth, face_id = capture.gbuffer(view)
+    hit = face_id >= 0
+    rendered = job.read("render").exr(file)
+    sensor = np.clip(view.exposure * photo, 0, 1) if capture.is_hdr else photo
+    show = (lambda image: pic.linear(image)) if capture.is_hdr else pic.encoded
+
+    def tile(title: str, image: np.ndarray, note: str = "", lossless: bool = False) -> Picture:
+        return Picture(title, pic.data_uri(image, lossless), note)
+
+    def materials(maps: dict[str, np.ndarray]) -> list[Picture | None]:
+        return [
+            tile("albedo", pic.linear(maps["albedo"])),
+            tile("roughness", pic.grey(maps["roughness"])),
+            tile("metallic", pic.grey(maps["metallic"])),
+        ]
+
+    strips = []
+    gaps: list[Picture | None] = [None, None, None]
+    result = material_maps(job.read("affines").exr(file)) if job.read("affines").has(file) else None
+    strips.append(
+        Strip(
+            "result",
+            [
+                tile("re-rendering", show(rgb(rendered, "ldr"))),
+                *(materials(result) if result else gaps),
+                tile("emission", pic.linear(rgb(rendered, "emission"), emission_exposure)),
+                tile(
+                    "re-rendering error",
+                    pic.difference(rgb(rendered, "ldr"), sensor, valid & hit),
+                    f"0 (dark) to {ERROR_RANGE} in sensor units",
+                ),
+            ],
+        )
+    )
+    photograph = tile("photograph", show(sensor))
+    if capture.has_truth:
+        truth = capture.truth(view)
+        maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
+        emission = tile("emission", pic.linear(truth.emission, emission_exposure), "same exposure as the result's")
+        error = None
+        if result:
+            picture = pic.difference(result["albedo"], truth.albedo, truth.valid & hit & ~(truth.emission > 0).any(-1))
+            error = tile("albedo error", picture, f"0 to {ERROR_RANGE}, linear")
+        strips.append(Strip("truth", [photograph, *materials(maps), emission, error]))
+    if job.read("prior").has(file):
+        channels = job.read("prior").exr(file)
+        numbers = prediction_numbers(channels)
+        if numbers:
+            first = materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
+            spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
+            disagreement = tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
+            start = None if capture.has_truth else photograph
+            strips.append(Strip("raw prediction", [start, *first, disagreement, None]))
+    strips.append(Strip("checks", _checks(job, view, file, sensor, depth, valid & hit, tile)))
+    captions = [f"{view.width} x {view.height}", f"exposure {view.exposure:.3g}"]
+    if view.split == "test":
+        captions.append("held out: not used in the reconstruction")
+    return ViewRows(view.name, ", ".join(captions), strips)
+
+
+def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> list[Picture | None]:
+    """Alignment, objects, selected prediction, uncertainty and base texture of a view, as far as they exist."""
+    out: list[Picture | None] = []
+    if job.read("segmentation").has(file):
+        channels = job.read("segmentation").exr(file)
+        object_id, segment_id = ids_from_disk(channels["object.id"]), ids_from_disk(channels["segment.id"])
+        out.append(tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
+        out.append(tile("objects", pic.ids(object_id), lossless=True))
+        table = job.read("base").table("selection.parquet")
+        k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
+        out.append(tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
+    if job.read("affines").has(file):
+        uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
+        note = f"of the albedo, 0 to {UNCERTAINTY_RANGE}"
+        out.append(tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
+    if job.read("base").has(file):
+        out.append(tile("base albedo", pic.linear(rgb(job.read("base").exr(file), "albedo")), "before the fit"))
+    return out[:6]
+
+
+# -------------------------------------------------------------------------------------------------- emitters and response
+
+
+def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
+    table = job.read("export").table("emitters.parquet")
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float64)
+    error = np.stack([table[f"error_{c}"] for c in "rgb"], 1).astype(np.float64)
+    kept = table["kept"].astype(bool)
+    sides = np.where(table["side"] == 0, 2.0, 1.0)
+    area = table["kind"] == "area"
+    power = np.where(kept & area, table["area_m2"] * sides, 0) * radiance.sum(1)
+    rows = []
+    for i in np.argsort(-power, kind="stable"):
+        peak = radiance[i].max()
+        swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
+        share = f"{100 * power[i] / power.sum():.1f} %" if area[i] and power.sum() > 0 else "–"
+        rows.append(
+            {
+                "id": int(table["emitter_id"][i]),
+                "kind": str(table["kind"][i]),
+                "faces": int(table["faces"][i]),
+                "area": float(table["area_m2"][i]),
+                "radiance": ", ".join(f"{v:.3g}" for v in radiance[i]),
+                "error": ", ".join(f"{v:.2g}" for v in error[i]),
+                "swatch": "#{:02x}{:02x}{:02x}".format(*swatch),
+                "share": share,
+                "observations": int(table["observations"][i]),
+                "kept": bool(kept[i]),
+                "reason": str(table["reason"][i]),
+            }
+        )
+    return rows
+
+
+def _emitter_note(capture: CaptureReader, recovered: Recovered) -> str:
+    text = "Radiance in the units of the photographs' exposure."
+    if not capture.is_hdr:
+        text += " LDR photographs leave one factor between light and albedo open; it was fixed by the prior's mean albedo."
+    if recovered.light_scale != 1:
+        text += f" Light was multiplied by {recovered.light_scale:.3g} for that."
+    return text
+
+
+def _response(job: Job, capture: CaptureReader) -> tuple[str, str]:
+    reader = job.read("affines")
+    if capture.is_hdr or not reader.has("camera_response.parquet"):
+        return "", ""
+    x, curves = response_samples(reader.table("camera_response.parquet"))
+    if not len(x):
+        return "", ""
+    drawn = [(x, curve, colour, False) for curve, colour in zip(curves, CHANNEL_COLOURS, strict=True)]
+    note = "Sensor value over exposed radiance, red, green and blue, as fitted."
+    truth = capture.facts.get("response_truth")
+    if truth is not None:
+        truth = np.asarray(truth, np.float64)
+        grid = np.linspace(0, 1, truth.shape[1])
+        drawn += [(grid, curve, colour, True) for curve, colour in zip(truth, CHANNEL_COLOURS, strict=True)]
+        fitted = np.stack([np.interp(grid, x, curve) for curve in curves])
+        rms = float(np.sqrt(np.mean((fitted - truth) ** 2)))
+        note += f" Dashed: what the camera did; difference {rms:.4f} (root mean square, sensor units)."
+    return pic.curves_svg(drawn), note

@@ -1,0 +1,46 @@
+"""Time and memory of the jobs of a scene, from the benchmark files that Snakemake leaves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from workflow.registry import STAGES
+
+
+def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
+    """One row a job: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads (0 = not recorded), in workflow order.
+
+    Of a job that ran several times the last line of `results/<scene>/benchmarks/<rule>.jsonl` counts; a rule without a
+    readable file (run without Snakemake, or not yet finished) has no row. Jobs of less than half a second have no CPU time or
+    memory ("NA"): 0.
+    """
+    rows = []
+    for stage in STAGES:
+        path = root / "results" / scene / "benchmarks" / f"{stage}.jsonl"
+        try:
+            lines = [line for line in path.read_text().splitlines() if line.strip()]
+            facts = json.loads(lines[-1])
+            seconds = float(facts["s"])
+        except (OSError, ValueError, KeyError, IndexError):
+            continue
+        rows.append(
+            {
+                "rule": stage,
+                "wildcards": f"scene={scene}",
+                "seconds": seconds,
+                "cpu_seconds": _number(facts.get("cpu_time")),
+                "max_rss_mb": _number(facts.get("max_rss")),
+                "threads": int(_number(facts.get("threads"))),
+            }
+        )
+    return rows
+
+
+def _number(value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return 0.0
+    return number if number == number else 0.0
