@@ -222,7 +222,7 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
 class _Block:
     """The usable pixels of one view in segment order, and the range of each segment."""
 
-    phi: NDArray  # (n, K, 6) float32: albedo, roughness, metallic, 1
+    phi: NDArray  # (n, K, 6) float64: albedo, roughness, metallic, 1
     cell: NDArray  # (n,) intp
     weight: NDArray  # (n,) float64
     segments: NDArray  # (s,)
@@ -245,21 +245,17 @@ def _block(problem: BaseProblem, view: int, usable: NDArray | None = None) -> tu
     lost = int((keep & ~finite).sum())
     keep = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
     keep = keep[np.argsort(segment[keep], kind="stable")]
-    phi = np.ones((len(keep), len(maps), 6), np.float32)
+    phi = np.ones((len(keep), len(maps), 6))
     phi[..., :5] = maps[:, keep].swapaxes(0, 1)
     phi[:, ~usable, :5] = 0  # weight 0, but NaN x 0 is NaN
     segments, start = np.unique(segment[keep], return_index=True)
     return _Block(phi, cell[keep], weight[keep], segments, np.r_[start, len(keep)].astype(np.intp)), usable, lost
 
 
-def _unclipped(phi: NDArray, options: BaseOptions) -> NDArray | None:
-    """(m, K) pixels whose albedo is inside (0, 1), for predictions where leaving the others out is possible."""
-    inside = ((phi[..., :3] > 0) & (phi[..., :3] < 1)).all(-1)
-    if inside.all():
-        return None
-    remain = inside.sum(0)
-    possible = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * len(phi))
-    return inside | ~possible
+def _inside(phi: NDArray) -> NDArray:
+    """(m, K) pixels whose albedo is inside (0, 1)."""
+    colour = phi[..., :3]
+    return (colour.min(-1) > 0) & (colour.max(-1) < 1)
 
 
 # ------------------------------------------------------------------------------------------------------------ sums
@@ -273,8 +269,9 @@ class _Sums:
         self.gram = np.zeros((n_segments, k, 6, 6))  # all pixels
         self.fit = np.zeros((n_segments, k, 4, 4))  # albedo without clipped pixels
         self.usable = np.zeros((n_segments, k), bool)
+        self.clipped = np.zeros((n_segments, k), bool)  # predictions that are fitted without their clipped pixels
 
-    def add(self, segment: int, phi: NDArray, weight: NDArray, usable: NDArray, unclipped: NDArray | None) -> None:
+    def add(self, segment: int, phi: NDArray, weight: NDArray, usable: NDArray, options: BaseOptions) -> None:
         if self.weight[segment] > 0:
             raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
         by_k = np.ascontiguousarray(phi.transpose(1, 0, 2))  # (K, m, 6) float64
@@ -282,9 +279,13 @@ class _Sums:
         self.usable[segment] = usable
         self.gram[segment] = (by_k * weight[:, None]).swapaxes(1, 2) @ by_k
         self.fit[segment] = self.gram[segment][:, _ALBEDO][:, :, _ALBEDO]
-        if unclipped is not None:
-            a = by_k[..., _ALBEDO] * unclipped.T[..., None]
-            self.fit[segment] = (a * weight[:, None]).swapaxes(1, 2) @ a
+        inside = _inside(phi).T  # (K, m)
+        remain = inside.sum(1)
+        enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * len(phi))
+        self.clipped[segment] = usable & enough & (remain < len(phi))
+        for k in np.flatnonzero(self.clipped[segment]):
+            a = by_k[k][inside[k]][:, _ALBEDO]
+            self.fit[segment, k] = (a * weight[inside[k], None]).T @ a
 
     def invert(self, options: BaseOptions) -> None:
         self.ridge = options.ridge * np.maximum(self.weight, options.ridge_pixels)
@@ -335,13 +336,13 @@ def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
         for view in range(n_views):
             block, _, _ = _block(problem, view, usable[view])
             for segment, rows in block.ranges():
-                phi = block.phi[rows].astype(np.float64)
+                phi = block.phi[rows]
                 weight, t = block.weight[rows], texture[block.cell[rows]]
-                weighted = phi * weight[:, None, None]
-                cross = (weighted.reshape(len(phi), -1).T @ t).reshape(k, 6, 5)
+                weighted = weight[:, None] * t
+                cross = (phi.reshape(len(phi), -1).T @ weighted).reshape(k, 6, 5)
                 if not means:
-                    affine[segment] = _fit(sums, segment, phi, weighted, cross, t, options)
-                error[segment] = _errors(sums, segment, affine[segment], cross, (weight[:, None] * t * t).sum(0))
+                    affine[segment] = _fit(sums, segment, phi, cross, weighted)
+                error[segment] = _errors(sums, segment, affine[segment], cross, (weighted * t).sum(0))
                 if options.variant == "full":
                     alpha[segment] = selection_weights(error[segment].T, temperature, sums.usable[segment]).T
                 mixture = _mixture(phi, affine[segment], alpha[segment])
@@ -398,8 +399,8 @@ def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDAr
         if lost and usable.any():
             dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
         for segment, rows in block.ranges():
-            phi = block.phi[rows].astype(np.float64)
-            sums.add(segment, phi, block.weight[rows], usable, _unclipped(phi, options))
+            phi = block.phi[rows]
+            sums.add(segment, phi, block.weight[rows], usable, options)
             if options.variant in ("texel_mean", "object_mean"):
                 start = phi[:, usable, :5].mean(1)
             else:
@@ -422,17 +423,15 @@ def _check_ids(problem: BaseProblem, view: int) -> None:
             raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
 
 
-def _fit(sums: _Sums, segment: int, phi: NDArray, weighted: NDArray, cross: NDArray, t: NDArray,
-         options: BaseOptions) -> NDArray:
-    """Corrections (K, 6, 5) of a segment: (G + lambda I)^-1 (phi' W t + lambda T_identity)."""
-    k = phi.shape[1]
+def _fit(sums: _Sums, segment: int, phi: NDArray, cross: NDArray, weighted: NDArray) -> NDArray:
+    """Corrections (K, 6, 5) of a segment: (G + lambda I)^-1 (phi' W t + lambda T_identity); `weighted` = W t."""
     ridge = sums.ridge[segment]
-    out = np.zeros((k, 6, 5))
+    out = np.zeros((phi.shape[1], 6, 5))
     albedo = cross[:, _ALBEDO, :3]
-    unclipped = _unclipped(phi, options)
-    if unclipped is not None:
-        inside = weighted[..., _ALBEDO] * unclipped[..., None]
-        albedo = (inside.reshape(len(phi), -1).T @ t[:, :3]).reshape(k, 4, 3)
+    for k in np.flatnonzero(sums.clipped[segment]):
+        one = phi[:, k]
+        inside = (one[:, :3].min(1) > 0) & (one[:, :3].max(1) < 1)
+        albedo[k] = one[inside][:, _ALBEDO].T @ weighted[inside, :3]
     out[:, _ALBEDO, :3] = sums.inverse_albedo[segment] @ (albedo + ridge * np.eye(4, 3))
     for rows, inverse, channel in ((_ROUGHNESS, sums.inverse_roughness, 3), (_METALLIC, sums.inverse_metallic, 4)):
         right = cross[:, rows, channel] + ridge * np.array([1.0, 0.0])
@@ -442,8 +441,7 @@ def _fit(sums: _Sums, segment: int, phi: NDArray, weighted: NDArray, cross: NDAr
 
 def _errors(sums: _Sums, segment: int, affine: NDArray, cross: NDArray, square: NDArray) -> NDArray:
     """(K, 3) mean squared error per property of phi T - t from sums: (T' G T - 2 T' c + t't) / weight."""
-    quadratic = np.einsum("kic,kij,kjc->kc", affine, sums.gram[segment], affine, optimize=True)
-    by_channel = quadratic - 2 * np.einsum("kic,kic->kc", affine, cross) + square
+    by_channel = (affine * (sums.gram[segment] @ affine - 2 * cross)).sum(1) + square
     by_channel = np.maximum(by_channel / sums.weight[segment], 0)
     return np.stack([by_channel[:, :3].mean(1), by_channel[:, 3], by_channel[:, 4]], 1)
 
@@ -451,9 +449,10 @@ def _errors(sums: _Sums, segment: int, affine: NDArray, cross: NDArray, square: 
 def _mixture(phi: NDArray, affine: NDArray, alpha: NDArray) -> NDArray:
     """(m, 5) sum_k alpha_k T_k v_k."""
     blended = affine * alpha[:, None, _PROPERTY_OF_CHANNEL]
-    # predictions nobody chose need no product: after the last sweep that is all but one
     active = np.flatnonzero((alpha > 0).any(1))
-    return phi[:, active].reshape(len(phi), -1) @ blended[active].reshape(-1, 5)
+    if 2 * len(active) <= len(alpha):  # after the last sweep all but one
+        phi, blended = phi[:, active], blended[active]
+    return phi.reshape(len(phi), -1) @ blended.reshape(-1, 5)
 
 
 class _CellSums:
@@ -523,9 +522,9 @@ def _scales(problem: BaseProblem, options: BaseOptions, texture: NDArray, affine
         for segment, rows in block.ranges():
             phi = block.phi[rows]
             cell, weight = block.cell[rows], block.weight[rows]
-            t = affine[segment][use].astype(np.float32)
-            corrected = np.clip(np.matmul(phi[:, use].swapaxes(0, 1), t), LOWEST, 1)  # (K, m, 5)
-            mixture = np.clip(_mixture(phi.astype(np.float64), affine[segment], alpha[segment]), LOWEST, 1)
+            by_k = phi[:, use].astype(np.float32).swapaxes(0, 1)
+            corrected = np.clip(by_k @ affine[segment][use].astype(np.float32), LOWEST, 1)  # (K, m, 5)
+            mixture = np.clip(_mixture(phi, affine[segment], alpha[segment]), LOWEST, 1)
             b_ref = laplace.reference_scale(mixture.astype(np.float32), corrected, options.scale_floor)
             part = laplace.scale_contribution(mixture - texture[cell], b_ref, options.scale_floor)
             np.add.at(total, cell, weight)

@@ -3,8 +3,9 @@
     f cos = k_d NoL / pi + (k_s + (1 - k_s) F_c) * spec          spec = D G NoL / (4 NoL NoV)
     k_d = (1 - m) a      k_s = 0.04 (1 - m) + m a      F_c = (1 - VoH)^5
 
-Every formula is in the form that stays exact in float32 down to r = 0.02 (METHOD sections 3.1, 3.2, 3.4). `xp` is a
-namespace of `iif_core.xp`; vectors are sequences (x, y, z) of arrays. All functions are elementwise and broadcast.
+Every formula is in the form that stays exact in float32 down to r = 0.02 (METHOD sections 3.1, 3.2, 3.4).
+`xp` is a namespace of `iif_core.xp`; vectors are sequences (x, y, z) of arrays. All functions are elementwise
+and broadcast.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def dot(u: _XYZ, v: _XYZ) -> Any:
 def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, Any, Any, Any, Any]:
     """(NoL, NoV, NoH, VoH, sin2_h) of unit vectors: clamped cosines and sin2_h = |n x h|^2.
 
-    h = (wi + wo) / max(|wi + wo|, 1e-8), so opposite directions give finite values (METHOD H19); sin2_h is taken
-    from the cross product because 1 - NoH^2 has no digits left near the peak (METHOD 3.4).
+    h = (wi + wo) / max(|wi + wo|, 1e-8), so opposite directions give finite values (METHOD H19); sin2_h is
+    taken from the cross product because 1 - NoH^2 has no digits left near the peak (METHOD 3.4).
     """
     hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
     scale = 1 / xp.maximum(xp.sqrt(hx * hx + hy * hy + hz * hz), 1e-8)
@@ -56,15 +57,21 @@ def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, A
     cx = normal[1] * h[2] - normal[2] * h[1]
     cy = normal[2] * h[0] - normal[0] * h[2]
     cz = normal[0] * h[1] - normal[1] * h[0]
-    return (xp.maximum(dot(normal, wi), 0), xp.maximum(dot(normal, wo), 0), xp.maximum(dot(normal, h), 0),
-            xp.maximum(dot(wo, h), 0), cx * cx + cy * cy + cz * cz)
+    return (
+        xp.maximum(dot(normal, wi), 0),
+        xp.maximum(dot(normal, wo), 0),
+        xp.maximum(dot(normal, h), 0),
+        xp.maximum(dot(wo, h), 0),
+        cx * cx + cy * cy + cz * cz,
+    )
 
 
 def normal_distribution(xp: Namespace, NoH: Any, sin2_h: Any, r: Any) -> Any:
-    """GGX normal distribution D, 1/sr, in the stable form alpha^2 / (pi (alpha^2 NoH^2 + sin2_h)^2), alpha = r^2.
+    """GGX normal distribution D, 1/sr, in the stable form alpha^2 / (pi (alpha^2 NoH^2 + sin2_h)^2), alpha =
+    r^2.
 
-    r is clamped to [R_MIN, inf). The bracket is at least alpha^2 for any real angle; it is held there, so that opposite
-    directions (h = 0) stay finite. Source: METHOD 3.4.
+    r is clamped to [R_MIN, inf). The bracket is at least alpha^2 for any real angle; it is held there, so
+    that opposite directions (h = 0) stay finite. Source: METHOD 3.4.
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
@@ -90,7 +97,8 @@ def lobes(xp: Namespace, NoL: Any, NoV: Any, NoH: Any, VoH: Any, sin2_h: Any, r:
 
 
 def specular_pdf(xp: Namespace, NoH: Any, VoH: Any, sin2_h: Any, r: Any) -> Any:
-    """Density (1/sr) of wi when h is drawn by `sample_ggx_half` and wi = reflect(wo, h): D NoH / (4 max(VoH, 1e-4)).
+    """Density (1/sr) of wi when h is drawn by `sample_ggx_half` and wi = reflect(wo, h): D NoH / (4 max(VoH,
+    1e-4)).
 
     Source: METHOD 3.2.
     """
@@ -103,7 +111,8 @@ def mixture_pdf(xp: Namespace, NoL: Any, NoH: Any, VoH: Any, sin2_h: Any, r: Any
 
 
 def sample_cosine(xp: Namespace, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
-    """Local direction (z = normal) with density cos / pi from uniforms in [0, 1): theta = asin sqrt(u1), phi = 2 pi u2."""
+    """Local direction (z = normal) with density cos / pi from uniforms in [0, 1): theta = asin sqrt(u1), phi
+    = 2 pi u2."""
     sine, phi = xp.sqrt(u1), 2 * xp.pi * u2
     return sine * xp.cos(phi), sine * xp.sin(phi), xp.sqrt(xp.maximum(1 - u1, 0))
 
@@ -111,8 +120,8 @@ def sample_cosine(xp: Namespace, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
 def sample_ggx_half(xp: Namespace, u1: Any, u2: Any, r: Any) -> tuple[Any, Any, Any]:
     """Local half vector with density D NoH from uniforms in [0, 1).
 
-    tan^2 theta_h = alpha^2 u1 / (1 - u1), alpha = r^2; sine and cosine are formed separately so that neither loses digits
-    at small alpha (METHOD 3.2, 3.4). r below R_MIN is clamped.
+    tan^2 theta_h = alpha^2 u1 / (1 - u1), alpha = r^2; sine and cosine are formed separately so that neither
+    loses digits at small alpha (METHOD 3.2, 3.4). r below R_MIN is clamped.
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
@@ -123,6 +132,7 @@ def sample_ggx_half(xp: Namespace, u1: Any, u2: Any, r: Any) -> tuple[Any, Any, 
 
 
 def reflect(wo: _XYZ, h: _XYZ) -> tuple[Any, Any, Any]:
-    """wi = 2 (wo . h) h - wo, the mirror image of wo about h; it may lie below the surface (its weight is then 0)."""
+    """wi = 2 (wo . h) h - wo, the mirror image of wo about h; it may lie below the surface (its weight is
+    then 0)."""
     twice = 2 * dot(wo, h)
     return twice * h[0] - wo[0], twice * h[1] - wo[1], twice * h[2] - wo[2]

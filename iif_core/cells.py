@@ -30,8 +30,8 @@ _PROBE_STRIDE = 0x9E3779B9
 def grid_origin(points: ArrayLike, edge: float) -> Array:
     """Lower corner (3,) float32 for a voxel grid around `points` (n, 3), so that every index is >= 1.
 
-    Lies an irrational part of an edge below the minimum: walls at round coordinates then do not coincide with voxel faces,
-    where rounding would scatter one wall over two layers of voxels.
+    Lies an irrational part of an edge below the minimum: walls at round coordinates then do not coincide with
+    voxel faces, where rounding would scatter one wall over two layers of voxels.
     """
     points = np.asarray(points, np.float64)
     if points.size == 0 or not np.isfinite(points).all():
@@ -52,7 +52,9 @@ def voxel_indices(points: ArrayLike, edge: float, origin: ArrayLike) -> Array:
         raise InputError("voxel_indices: points contain NaN or infinity; drop rays that miss the mesh first")
     scaled = np.floor((points - np.asarray(origin, np.float32)) * inverse_edge(edge))
     if scaled.size and np.abs(scaled).max() > 2**31 - 256:
-        raise InputError(f"voxel edge {edge} m is too small for points {np.abs(points).max()} m from the origin")
+        raise InputError(
+            f"voxel edge {edge} m is too small for points {np.abs(points).max()} m from the origin"
+        )
     return scaled.astype(np.int32)
 
 
@@ -69,10 +71,15 @@ def pack_keys(ijk: ArrayLike, object_id: ArrayLike = -1) -> Array:
     ijk = np.asarray(ijk).reshape(-1, 3).astype(np.int64)
     objects = np.broadcast_to(np.asarray(object_id, np.int64), (len(ijk),)) + 1
     if ijk.size and (ijk.min() < 0 or ijk.max() >= INDEX_LIMIT):
-        raise InputError(f"voxel indices span {ijk.min()} ... {ijk.max()}, allowed are 0 ... {INDEX_LIMIT - 1}: "
-                         "use a larger cell edge or `grid_origin`")
+        raise InputError(
+            f"voxel indices span {ijk.min()} ... {ijk.max()}, allowed are 0 ... {INDEX_LIMIT - 1}: "
+            "use a larger cell edge or `grid_origin`"
+        )
     if objects.size and (objects.min() < 0 or objects.max() >= INDEX_LIMIT):
-        raise InputError(f"object ids span {objects.min() - 1} ... {objects.max() - 1}, allowed are -1 ... {INDEX_LIMIT - 2}")
+        raise InputError(
+            f"object ids span {objects.min() - 1} ... {objects.max() - 1}, "
+            f"allowed are -1 ... {INDEX_LIMIT - 2}"
+        )
     i, j, k, o = (part.astype(np.uint64) for part in (*ijk.T, objects))
     return i | (j << np.uint64(16)) | (k << np.uint64(32)) | (o << np.uint64(48))
 
@@ -85,7 +92,8 @@ def unpack_keys(keys: ArrayLike) -> tuple[Array, Array]:
 
 
 def hash_words(low, high):
-    """32-bit hash of a key's two words; only wrapping 32-bit multiplies, xors and shifts, for NumPy and Dr.Jit uint32 alike."""
+    """32-bit hash of a key's two words; only wrapping 32-bit multiplies, xors and shifts, for NumPy and
+    Dr.Jit uint32 alike."""
     h = (low * 0x85EBCA6B) ^ (high * 0xC2B2AE35)
     h = (h ^ (h >> 15)) * 0x2C1B3C6D
     h = (h ^ (h >> 12)) * 0x297A2D39
@@ -101,8 +109,9 @@ def probe_step(h):
 class CellTable:
     """Open-addressing hash table from 64-bit keys to row indices, read with at most `probes` <= 8 looks.
 
-    `slots` is (size, 4) uint32: low word, high word, row (0xFFFFFFFF = empty), 0; size is a power of two. Probe p of a key
-    looks at (hash + p * step) mod size; an empty slot ends the search, since no later slot can hold the key.
+    `slots` is (size, 4) uint32: low word, high word, row (0xFFFFFFFF = empty), 0; size is a power of two.
+    Probe p of a key looks at (hash + p * step) mod size; an empty slot ends the search, since no later slot
+    can hold the key.
     """
 
     slots: Array
@@ -110,7 +119,8 @@ class CellTable:
 
     @classmethod
     def build(cls, keys: ArrayLike) -> CellTable:
-        """Table in which key number i maps to row i; deterministic, vectorised over keys. Keys must be distinct."""
+        """Table in which key number i maps to row i; deterministic, vectorised over keys. Keys must be
+        distinct."""
         keys = np.ascontiguousarray(np.asarray(keys, np.uint64).reshape(-1))
         if len(keys) >= 1 << 28:
             raise InputError(f"{len(keys)} cells; the table holds fewer than 2^28: use a larger cell edge")
@@ -123,7 +133,8 @@ class CellTable:
 
     @classmethod
     def _place(cls, keys: Array, size: int) -> CellTable | None:
-        """Rounds: every unplaced key asks for its next slot; the lowest row that asks for a free slot gets it."""
+        """Rounds: every unplaced key asks for its next slot; the lowest row that asks for a free slot gets
+        it."""
         low, high = _words(keys)
         h = hash_words(low, high)
         step = probe_step(h)

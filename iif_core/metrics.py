@@ -118,7 +118,9 @@ def ssim(prediction: Array, truth: Array, mask: Array) -> float:
     from skimage.metrics import structural_similarity
 
     if min(mask.shape) < SSIM_WINDOW:
-        raise InputError(f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way")
+        raise InputError(
+            f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way"
+        )
     inside = mask if mask.ndim == truth.ndim else mask[..., None]
     truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
     filled = np.where(inside, prediction, truth).astype(np.float32)
@@ -155,13 +157,17 @@ def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) ->
 
     truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
     filled = np.where(mask[..., None], np.clip(prediction, 0, 1), truth).astype(np.float32)
-    error, _, _ = evaluate(np.clip(truth, 0, 1), filled, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False)
+    error, _, _ = evaluate(
+        np.clip(truth, 0, 1), filled, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False
+    )
     return float(np.asarray(error)[..., 0][mask].mean(dtype=np.float64))
 
 
 def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
     """Mean squared error of log(1 + x), for radiance (negative values count as 0)."""
-    difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(np.maximum(truth[mask], 0))
+    difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(
+        np.maximum(truth[mask], 0)
+    )
     return float(np.mean(difference * difference))
 
 
@@ -187,7 +193,9 @@ def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1
     return np.clip(prediction * gain, 0, limit)
 
 
-def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
+def oracle_affine(
+    prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6
+) -> Array:
     """Prediction mapped by the affine of each object that is nearest to the truth: an upper bound, not a result.
 
     Least squares per image and object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's
@@ -285,7 +293,9 @@ _FUNCTIONS = {"l2": l2, "psnr": psnr, "ssim": ssim, "log_l2": log_l2, "iou": iou
 
 def _score(metric: str, protocol: str, image: Array, truth: Array, mask: Array, encoded: bool) -> Score:
     try:
-        value = flip(image, truth, mask, encoded) if metric == "flip" else _FUNCTIONS[metric](image, truth, mask)
+        value = (
+            flip(image, truth, mask, encoded) if metric == "flip" else _FUNCTIONS[metric](image, truth, mask)
+        )
     except InputError as error:
         return Score(metric, protocol, None, str(error))
     return Score(metric, protocol, float(value))

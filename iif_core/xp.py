@@ -1,7 +1,7 @@
 """One namespace for three array libraries, so that a formula is written once and tested across all of them.
 
-`NUMPY`, `DRJIT` and `TORCH` offer the same few elementwise functions; the two heavy ones are imported when first asked for.
-Comparisons and arithmetic are the operators of the arrays themselves.
+`NUMPY`, `DRJIT` and `TORCH` offer the same few elementwise functions; the two heavy ones are imported when
+first asked for. Comparisons and arithmetic are the operators of the arrays themselves.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Namespace:
-    """Elementwise functions of one array library; Python scalars are allowed beside arrays and never widen them."""
+    """Elementwise functions of one array library; Python scalars are allowed beside arrays and never widen
+    them."""
 
     name: str
     sqrt: Callable[[Any], Any]
@@ -33,15 +34,17 @@ class Namespace:
 
 
 def _numpy() -> Namespace:
-    return Namespace("numpy", np.sqrt, np.exp, np.log, np.abs, np.sin, np.cos, np.floor,
-                     np.maximum, np.minimum, np.where)
+    return Namespace(
+        "numpy", np.sqrt, np.exp, np.log, np.abs, np.sin, np.cos, np.floor, np.maximum, np.minimum, np.where
+    )
 
 
 def _drjit() -> Namespace:
     import drjit as dr
 
-    return Namespace("drjit", dr.sqrt, dr.exp, dr.log, dr.abs, dr.sin, dr.cos, dr.floor,
-                     dr.maximum, dr.minimum, dr.select)
+    return Namespace(
+        "drjit", dr.sqrt, dr.exp, dr.log, dr.abs, dr.sin, dr.cos, dr.floor, dr.maximum, dr.minimum, dr.select
+    )
 
 
 def _torch() -> Namespace:
@@ -52,12 +55,22 @@ def _torch() -> Namespace:
             if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
                 return of_tensors(a, b)
             return clamp_with(a, b) if isinstance(a, torch.Tensor) else clamp_with(b, a)
+
         return apply
 
-    return Namespace("torch", torch.sqrt, torch.exp, torch.log, torch.abs, torch.sin, torch.cos, torch.floor,
-                     extremum(torch.maximum, lambda tensor, scalar: torch.clamp(tensor, min=scalar)),
-                     extremum(torch.minimum, lambda tensor, scalar: torch.clamp(tensor, max=scalar)),
-                     torch.where)
+    return Namespace(
+        "torch",
+        torch.sqrt,
+        torch.exp,
+        torch.log,
+        torch.abs,
+        torch.sin,
+        torch.cos,
+        torch.floor,
+        extremum(torch.maximum, lambda tensor, scalar: torch.clamp(tensor, min=scalar)),
+        extremum(torch.minimum, lambda tensor, scalar: torch.clamp(tensor, max=scalar)),
+        torch.where,
+    )
 
 
 _MAKERS = {"NUMPY": _numpy, "DRJIT": _drjit, "TORCH": _torch}

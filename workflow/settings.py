@@ -146,6 +146,8 @@ class Segmentation(Section):
     """`geometry`: larger gives fewer, larger pieces."""
     min_faces: int = Field(100, ge=1)
     """`geometry`: smaller pieces are merged into a neighbour."""
+    colour: float = Field(0.1, ge=0)
+    """`geometry`: weight of the photographs' mean colour of a face beside the bend of the surface (0 = shape alone)."""
 
 
 class Base(Section):

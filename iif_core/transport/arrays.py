@@ -1,8 +1,8 @@
 """Moving arrays between NumPy and the device, and cutting work into lanes with a random stream each.
 
-A lane owns a few samples of one point and adds them up itself; the lanes of a point are added in a fixed order. How a
-point is cut depends on the number of samples alone, so its result does not depend on its neighbours, on the chunks or on
-the threads.
+A lane owns a few samples of one point and adds them up itself; the lanes of a point are added in a fixed
+order. How a point is cut depends on the number of samples alone, so its result does not depend on its
+neighbours, on the chunks or on the threads.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def vectors(kind: Any, rows: Array) -> Any:
 
 def to_numpy(value: Any) -> Array:
     """(n,) of a device scalar type, (n, width) of a device vector type."""
-    data = np.array(value)
+    data = value.numpy()
     return data if data.ndim == 1 else np.ascontiguousarray(data.T)
 
 
@@ -57,7 +57,8 @@ def rows_of(value: ArrayLike, count: int, width: int | None, name: str) -> Array
 
 
 SAMPLES_PER_LANE = 8
-"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough that the start-up is paid off."""
+"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough that the start-up is
+paid off."""
 
 LANES = 1 << 18
 """Lanes on the device at once, unless their results would need more than DEVICE_FLOATS."""
@@ -68,7 +69,8 @@ DEVICE_FLOATS = 1 << 26
 
 @dataclass(frozen=True)
 class Batch:
-    """Points `part` of the caller's arrays, each worked on by `split` neighbouring lanes, numbered from `first_lane`."""
+    """Points `part` of the caller's arrays, each worked on by `split` neighbouring lanes, numbered from
+    `first_lane`."""
 
     part: slice
     split: int
@@ -79,10 +81,13 @@ class Batch:
         return (self.part.stop - self.part.start) * self.split
 
     def spread(self, kind: Any, rows: Array) -> Any:
-        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes of a point."""
+        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes
+        of a point."""
         rows = rows[self.part]
         columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
-        parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
+        parts = [
+            dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns
+        ]
         return kind(*parts)
 
     def samples(self, count: int) -> tuple[Any, Any]:
@@ -100,8 +105,12 @@ class Batch:
         """One PCG32 stream a lane, a function of (seed, lane number) alone. The seed is any integer >= 0."""
         words = np.random.SeedSequence(seed).generate_state(4)
         lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
-        a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
-        c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
+        a, b = mi.sample_tea_32(
+            lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8
+        )
+        c, d = mi.sample_tea_32(
+            lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8
+        )
         return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))
 
 
@@ -109,7 +118,9 @@ def batches(points: int, samples: int, floats_per_lane: int, lanes: int | None =
     """Cuts `points` x `samples` into batches of at most `lanes` lanes (at least one point)."""
     split = -(-samples // SAMPLES_PER_LANE)
     if points * split >= 1 << 32:
-        raise InputError(f"{points} points with {samples} samples are too many for one call; call with fewer points")
+        raise InputError(
+            f"{points} points with {samples} samples are too many for one call; call with fewer points"
+        )
     if lanes is None:
         lanes = min(LANES, DEVICE_FLOATS // max(floats_per_lane, 1))
     for part in chunks(points, max(1, lanes // split)):

@@ -1,4 +1,5 @@
-"""Voxel tables on the device: the hash lookup shared by cell materials and the radiance cache, and that cache."""
+"""Voxel tables on the device: the hash lookup shared by cell materials and the radiance cache, and that
+cache."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ Array = np.ndarray
 
 
 class VoxelRows:
-    """Device copy of a `CellTable` with its grid: from a point (and an object id) to a row of the caller's table."""
+    """Device copy of a `CellTable` with its grid: from a point (and an object id) to a row of the caller's
+    table."""
 
     def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, object_id: ArrayLike):
         self.table = CellTable.build(pack_keys(ijk, object_id))
@@ -28,7 +30,10 @@ class VoxelRows:
 
     def find(self, point: Any, object_id: Any, active: Any) -> tuple[Any, Any]:
         """(found, row) of the cell around `point`; row is 0 where nothing is found."""
-        i, j, k = (mi.Int32(dr.floor((x - low) * self._inverse_edge)) for x, low in zip(point, self._origin, strict=True))
+        i, j, k = (
+            mi.Int32(dr.floor((x - low) * self._inverse_edge))
+            for x, low in zip(point, self._origin, strict=True)
+        )
         # One unsigned test covers both ends: negative indices wrap to huge values.
         inside = (mi.UInt32(i | j | k) < 65536) & (object_id >= -1) & (object_id < 65535)
         low = mi.UInt32(i) | (mi.UInt32(j) << 16)
@@ -49,8 +54,9 @@ class VoxelRows:
 class RadianceCache:
     """Diffuse outgoing radiance on a voxel grid: what a path takes over instead of bouncing on.
 
-    `ijk` (n, 3) voxel indices from `cells.voxel_indices(points, edge, origin)`, `radiance` (n, 3) linear, >= 0. A voxel in
-    the table with radiance 0 is a black surface; a voxel not in the table is a miss and the path goes on (METHOD H27).
+    `ijk` (n, 3) voxel indices from `cells.voxel_indices(points, edge, origin)`, `radiance` (n, 3) linear, >=
+    0. A voxel in the table with radiance 0 is a black surface; a voxel not in the table is a miss and the
+    path goes on (METHOD H27).
     """
 
     def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike):
@@ -60,7 +66,9 @@ class RadianceCache:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
         self.count = len(ijk)
         self._rows = VoxelRows(edge, origin, ijk, -1)
-        self._radiance = table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
+        self._radiance = (
+            table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
+        )
 
     def radiance(self, point: Any, active: Any) -> tuple[Any, Any]:
         """(found, radiance) at a surface point (device types)."""

@@ -21,14 +21,21 @@ MIN_SLOTS = 4096
 class Emitters:
     """Emitting faces of one geometry.
 
-    radiance (m, 3) per face, linear, >= 0; side (m,) int8: +1 the side of the right-hand normal emits, -1 the other, 0 both
-    (default 0); environment (3,) constant radiance of escaping rays; sampling_weight (m,) >= 0: how often a face is drawn
-    (default area x mean radiance). A face with weight 0 is still found by directions that hit it; faces with a
-    positive weight and unknown radiance 0 may be candidates. Emitting faces reflect too, with whatever the material says.
+    radiance (m, 3) per face, linear, >= 0; side (m,) int8: +1 the side of the right-hand normal emits, -1 the
+    other, 0 both (default 0); environment (3,) constant radiance of escaping rays; sampling_weight (m,) >= 0:
+    how often a face is drawn (default area x mean radiance). A face with weight 0 is still found by
+    directions that hit it; faces with a positive weight and unknown radiance 0 may be candidates. Emitting
+    faces reflect too, with whatever the material says.
     """
 
-    def __init__(self, geometry: Geometry, radiance: ArrayLike, side: ArrayLike | None = None,
-                 environment: ArrayLike = (0.0, 0.0, 0.0), sampling_weight: ArrayLike | None = None):
+    def __init__(
+        self,
+        geometry: Geometry,
+        radiance: ArrayLike,
+        side: ArrayLike | None = None,
+        environment: ArrayLike = (0.0, 0.0, 0.0),
+        sampling_weight: ArrayLike | None = None,
+    ):
         faces = len(geometry.faces)
         radiance = rows_of(radiance, faces, 3, "emitter radiance")
         environment = rows_of(environment, 3, None, "environment radiance")
@@ -56,7 +63,8 @@ class Emitters:
         return mi.Color3f(*self._environment)
 
     def surface(self, face: Any, cos_front: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """(radiance, area density, emits, is_emitter) of a face seen under the cosine `cos_front` to its right-hand normal.
+        """(radiance, area density, emits, is_emitter) of a face seen under the cosine `cos_front` to its
+        right-hand normal.
 
         `emits`: the side that is seen is a radiating one; `is_emitter`: the face is one at all.
         """
@@ -76,10 +84,12 @@ class Emitters:
 
 
 def _slots(weight: Array, areas: Array) -> tuple[Array, Array]:
-    """(slots uint32, pdf_area (m,) float32): face of every slot and count / slots / area, the density of one draw.
+    """(slots uint32, pdf_area (m,) float32): face of every slot and count / slots / area, the density of one
+    draw.
 
-    Each face of positive weight owns at least one slot; the rest follow the weights by largest remainder, ties to the
-    lower face id. A table replaces the search in a cumulative sum: one read, no rounding at its ends (METHOD H22).
+    Each face of positive weight owns at least one slot; the rest follow the weights by largest remainder,
+    ties to the lower face id. A table replaces the search in a cumulative sum: one read, no rounding at its
+    ends (METHOD H22).
     """
     pdf = np.zeros(len(weight), np.float32)
     faces = np.flatnonzero(weight > 0)

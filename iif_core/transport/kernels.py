@@ -1,9 +1,9 @@
 """The path tracer itself: one vertex, one loop. Everything here works on device types inside a kernel.
 
 Directions are of unit length, `wo` points to where the light goes, `wi` to where it comes from. Surfaces are
-double-sided. A vertex is lit twice, by a point drawn on an emitter and by the direction in which the path goes on, and the
-two are weighted with the power heuristic, both densities per solid angle (METHOD 2.5; the measure mix-up named
-there is avoided).
+double-sided. A vertex is lit twice, by a point drawn on an emitter and by the direction in which the path
+goes on, and the two are weighted with the power heuristic, both densities per solid angle (METHOD 2.5; the
+measure mix-up named there is avoided).
 """
 
 from __future__ import annotations
@@ -27,13 +27,21 @@ ROULETTE_LIMIT = 0.95
 class World:
     """What a path meets: not a Dr.Jit struct on purpose, so that loops do not carry its tables as state."""
 
-    def __init__(self, geometry: Geometry, material: Any, emitters: Emitters, cache: RadianceCache | None, collector: Any):
+    def __init__(
+        self,
+        geometry: Geometry,
+        material: Any,
+        emitters: Emitters,
+        cache: RadianceCache | None,
+        collector: Any,
+    ):
         self.geometry, self.material, self.emitters = geometry, material, emitters
         self.cache, self.collector = cache, collector
 
 
 class RadianceCollector:
-    """Adds up radiance. A collector says what a path gains by reaching an emitter; kernels are otherwise the same."""
+    """Adds up radiance. A collector says what a path gains by reaching an emitter; kernels are otherwise the
+    same."""
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
         """Gain of reaching `face` of the given radiance with path weight `weight` (Color3f)."""
@@ -45,7 +53,8 @@ class RadianceCollector:
 
 
 def power_weight(p: Any, q: Any) -> Any:
-    """p^2 / (p^2 + q^2) as 1 / (1 + (q/p)^2): no overflow of the squares, p = inf gives 1, p = 0 gives 0 (METHOD H16, H56)."""
+    """p^2 / (p^2 + q^2) as 1 / (1 + (q/p)^2): no overflow of the squares, p = inf gives 1, p = 0 gives 0
+    (METHOD H16, H56)."""
     ratio = q / p
     return dr.select(p > 0, 1 / dr.fma(ratio, ratio, 1), 0)
 
@@ -82,7 +91,8 @@ def sample_lobe(choose_specular: Any, u1: Any, u2: Any, wo: Any, normal: Any, ro
 
 @dataclass
 class LightSample:
-    """A point drawn on an emitter: `valid` = visible and radiating this way; `pdf` per solid angle at the receiver."""
+    """A point drawn on an emitter: `valid` = visible and radiating this way; `pdf` per solid angle at the
+    receiver."""
 
     valid: Any
     face: Any
@@ -112,8 +122,18 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     return LightSample(valid, face, radiance, wi, pdf)
 
 
-def direct_light(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any,
-                 weight: Any, active: Any) -> Any:
+def direct_light(
+    world: World,
+    rng: Any,
+    point: Any,
+    normal: Any,
+    wo: Any,
+    kd: Any,
+    ks: Any,
+    roughness: Any,
+    weight: Any,
+    active: Any,
+) -> Any:
     """Gain of next-event estimation at a vertex whose path weight so far is `weight`."""
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
@@ -124,7 +144,9 @@ def direct_light(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: A
     return world.collector.emitter(light.face, light.radiance, weight * f * share, light.valid)
 
 
-def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+def scatter(
+    rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
+) -> tuple[Any, Any, Any, Any]:
     """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
     wi = sample_lobe(choice < 0.5, u1, u2, wo, normal, roughness)
@@ -150,13 +172,24 @@ def take_from_cache(world: World, point: Any, throughput: Any, active: Any) -> t
 
 
 @dr.syntax
-def incoming(world: World, rng: Any, origin: Any, direction: Any, pdf: Any, bounce: Any, max_bounces: Any,
-             active: Any, throughput: Any = 1.0) -> tuple[Any, Any]:
-    """(gain, rng) along `direction` from `origin`: radiance times `throughput`, when the collector collects radiance.
+def incoming(
+    world: World,
+    rng: Any,
+    origin: Any,
+    direction: Any,
+    pdf: Any,
+    bounce: Any,
+    max_bounces: Any,
+    active: Any,
+    throughput: Any = 1.0,
+) -> tuple[Any, Any]:
+    """(gain, rng) along `direction` from `origin`: radiance times `throughput`, when the collector collects
+    radiance.
 
-    `pdf` is the density with which the direction was drawn where emitters were sampled as well, inf where they were
-    not; `bounce` counts the surface interactions so far. The path ends at the environment, in the radiance cache (only
-    for bounce >= 1 and never on an emitting face), after `max_bounces` interactions, or by Russian roulette.
+    `pdf` is the density with which the direction was drawn where emitters were sampled as well, inf where
+    they were not; `bounce` counts the surface interactions so far. The path ends at the environment, in the
+    radiance cache (only for bounce >= 1 and never on an emitting face), after `max_bounces` interactions, or
+    by Russian roulette.
     """
     gain = mi.Color3f(0)
     throughput = mi.Color3f(throughput)
@@ -167,7 +200,9 @@ def incoming(world: World, rng: Any, origin: Any, direction: Any, pdf: Any, boun
     active = mi.Bool(active)
     while active:
         hit = nearest_hit(world.geometry, origin, direction, active)
-        gain += world.collector.environment(world.emitters.environment_radiance(), throughput, active & ~hit.valid)
+        gain += world.collector.environment(
+            world.emitters.environment_radiance(), throughput, active & ~hit.valid
+        )
         cos_front = -dr.dot(hit.normal, direction)
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))

@@ -1,6 +1,8 @@
-"""Materials: callables `material(point, face, object_id, active) -> (base_color, roughness, metallic)` on device types.
+"""Materials: callables `material(point, face, object_id, active) -> (base_color, roughness, metallic)` on
+device types.
 
-Table rows are (base colour R, G, B, roughness, metallic), linear; roughness is clamped to [0.02, 1], the others to [0, 1].
+Table rows are (base colour R, G, B, roughness, metallic), linear; roughness is clamped to [0.02, 1], the
+others to [0, 1].
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ class _Rows:
         values = rows_of(values, len(values), 5, name)
         clamped = np.clip(values, [0, 0, 0, R_MIN, 0], 1)
         self.count = len(values)
-        self._table = table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
+        self._table = (
+            table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
+        )
 
     def read(self, row: Any, active: Any) -> tuple[Any, Any, Any]:
         first = dr.gather(mi.Vector4f, self._table, row * 2, active)
@@ -50,22 +54,34 @@ class FaceMaterials:
 class CellMaterials:
     """One material for each surface cell (voxel x object), the object's mean where no cell was observed.
 
-    `ijk` (n, 3) from `cells.voxel_indices(points, edge, origin)`, `object_id` (n,), values (n, 5), object_values (n_objects, 5).
-    Faces without an object (-1) and without a cell get the mean over all objects.
+    `ijk` (n, 3) from `cells.voxel_indices(points, edge, origin)`, `object_id` (n,), values (n, 5),
+    object_values (n_objects, 5). Faces without an object (-1) and without a cell get the mean over all
+    objects.
     """
 
-    def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, object_id: ArrayLike, values: ArrayLike,
-                 object_values: ArrayLike):
+    def __init__(
+        self,
+        edge: float,
+        origin: ArrayLike,
+        ijk: ArrayLike,
+        object_id: ArrayLike,
+        values: ArrayLike,
+        object_values: ArrayLike,
+    ):
         ijk = np.asarray(ijk).reshape(-1, 3)
         values = rows_of(np.asarray(values, np.float32).reshape(-1, 5), len(ijk), 5, "cell values")
         object_values = np.asarray(object_values, np.float32)
         object_values = rows_of(object_values, len(object_values), 5, "object values")
         if not len(object_values):
-            raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
+            raise InputError(
+                "CellMaterials needs at least one row of object_values: the material of surface nobody saw"
+            )
         self._cells = VoxelRows(edge, origin, ijk, object_id)
         self._objects = len(object_values)
         # One table: cells, then objects, then the overall mean; a miss only changes which row is read.
-        self._rows = _Rows(np.concatenate([values, object_values, object_values.mean(axis=0, keepdims=True)]), "values")
+        self._rows = _Rows(
+            np.concatenate([values, object_values, object_values.mean(axis=0, keepdims=True)]), "values"
+        )
         self._first_object = len(ijk)
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:

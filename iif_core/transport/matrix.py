@@ -1,4 +1,4 @@
-"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one set of paths."""
+"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one path set."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ Array = np.ndarray
 
 
 class _ColumnCollector:
-    """Deposits path weights in the row of the lane and the column of the emitter's group; only cached light is returned.
+    """Deposits path weights in the row of the lane and the column of the emitter's group.
 
-    A lane writes to its own row alone, so plain (non-atomic) additions are safe and their order is fixed.
+    Only cached light is returned. A lane writes to its own row alone, so plain (non-atomic) additions are
+    safe and their order is fixed.
     """
 
     def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, environment_group: int | None):
@@ -44,14 +45,31 @@ class _ColumnCollector:
     def _deposit(self, group: Any, weight: Any, active: Any) -> Any:
         entry = (self.lane * self.groups + group) * 3
         for channel in range(3):
-            dr.scatter_reduce(dr.ReduceOp.Add, self.rows, weight[channel], entry + channel, active,
-                              mode=dr.ReduceMode.NoConflicts)
+            dr.scatter_reduce(
+                dr.ReduceOp.Add,
+                self.rows,
+                weight[channel],
+                entry + channel,
+                active,
+                mode=dr.ReduceMode.NoConflicts,
+            )
         return mi.Color3f(0)
 
 
 @dr.syntax
-def _deposit_paths(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any,
-                   sample: Any, end: Any, max_bounces: Any) -> Any:
+def _deposit_paths(
+    world: World,
+    rng: Any,
+    point: Any,
+    normal: Any,
+    wo: Any,
+    kd: Any,
+    ks: Any,
+    roughness: Any,
+    sample: Any,
+    end: Any,
+    max_bounces: Any,
+) -> Any:
     cached = mi.Color3f(0)
     origin = offset_from(point, normal)
     visible = dr.dot(normal, wo) > 0
@@ -64,21 +82,37 @@ def _deposit_paths(world: World, rng: Any, point: Any, normal: Any, wo: Any, kd:
     return cached
 
 
-def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, normals: ArrayLike, wo: ArrayLike,
-                     base_color: ArrayLike, roughness: ArrayLike, metallic: ArrayLike, emitter_of_face: ArrayLike,
-                     n_groups: int, side: ArrayLike | None, samples: int, max_bounces: int, seed: int,
-                     cache: RadianceCache | None = None, environment_group: int | None = None,
-                     sampling_weight: ArrayLike | None = None, chunk: int | None = None) -> tuple[Array, Array]:
-    """(A (n, G, 3), h (n, 3)) float32: radiance reflected at each point is A @ E + h for emitter radiances E (G, 3).
+def transport_matrix(
+    geometry: Geometry,
+    material: Any,
+    points: ArrayLike,
+    normals: ArrayLike,
+    wo: ArrayLike,
+    base_color: ArrayLike,
+    roughness: ArrayLike,
+    metallic: ArrayLike,
+    emitter_of_face: ArrayLike,
+    n_groups: int,
+    side: ArrayLike | None,
+    samples: int,
+    max_bounces: int,
+    seed: int,
+    cache: RadianceCache | None = None,
+    environment_group: int | None = None,
+    sampling_weight: ArrayLike | None = None,
+    chunk: int | None = None,
+) -> tuple[Array, Array]:
+    """(A (n, G, 3), h (n, 3)) float32: radiance reflected at each point is A @ E + h for emitter radiances E
+    (G, 3).
 
-    points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own materials;
-    `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in `Emitters`; faces of a
-    group emit its unknown radiance. h is what paths take from `cache` (0 without). Escaping paths are deposited in column
-    environment_group when given. The point's own, directly visible emission is not included. sampling_weight (m,)
-    overrides the default, half by area and half the same for every group. max_bounces counts surface interactions including
-    the point. chunk: lanes on the device at once, a lane being up to 8 samples of a point and a row of A (default: 2^18,
-    fewer when their rows would take more than 256 MiB).
-    Source: METHOD 7a (multi-bounce, or one bounce and the cache); COMPUTE 4.
+    points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own
+    materials; `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in
+    `Emitters`; faces of a group emit its unknown radiance. h is what paths take from `cache` (0 without).
+    Escaping paths are deposited in column environment_group when given. The point's own, directly visible
+    emission is not included. sampling_weight (m,) overrides the default, half by area and half the same for
+    every group. max_bounces counts surface interactions including the point. chunk: lanes on the device at
+    once, a lane being up to 8 samples of a point and a row of A (default: 2^18, fewer when their rows would
+    take more than 256 MiB). Source: METHOD 7a (multi-bounce, or one bounce and the cache); COMPUTE 4.
     """
     check_counts(samples, max_bounces)
     points, normals, wo = surface_points(points, normals, wo)
@@ -88,8 +122,10 @@ def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, norma
     metallic = np.clip(rows_of(metallic, count, None, "metallic"), 0, 1)
     groups = np.ascontiguousarray(emitter_of_face, np.int32)
     if groups.shape != (len(geometry.faces),) or groups.min() < -1 or groups.max() >= n_groups:
-        raise InputError(f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
-                         f"({len(geometry.faces)},) in -1 ... {n_groups - 1}")
+        raise InputError(
+            f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
+            f"({len(geometry.faces)},) in -1 ... {n_groups - 1}"
+        )
     if environment_group is not None and not 0 <= environment_group < n_groups:
         raise InputError(f"environment_group is {environment_group}; expected 0 ... {n_groups - 1}")
     matrix, cached = np.zeros((count, n_groups, 3), np.float32), np.zeros((count, 3), np.float32)
@@ -103,12 +139,21 @@ def transport_matrix(geometry: Geometry, material: Any, points: ArrayLike, norma
     width = 3 * n_groups
     for batch in batches(count, samples, width, chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
-        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group)
+        collector = _ColumnCollector(
+            rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group
+        )
         gain = _deposit_paths(
-            World(geometry, material, emitters, cache, collector), batch.streams(seed), batch.spread(mi.Point3f, points),
-            batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo), batch.spread(mi.Color3f, kd),
-            batch.spread(mi.Color3f, ks), batch.spread(mi.Float, roughness), *batch.samples(samples),
-            dr.opaque(mi.UInt32, max_bounces))
+            World(geometry, material, emitters, cache, collector),
+            batch.streams(seed),
+            batch.spread(mi.Point3f, points),
+            batch.spread(mi.Vector3f, normals),
+            batch.spread(mi.Vector3f, wo),
+            batch.spread(mi.Color3f, kd),
+            batch.spread(mi.Color3f, ks),
+            batch.spread(mi.Float, roughness),
+            *batch.samples(samples),
+            dr.opaque(mi.UInt32, max_bounces),
+        )
         dr.eval(gain, rows)
         cached[batch.part] = batch.collect(gain) / samples
         if n_groups:

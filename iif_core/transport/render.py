@@ -26,8 +26,17 @@ def check_counts(samples: int, max_bounces: int) -> None:
 
 
 @dr.syntax
-def _radiance_sum(world: World, rng: Any, origin: Any, direction: Any, d_du: Any, d_dv: Any, sample: Any, end: Any,
-                  max_bounces: Any) -> Any:
+def _radiance_sum(
+    world: World,
+    rng: Any,
+    origin: Any,
+    direction: Any,
+    d_du: Any,
+    d_dv: Any,
+    sample: Any,
+    end: Any,
+    max_bounces: Any,
+) -> Any:
     total = mi.Color3f(0)
     while sample < end:
         du = uniform(rng) - 0.5
@@ -39,34 +48,55 @@ def _radiance_sum(world: World, rng: Any, origin: Any, direction: Any, d_du: Any
     return total
 
 
-def render(geometry: Geometry, material: Any, emitters: Emitters, origins: ArrayLike, directions: ArrayLike, samples: int,
-           max_bounces: int, seed: int, cache: RadianceCache | None = None,
-           jitter: tuple[ArrayLike, ArrayLike] | None = None, chunk: int | None = None) -> Array:
+def render(
+    geometry: Geometry,
+    material: Any,
+    emitters: Emitters,
+    origins: ArrayLike,
+    directions: ArrayLike,
+    samples: int,
+    max_bounces: int,
+    seed: int,
+    cache: RadianceCache | None = None,
+    jitter: tuple[ArrayLike, ArrayLike] | None = None,
+    chunk: int | None = None,
+) -> Array:
     """Mean radiance (n, 3) float32, linear, of `samples` paths along each ray.
 
-    origins (n, 3) or (3,) metres; directions (n, 3), any length. max_bounces counts surface interactions: 0 = visible
-    emission only, 1 = direct light. jitter = (d_du, d_dv), (n, 3) or (3,) each: the direction becomes d + xi_1 d_du + xi_2 d_dv
-    with xi uniform in [-1/2, 1/2) BEFORE it is normalised, a box filter over the pixel (METHOD 1.4). The first hit is
-    always shaded with its material; from the second on a path ends in `cache` where it has a voxel.
-    chunk: lanes on the device at once, a lane being up to 8 samples of a ray (default 2^18).
-    Unbiased but for the offset along the normal, the bounce limit and the cache. Source: METHOD 2.5, 3.
+    origins (n, 3) or (3,) metres; directions (n, 3), any length. max_bounces counts surface interactions: 0 =
+    visible emission only, 1 = direct light. jitter = (d_du, d_dv), (n, 3) or (3,) each: the direction becomes
+    d + xi_1 d_du + xi_2 d_dv with xi uniform in [-1/2, 1/2) BEFORE it is normalised, a box filter over the
+    pixel (METHOD 1.4). The first hit is always shaded with its material; from the second on a path ends in
+    `cache` where it has a voxel. chunk: lanes on the device at once, a lane being up to 8 samples of a ray
+    (default 2^18). Unbiased but for the offset along the normal, the bounce limit and the cache. Source:
+    METHOD 2.5, 3.
     """
     check_counts(samples, max_bounces)
     directions = np.asarray(directions, np.float32)
     directions = rows_of(directions, len(directions), 3, "directions")
     if not (np.abs(directions).max(axis=1, initial=0) > 0).all():
         raise InputError("directions contain a zero vector")
-    origins = rows_of(np.broadcast_to(np.asarray(origins, np.float32), directions.shape), len(directions), 3, "origins")
+    origins = rows_of(
+        np.broadcast_to(np.asarray(origins, np.float32), directions.shape), len(directions), 3, "origins"
+    )
     steps = (np.zeros(3), np.zeros(3)) if jitter is None else jitter
-    d_du, d_dv = (rows_of(np.broadcast_to(np.asarray(step, np.float32), directions.shape), len(directions), 3, "jitter")
-                  for step in steps)
+    d_du, d_dv = (
+        rows_of(np.broadcast_to(np.asarray(step, np.float32), directions.shape), len(directions), 3, "jitter")
+        for step in steps
+    )
     world = World(geometry, material, emitters, cache, RadianceCollector())
     result = np.zeros(directions.shape, np.float32)
     for batch in batches(len(directions), samples, 3, chunk):
         total = _radiance_sum(
-            world, batch.streams(seed), batch.spread(mi.Point3f, origins), batch.spread(mi.Vector3f, directions),
-            batch.spread(mi.Vector3f, d_du), batch.spread(mi.Vector3f, d_dv), *batch.samples(samples),
-            dr.opaque(mi.UInt32, max_bounces))
+            world,
+            batch.streams(seed),
+            batch.spread(mi.Point3f, origins),
+            batch.spread(mi.Vector3f, directions),
+            batch.spread(mi.Vector3f, d_du),
+            batch.spread(mi.Vector3f, d_dv),
+            *batch.samples(samples),
+            dr.opaque(mi.UInt32, max_bounces),
+        )
         dr.eval(total)
         result[batch.part] = batch.collect(total) / samples
     return result

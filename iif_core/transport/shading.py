@@ -17,14 +17,15 @@ from .arrays import batches, rows_of
 from .cache import RadianceCache
 from .emitters import Emitters
 from .geometry import Geometry, offset_from
-from .kernels import RadianceCollector, World, incoming, power_weight, sample_lobe, sample_light, uniform
+from .kernels import RadianceCollector, World, incoming, power_weight, sample_light, sample_lobe, uniform
 from .render import check_counts
 
 Array = np.ndarray
 
 
 class _Levels:
-    """Roughness levels and the sampling lobes: the cosine twice, and GGX lobes from the sharpest level up to 0.5."""
+    """Roughness levels and the sampling lobes: the cosine twice, and GGX lobes from the sharpest level up to
+    0.5."""
 
     def __init__(self, levels: Array):
         self.levels = [float(level) for level in levels]
@@ -71,14 +72,25 @@ class _Levels:
 
 
 @dr.syntax
-def _lobe_sums(world: World, levels: _Levels, rng: Any, point: Any, normal: Any, wo: Any, samples: Any, sample: Any,
-               end: Any, max_bounces: Any) -> Any:
+def _lobe_sums(
+    world: World,
+    levels: _Levels,
+    rng: Any,
+    point: Any,
+    normal: Any,
+    wo: Any,
+    samples: Any,
+    sample: Any,
+    end: Any,
+    max_bounces: Any,
+) -> Any:
     sums = [mi.Color3f(0) for _ in range(1 + 2 * len(levels.levels))]
     origin = offset_from(point, normal)
     while sample < end:
         sums = levels.light(world, rng, origin, normal, wo, sums)
-        # Stratified choice: over all samples every lobe is drawn equally often in expectation, whatever their number.
-        lobe = mi.UInt32((mi.Float(sample) + uniform(rng)) / mi.Float(samples) * levels.count)
+        # Stratified choice: over all samples every lobe is drawn equally often in expectation.
+        position = (mi.Float(sample) + uniform(rng)) / mi.Float(samples)
+        lobe = dr.minimum(mi.UInt32(position * levels.count), levels.count - 1)
         u1 = uniform(rng)
         u2 = uniform(rng)
         wi = sample_lobe(lobe >= levels.cosine_lobes, u1, u2, wo, normal, levels.lobe_roughness(lobe))
@@ -110,24 +122,37 @@ def surface_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tupl
     return points, np.where(away[:, None], -normals, normals), wo
 
 
-def shading_caches(geometry: Geometry, material: Any, emitters: Emitters, points: ArrayLike, normals: ArrayLike,
-                   wo: ArrayLike, levels: ArrayLike, samples: int, max_bounces: int, seed: int,
-                   cache: RadianceCache | None = None, chunk: int | None = None) -> tuple[Array, Array, Array]:
+def shading_caches(
+    geometry: Geometry,
+    material: Any,
+    emitters: Emitters,
+    points: ArrayLike,
+    normals: ArrayLike,
+    wo: ArrayLike,
+    levels: ArrayLike,
+    samples: int,
+    max_bounces: int,
+    seed: int,
+    cache: RadianceCache | None = None,
+    chunk: int | None = None,
+) -> tuple[Array, Array, Array]:
     """(diffuse (n, 3), s0 (n, J, 3), s1 (n, J, 3)) float32 of points (n, 3) seen along wo (n, 3).
 
         diffuse = 1/pi int L cos,  s0(r) = int spec_r (1 - F_c) L,  s1(r) = int spec_r F_c L,
 
-    with L the incident radiance under the given materials elsewhere, so that `brdf.compose(k_d, k_s, diffuse, s0(r), s1(r))`
-    is the radiance reflected at the point for ANY material of roughness r there. normals are flipped to the viewer.
-    levels (J,) roughness in [0.02, 1], increasing (may be empty). max_bounces counts surface interactions including the
-    point itself. All lobes share one path per sample, drawn from a mixture of the cosine and a few GGX lobes and
-    weighted with that mixture's density (balance heuristic). chunk: lanes on the device at once, a lane being up to 8
-    samples of a point (default: 2^18, fewer when the lobes would take more than 256 MiB).
-    Source: METHOD 2.7; COMPUTE 5.
+    with L the incident radiance under the given materials elsewhere, so that `brdf.compose(k_d, k_s, diffuse,
+    s0(r), s1(r))` is the radiance reflected at the point for ANY material of roughness r there. normals are
+    flipped to the viewer. levels (J,) roughness in [0.02, 1], increasing (may be empty). max_bounces counts
+    surface interactions including the point itself. All lobes share one path per sample, drawn from a mixture
+    of the cosine and a few GGX lobes and weighted with that mixture's density (balance heuristic). chunk:
+    lanes on the device at once, a lane being up to 8 samples of a point (default: 2^18, fewer when the lobes
+    would take more than 256 MiB). Source: METHOD 2.7; COMPUTE 5.
     """
     check_counts(samples, max_bounces)
     levels = np.asarray(levels, np.float64).reshape(-1)
-    if levels.size and not (levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()):
+    if levels.size and not (
+        levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()
+    ):
         raise InputError(f"roughness levels {levels.tolist()}: must increase within [{R_MIN}, 1]")
     points, normals, wo = surface_points(points, normals, wo)
     count = len(levels)
@@ -137,9 +162,17 @@ def shading_caches(geometry: Geometry, material: Any, emitters: Emitters, points
         return diffuse, s0, s1
     world, lobes = World(geometry, material, emitters, cache, RadianceCollector()), _Levels(levels)
     for batch in batches(len(points), samples, 3 * (1 + 2 * count), chunk):
-        sums = _lobe_sums(world, lobes, batch.streams(seed), batch.spread(mi.Point3f, points),
-                          batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo),
-                          dr.opaque(mi.UInt32, samples), *batch.samples(samples), dr.opaque(mi.UInt32, max_bounces))
+        sums = _lobe_sums(
+            world,
+            lobes,
+            batch.streams(seed),
+            batch.spread(mi.Point3f, points),
+            batch.spread(mi.Vector3f, normals),
+            batch.spread(mi.Vector3f, wo),
+            dr.opaque(mi.UInt32, samples),
+            *batch.samples(samples),
+            dr.opaque(mi.UInt32, max_bounces),
+        )
         dr.eval(sums)
         diffuse[batch.part] = batch.collect(sums[0])
         for number in range(count):

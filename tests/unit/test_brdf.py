@@ -1,4 +1,5 @@
-"""The reflectance: against the published furnace table, float64, sampling statistics, and across array libraries."""
+"""The reflectance: against the published furnace table, float64, sampling statistics, and across array
+libraries."""
 
 from __future__ import annotations
 
@@ -58,7 +59,10 @@ def test_furnace_table(r):
 def test_furnace_by_integrating_the_textbook_form(r, NoV):
     z, turn = uniform_grid(1200)
     sine = np.sqrt(1 - z * z)
-    wi, wo = np.array([sine * np.cos(2 * np.pi * turn), sine * np.sin(2 * np.pi * turn), z]), np.array(view(NoV))
+    wi, wo = (
+        np.array([sine * np.cos(2 * np.pi * turn), sine * np.sin(2 * np.pi * turn), z]),
+        np.array(view(NoV)),
+    )
     h = wi + wo[:, None]
     h /= np.linalg.norm(h, axis=0)
     spec, fc = textbook(z, NoV, 1 - h[2] ** 2, wo @ h, r)
@@ -90,7 +94,9 @@ def test_float32_keeps_its_digits_at_the_peak(r):
     NoH = np.sqrt(1 - sin2.astype(np.float64)).astype(np.float32)
     NoL, NoV, VoH = (np.full(200, x, np.float32) for x in (0.7, 0.45, 0.8))
     _, spec, fc = brdf.lobes(NUMPY, NoL, NoV, NoH, VoH, sin2, np.float32(r))
-    oracle, schlick = textbook(*(x.astype(np.float64) for x in (NoL, NoV, sin2, VoH)), np.float64(np.float32(r)))
+    oracle, schlick = textbook(
+        *(x.astype(np.float64) for x in (NoL, NoV, sin2, VoH)), np.float64(np.float32(r))
+    )
     assert spec.dtype == np.float32
     np.testing.assert_allclose(spec, oracle, rtol=3e-6)
     np.testing.assert_allclose(fc, schlick, rtol=1e-5)
@@ -113,8 +119,11 @@ def test_compose_is_the_fresnel_form():
     a, r, m = RNG.random((3, 50)), 0.02 + 0.98 * RNG.random(50), RNG.random(50)
     kd, ks = brdf.kd_ks(a, m)
     diffuse, spec, fc = brdf.lobes(NUMPY, *brdf.half_angles(NUMPY, Z, wi, wo), r)
-    np.testing.assert_allclose(brdf.compose(kd, ks, diffuse, spec * (1 - fc), spec * fc),
-                               kd * wi[2] / np.pi + (ks + (1 - ks) * fc) * spec, rtol=1e-12)
+    np.testing.assert_allclose(
+        brdf.compose(kd, ks, diffuse, spec * (1 - fc), spec * fc),
+        kd * wi[2] / np.pi + (ks + (1 - ks) * fc) * spec,
+        rtol=1e-12,
+    )
     np.testing.assert_allclose(kd + ks, 0.04 * (1 - m) + a, rtol=1e-12)
 
 
@@ -129,7 +138,8 @@ def test_reflectance_is_reciprocal():
 
 @pytest.mark.parametrize("r", [0.02, 0.2, 1.0])
 def test_half_vectors_follow_ggx(r):
-    """tan^2(theta_h) has the distribution function t / (alpha^2 + t), phi is uniform: chi-squared over 20 x 10 cells."""
+    """tan^2(theta_h) has the distribution function t / (alpha^2 + t), phi is uniform: chi-squared over 20 x
+    10 cells."""
     n = 100_000
     h = brdf.sample_ggx_half(NUMPY, RNG.random(n), RNG.random(n), r)
     np.testing.assert_allclose(sum(x * x for x in h), 1, rtol=1e-6)
@@ -142,7 +152,8 @@ def test_half_vectors_follow_ggx(r):
 
 @pytest.mark.parametrize(("r", "NoV"), [(0.25, 0.8), (0.5, 0.3), (1.0, 0.05)])
 def test_directions_follow_mixture_pdf(r, NoV):
-    """Chi-squared of sampled directions against the integrated density; directions below the surface are one cell."""
+    """Chi-squared of sampled directions against the integrated density; directions below the surface are one
+    cell."""
     wo, n = view(NoV), 200_000
     u0, u1, u2 = RNG.random((3, n))
     specular = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
@@ -150,8 +161,10 @@ def test_directions_follow_mixture_pdf(r, NoV):
     wi = [np.where(u0 < 0.5, s, c) for s, c in zip(specular, cosine, strict=True)]
     rows, columns, fine = 12, 16, 60
     above = wi[2] > 0
-    cell = np.minimum((wi[2] * rows).astype(int), rows - 1) * columns + (
-        (np.arctan2(wi[1], wi[0]) / (2 * np.pi) % 1) * columns).astype(int) % columns
+    cell = (
+        np.minimum((wi[2] * rows).astype(int), rows - 1) * columns
+        + ((np.arctan2(wi[1], wi[0]) / (2 * np.pi) % 1) * columns).astype(int) % columns
+    )
     counts = np.append(np.bincount(cell[above], minlength=rows * columns), np.count_nonzero(~above))
 
     z = (np.arange(rows * fine) + 0.5) / (rows * fine)
@@ -171,9 +184,11 @@ def test_directions_follow_mixture_pdf(r, NoV):
 def test_extremes_are_finite_and_one_sided():
     zero, one = np.float32(0), np.float32(1)
     edge = [zero, np.float32(1e-7), np.float32(1e-3), one]
-    grid = [g.ravel() for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")]
-    for value in (*brdf.lobes(NUMPY, *grid),
-                  brdf.specular_pdf(NUMPY, *grid[2:])):
+    grid = [
+        g.ravel()
+        for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")
+    ]
+    for value in (*brdf.lobes(NUMPY, *grid), brdf.specular_pdf(NUMPY, *grid[2:])):
         assert np.isfinite(value).all() and (value >= 0).all()
     diffuse, spec, _ = brdf.lobes(NUMPY, *grid)
     dark = (grid[0] == 0) | (grid[1] == 0)
@@ -197,11 +212,21 @@ def test_three_libraries_agree():
     u1, u2 = RNG.random((2, 3000)).astype(np.float32)
 
     def everything(xp, convert):
-        a, b, rough, v1, v2 = [convert(x) for x in wi], [convert(x) for x in wo], convert(r), convert(u1), convert(u2)
+        a, b, rough, v1, v2 = (
+            [convert(x) for x in wi],
+            [convert(x) for x in wo],
+            convert(r),
+            convert(u1),
+            convert(u2),
+        )
         normal = [convert(np.full(3000, x, np.float32)) for x in Z]
         NoL, NoV, NoH, VoH, sin2 = brdf.half_angles(xp, normal, a, b)
-        return [*brdf.lobes(xp, NoL, NoV, NoH, VoH, sin2, rough), brdf.mixture_pdf(xp, NoL, NoH, VoH, sin2, rough),
-                *brdf.sample_ggx_half(xp, v1, v2, rough), *brdf.sample_cosine(xp, v1, v2)]
+        return [
+            *brdf.lobes(xp, NoL, NoV, NoH, VoH, sin2, rough),
+            brdf.mixture_pdf(xp, NoL, NoH, VoH, sin2, rough),
+            *brdf.sample_ggx_half(xp, v1, v2, rough),
+            *brdf.sample_cosine(xp, v1, v2),
+        ]
 
     reference = everything(NUMPY, lambda x: x)
     assert all(value.dtype == np.float32 for value in reference)

@@ -26,7 +26,10 @@ def test_keys_are_unique_and_reversible(parts):
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.integers(0, 2**64 - 1), max_size=300, unique=True), st.lists(st.integers(0, 2**64 - 1), max_size=50))
+@given(
+    st.lists(st.integers(0, 2**64 - 1), max_size=300, unique=True),
+    st.lists(st.integers(0, 2**64 - 1), max_size=50),
+)
 def test_table_is_a_dictionary(present, asked):
     table = cells.CellTable.build(np.array(present, np.uint64))
     rows = {key: row for row, key in enumerate(present)}

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from iif_core.camera import look_at, pixel_directions
+from iif_core.camera import direction_derivatives, look_at, pixel_directions
 from iif_core.cells import grid_origin, voxel_indices
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader, StageWriter
@@ -43,7 +43,7 @@ class FakeJob:
         self.scene, self.root = scene, root
         self.stage = SimpleNamespace(name=stage, upstream=tuple(STAGES)[: tuple(STAGES).index(stage)])
         self.settings = SimpleNamespace(
-            render=SimpleNamespace(samples=64, max_bounces=4),
+            render=SimpleNamespace(samples=256, max_bounces=4),
             export=SimpleNamespace(max_faces_glb=100_000),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
             metrics=SimpleNamespace(views="all"),
@@ -100,7 +100,9 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
         eye = view.world_from_camera[:3, 3]
         rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(-1, 3)
         face, depth = trace(geometry, eye, rays)
-        image = render(geometry, FaceMaterials(TRUE[object_id]), emitters, eye, rays, 64, 4, 1).reshape(HEIGHT, WIDTH, 3)
+        material = FaceMaterials(TRUE[object_id])
+        jitter = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+        image = render(geometry, material, emitters, eye, rays, 256, 4, 1, jitter=jitter).reshape(HEIGHT, WIDTH, 3)
         exposed = np.clip(view.exposure * image, 0, 1)
         photo = image if dynamic_range == "hdr" else exposed ** (1 / 2.2)
         writer.photo(view.name, photo, np.ones((HEIGHT, WIDTH), bool), dynamic_range == "ldr")
@@ -229,8 +231,8 @@ def test_recovered_scene(toy):
     assert scene.object_names == ["walls", "box", "lamp"]
     np.testing.assert_allclose(scene.emitter_radiance, [LAMP, [0, 0, 0]])  # light scale applied, dropped emitter is dark
     np.testing.assert_array_equal(np.flatnonzero(scene.emitter_id >= 0), [24, 25])
-    np.testing.assert_allclose(scene.object_values[:2], TRUE[:2], atol=1e-6)  # base mean through T_o
-    np.testing.assert_allclose(scene.environment, 0)
+    np.testing.assert_allclose(scene.surface.object_values[:2], TRUE[:2], atol=1e-6)  # base mean through T_o
+    np.testing.assert_allclose(scene.light.environment, 0)
     below = scene.emission_map(np.array([[24, 0, -1]]), np.array([1.5, 1, 1]))
     np.testing.assert_allclose(below[0], [LAMP, [0, 0, 0], [0, 0, 0]])
     above = scene.emission_map(np.array([[24]]), np.array([1.5, 1, 2.45]))
@@ -244,8 +246,8 @@ def test_response_is_read_back(toy):
 
 
 def test_response_of_different_grids_is_refused():
-    table = {"channel": np.array(["R", "G", "B", "B"]), "kind": np.array(["sample"] * 4), "x": np.array([0, 0, 0, 1.0])}
-    with pytest.raises(InputError, match="different x"):
+    table = {"channel": np.array(["r", "g", "b", "b"]), "kind": np.array(["sample"] * 4), "x": np.array([0, 0, 0, 1.0])}
+    with pytest.raises(InputError, match="same x"):
         response_samples(table | {"value": np.zeros(4)})
 
 
@@ -463,8 +465,13 @@ def test_edges_and_selection():
     values[:, 3:] = 1
     found = pic.edges(values)
     assert found[:, 2].all() and found.sum() == 4
-    depth = np.array([[1.0, 1.02, 2.0, 0.0]])
-    np.testing.assert_array_equal(pic.edges(depth, 0.05), [[False, True, True, False]])
+    u = np.arange(40.0)
+    wall = np.tile(1 / (0.05 + 0.1 * u), (4, 1))  # a plane, seen at a grazing angle
+    assert not pic.depth_edges(wall).any()
+    wall[:, 20:] *= 1.5
+    assert set(np.flatnonzero(pic.depth_edges(wall)[1])) == {19, 20}
+    wall[:, 30:] = 0
+    assert set(np.flatnonzero(pic.depth_edges(wall)[1])) == {19, 20, 29, 30}
     segment = np.array([[0, 1, 2, -1]])
     rows = (np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1]), np.array([0.2, 0.8, 0.5, 0.5]))
     np.testing.assert_array_equal(pic.selected_prediction(segment, *rows), [[1, 0, -1, -1]])

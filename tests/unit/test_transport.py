@@ -45,7 +45,11 @@ def box(low, high, inward):
         e2[(axis + 2) % 3] = (high - low)[(axis + 2) % 3]
         lift = np.zeros(3)
         lift[axis] = (high - low)[axis]
-        parts += [quad(low, e1, e2), quad(low + lift, e2, e1)] if inward else [quad(low, e2, e1), quad(low + lift, e1, e2)]
+        parts += (
+            [quad(low, e1, e2), quad(low + lift, e2, e1)]
+            if inward
+            else [quad(low, e2, e1), quad(low + lift, e1, e2)]
+        )
     return merge(parts)[:2]
 
 
@@ -61,8 +65,16 @@ def merge(parts):
 
 
 # base colour, roughness, metallic: walls, glossy block, rough metal block, black emitter
-ROOM_MATERIALS = np.array([[0.7, 0.6, 0.5, 0.9, 0.0], [0.3, 0.5, 0.7, 0.25, 0.0], [0.9, 0.7, 0.4, 0.35, 1.0],
-                           [0.0, 0.0, 0.0, 1.0, 1.0], [0.0, 0.0, 0.0, 1.0, 1.0]], np.float32)
+ROOM_MATERIALS = np.array(
+    [
+        [0.7, 0.6, 0.5, 0.9, 0.0],
+        [0.3, 0.5, 0.7, 0.25, 0.0],
+        [0.9, 0.7, 0.4, 0.35, 1.0],
+        [0.0, 0.0, 0.0, 1.0, 1.0],
+        [0.0, 0.0, 0.0, 1.0, 1.0],
+    ],
+    np.float32,
+)
 ROOM_RADIANCE = np.array([[8.0, 7.0, 5.0], [2.0, 3.0, 6.0]], np.float32)
 
 
@@ -70,9 +82,13 @@ class Room:
     """4 x 3 x 2.5 m, a glossy and a metal block, a ceiling light and a wall light."""
 
     def __init__(self, T):
-        parts = [box((0, 0, 0), (4, 3, 2.5), inward=True), box((0.6, 1.2, 0.0005), (1.4, 2, 0.9), inward=False),
-                 box((2.4, 1.0, 0.0005), (3.2, 1.8, 0.7), inward=False),
-                 quad((1.5, 1.0, 2.45), (0, 0.8, 0), (1, 0, 0)), quad((3.95, 0.5, 1), (0, 0, 0.5), (0, 0.6, 0))]
+        parts = [
+            box((0, 0, 0), (4, 3, 2.5), inward=True),
+            box((0.6, 1.2, 0.0005), (1.4, 2, 0.9), inward=False),
+            box((2.4, 1.0, 0.0005), (3.2, 1.8, 0.7), inward=False),
+            quad((1.5, 1.0, 2.45), (0, 0.8, 0), (1, 0, 0)),
+            quad((3.95, 0.5, 1), (0, 0, 0.5), (0, 0.6, 0)),
+        ]
         self.vertices, self.faces, self.ids = merge(parts)
         self.geometry = T.build_geometry(self.vertices, self.faces, self.ids)
         self.material = T.FaceMaterials(ROOM_MATERIALS[self.ids])
@@ -96,8 +112,16 @@ class Room:
 
     def render(self, T, samples, seed, **options):
         options = {"max_bounces": 5} | options
-        return T.render(self.geometry, self.material, self.emitters, self.origin, self.directions, samples, seed=seed,
-                        **options)
+        return T.render(
+            self.geometry,
+            self.material,
+            self.emitters,
+            self.origin,
+            self.directions,
+            samples,
+            seed=seed,
+            **options,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -110,14 +134,16 @@ def repeated(vector, count):
 
 
 def assert_mean(samples, expected, sigmas=3.0, slack=0.0):
-    """The mean of independent rows is the expected number within `sigmas` standard errors (plus a relative slack)."""
+    """The mean of independent rows is the expected number within `sigmas` standard errors (plus a relative
+    slack)."""
     samples = np.asarray(samples, np.float64)
     error = samples.std(ddof=1) / np.sqrt(len(samples))
     assert samples.mean() == pytest.approx(expected, abs=sigmas * error + slack * abs(expected) + 1e-7)
 
 
 def polygon_irradiance(point, normal, polygon):
-    """Lambert: irradiance of a unit-radiance polygon, wholly above the horizon, = 1/2 |sum angle_i (gamma_i . n)|."""
+    """Lambert: irradiance of a unit-radiance polygon, wholly above the horizon, = 1/2 |sum angle_i (gamma_i .
+    n)|."""
     rays = polygon - np.asarray(point, float)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     following = np.roll(rays, -1, axis=0)
@@ -129,17 +155,30 @@ def polygon_irradiance(point, normal, polygon):
 @pytest.mark.parametrize("half", [0.15, 1.5])
 @pytest.mark.parametrize("nee", [True, False])
 def test_direct_light_of_a_rectangle_is_the_form_factor(T, half, nee):
-    """A large near light is where a mixed-up measure in the MIS weights shows (METHOD 2.5: x1.64 for 3 x 3 m at 2 m)."""
+    """A large near light is where a mixed-up measure in the MIS weights shows (METHOD 2.5: x1.64 for 3 x 3 m
+    at 2 m)."""
     light = quad((-half, -half + 0.2, 2), (0, 2 * half, 0), (2 * half, 0, 0))
     vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), light])
     geometry = T.build_geometry(vertices, faces, ids)
     radiance = np.where(ids[:, None] == 1, np.float32([3, 1, 0.5]), 0)
-    emitters = T.Emitters(geometry, radiance, np.where(ids == 1, 1, 0), sampling_weight=None if nee else np.zeros(4))
+    emitters = T.Emitters(
+        geometry, radiance, np.where(ids == 1, 1, 0), sampling_weight=None if nee else np.zeros(4)
+    )
     assert emitters.can_be_sampled == nee
     n = 2000
     black = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (4, 1)))
-    diffuse, s0, s1 = T.shading_caches(geometry, black, emitters, repeated((0.3, 0, 0), n), repeated((0, 0, 1), n),
-                                       repeated((0.6, 0, 0.8), n), [], 64, 1, seed=3)
+    diffuse, s0, s1 = T.shading_caches(
+        geometry,
+        black,
+        emitters,
+        repeated((0.3, 0, 0), n),
+        repeated((0, 0, 1), n),
+        repeated((0.6, 0, 0.8), n),
+        [],
+        64,
+        1,
+        seed=3,
+    )
     assert s0.shape == s1.shape == (n, 0, 3)
     expected = polygon_irradiance((0.3, 0, 1e-4), (0, 0, 1), light[0]) / np.pi
     for channel, strength in enumerate((3, 1, 0.5)):
@@ -154,18 +193,25 @@ def test_emitters_radiate_from_their_side_only(T):
     nothing = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (2, 1)))
     for side, below, above in ((1, 0, 1), (-1, 1, 0), (0, 1, 1)):
         emitters = T.Emitters(geometry, np.ones((2, 3)), np.full(2, side))
-        seen = T.render(geometry, nothing, emitters, [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], 2, 0, seed=0)
+        seen = T.render(
+            geometry, nothing, emitters, [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], 2, 0, seed=0
+        )
         assert seen[:, 0].tolist() == [below, above]
-        diffuse, _, _ = T.shading_caches(geometry, nothing, emitters, [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], 64, 1, 0)
+        diffuse, _, _ = T.shading_caches(
+            geometry, nothing, emitters, [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], 64, 1, 0
+        )
         assert (diffuse[0, 0] > 0.1) == bool(below)
 
 
 def lambertian(rho):
-    """Material without the dielectric lobe: metallic chosen so that k_s = 0; only the grazing rest S1 <= 0.014 is left."""
+    """Material without the dielectric lobe: metallic chosen so that k_s = 0; only the grazing rest S1 <=
+    0.014 is left."""
     import mitsuba as mi
 
     metallic = -0.04 / (rho - 0.04)
-    return lambda point, face, object_id, active: (mi.Color3f(rho), mi.Float(1), mi.Float(metallic)), (1 - metallic) * rho
+    return lambda point, face, object_id, active: (mi.Color3f(rho), mi.Float(1), mi.Float(metallic)), (
+        1 - metallic
+    ) * rho
 
 
 def test_closed_grey_box_sums_the_geometric_series(T):
@@ -175,7 +221,16 @@ def test_closed_grey_box_sums_the_geometric_series(T):
     for weight in (None, np.zeros(12)):
         emitters = T.Emitters(geometry, np.full((12, 3), 0.7), np.ones(12), sampling_weight=weight)
         n = 4000
-        seen = T.render(geometry, material, emitters, repeated((0.4, 0.9, 0.8), n), repeated((0.3, 0.5, -0.6), n), 16, 64, 1)
+        seen = T.render(
+            geometry,
+            material,
+            emitters,
+            repeated((0.4, 0.9, 0.8), n),
+            repeated((0.3, 0.5, -0.6), n),
+            16,
+            64,
+            1,
+        )
         # The last term is the grazing remainder, between 0 and 0.0035 of albedo on cosine average.
         low, high = 0.7 / (1 - rho), 0.7 / (1 - rho - 0.004)
         error = 3 * seen[:, 0].std() / np.sqrt(n)
@@ -183,7 +238,8 @@ def test_closed_grey_box_sums_the_geometric_series(T):
 
 
 def test_closed_sphere_solves_its_integral_equation(T):
-    """In a sphere a ray leaves under the angle under which it arrived, so L(theta) obeys a one-dimensional equation."""
+    """In a sphere a ray leaves under the angle under which it arrived, so L(theta) obeys a one-dimensional
+    equation."""
     import trimesh
 
     sphere = trimesh.creation.icosphere(subdivisions=5)
@@ -209,9 +265,13 @@ def test_closed_sphere_solves_its_integral_equation(T):
         start /= np.linalg.norm(start)
         side = np.cross(start, (0, 1, 0))
         side /= np.linalg.norm(side)
-        toward = cosine * start + np.sqrt(1 - cosine**2) * side  # arrives at the far wall under the same angle
+        toward = (
+            cosine * start + np.sqrt(1 - cosine**2) * side
+        )  # arrives at the far wall under the same angle
         n = 4000
-        seen = T.render(geometry, material, emitters, repeated(start * 0.9 - 0 * side, n), repeated(toward, n), 32, 64, 5)
+        seen = T.render(
+            geometry, material, emitters, repeated(start * 0.9 - 0 * side, n), repeated(toward, n), 32, 64, 5
+        )
         arrived = np.array([0.9 * start @ toward])
         distance = -arrived + np.sqrt(arrived**2 + 1 - 0.81)
         hit = 0.9 * start + distance * toward
@@ -221,7 +281,8 @@ def test_closed_sphere_solves_its_integral_equation(T):
 
 @pytest.mark.parametrize(("r", "m"), [(0.02, 1.0), (0.3, 0.0), (1.0, 0.5)])
 def test_white_furnace(T, r, m):
-    """Environment 1 over a floor: reflected radiance is the albedo of the lobes; an all-white cache closes it likewise."""
+    """Environment 1 over a floor: reflected radiance is the albedo of the lobes; an all-white cache closes it
+    likewise."""
     floor = quad((-5, -5, 0), (10, 0, 0), (0, 10, 0))
     geometry = T.build_geometry(*floor, np.zeros(2, np.int32))
     NoV, a, n = 0.6, np.array([0.9, 0.5, 0.1]), 3000
@@ -239,12 +300,38 @@ def test_white_furnace(T, r, m):
     emitters = T.Emitters(geometry, np.zeros((2, 3)), environment=(1, 1, 1))
     assert not emitters.can_be_sampled
     material = T.FaceMaterials(np.tile([*a, r, m], (2, 1)))
-    seen = T.render(geometry, material, emitters, repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), 32, 8, 1)
-    caches = T.shading_caches(geometry, material, emitters, repeated((0, 0, 0), n), repeated((0, 0, 1), n),
-                              repeated(wo, n), [r], 32, 8, 1)
+    seen = T.render(
+        geometry, material, emitters, repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), 32, 8, 1
+    )
+    caches = T.shading_caches(
+        geometry,
+        material,
+        emitters,
+        repeated((0, 0, 0), n),
+        repeated((0, 0, 1), n),
+        repeated(wo, n),
+        [r],
+        32,
+        8,
+        1,
+    )
     matrix, cached = T.transport_matrix(
-        geometry, material, repeated((0, 0, 0), n), repeated((0, 0, 1), n), repeated(wo, n), repeated(a, n), np.full(n, r),
-        np.full(n, m), np.full(2, -1), 1, None, 32, 8, 1, environment_group=0)
+        geometry,
+        material,
+        repeated((0, 0, 0), n),
+        repeated((0, 0, 1), n),
+        repeated(wo, n),
+        repeated(a, n),
+        np.full(n, r),
+        np.full(n, m),
+        np.full(2, -1),
+        1,
+        None,
+        32,
+        8,
+        1,
+        environment_group=0,
+    )
     assert not cached.any()
     for channel in range(3):
         assert_mean(seen[:, channel], expected[channel], slack=2e-4)
@@ -262,11 +349,16 @@ def bias_over(values, reference, groups, seeds):
             continue
         a = np.array([v[member].mean() for v in values])
         b = np.array([v[member].mean() for v in reference])
-        yield number, a.mean() / b.mean() - 1, np.hypot(a.std(ddof=1), b.std(ddof=1)) / np.sqrt(seeds) / b.mean()
+        yield (
+            number,
+            a.mean() / b.mean() - 1,
+            np.hypot(a.std(ddof=1), b.std(ddof=1)) / np.sqrt(seeds) / b.mean(),
+        )
 
 
 def test_shading_caches_compose_to_the_rendered_radiance(T, room):
-    """Diffuse walls, a glossy and a metal block; exact levels agree within noise, interpolated levels within 0.5 %."""
+    """Diffuse walls, a glossy and a metal block; exact levels agree within noise, interpolated levels within
+    0.5 %."""
     exact = np.array([0.25, 0.35, 0.9])
     grid = np.array([0.02, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0])
     kd, ks = brdf.kd_ks(room.base_color, room.metallic[:, None])
@@ -275,8 +367,18 @@ def test_shading_caches_compose_to_the_rendered_radiance(T, room):
     for seed in range(seeds):
         rendered.append(room.render(T, 128, seed=100 + seed))
         for levels, kept in ((exact, composed), (grid, interpolated)):
-            diffuse, s0, s1 = T.shading_caches(room.geometry, room.material, room.emitters, room.points, room.normals,
-                                               room.wo, levels, 128, 5, seed=seed)
+            diffuse, s0, s1 = T.shading_caches(
+                room.geometry,
+                room.material,
+                room.emitters,
+                room.points,
+                room.normals,
+                room.wo,
+                levels,
+                128,
+                5,
+                seed=seed,
+            )
             lower = np.clip(np.searchsorted(levels, room.roughness) - 1, 0, len(levels) - 2)
             t = ((room.roughness - levels[lower]) / (levels[lower + 1] - levels[lower]))[:, None]
             at_r = [(1 - t) * s[rows, lower] + t * s[rows, lower + 1] for s in (s0, s1)]
@@ -291,11 +393,26 @@ def test_transport_matrix_reproduces_reflected_radiance(T, room):
     seeds, products, rendered = 4, [], []
     for seed in range(seeds):
         matrix, cached = T.transport_matrix(
-            room.geometry, room.material, room.points, room.normals, room.wo, room.base_color, room.roughness,
-            room.metallic, room.group, 2, room.side, 128, 5, seed=seed)
+            room.geometry,
+            room.material,
+            room.points,
+            room.normals,
+            room.wo,
+            room.base_color,
+            room.roughness,
+            room.metallic,
+            room.group,
+            2,
+            room.side,
+            128,
+            5,
+            seed=seed,
+        )
         assert matrix.shape == (len(room.points), 2, 3) and not cached.any() and (matrix >= 0).all()
         products.append(np.einsum("ngc,gc->nc", matrix, ROOM_RADIANCE))
-        rendered.append(room.render(T, 128, seed=50 + seed))  # no visible emission: those pixels were left out
+        rendered.append(
+            room.render(T, 128, seed=50 + seed)
+        )  # no visible emission: those pixels were left out
     for number, bias, error in bias_over(products, rendered, room.object, seeds):
         assert abs(bias) < 4 * error + 1e-3 and error < 8e-3, number
 
@@ -312,20 +429,47 @@ def test_constant_cache_in_a_closed_room_is_a_furnace(T, room):
     pick = slice(0, None, 3)
     levels = [0.1, 0.9]
     cache = constant_cache(T, (2, 1, 0))
-    diffuse, s0, s1 = T.shading_caches(room.geometry, room.material, dark, room.points[pick], room.normals[pick],
-                                       room.wo[pick], levels, 64, 1, 0, cache=cache)
+    diffuse, s0, s1 = T.shading_caches(
+        room.geometry,
+        room.material,
+        dark,
+        room.points[pick],
+        room.normals[pick],
+        room.wo[pick],
+        levels,
+        64,
+        1,
+        0,
+        cache=cache,
+    )
     assert_mean(diffuse[:, 0], 2)
     assert_mean(diffuse[:, 1], 1)
     assert not diffuse[:, 2].any()  # in the table with radiance 0: black, not a miss
     matrix, h = T.transport_matrix(
-        room.geometry, room.material, room.points[pick], room.normals[pick], room.wo[pick], room.base_color[pick],
-        room.roughness[pick], room.metallic[pick], np.full(len(room.faces), -1), 0, None, 64, 1, 0, cache=cache)
+        room.geometry,
+        room.material,
+        room.points[pick],
+        room.normals[pick],
+        room.wo[pick],
+        room.base_color[pick],
+        room.roughness[pick],
+        room.metallic[pick],
+        np.full(len(room.faces), -1),
+        0,
+        None,
+        64,
+        1,
+        0,
+        cache=cache,
+    )
     assert matrix.shape == (len(diffuse), 0, 3)
     walls = room.object[pick] == 0
     kd, ks = brdf.kd_ks(room.base_color[pick], room.metallic[pick, None])
     expected = brdf.compose(kd, ks, diffuse, s0[:, 1], s1[:, 1])
     assert_mean((h - expected)[walls, 0], 0)
-    seen = T.render(room.geometry, room.material, dark, room.origin, room.directions[pick], 64, 1, 0, cache=cache)
+    seen = T.render(
+        room.geometry, room.material, dark, room.origin, room.directions[pick], 64, 1, 0, cache=cache
+    )
     assert_mean(seen[:, 0] - h[:, 0], 0)  # the primary hit is shaded with its material, never cached
     assert_mean(seen[:, 1] - h[:, 1], 0)
     assert seen[:, 0].mean() < 1.7 and not seen[:, 2].any()
@@ -333,13 +477,16 @@ def test_constant_cache_in_a_closed_room_is_a_furnace(T, room):
 
 def test_empty_cache_and_missing_voxels_trace_on(T, room):
     none = room.render(T, 4, seed=1)
-    for cache in (T.RadianceCache(0.1, (0, 0, 0), np.zeros((0, 3)), np.zeros((0, 3))),
-                  T.RadianceCache(0.1, (50, 50, 50), [[0, 0, 0]], [[9, 9, 9]])):
+    for cache in (
+        T.RadianceCache(0.1, (0, 0, 0), np.zeros((0, 3)), np.zeros((0, 3))),
+        T.RadianceCache(0.1, (50, 50, 50), [[0, 0, 0]], [[9, 9, 9]]),
+    ):
         assert np.array_equal(none, room.render(T, 4, seed=1, cache=cache))
 
 
 def test_true_radiance_cache_replaces_the_tail_of_the_paths(T):
-    """Nearly Lambertian room: cache = radiance traced along wall normals; one bounce + cache equals eight bounces."""
+    """Nearly Lambertian room: cache = radiance traced along wall normals; one bounce + cache equals eight
+    bounces."""
     shell = box((0, 0, 0), (2, 2, 2), inward=True)
     light = quad((0.7, 0.7, 1.98), (0, 0.6, 0), (0.6, 0, 0))
     vertices, faces, ids = merge([shell, light])
@@ -349,8 +496,13 @@ def test_true_radiance_cache_replaces_the_tail_of_the_paths(T):
     def material(point, face, object_id, active):
         import drjit as dr
         import mitsuba as mi
+
         colour, roughness, metallic = grey(point, face, object_id, active)
-        return dr.select(object_id == 1, mi.Color3f(0), colour), roughness, dr.select(object_id == 1, 1, metallic)
+        return (
+            dr.select(object_id == 1, mi.Color3f(0), colour),
+            roughness,
+            dr.select(object_id == 1, 1, metallic),
+        )
 
     emitters = T.Emitters(geometry, np.where(ids[:, None] == 1, [5.0, 5, 5], 0.0), np.where(ids == 1, 1, 0))
     edge, origin = 0.1, np.array([-0.05, -0.05, -0.05], np.float32)
@@ -393,11 +545,37 @@ def test_reruns_chunks_and_threads_do_not_change_a_bit(T, room):
     def everything(chunk):
         parts = (room.points[pick], room.normals[pick], room.wo[pick])
         du = np.float32([1 / 26, 0, 0])
-        rendered = T.render(room.geometry, room.material, room.emitters, room.origin, room.directions[pick], 8, 4, 9,
-                            jitter=(du, du), chunk=chunk, cache=constant_cache(T, (1, 2, 3), low=(-6, -6, -3), count=12))
-        caches = T.shading_caches(room.geometry, room.material, room.emitters, *parts, levels, 8, 4, 9, chunk=chunk)
-        matrix = T.transport_matrix(room.geometry, room.material, *parts, room.base_color[pick], room.roughness[pick],
-                                    room.metallic[pick], room.group, 2, room.side, 8, 4, 9, chunk=chunk)
+        rendered = T.render(
+            room.geometry,
+            room.material,
+            room.emitters,
+            room.origin,
+            room.directions[pick],
+            8,
+            4,
+            9,
+            jitter=(du, du),
+            chunk=chunk,
+            cache=constant_cache(T, (1, 2, 3), low=(-6, -6, -3), count=12),
+        )
+        caches = T.shading_caches(
+            room.geometry, room.material, room.emitters, *parts, levels, 8, 4, 9, chunk=chunk
+        )
+        matrix = T.transport_matrix(
+            room.geometry,
+            room.material,
+            *parts,
+            room.base_color[pick],
+            room.roughness[pick],
+            room.metallic[pick],
+            room.group,
+            2,
+            room.side,
+            8,
+            4,
+            9,
+            chunk=chunk,
+        )
         return b"".join(a.tobytes() for a in (rendered, *caches, *matrix))
 
     first = everything(1 << 18)
@@ -415,7 +593,9 @@ def test_lanes_and_seeds_are_independent(T, room):
     same = (repeated(room.origin, n), repeated(room.directions[len(room.directions) // 2], n))
 
     def run(seed):
-        return T.render(room.geometry, room.material, room.emitters, *same, 1, 5, seed)[:, 0].astype(np.float64)
+        return T.render(room.geometry, room.material, room.emitters, *same, 1, 5, seed)[:, 0].astype(
+            np.float64
+        )
 
     a, b, c = run(0), run(1), run(2**63 + 1)
     assert len(np.unique(a)) > 0.5 * n
@@ -430,11 +610,29 @@ def test_jitter_is_a_box_filter_over_the_pixel(T):
     black = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (2, 1)))
     n = 2000
     # At depth 2 the pixel of width 1 spans x in [-1, 1] (centre 0): 40 % lies beyond x = 0.2.
-    seen = T.render(geometry, black, emitters, repeated((0, 0, 0), n), repeated((0, 0, 1), n), 16, 0, 0,
-                    jitter=((1, 0, 0), (0, 1, 0)))
+    seen = T.render(
+        geometry,
+        black,
+        emitters,
+        repeated((0, 0, 0), n),
+        repeated((0, 0, 1), n),
+        16,
+        0,
+        0,
+        jitter=((1, 0, 0), (0, 1, 0)),
+    )
     assert_mean(seen[:, 0], 0.4)
-    wide = T.render(geometry, black, emitters, repeated((0, 0, 0), n), repeated((3, 0, 5), n), 16, 0, 0,
-                    jitter=((3, 0, 0), (0, 1, 0)))  # un-normalised direction: x/z in 2 * [0.3, 0.9] - all but nothing below 0.1
+    wide = T.render(
+        geometry,
+        black,
+        emitters,
+        repeated((0, 0, 0), n),
+        repeated((3, 0, 5), n),
+        16,
+        0,
+        0,
+        jitter=((3, 0, 0), (0, 1, 0)),
+    )  # un-normalised direction: x/z in 2 * [0.3, 0.9] - all but nothing below 0.1
     assert (wide == 1).all()
 
 
@@ -445,8 +643,9 @@ def test_trace_agrees_with_open3d(T, room):
     directions = (rng.normal(size=(20000, 3)) * rng.uniform(0.1, 5, (20000, 1))).astype(np.float32)
     face, t = T.trace(room.geometry, origins, directions, chunk=7001)
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(open3d.core.Tensor(room.vertices.astype(np.float32)),
-                        open3d.core.Tensor(room.faces.astype(np.uint32)))
+    scene.add_triangles(
+        open3d.core.Tensor(room.vertices.astype(np.float32)), open3d.core.Tensor(room.faces.astype(np.uint32))
+    )
     other = scene.cast_rays(open3d.core.Tensor(np.concatenate([origins, directions], 1)))
     assert np.mean(face == other["primitive_ids"].numpy().astype(np.int64)) > 0.9995
     np.testing.assert_allclose(t, other["t_hit"].numpy(), rtol=1e-4)
@@ -468,7 +667,9 @@ def test_degenerate_faces_keep_their_ids(T):
     emitters = T.Emitters(geometry, np.ones((4, 3)))
     assert set(emitters.slots) == {1, 3} and emitters.pdf_area[[0, 2]].tolist() == [0, 0]
     colours = T.FaceMaterials(np.tile([0.5, 0.5, 0.5, 0.5, 0], (4, 1)))
-    assert np.isfinite(T.render(geometry, colours, emitters, [0, 0, 1], repeated((0.1, 0, -1), 5), 8, 3, 0)).all()
+    assert np.isfinite(
+        T.render(geometry, colours, emitters, [0, 0, 1], repeated((0.1, 0, -1), 5), 8, 3, 0)
+    ).all()
 
 
 def test_light_slots_have_the_density_they_report(T):
@@ -489,7 +690,9 @@ def test_sampling_weights_do_not_change_the_mean(T, room):
     means = []
     for weight in (None, room.geometry.areas, np.where(room.group == 0, 1.0, 0.0), np.zeros(len(room.faces))):
         emitters = T.Emitters(room.geometry, room.radiance, room.side, sampling_weight=weight)
-        seen = T.render(room.geometry, room.material, emitters, repeated(room.origin, n), repeated(direction, n), 32, 3, 4)
+        seen = T.render(
+            room.geometry, room.material, emitters, repeated(room.origin, n), repeated(direction, n), 32, 3, 4
+        )
         means.append((seen[:, 0].mean(), seen[:, 0].std() / np.sqrt(n)))
     for mean, error in means[1:]:
         assert abs(mean - means[0][0]) < 3.5 * np.hypot(error, means[0][1])
@@ -511,7 +714,9 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     far = np.array([[1e9, 0, 0], [-1e9, 0, 0], [2, 1, 1e4]], np.float32)
     points = np.concatenate([room.points, far]).astype(np.float32)
     objects = np.concatenate([objects, [0, 1, 2]]).astype(np.int32)
-    color, roughness, metallic = material(mi.Point3f(points.T), mi.UInt32(0), mi.Int32(objects), mi.Bool(True))
+    color, roughness, metallic = material(
+        mi.Point3f(points.T), mi.UInt32(0), mi.Int32(objects), mi.Bool(True)
+    )
     got = np.column_stack([color.numpy().T, roughness.numpy(), metallic.numpy()])
 
     table = cells.CellTable.build(keys)
@@ -527,20 +732,48 @@ def test_cell_materials_read_what_numpy_reads(T, room):
 
 
 def test_extremes_are_finite(T, room):
-    mirror = T.FaceMaterials(np.tile([0, 0, 0, 0, 1.0], (len(room.faces), 1)))  # black metal, r clamped to 0.02
+    mirror = T.FaceMaterials(
+        np.tile([0, 0, 0, 0, 1.0], (len(room.faces), 1))
+    )  # black metal, r clamped to 0.02
     bright = T.Emitters(room.geometry, room.radiance * 1e6, room.side)
     grazing = room.normals * 1e-6 + np.cross(room.normals, (0.3, 0.5, 0.8))
     behind = np.cross(room.normals, (0.3, 0.5, 0.8))
     some = slice(0, 300)
     for material in (mirror, room.material):
         for wo in (grazing, behind, room.wo):
-            caches = T.shading_caches(room.geometry, material, bright, room.points[some], room.normals[some], wo[some],
-                                      [0.02, 1], 8, 6, 0)
-            matrix = T.transport_matrix(room.geometry, material, room.points[some], room.normals[some], wo[some],
-                                        np.zeros((300, 3)), np.zeros(300), np.ones(300), room.group, 2, room.side, 8, 6, 0)
+            caches = T.shading_caches(
+                room.geometry,
+                material,
+                bright,
+                room.points[some],
+                room.normals[some],
+                wo[some],
+                [0.02, 1],
+                8,
+                6,
+                0,
+            )
+            matrix = T.transport_matrix(
+                room.geometry,
+                material,
+                room.points[some],
+                room.normals[some],
+                wo[some],
+                np.zeros((300, 3)),
+                np.zeros(300),
+                np.ones(300),
+                room.group,
+                2,
+                room.side,
+                8,
+                6,
+                0,
+            )
             for value in (*caches, *matrix):
                 assert np.isfinite(value).all() and (value >= 0).all()
-        assert np.isfinite(T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)).all()
+        assert np.isfinite(
+            T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)
+        ).all()
     dark = T.Emitters(room.geometry, np.zeros((len(room.faces), 3)))
     assert not T.render(room.geometry, room.material, dark, room.origin, room.directions, 2, 4, 0).any()
 
@@ -580,14 +813,41 @@ def test_bad_input_is_named(T, room):
     with pytest.raises(InputError, match="NaN"):
         T.FaceMaterials(np.full((2, 5), np.nan))
     with pytest.raises(InputError, match="roughness levels"):
-        T.shading_caches(room.geometry, room.material, room.emitters, room.points, room.normals, room.wo, [0.5, 0.1], 1, 1, 0)
+        T.shading_caches(
+            room.geometry,
+            room.material,
+            room.emitters,
+            room.points,
+            room.normals,
+            room.wo,
+            [0.5, 0.1],
+            1,
+            1,
+            0,
+        )
     with pytest.raises(InputError, match="samples=0"):
         room.render(T, 0, seed=0)
     with pytest.raises(InputError, match="zero vector"):
         T.render(room.geometry, room.material, room.emitters, [0, 0, 0], np.zeros((1, 3)), 1, 1, 0)
     with pytest.raises(InputError, match="emitter_of_face"):
-        T.transport_matrix(room.geometry, room.material, room.points, room.normals, room.wo, room.base_color, room.roughness,
-                           room.metallic, room.group, 1, room.side, 1, 1, 0)
+        T.transport_matrix(
+            room.geometry,
+            room.material,
+            room.points,
+            room.normals,
+            room.wo,
+            room.base_color,
+            room.roughness,
+            room.metallic,
+            room.group,
+            1,
+            room.side,
+            1,
+            1,
+            0,
+        )
     none = np.zeros((0, 3), np.float32)
     assert T.render(room.geometry, room.material, room.emitters, none, none, 1, 1, 0).shape == (0, 3)
-    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[1].shape == (0, 1, 3)
+    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[
+        1
+    ].shape == (0, 1, 3)

@@ -14,7 +14,7 @@ Array = np.ndarray
 
 SEGMENT_EDGE = (1.0, 0.55, 0.0)
 DEPTH_EDGE = (0.0, 0.85, 1.0)
-DEPTH_STEP = 0.05  # relative change of depth between neighbours that counts as an edge
+DEPTH_STEP = 0.05  # see `depth_edges`
 
 
 def encoded(image: Array) -> Array:
@@ -49,21 +49,34 @@ def difference(a: Array, b: Array, mask: Array, high: float = 0.25) -> Array:
     return scalar(error.mean(-1) if error.ndim == 3 else error, 0.0, high, "error", mask)
 
 
-def edges(values: Array, step: float | None = None) -> Array:
-    """(H, W) bool: differs from the pixel to the right or below; with `step`, by more than that share of the smaller value."""
-    out = np.zeros(values.shape, bool)
-    for axis in (0, 1):
-        a = values[:-1] if axis == 0 else values[:, :-1]
-        b = values[1:] if axis == 0 else values[:, 1:]
-        far = a != b if step is None else np.abs(a - b) > step * np.maximum(np.minimum(a, b), 1e-6)
-        (out[:-1] if axis == 0 else out[:, :-1])[far] = True
+def edges(ids: Array) -> Array:
+    """(H, W) bool: the id differs from that of the pixel to the right or below."""
+    out = np.zeros(ids.shape, bool)
+    out[:-1] |= ids[:-1] != ids[1:]
+    out[:, :-1] |= ids[:, :-1] != ids[:, 1:]
+    return out
+
+
+def depth_edges(depth: Array, step: float = DEPTH_STEP) -> Array:
+    """(H, W) bool: inverse depth bends by more than the share `step` of itself between three neighbours.
+
+    Inverse depth is linear over the image of a plane, so slanted walls have no edges, only steps and sharp folds do.
+    0 = miss counts as infinitely far.
+    """
+    w = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0)
+    out = np.zeros(depth.shape, bool)
+    for a, b, c, middle in (
+        (w[:-2], w[1:-1], w[2:], out[1:-1]),
+        (w[:, :-2], w[:, 1:-1], w[:, 2:], out[:, 1:-1]),
+    ):
+        middle |= np.abs(a - 2 * b + c) > step * np.maximum(np.maximum(a, b), c)
     return out
 
 
 def alignment(photo: Array, object_id: Array, depth: Array) -> Array:
     """Edges of the mesh over the pale photograph: objects orange, depth steps cyan. They should lie on what they outline."""
     picture = 0.55 * np.repeat(np.clip(photo, 0, 1).mean(-1, keepdims=True), 3, -1) + 0.2
-    picture[edges(depth, DEPTH_STEP)] = DEPTH_EDGE
+    picture[depth_edges(depth)] = DEPTH_EDGE
     picture[edges(object_id)] = SEGMENT_EDGE
     return color.to_uint8(picture)
 

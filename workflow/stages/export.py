@@ -26,17 +26,17 @@ def run(job: Job) -> None:
     """Write scene.glb, mitsuba/, maps/<view>.exr and the tables of the deliverable."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
-    if len(recovered.faces) > job.settings.export.max_faces_glb:
+    if len(recovered.surface.faces) > job.settings.export.max_faces_glb:
         raise InputError(
-            f"scene {job.scene}: the mesh has {len(recovered.faces)} faces, export.max_faces_glb allows"
+            f"scene {job.scene}: the mesh has {len(recovered.surface.faces)} faces, export.max_faces_glb allows"
             f" {job.settings.export.max_faces_glb}. Raise it, or decimate the mesh."
         )
     scene = _with_observers(capture, recovered)
-    budget = max(len(recovered.faces), min(SPLIT_FACES, job.settings.export.max_faces_glb))
-    parts = build_parts(scene, max(VERTEX_SPACING, 2 * recovered.cell_edge), budget)
+    budget = max(len(recovered.surface.faces), min(SPLIT_FACES, job.settings.export.max_faces_glb))
+    parts = build_parts(scene, max(VERTEX_SPACING, 2 * recovered.surface.cell_edge), budget)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
     job.writer.bytes("scene.glb", glb_bytes(parts, scene.up, provenance))
-    for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.environment).items():
+    for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.light.environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
     _maps(job, capture)
     _emitter_table(job, recovered)
@@ -52,28 +52,29 @@ def run(job: Job) -> None:
 
 def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredScene:
     """The scene with what the exporters need to know about who looked at it."""
-    front, back = np.zeros((2, len(recovered.faces)), np.int64)
-    vertices = recovered.vertices.astype(np.float64)
+    front, back = np.zeros((2, len(recovered.surface.faces)), np.int64)
+    vertices = recovered.surface.vertices.astype(np.float64)
     for view in capture.views:
         _, face_id = capture.gbuffer(view)
-        sides = seen_sides(vertices, recovered.faces, face_id, view.world_from_camera[:3, 3])
+        sides = seen_sides(vertices, recovered.surface.faces, face_id, view.world_from_camera[:3, 3])
         front += sides[0]
         back += sides[1]
     up = capture.facts.get("up")
     poses = np.stack([view.world_from_camera for view in capture.views])
+    surface = recovered.surface
     return RecoveredScene(
-        recovered.vertices,
-        recovered.faces,
-        recovered.object_id,
+        surface.vertices,
+        surface.faces,
+        surface.object_id,
         recovered.object_names,
         recovered.cell_centres,
-        recovered.cell_object,
-        recovered.cell_values,
-        recovered.object_values,
+        surface.cell_object,
+        surface.cell_values,
+        surface.object_values,
         recovered.emitter_id,
-        recovered.emitter_side,
+        recovered.light.side,
         recovered.emitter_radiance,
-        recovered.environment,
+        recovered.light.environment,
         front,
         back,
         np.asarray(up, np.float64) if up else up_axis(poses),

@@ -12,6 +12,7 @@ import numpy as np
 
 from iif_core import metrics
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.base_scene import read_exposures
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
@@ -58,9 +59,14 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     rows = _Rows()
     means = _PredictionMeans(job, capture) if capture.has_truth else None
+    exposures = read_exposures(job, capture)
+
+    def scores_of(index: int) -> list[tuple[str, str, str, list[metrics.Score]]]:
+        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means))
+
     with ThreadPoolExecutor(job.threads) as pool:
         # map keeps the order of the views, so the tables do not depend on the number of threads
-        for done, scored in enumerate(pool.map(lambda view: list(_view_scores(job, capture, view, means)), capture.views)):
+        for done, scored in enumerate(pool.map(scores_of, range(len(capture.views)))):
             for entry in scored:
                 rows.add(*entry)
             job.progress(done + 1, len(capture.views), "views scored")
@@ -71,7 +77,7 @@ def run(job: Job) -> None:
 
 
 def _view_scores(
-    job: Job, capture: CaptureReader, view: View, means: _PredictionMeans | None
+    job: Job, capture: CaptureReader, view: View, exposure: float, means: _PredictionMeans | None
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
     """(variant, view, quantity, scores) of one view."""
     photo, valid = capture.photo(view)
@@ -79,7 +85,7 @@ def _view_scores(
     hit = face_id >= 0
     file = f"maps/{view.name}.exr"
     rendered = job.read("render").exr(file)
-    sensor = np.clip(view.exposure * photo, 0, 1) if capture.is_hdr else photo
+    sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
     yield "result", view.name, "rgb", metrics.score_map(
         "rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr
     )

@@ -9,6 +9,7 @@ import yaml
 
 from iif_core import color
 from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.base_scene import read_exposures
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.recovered import Recovered, read_recovered, response_samples
@@ -99,10 +100,10 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
 def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple[str, str]]:
     first = capture.views[0]
     sizes = sorted({(v.width, v.height) for v in capture.views})
-    exposures = np.array([v.exposure for v in capture.views])
+    exposures = read_exposures(job, capture)
     stops = np.log2(exposures.max() / exposures.min()) if exposures.min() > 0 else 0.0
     held_out = sum(v.split == "test" for v in capture.views)
-    extent = np.ptp(recovered.vertices, axis=0)
+    extent = np.ptp(recovered.surface.vertices, axis=0)
     prior = job.read("prior").manifest.get("settings", {}).get("prior", {})
     size = f"{first.width} x {first.height}" if len(sizes) == 1 else f"{len(sizes)} sizes, first {first.width} x {first.height}"
     facts = [
@@ -110,9 +111,9 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         ("source", str(capture.facts.get("source", ""))),
         ("photographs", f"{len(capture.views)} of {size} pixels, {capture.facts['dynamic_range'].upper()}"),
         ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
-        ("mesh", f"{len(recovered.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
+        ("mesh", f"{len(recovered.surface.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
         ("objects", str(len(recovered.object_names))),
-        ("surface cells", f"{len(recovered.cell_ijk)} of {1000 * recovered.cell_edge:.1f} mm"),
+        ("surface cells", f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm"),
         ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
     ]
     if held_out:
@@ -154,20 +155,20 @@ def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewR
     count = min(job.settings.report.views, len(capture.views))
     chosen = np.unique(np.linspace(0, len(capture.views) - 1, count).round().astype(int))
     emission_exposure = 0.8 / max(float(recovered.emitter_radiance.max(initial=0)), 1e-6)
-    rows = []
+    exposures, rows = read_exposures(job, capture), []
     for done, i in enumerate(chosen):
-        rows.append(_view(job, capture, recovered, capture.views[i], emission_exposure))
+        rows.append(_view(job, capture, capture.views[i], float(exposures[i]), emission_exposure))
         job.progress(done + 1, len(chosen), "views drawn")
     return rows
 
 
-def _view(job: Job, capture: CaptureReader, recovered: Recovered, view: View, emission_exposure: float) -> ViewRows:
+def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emission_exposure: float) -> ViewRows:
     file = f"maps/{view.name}.exr"
     photo, valid = capture.photo(view)
     depth, face_id = capture.gbuffer(view)
     hit = face_id >= 0
     rendered = job.read("render").exr(file)
-    sensor = np.clip(view.exposure * photo, 0, 1) if capture.is_hdr else photo
+    sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
     show = (lambda image: pic.linear(image)) if capture.is_hdr else pic.encoded
 
     def tile(title: str, image: np.ndarray, note: str = "", lossless: bool = False) -> Picture:
@@ -218,7 +219,7 @@ def _view(job: Job, capture: CaptureReader, recovered: Recovered, view: View, em
             start = None if capture.has_truth else photograph
             strips.append(Strip("raw prediction", [start, *first, disagreement, None]))
     strips.append(Strip("checks", _checks(job, view, file, sensor, depth, valid & hit, tile)))
-    captions = [f"{view.width} x {view.height}", f"exposure {view.exposure:.3g}"]
+    captions = [f"{view.width} x {view.height}", f"exposure {exposure:.3g}"]
     if view.split == "test":
         captions.append("held out: not used in the reconstruction")
     return ViewRows(view.name, ", ".join(captions), strips)

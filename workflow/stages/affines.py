@@ -1,0 +1,281 @@
+"""affines: one correction per object and the camera response, fitted to the photographs (METHOD 2.8, 7b)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from iif_core import plan
+from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
+from iif_core.response import Response, family_for, response
+from workflow.artifacts.store import StageReader, ids_from_disk, rgb, split_rgb
+from workflow.base_scene import (
+    MATERIAL,
+    BaseScene,
+    base_maps,
+    read_base_scene,
+    read_exposures,
+    read_light,
+    view_pixels,
+)
+from workflow.job import Job
+from workflow.normal_form import CaptureReader, View
+
+SATURATION = 0.99
+RESPONSE_SAMPLES = 101
+PROBE_PIXELS = 20_000
+_SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
+
+
+def run(job: Job) -> None:
+    """Write objects.parquet, camera_response.parquet (LDR), cells.parquet, maps/<view>.exr and affines.json."""
+    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    settings = job.settings.affines
+    emits = read_light(job, len(scene.faces)).emits
+    exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job, capture), strict=True))
+    problem = _problem(job, capture, scene, emits, exposures)
+    family = family_for(settings.response, capture.facts["dynamic_range"])
+    start = response(family)
+    options = FitOptions(
+        iterations=settings.iterations, ridge=settings.ridge, robust_width=settings.robust_width,
+        scale="none" if capture.is_hdr else settings.scale,
+    )
+    job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
+    fit = fit_affines(problem, start, options)
+    names = _names(job, scene.n_objects)
+    for o in range(scene.n_objects):
+        job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
+    _write_objects(job, names, fit)
+    if not capture.is_hdr:
+        _write_response(job, fit.response)
+    _write_cells(job, fit)
+    _write_maps(job, capture, fit)
+    decisions = _plan(problem, fit, start, options, capture.facts["dynamic_range"])
+    job.writer.json(
+        "affines.json",
+        {
+            "light_scale": fit.light_scale,
+            "history": [float(x) for x in fit.history],
+            "converged": bool(fit.converged),
+            "pixels": int(fit.pixels.sum()),
+            "residual": float(np.sqrt(np.average(fit.residual**2, weights=np.maximum(fit.pixels, 1e-9)))) if len(fit.pixels) else 0.0,
+            "response": {
+                "family": fit.response.family, "names": list(fit.response.names),
+                "parameters": np.ravel(fit.response.params).tolist(),
+            },
+            "plan": decisions,
+        },
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------------ input
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    """Pixels of one view that enter the fit."""
+
+    index: np.ndarray
+    object_id: np.ndarray
+    value: np.ndarray
+
+
+def _eligible(job: Job, capture: CaptureReader, scene: BaseScene, view: View, emits: np.ndarray) -> _Chosen:
+    """Interior, valid pixels of surface that does not shine."""
+    pixels = view_pixels(job, capture, scene, view)
+    use = pixels.valid & pixels.interior & (pixels.object_id >= 0) & ~emits[pixels.face]
+    return _Chosen(pixels.index[use], pixels.object_id[use], pixels.value[use])
+
+
+def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
+    """Share of each object's pixels to keep, (O,): the same number for every object until the budget is used, all of the
+    pixels of those that have fewer."""
+    counts = np.asarray(counts, np.float64)
+    if counts.sum() <= budget:
+        return np.ones(len(counts))
+    order = np.sort(counts)
+    below = np.r_[0.0, np.cumsum(order)[:-1]]
+    limits = (budget - below) / np.arange(len(order), 0, -1)
+    limit = limits[np.argmax(limits <= order)]
+    return np.minimum(1.0, limit / np.maximum(counts, 1.0))
+
+
+def _problem(
+    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]
+) -> FitProblem:
+    """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
+    views = [view for view in capture.views if view.split != "test"] or list(capture.views)
+    counts = np.zeros(max(scene.n_objects, 1), np.int64)
+    for view in views:
+        counts += np.bincount(_eligible(job, capture, scene, view, emits).object_id, minlength=len(counts))
+    share = fair_shares(counts, job.settings.affines.pixels)
+    shading, levels = job.read("shading"), job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure")}
+    cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
+    for done, view in enumerate(views):
+        chosen = _eligible(job, capture, scene, view, emits)
+        rng = np.random.default_rng([job.seed, _SEEDS, view.view_id])
+        keep = rng.random(len(chosen.index)) < share[chosen.object_id]
+        index = chosen.index[keep]
+        rows["object"].append(chosen.object_id[keep])
+        rows["base"].append(base_maps(job, view)[index])
+        rows["value"].append(chosen.value[keep])
+        rows["exposure"].append(np.full(len(index), exposures[view.view_id] if not capture.is_hdr else 1.0))
+        channels = shading.exr(f"maps/{view.name}.exr")
+        for half in range(2):
+            for number, part in enumerate(_cached(channels, half, len(levels), index)):
+                cached[half][number].append(part)
+        job.progress(done + 1, len(views), "views read")
+    joined = {name: np.concatenate(parts) for name, parts in rows.items()}
+    value = np.asarray(joined["value"], np.float32)
+    saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
+    halves = [[np.concatenate(part) for part in half] for half in cached]
+    d, s0, s1 = ((halves[0][i], halves[1][i]) for i in range(3))
+    # A value at the top of the range is a bound there, whatever is stored above it.
+    value = np.minimum(value, SATURATION) if not capture.is_hdr else value
+    return FitProblem(
+        joined["object"].astype(np.int32), scene.n_objects, joined["base"], d, s0, s1, levels, value, joined["exposure"],
+        saturated,
+    )
+
+
+def _cached(
+    channels: dict[str, np.ndarray], half: int, levels: int, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Diffuse (n, 3), s0 and s1 (n, J, 3) of some pixels."""
+
+    def read(layer: str) -> np.ndarray:
+        return np.stack([channels[f"half{half}.{layer}.{c}"].reshape(-1)[index] for c in "RGB"], -1)
+
+    lobes = [np.stack([read(f"{name}.{j:02d}") for j in range(levels)], 1) for name in ("s0", "s1")]
+    return read("diffuse"), lobes[0], lobes[1]
+
+
+def _names(job: Job, n_objects: int) -> list[str]:
+    table = job.read("segmentation").table("objects.parquet")
+    names = [f"object{i}" for i in range(n_objects)]
+    for i, name in zip(table["object_id"], table["name"], strict=True):
+        names[int(i)] = str(name)
+    return names
+
+
+# ----------------------------------------------------------------------------------------------------------------- output
+
+
+def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
+    spread = np.sqrt(np.clip(np.diagonal(fit.covariance, axis1=1, axis2=2), 0.0, None))
+    columns: dict[str, Any] = {
+        "object_id": np.arange(len(names), dtype=np.int32), "name": np.array(names, dtype=str), "pixels": fit.pixels,
+    }
+    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
+        columns[f"T_{name}"] = fit.affine[:, part]
+    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
+        columns[f"std_{name}"] = spread[:, part]
+    columns |= {
+        "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2), "residual": fit.residual,
+        "model": np.array(fit.model, dtype=str),
+    }
+    job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
+
+
+def _write_response(job: Job, curve: Response) -> None:
+    """Parameters (x = 0) and samples of f on [0, 1] for each channel."""
+    x = np.linspace(0.0, 1.0, RESPONSE_SAMPLES)
+    columns: dict[str, list[Any]] = {name: [] for name in ("channel", "kind", "name", "x", "value")}
+    for number, channel in enumerate("RGB"):
+        own = curve.channel(number)
+        rows = [("parameter", name, 0.0, value) for name, value in zip(own.names, own.params, strict=True)]
+        rows += [("sample", "", at, value) for at, value in zip(x, own(x), strict=True)]
+        for kind, name, at, value in rows:
+            for column, entry in zip(columns, (channel, kind, name, float(at), float(value)), strict=True):
+                columns[column].append(entry)
+    job.writer.table("camera_response.parquet", columns)
+
+
+def _write_cells(job: Job, fit: FitResult) -> None:
+    cells = job.read("base").table("cells.parquet")
+    base = np.stack([cells[name] for name in MATERIAL], 1)
+    scale = np.stack([cells[f"scale_albedo_{c}"] for c in "rgb"], 1)
+    object_id = cells["object_id"].astype(np.int64)
+    fitted = apply_affines(fit.affine, object_id, base)
+    spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, scale)
+    columns = {"cell_id": cells["cell_id"], **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)}}
+    job.writer.table("cells.parquet", {**columns, "uncertainty": spread.astype(np.float32)})
+
+
+def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
+    base, segmentation = job.read("base"), job.read("segmentation")
+    for done, view in enumerate(capture.views):
+        file = f"maps/{view.name}.exr"
+        object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)
+        values = base_maps(job, view)
+        scale = _base_scale(base, file)
+        fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
+        spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(scale[:, None], 3, 1))
+        seen = object_id >= 0
+        fitted[~seen], spread[~seen] = 0.0, 0.0
+        shape = (view.height, view.width)
+        channels = {
+            **split_rgb(fitted[:, :3].reshape(*shape, 3), "albedo"),
+            "roughness": fitted[:, 3].reshape(shape), "metallic": fitted[:, 4].reshape(shape),
+            "uncertainty": spread.astype(np.float32).reshape(shape),
+        }
+        job.writer.exr(file, channels)
+        job.progress(done + 1, len(capture.views), "views written")
+
+
+def _base_scale(base: StageReader, file: str) -> np.ndarray:
+    channels = base.exr(file)
+    if "scale.albedo" in channels:
+        return channels["scale.albedo"].ravel().astype(np.float32)
+    return rgb(channels, "scale.albedo").mean(-1).ravel()
+
+
+# ------------------------------------------------------------------------------------------------------------------- plan
+
+
+def _plan(
+    problem: FitProblem, fit: FitResult, start: Response, options: FitOptions, dynamic_range: str
+) -> list[plan.Decision]:
+    object_id = problem.object_id
+    fitted = apply_affines(fit.affine, object_id, problem.base)
+    medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)
+    order = np.argsort(object_id, kind="stable")
+    bounds = np.searchsorted(object_id[order], np.arange(problem.n_objects + 1))
+    for o in range(problem.n_objects):
+        own = order[bounds[o] : bounds[o + 1]]
+        if len(own):
+            medians[o] = np.median(problem.base[own, 4])
+            glossy[o] = np.quantile(fitted[own, 3], 0.05)
+            gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
+    free_metal = fit.free[:, 15] if len(fit.free) else np.zeros(0, bool)
+    fixed, freed = _response_probe(problem, start, options)
+    return [
+        plan.camera_response(dynamic_range, start.family, fixed, freed),
+        plan.metallic(free_metal, medians),
+        plan.specular(glossy, free_metal),
+        plan.affine_size(fit.model),
+        plan.second_pass(gains, fit.pixels),
+    ]
+
+
+def _response_probe(problem: FitProblem, start: Response, options: FitOptions) -> tuple[float, float]:
+    """Residual of a small fit with the starting response and with a fitted one."""
+    if not start.params.size or not len(problem.object_id):
+        return 0.0, 0.0
+    stride = max(1, len(problem.object_id) // PROBE_PIXELS)
+    arrays = {
+        name: tuple(part[::stride] for part in value) if isinstance(value, tuple) else value[::stride]
+        for name, value in problem.__dict__.items()
+        if name not in ("n_objects", "levels")
+    }
+    few = replace(problem, **arrays)
+    out = []
+    for free in (False, True):
+        fit = fit_affines(few, start, replace(options, iterations=6, multi_start=False, free_response=free))
+        weight = fit.pixels.astype(np.float64)
+        out.append(float(np.sqrt((weight * fit.residual**2).sum() / max(weight.sum(), 1.0))))
+    return out[0], out[1]
+
