@@ -666,6 +666,8 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
             first, second = _residuals(px, affine, tone)
             # Fireflies of one half: the distance between the halves, three robust widths wide. Fixed for the whole fit.
             px.trust = 1.0 / (1.0 + (0.5 * (first - second) / (3.0 * opt.robust_width)) ** 2)
+            # A one-sided row takes the low side of the noise for a violation; bounds count below their noise only.
+            px.target = np.where(px.saturated, px.target - 1.5 * np.abs(first - second), px.target)
         early = max(1, opt.iterations // 2) if opt.multi_start else opt.iterations
         state, converged = _descend(px, state, tone, opt, early, opt.free_response, start_params)
         history = state.history

@@ -9,9 +9,11 @@ views a sweep:
 2. alpha: softmax over k of minus the segment's mean squared error, at a temperature that falls from sweep to sweep
    and is 0 in the last one, where the best prediction is taken;
 3. texture: weighted mean (or M-estimate) in each cell of the mixture sum_k alpha_ik T_ik v_nk;
-4. gauge: an affine map of an object's texture and its inverse on all T cancel, so nothing but the ridge holds them,
-   and regression towards a noisy mean shrinks the texture a little every sweep. The object's texture is moved back
-   so that the mean correction has gain one and keeps the mean colour.
+4. gauge: an affine map of an object's texture and its inverse on all T cancel, so the level of an object would drift
+   from sweep to sweep. It is moved back to the object's mean over all predictions, so that the mean correction keeps
+   the mean colour. Contrast is held by the ridge: with predictions of variance v that correlate by rho it settles at
+   about ridge / (ridge + v (1 - rho)) of theirs, it cannot collapse; `history` has the mean gain. Stretching it back
+   every sweep was tried and only amplified the noise of plain objects, with no gain elsewhere.
 
 Given T, errors follow from sums over the segment (Gram matrices, made once) and are not a pass of their own. A segment
 lies in one view, so T, alpha and the mixture of a view need only the previous texture: memory is one view's predictions
@@ -22,7 +24,9 @@ Results do not depend on the order of the predictions, nor on threads.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +46,9 @@ _PROPERTY_OF_CHANNEL = np.array([0, 0, 0, 1, 2])
 _ALBEDO = [0, 1, 2, 5]  # columns of phi = [albedo, roughness, metallic, 1] that each correction reads
 _ROUGHNESS = [3, 5]
 _METALLIC = [4, 5]
+
+_NOTHING = np.zeros((0, 0, 6))
+_T = TypeVar("_T")
 
 Predictions = Callable[[int], NDArray] | Sequence[NDArray]
 
@@ -253,9 +260,19 @@ def _block(problem: BaseProblem, view: int, usable: NDArray | None = None) -> tu
 
 
 def _inside(phi: NDArray) -> NDArray:
-    """(m, K) pixels whose albedo is inside (0, 1)."""
-    colour = phi[..., :3]
-    return (colour.min(-1) > 0) & (colour.max(-1) < 1)
+    """Pixels (...) whose albedo is inside (0, 1) in every channel."""
+    r, g, b = phi[..., 0], phi[..., 1], phi[..., 2]  # NumPy reduces a short last axis slowly
+    return (r > 0) & (r < 1) & (g > 0) & (g < 1) & (b > 0) & (b < 1)
+
+
+def _in_order(work: Callable[[int], _T], n_views: int, threads: int) -> Iterator[_T]:
+    """work(0), work(1), ... in this order, `threads` of them under way at a time."""
+    if threads <= 1:
+        yield from map(work, range(n_views))
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, n_views, threads):  # in rounds, so that no more results wait than there are threads
+            yield from pool.map(work, range(first, min(first + threads, n_views)))
 
 
 # ------------------------------------------------------------------------------------------------------------ sums
@@ -306,10 +323,11 @@ def _identity(n_segments: int, k: int) -> NDArray:
 
 
 def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
-               progress: Callable[[int, int], None] | None = None) -> BaseResult:
+               progress: Callable[[int, int], None] | None = None, threads: int = 1) -> BaseResult:
     """Base texture of a problem by alternating closed forms; deterministic, independent of the order of predictions.
 
-    `progress(done, total)` is called after every pass over the views.
+    `progress(done, total)` is called after every pass over the views. `threads` views are worked on at a time (and are
+    in memory); the result does not depend on it. BLAS threads of their own only get in the way: limit them to one.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
@@ -330,37 +348,41 @@ def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
     history: list[dict[str, float]] = []
 
     for sweep in range(sweeps):
-        last = sweep == sweeps - 1
-        temperature = 0.0 if last else options.temperature * options.anneal**sweep
+        temperature = 0.0 if sweep == sweeps - 1 else options.temperature * options.anneal**sweep
         cells = _CellSums(problem.n_cells)
-        for view in range(n_views):
+        centre = texture if options.robust and sweep else None
+
+        def one_view(view: int, texture: NDArray = texture, temperature: float = temperature) -> tuple[_Block, NDArray]:
+            # writes only the rows of its own segments, so views can run side by side
             block, _, _ = _block(problem, view, usable[view])
+            mixture = np.empty((len(block.cell), 5))
             for segment, rows in block.ranges():
-                phi = block.phi[rows]
-                weight, t = block.weight[rows], texture[block.cell[rows]]
-                weighted = weight[:, None] * t
+                phi, t = block.phi[rows], texture[block.cell[rows]]
+                weighted = block.weight[rows, None] * t
                 cross = (phi.reshape(len(phi), -1).T @ weighted).reshape(k, 6, 5)
                 if not means:
                     affine[segment] = _fit(sums, segment, phi, cross, weighted)
                 error[segment] = _errors(sums, segment, affine[segment], cross, (weighted * t).sum(0))
                 if options.variant == "full":
                     alpha[segment] = selection_weights(error[segment].T, temperature, sums.usable[segment]).T
-                mixture = _mixture(phi, affine[segment], alpha[segment])
-                cells.add(block.cell[rows], mixture, weight, t if options.robust and sweep else None, options)
+                mixture[rows] = _mixture(phi, affine[segment], alpha[segment])
+            return replace(block, phi=_NOTHING), mixture
+
+        for block, mixture in _in_order(one_view, n_views, threads):
+            cells.add(block.cell, mixture, block.weight, centre, options)
         updated = cells.mean(texture)
-        gain = 1.0
         if not means:
-            updated, affine, gain = _regauge(problem, sums, updated, affine, alpha)
+            updated, affine = _anchored(problem, sums, updated, affine, counts)
         change = float(np.sqrt(np.mean((updated - texture)[cells.seen] ** 2))) if cells.seen.any() else 0.0
         texture = updated
         history.append({"temperature": temperature, **_mean_errors(sums, alpha, error), "entropy": _entropy(sums, alpha),
-                        "gain": gain, "change": change})
+                        "gain": _mean_gain(sums, affine, alpha), "change": change})
         _notify(progress, sweep + 2, total)
 
     texture = np.clip(texture, LOWEST, 1.0)
     if options.variant == "object_mean":
         texture = object_means(texture, problem.object_of_cell, counts.weight)[0].astype(np.float64)[problem.object_of_cell]
-    scale = _scales(problem, options, texture, affine, alpha, usable)
+    scale = _scales(problem, options, texture, affine, alpha, usable, threads)
     _notify(progress, total, total)
     value, object_value, object_cells = _filled(problem, texture, counts)
     scale[counts.weight == 0] = _unseen_scale(scale, counts.weight > 0, options)
@@ -429,9 +451,8 @@ def _fit(sums: _Sums, segment: int, phi: NDArray, cross: NDArray, weighted: NDAr
     out = np.zeros((phi.shape[1], 6, 5))
     albedo = cross[:, _ALBEDO, :3]
     for k in np.flatnonzero(sums.clipped[segment]):
-        one = phi[:, k]
-        inside = (one[:, :3].min(1) > 0) & (one[:, :3].max(1) < 1)
-        albedo[k] = one[inside][:, _ALBEDO].T @ weighted[inside, :3]
+        inside = _inside(phi[:, k])
+        albedo[k] = phi[inside, k][:, _ALBEDO].T @ weighted[inside, :3]
     out[:, _ALBEDO, :3] = sums.inverse_albedo[segment] @ (albedo + ridge * np.eye(4, 3))
     for rows, inverse, channel in ((_ROUGHNESS, sums.inverse_roughness, 3), (_METALLIC, sums.inverse_metallic, 4)):
         right = cross[:, rows, channel] + ridge * np.array([1.0, 0.0])
@@ -463,12 +484,12 @@ class _CellSums:
         self.total = np.zeros((5, n_cells))
 
     def add(self, cell: NDArray, value: NDArray, weight: NDArray, centre: NDArray | None, options: BaseOptions) -> None:
-        """`centre` (m, 5): the cell's value, for the weights of the M-estimate; None = mean."""
+        """`centre` (n_cells, 5): texture about which the M-estimate weighs; None = mean."""
         value = np.clip(value, LOWEST, 1.0)
         for c in range(5):
             w = weight
             if centre is not None:
-                w = weight * laplace.kl_weight(value[:, c] - centre[:, c], options.scale_floor, 1.0)
+                w = weight * laplace.kl_weight(value[:, c] - centre[cell, c], options.scale_floor, 1.0)
             np.add.at(self.sum[c], cell, w * value[:, c])
             np.add.at(self.total[c], cell, w)
 
@@ -482,54 +503,51 @@ class _CellSums:
         return np.where(self.seen[:, None], mean.T, fallback)
 
 
-def _regauge(problem: BaseProblem, sums: _Sums, texture: NDArray, affine: NDArray,
-             alpha: NDArray) -> tuple[NDArray, NDArray, float]:
-    """Undo the shrinking of each object's contrast: divide by the mean gain of its selected corrections.
+def _anchored(problem: BaseProblem, sums: _Sums, texture: NDArray, affine: NDArray,
+              counts: _Counts) -> tuple[NDArray, NDArray]:
+    """Texture and corrections, shifted so that each object's mean is that of all its usable predictions."""
+    of_segment, of_cell = problem.object_of_segment, problem.object_of_cell
+    n_objects = int(max(np.max(of_segment, initial=-1), np.max(of_cell, initial=-1))) + 1
+    usable = np.maximum(sums.usable.sum(1), 1)
+    predicted = (sums.gram[:, :, :5, 5] * sums.usable[:, :, None]).sum(1) / usable[:, None]  # (S, 5) weighted sums
+    total = np.bincount(of_cell, counts.weight, n_objects)
+    shift = np.zeros((n_objects, 5))
+    for c in range(5):
+        wanted = np.bincount(of_segment, predicted[:, c], n_objects)
+        found = np.bincount(of_cell, counts.weight * texture[:, c], n_objects)
+        shift[:, c] = (wanted - found) / np.where(total > 0, total, np.inf)
+    affine = affine.copy()
+    affine[..., 5, :] += shift[of_segment][:, None, :]
+    return texture + shift[of_cell], affine
 
-    The map of a property p of object o is x -> (x - c) / g + c with g the weighted mean gain (albedo: trace of A / 3)
-    and c the object's mean, so the level stays where the data put it. Gains are limited to [0.5, 2]; out of that the
-    object is nearly constant and has no contrast to speak of. Returns texture, corrections, mean gain before.
-    """
-    n_objects = int(max(np.max(problem.object_of_segment, initial=-1), np.max(problem.object_of_cell, initial=-1))) + 1
-    seg_object = problem.object_of_segment
-    gains = np.stack([affine[..., range(3), range(3)].mean(-1), affine[..., 3, 3], affine[..., 4, 4]], -1)  # (S, K, 3)
-    weight = (sums.weight[:, None, None] * alpha).sum(1)  # (S, 3)
-    mean_gain = np.ones((n_objects, 3))
-    per_segment = (sums.weight[:, None, None] * alpha * gains).sum(1)
-    for p in range(3):
-        total = np.bincount(seg_object, weight[:, p], n_objects)
-        mean_gain[:, p] = np.where(total > 0, np.bincount(seg_object, per_segment[:, p], n_objects) /
-                                   np.where(total > 0, total, 1), 1.0)
-    overall = float(per_segment[:, 0].sum() / weight[:, 0].sum()) if weight[:, 0].sum() > 0 else 1.0
-    stretch = (1 / np.clip(mean_gain, 0.5, 2.0))[:, _PROPERTY_OF_CHANNEL]  # (O, 5)
-    cells = np.maximum(np.bincount(problem.object_of_cell, minlength=n_objects), 1)
-    centre = np.stack([np.bincount(problem.object_of_cell, texture[:, c], n_objects) / cells for c in range(5)], 1)
-    shift = centre * (1 - stretch)
-    o = problem.object_of_cell
-    texture = texture * stretch[o] + shift[o]
-    affine = affine * stretch[seg_object][:, None, None, :]
-    affine[..., 5, :] += shift[seg_object][:, None, :]
-    return texture, affine, overall
+
+def _mean_gain(sums: _Sums, affine: NDArray, alpha: NDArray) -> float:
+    """Mean gain (trace of A / 3) of the selected albedo corrections, weighted by pixels (METHOD H14: watch it)."""
+    gain = affine[..., range(3), range(3)].mean(-1)
+    return float(sums.weight @ (alpha[..., 0] * gain).sum(1) / max(sums.weight.sum(), 1e-30))
 
 
 def _scales(problem: BaseProblem, options: BaseOptions, texture: NDArray, affine: NDArray, alpha: NDArray,
-            usable: list[NDArray]) -> NDArray:
+            usable: list[NDArray], threads: int) -> NDArray:
     """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels, b_r the spread of the K values."""
-    total = np.zeros(problem.n_cells)
-    summed = np.zeros((5, problem.n_cells))
-    for view in range(len(problem.cell_of_pixel)):
+    def one_view(view: int) -> tuple[_Block, NDArray]:
         block, use, _ = _block(problem, view, usable[view])
+        part = np.empty((len(block.cell), 5))
         for segment, rows in block.ranges():
             phi = block.phi[rows]
-            cell, weight = block.cell[rows], block.weight[rows]
+            mixture = np.clip(_mixture(phi, affine[segment], alpha[segment]), LOWEST, 1)
             by_k = phi[:, use].astype(np.float32).swapaxes(0, 1)
             corrected = np.clip(by_k @ affine[segment][use].astype(np.float32), LOWEST, 1)  # (K, m, 5)
-            mixture = np.clip(_mixture(phi, affine[segment], alpha[segment]), LOWEST, 1)
             b_ref = laplace.reference_scale(mixture.astype(np.float32), corrected, options.scale_floor)
-            part = laplace.scale_contribution(mixture - texture[cell], b_ref, options.scale_floor)
-            np.add.at(total, cell, weight)
-            for c in range(5):
-                np.add.at(summed[c], cell, weight * part[:, c])
+            part[rows] = laplace.scale_contribution(mixture - texture[block.cell[rows]], b_ref, options.scale_floor)
+        return replace(block, phi=_NOTHING), part
+
+    total = np.zeros(problem.n_cells)
+    summed = np.zeros((5, problem.n_cells))
+    for block, part in _in_order(one_view, len(problem.cell_of_pixel), threads):
+        np.add.at(total, block.cell, block.weight)
+        for c in range(5):
+            np.add.at(summed[c], block.cell, block.weight * part[:, c])
     return laplace.floored((summed / np.where(total > 0, total, 1.0)).T, options.scale_floor).astype(np.float32)
 
 

@@ -1,5 +1,4 @@
-"""Colour for the border: the sRGB transfer curve, luminance, and pictures of radiance, ids and errors for
-people.
+"""Colour for the border: the sRGB transfer curve, luminance, and pictures of radiance, ids and errors for people.
 
 Everything inside the project is linear; nothing here is used in a computation that ends in a material.
 """
@@ -21,14 +20,15 @@ NO_ID_COLOUR = (0.08, 0.08, 0.08)
 
 # 17 samples of two perceptually uniform maps (inferno, viridis; CC0), sRGB-encoded. Dark = small.
 _MAPS = {
-    "error": "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754 d24644 e45a31 f1731d f98e09 fcac11 f9cb35 f2ea69 fcffa4",
-    "value": "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725",
+    "error": "000004 0b0724 210c4a 3d0965 57106e 71196e 8a226a a32c61 bc3754"
+    " d24644 e45a31 f1731d f98e09 fcac11 f9cb35 f2ea69 fcffa4",
+    "value": "440154 48186a 472d7b 424086 3b528b 33638d 2c728e 26828e 21918c"
+    " 1fa088 28ae80 3fbc73 5ec962 84d44b addc30 d8e219 fde725",
 }
 
 
 def srgb_from_linear(x: ArrayLike) -> Array:
-    """Encode: 12.92 x below 0.0031308, else 1.055 x^(1/2.4) - 0.055 (IEC 61966-2-1); odd in x, so negative
-    values survive.
+    """Encode: 12.92 x below 0.0031308, else 1.055 x^(1/2.4) - 0.055 (IEC 61966-2-1); odd in x.
 
     Any shape, result float64 (float32 in, float32 out). Example: 0.5 -> 0.73536.
     """
@@ -70,8 +70,7 @@ def display_exposure(
 
 
 def tone_map(radiance: ArrayLike, exposure: float = 1.0) -> Array:
-    """Picture of linear radiance: sRGB(clip(exposure L, 0, 1)); NaN becomes 0. Shape kept, values in [0,
-    1]."""
+    """Picture of linear radiance: sRGB(clip(exposure L, 0, 1)); NaN becomes 0. Shape kept, values in [0, 1]."""
     exposed = np.nan_to_num(_floating(radiance) * exposure, nan=0.0, posinf=1.0, neginf=0.0)
     return srgb_from_linear(np.clip(exposed, 0.0, 1.0))
 
@@ -82,27 +81,23 @@ def to_uint8(picture: ArrayLike) -> Array:
 
 
 def id_colours(ids: ArrayLike) -> Array:
-    """Distinct sRGB colours (..., 3) in [0, 1] of integer ids: the same id has the same colour in every
-    picture.
+    """Distinct sRGB colours (..., 3) in [0, 1] of integer ids: the same id has the same colour in every picture.
 
-    The hue advances by the golden ratio, so that neighbouring ids are far apart; lightness and chroma cycle
-    with periods 3 and 2 in OKLCh. Negative ids (none) are dark grey.
+    The hue advances by the golden ratio, so that neighbouring ids are far apart; lightness and chroma cycle with
+    periods 3 and 2 in OKLCh. Negative ids (none) are dark grey.
     """
     ids = np.asarray(ids, np.int64)
     unique, inverse = np.unique(ids, return_inverse=True)
     hue = 2 * np.pi * np.mod(unique * GOLDEN_RATIO, 1.0)
     lightness = np.asarray([0.72, 0.58, 0.84])[unique % 3]
     chroma = np.asarray([0.13, 0.09])[(unique // 3) % 2]
-    colours = srgb_from_linear(
-        np.clip(_linear_from_oklab(lightness, chroma * np.cos(hue), chroma * np.sin(hue)), 0, 1)
-    )
+    colours = srgb_from_linear(np.clip(_linear_from_oklab(lightness, chroma * np.cos(hue), chroma * np.sin(hue)), 0, 1))
     colours[unique < 0] = NO_ID_COLOUR
     return colours[inverse.ravel()].reshape(*ids.shape, 3)
 
 
 def false_colour(values: ArrayLike, low: float = 0.0, high: float = 1.0, scheme: str = "error") -> Array:
-    """Scalar map (...) as sRGB colours (..., 3) in [0, 1] by a perceptually uniform map: `low` dark, `high`
-    light.
+    """Scalar map (...) as sRGB colours (..., 3) in [0, 1] by a perceptually uniform map: `low` dark, `high` light.
 
     Values outside the range take its end, NaN is mid-grey. `scheme`: `error` (inferno) or `value` (viridis).
 
@@ -114,9 +109,7 @@ def false_colour(values: ArrayLike, low: float = 0.0, high: float = 1.0, scheme:
     if not high > low:
         raise InputError(f"colour map range {low} ... {high}: the upper end must be larger")
     values = _floating(values)
-    anchors = (
-        np.array([[int(text[i : i + 2], 16) for i in (0, 2, 4)] for text in _MAPS[scheme].split()]) / 255
-    )
+    anchors = np.array([[int(text[i : i + 2], 16) for i in (0, 2, 4)] for text in _MAPS[scheme].split()]) / 255
     position = np.clip((np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (high - low), 0, 1)
     grid = np.linspace(0, 1, len(anchors))
     colours = np.stack([np.interp(position, grid, anchors[:, c]) for c in range(3)], -1)

@@ -13,6 +13,10 @@ import numpy as np
 
 from iif_core.cells import pack_keys, unpack_keys, voxel_indices
 
+SMALL_AREA = 0.25
+"""Surface (m^2) of a lamp that may be one group whatever its shape."""
+_BRIDGE = 3  # faces by which pools reach over unseen surface
+
 
 @dataclass(frozen=True)
 class FaceStatistics:
@@ -105,33 +109,56 @@ def emitter_candidates(
     """Faces that may shine by themselves: (F,) bool (METHOD 2.4).
 
     A face counts when its low quantile reaches `threshold` over at least `min_observations` pixels. Faces seen by fewer
-    pixels are pooled: connected ones that all reach the threshold count when together they were seen often enough (finely
-    tessellated lamps). A mesh component whose observed area is candidate to 90 % is taken whole (the far side of a lamp).
+    pixels are pooled: neighbours (also across a few unseen faces) that all reach the threshold count when together
+    they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to 90 % joins
+    them, up to four times their area or `SMALL_AREA`: the gaps between them, and the far side of a lamp.
     """
+    solid, unseen = areas > 1e-12, statistics.count == 0
+    bright = ~unseen & (statistics.low >= threshold) & solid
+    if not bright.any():
+        return bright
+    first, second = adjacency[:, 0], adjacency[:, 1]
+    reached = bright.copy()
+    for _ in range(_BRIDGE):
+        grown = reached.copy()
+        grown[first[reached[second]]] = True
+        grown[second[reached[first]]] = True
+        reached = bright | (grown & unseen)
+    label = _components(adjacency, reached)
+    pooled = np.bincount(label, np.where(bright, statistics.count, 0))
+    candidate = bright & (pooled[label] >= min_observations)
+    return candidate | (_enclosed(adjacency, areas, unseen, candidate, label) & solid)
+
+
+def _components(adjacency: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Label of the connected component of every face; faces outside `mask` are alone."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    n_faces = len(statistics.count)
-    bright = (statistics.count > 0) & (statistics.low >= threshold) & (areas > 1e-12)
-    candidate = bright & (statistics.count >= min_observations)
+    n = len(mask)
+    pair = adjacency[mask[adjacency[:, 0]] & mask[adjacency[:, 1]]]
+    graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n, n))
+    return connected_components(graph, directed=False)[1]
 
-    def components(mask: np.ndarray) -> np.ndarray:
-        pair = adjacency[mask[adjacency[:, 0]] & mask[adjacency[:, 1]]]
-        graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n_faces, n_faces))
-        return connected_components(graph, directed=False)[1]
 
-    if not bright.any():
-        return candidate
-    label = components(bright)
-    pooled = np.bincount(label, np.where(bright, statistics.count, 0), label.max() + 1)
-    candidate = bright & (pooled[label] >= min_observations)
-    if not candidate.any():
-        return candidate
-    whole = components(np.ones(n_faces, bool))
-    observed = np.bincount(whole, np.where(statistics.count > 0, areas, 0.0))
-    shining = np.bincount(whole, np.where(candidate, areas, 0.0), len(observed))
-    complete = (observed > 0) & (shining >= 0.9 * observed)
-    return candidate | (complete[whole] & (statistics.count == 0) & (areas > 1e-12))
+def _enclosed(
+    adjacency: np.ndarray, areas: np.ndarray, unseen: np.ndarray, candidate: np.ndarray, pool: np.ndarray
+) -> np.ndarray:
+    """Unseen faces in regions that border on candidates (almost) alone and are not much larger than their pools."""
+    region = _components(adjacency, unseen)
+    size = int(region.max(initial=-1)) + 1
+    pair = np.concatenate([adjacency, adjacency[:, ::-1]])
+    pair = pair[unseen[pair[:, 0]] & ~unseen[pair[:, 1]]]
+    border = np.bincount(region[pair[:, 0]], minlength=size)
+    pair = pair[candidate[pair[:, 1]]]
+    shining = np.bincount(region[pair[:, 0]], minlength=size)
+    pool_area = np.bincount(pool, np.where(candidate, areas, 0.0))
+    # Each pool counts once for a region, however many edges they share.
+    pair = np.unique(np.stack([region[pair[:, 0]], pool[pair[:, 1]]], 1), axis=0)
+    lit_area = np.bincount(pair[:, 0], pool_area[pair[:, 1]], size)
+    area = np.bincount(region, np.where(unseen, areas, 0.0), size)
+    inside = (shining >= 0.9 * border) & (border > 0) & (area <= np.maximum(4.0 * lit_area, SMALL_AREA))
+    return unseen & inside[region]
 
 
 @dataclass(frozen=True)
@@ -166,7 +193,7 @@ def group_emitters(
     areas: np.ndarray,
     max_angle: float = 15.0,
     max_ratio: float = 1.5,
-    small_area: float = 0.25,
+    small_area: float = SMALL_AREA,
     min_faces: int = 3,
     min_area: float = 1e-4,
     max_groups: int = 64,
@@ -197,7 +224,8 @@ def group_emitters(
     pair = pair[side[pair[:, 0]] == side[pair[:, 1]]]
     local = np.full(n_faces, -1, np.int64)
     local[ids] = np.arange(len(ids))
-    piece_area = _piece_areas(local[pair], areas[ids])
+    label = _components(local[pair], np.ones(len(ids), bool)) if len(ids) else np.zeros(0, np.int64)
+    piece_area = np.bincount(label, areas[ids])[label] if len(ids) else np.zeros(0)
     weight = np.maximum(statistics.count[ids], 1e-3).astype(np.float64)
     colour = np.where(unseen[:, None], 0.0, statistics.mean[ids]) * weight[:, None]
     parent = _merge(
@@ -229,18 +257,6 @@ def group_emitters(
         of_face, side, count[kept_index].astype(np.int32), area[kept_index], observed[kept_index].astype(np.float64),
         pixels[kept_index].astype(np.int64), dropped,
     )
-
-
-def _piece_areas(pair: np.ndarray, areas: np.ndarray) -> np.ndarray:
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(areas)
-    if not n:
-        return np.zeros(0)
-    graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n, n))
-    label = connected_components(graph, directed=False)[1]
-    return np.bincount(label, areas)[label]
 
 
 def _merge(

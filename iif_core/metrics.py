@@ -6,13 +6,13 @@ Protocols say what the prediction may be forgiven before it is compared:
 |---|---|
 | `raw` | taken as it is |
 | `scaled` | multiplied by one gain per image and channel, sum truth / sum prediction (albedo, emission, radiance) |
-| `oracle_affine` | mapped by the affine of each object that fits the truth best: 3x4 for albedo, 1x2 for roughness and metallic |
+| `oracle_affine` | mapped by each object's best affine to the truth: 3x4 for albedo, 1x2 for roughness, metallic |
 
-Which pixels count is METHOD 2.11 (B), masks from the *truth*: emitters count for no material, mirrors (roughness below 0.05)
-not for albedo, nor pixels without a hit or without meaningful truth. A prediction cannot change its own mask.
+Which pixels count is METHOD 2.11 (B), masks from the *truth*: emitters count for no material, mirrors (roughness below
+0.05) not for albedo, nor pixels without a hit or without meaningful truth. A prediction cannot change its own mask.
 
-All images are linear float (H, W) or (H, W, 3); `mask` is (H, W) bool. A score that cannot be computed is a `Score` with
-`value=None` and the reason, never a NaN. Not quantised to 8 bits (the reference's protocol is; it moves L2 by 1e-6).
+All images are linear float (H, W) or (H, W, 3); `mask` is (H, W) bool. A score that cannot be computed is a `Score`
+with `value=None` and the reason, never a NaN. Not quantised to 8 bits (the reference is; that moves L2 by 1e-6).
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Score:
     reason: str = ""
 
 
-# ------------------------------------------------------------------------------------------------------------------ masks
+# --------------------------------------------------------------------------------------------------------------- masks
 
 
 def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) -> dict[str, Array]:
@@ -90,7 +90,7 @@ def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) 
     }
 
 
-# ---------------------------------------------------------------------------------------------------------------- metrics
+# ------------------------------------------------------------------------------------------------------------- metrics
 
 
 def l2(prediction: Array, truth: Array, mask: Array) -> float:
@@ -106,11 +106,12 @@ def psnr(prediction: Array, truth: Array, mask: Array) -> float:
 
 
 def ssim(prediction: Array, truth: Array, mask: Array) -> float:
-    """Structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, data range 1 (Wang et al. 2004).
+    """Structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, range 1 (Wang et al. 2004).
 
-    Pixels that do not count get the truth on both sides, and the map of local similarities is averaged over pixels that
-    count: a window that reaches over the border of the mask sees agreement there, so such pixels score slightly too well.
-    As in the common implementations, the 5 pixels next to the image border are windows only, unless nothing else counts.
+    Pixels that do not count get the truth on both sides, and the map of local similarities is averaged over pixels
+    that count: a window that reaches over the border of the mask sees agreement there, so such pixels score slightly
+    too well. As in the common implementations, the 5 pixels next to the image border are windows only, unless nothing
+    else counts.
 
     Raises:
         InputError: an image smaller than the window.
@@ -165,9 +166,7 @@ def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) ->
 
 def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
     """Mean squared error of log(1 + x), for radiance (negative values count as 0)."""
-    difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(
-        np.maximum(truth[mask], 0)
-    )
+    difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(np.maximum(truth[mask], 0))
     return float(np.mean(difference * difference))
 
 
@@ -178,13 +177,13 @@ def iou(prediction: Array, truth: Array, mask: Array) -> float:
     return np.count_nonzero(p & t) / union if union else 1.0
 
 
-# -------------------------------------------------------------------------------------------------------------- protocols
+# ----------------------------------------------------------------------------------------------------------- protocols
 
 
 def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1.0) -> Array:
     """Prediction times one gain per channel, sum truth / sum prediction over the mask; clamped to [0, limit].
 
-    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36). `limit=None` for radiance: not clamped above.
+    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36). `limit=None`: not clamped above.
     """
     prediction = np.asarray(prediction, np.float64)
     mean_prediction = prediction[mask].mean(0)
@@ -193,14 +192,12 @@ def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1
     return np.clip(prediction * gain, 0, limit)
 
 
-def oracle_affine(
-    prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6
-) -> Array:
+def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
     """Prediction mapped by the affine of each object that is nearest to the truth: an upper bound, not a result.
 
     Least squares per image and object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's
-    pixels in `mask`; 3x4 for three channels, 1x2 for one; clamped to [0, 1]. Where the prediction is constant, A tends to 0
-    and the object gets its mean. Pixels outside the mask are left as they are.
+    pixels in `mask`; 3x4 for three channels, 1x2 for one; clamped to [0, 1]. Where the prediction is constant, A tends
+    to 0 and the object gets its mean. Pixels outside the mask are left as they are.
 
     Args:
         object_id: (H, W) int; -1 forms one object.
@@ -228,7 +225,7 @@ def _sums(group: Array, values: Array, n: int) -> Array:
     return np.stack([np.bincount(group, values[:, i], n) for i in range(values.shape[1])], -1)
 
 
-# ------------------------------------------------------------------------------------------------------------- one image
+# ----------------------------------------------------------------------------------------------------------- one image
 
 
 def score_map(
@@ -293,9 +290,7 @@ _FUNCTIONS = {"l2": l2, "psnr": psnr, "ssim": ssim, "log_l2": log_l2, "iou": iou
 
 def _score(metric: str, protocol: str, image: Array, truth: Array, mask: Array, encoded: bool) -> Score:
     try:
-        value = (
-            flip(image, truth, mask, encoded) if metric == "flip" else _FUNCTIONS[metric](image, truth, mask)
-        )
+        value = flip(image, truth, mask, encoded) if metric == "flip" else _FUNCTIONS[metric](image, truth, mask)
     except InputError as error:
         return Score(metric, protocol, None, str(error))
     return Score(metric, protocol, float(value))

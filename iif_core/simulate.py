@@ -75,10 +75,10 @@ class SimulatedErrors:
 
 
 RGBX = SimulatedErrors(
-    gain_mean=-0.22, gain_object=0.06, gain_view=0.10, gain_sample=0.12,
+    gain_mean=-0.175, gain_object=0.06, gain_view=0.10, gain_sample=0.12,
     tint_object=0.06, tint_sample=0.03, offset_object=0.02, offset_sample=0.01, desaturation=0.3,
-    good_share=0.4, good_residue=0.08, pattern=0.4, pattern_shared=0.6, leak=0.3, blur=0.9, blur_sigma=0.04, noise=0.01,
-    roughness_target=(0.4, 0.6), roughness_pull=0.9, metallic_target=(0.45, 0.6), metallic_pull=0.97,
+    good_share=0.4, good_residue=0.12, pattern=0.5, pattern_shared=0.6, leak=0.3, blur=0.9, blur_sigma=0.04, noise=0.01,
+    roughness_target=(0.44, 0.54), roughness_pull=0.91, metallic_target=(0.50, 0.62), metallic_pull=0.97,
     material_view=0.06, material_sample=0.08, material_pattern=0.10,
 )
 
@@ -200,7 +200,7 @@ def _patterns(shape: tuple[int, ...], draw: _Draws, e: SimulatedErrors, waves: i
         out = np.zeros((*shape, 3))
         frequency = 2 * np.pi * 4 * draw.picture_normal("frequency", k, 2 * waves).reshape(waves, 2) / size
         phase = 2 * np.pi * draw.picture_uniform("phase", k, waves)
-        colour = 0.4 * draw.picture_normal("colour", k, 3 * waves).reshape(waves, 3) + draw.picture_normal("height", k, waves)[:, None]
+        colour = 0.15 * draw.picture_normal("colour", k, 3 * waves).reshape(waves, 3) + draw.picture_normal("height", k, waves)[:, None]
         for (fx, fy), shift, rgb in zip(frequency, phase, colour, strict=True):
             out += np.sin(fx * x[None, :] + fy * y[:, None] + shift)[..., None] * rgb
         return out / np.sqrt(0.5 * np.maximum((colour**2).sum(0), 1e-6))

@@ -13,8 +13,8 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
     """One row a job: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads (0 = not recorded), in workflow order.
 
     Of a job that ran several times the last line of `results/<scene>/benchmarks/<rule>.jsonl` counts; a rule without a
-    readable file (run without Snakemake, or not yet finished) has no row. Jobs of less than half a second have no CPU time or
-    memory ("NA"): 0.
+    readable file (run without Snakemake, or not yet finished) has no row. Jobs of less than half a second have no CPU
+    time or memory ("NA"): 0.
     """
     rows = []
     for stage in STAGES:

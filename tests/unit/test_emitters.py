@@ -81,9 +81,21 @@ def test_finely_tessellated_lamp_is_found_by_pooling():
     count = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 0)  # the upper half was seen, one pixel a face
     stats = _statistics(count, count * 1.0)
     assert (emitter_candidates(stats, adjacency, areas, 0.99)).all()  # far side included
+    sparse = np.where(np.random.default_rng(0).random(len(faces)) < 0.25, 1, 0) * (vertices[faces].mean(1)[:, 2] > -0.05)
+    found = emitter_candidates(_statistics(sparse, sparse * 1.0), adjacency, areas, 0.99)
+    assert areas[found].sum() > 0.9 * areas.sum()  # gaps between the seen faces are filled
     few = np.zeros(len(faces))
     few[:5] = 1
     assert not emitter_candidates(_statistics(few, few), adjacency, areas, 0.99).any()
+
+
+def test_unseen_surface_beside_dark_surface_does_not_shine():
+    _, faces = _strip(6)
+    low = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0.2, 0.2, 0.2, 0.2])
+    count = np.where(np.arange(12) // 2 % 4 < 2, 9, 0)
+    count[8:] = 9
+    got = emitter_candidates(_statistics(count, low), face_adjacency(faces), np.full(12, 0.5), 0.99)
+    assert got.tolist() == [True] * 4 + [False] * 8
 
 
 def test_dark_neighbour_is_not_pooled_and_degenerate_faces_never_shine():

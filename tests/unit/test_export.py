@@ -29,7 +29,20 @@ from workflow.normal_form import View
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
 OUTWARD = np.array(
-    [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4], [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]],
+    [
+        [0, 2, 1],
+        [1, 2, 3],
+        [4, 5, 6],
+        [5, 7, 6],
+        [0, 1, 4],
+        [1, 5, 4],
+        [2, 6, 3],
+        [3, 6, 7],
+        [0, 4, 2],
+        [2, 4, 6],
+        [1, 3, 5],
+        [3, 7, 5],
+    ],
     np.int32,
 )
 EYE = np.array([1.5, 1.0, 1.2])
@@ -74,7 +87,7 @@ def parts_of(scene, longest=0.2, max_faces=20000):
     return {part.name: part for part in build_parts(scene, longest, max_faces)}
 
 
-# --------------------------------------------------------------------------------------------------------------- surface
+# ------------------------------------------------------------------------------------------------------------- surface
 
 
 def test_subdivision_keeps_the_surface_closed():
@@ -163,7 +176,7 @@ def test_mesh_without_surface_is_refused():
         build_parts(replace(room(), vertices=np.zeros((20, 3), np.float32)), 0.1, 1000)
 
 
-# ------------------------------------------------------------------------------------------------------------------- glb
+# ----------------------------------------------------------------------------------------------------------------- glb
 
 
 def chunks_of(data):
@@ -314,7 +327,7 @@ def test_khronos_validator(glb, tmp_path):
     assert issues["numErrors"] == 0 and issues["numWarnings"] == 0, issues["messages"]
 
 
-# --------------------------------------------------------------------------------------------------------------- mitsuba
+# ------------------------------------------------------------------------------------------------------------- mitsuba
 
 
 def view(width=48, height=36, f=40.0, cx=None, cy=None, name="a"):
@@ -404,6 +417,7 @@ def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
     assert np.isfinite(theirs).all() and theirs.mean() > 0.01
     # Not the same BRDF: principled is brighter by up to about 10 % (see the note in the file).
     assert theirs.mean() / ours.mean() == pytest.approx(1.05, abs=0.1)
+
     # Same camera: edges fall on the same pixels, also with the principal point off centre.
     def structure(image):
         grey = np.log(image.mean(-1) + 1e-3)

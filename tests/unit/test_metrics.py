@@ -64,7 +64,9 @@ def test_small_image_is_a_named_result():
     small = np.full((8, 40), 0.5)
     scores = values(m.score_map("roughness", small, small, np.ones((8, 40), bool)))
     assert scores["raw", "ssim"] is None and scores["raw", "psnr"] == 100.0
-    reason = next(s.reason for s in m.score_map("roughness", small, small, np.ones((8, 40), bool)) if s.metric == "ssim")
+    reason = next(
+        s.reason for s in m.score_map("roughness", small, small, np.ones((8, 40), bool)) if s.metric == "ssim"
+    )
     assert "at least 11" in reason
 
 

@@ -51,7 +51,9 @@ class FakeJob:
         self.document = {"seed": 3}
         self.log = logging.getLogger("test")
         self.readers = {}
-        self.writer = StageWriter(root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"})
+        self.writer = StageWriter(
+            root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"}
+        )
 
     def read(self, stage):
         assert stage in self.stage.upstream
@@ -75,7 +77,7 @@ def material_channels(values, shape, prefix=""):
 
 
 def make_scene(root, truth=True, dynamic_range="ldr"):
-    """Every artefact that the last stages read, of a room with a box and a lamp: materials known, base 20 % too dark."""
+    """Every artefact that the last stages read, of a room with a box and a lamp; the base is 20 % too dark."""
     from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
 
     rng = np.random.default_rng(0)
@@ -98,7 +100,9 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     seen = []
     for view in views:
         eye = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(-1, 3)
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(
+            -1, 3
+        )
         face, depth = trace(geometry, eye, rays)
         material = FaceMaterials(TRUE[object_id])
         jitter = direction_derivatives(view.fx, view.fy, view.world_from_camera)
@@ -149,11 +153,17 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     cell_of = cell_of.ravel()
     base = TRUE[cells[:, 3]] * [0.8, 0.8, 0.8, 1, 1]
     centres = origin + (cells[:, :3] + 0.5) * edge
-    columns = {"cell_id": np.arange(len(cells)), **{c: cells[:, i] for i, c in enumerate("ijk")}, "object_id": cells[:, 3]}
+    columns = {
+        "cell_id": np.arange(len(cells)),
+        **{c: cells[:, i] for i, c in enumerate("ijk")},
+        "object_id": cells[:, 3],
+    }
     columns |= {c: centres[:, i] for i, c in enumerate("xyz")}
     job.writer.table("cells.parquet", {**columns, **material_columns(base)})
     counts = np.bincount(cells[:, 3], minlength=3)
-    job.writer.table("objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])})
+    job.writer.table(
+        "objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])}
+    )
     rows = {"segment_id": np.repeat(np.arange(6), K), "k": np.tile(np.arange(K), 6)}
     job.writer.table("selection.parquet", {**rows, "weight_albedo": rng.uniform(0, 1, 6 * K)})
     start = 0
@@ -168,7 +178,12 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.finish()
 
     job = FakeJob("emission", root)
-    rows = {"emitter_id": np.array([0, 1]), "kind": ["area", "area"], "faces": np.array([2, 0]), "area_m2": np.array([0.6, 0.1])}
+    rows = {
+        "emitter_id": np.array([0, 1]),
+        "kind": ["area", "area"],
+        "faces": np.array([2, 0]),
+        "area_m2": np.array([0.6, 0.1]),
+    }
     rows |= {"side": np.array([1, 0]), "observations": np.array([40, 9]), "kept": np.array([True, False])}
     rows |= {f"radiance_{c}": np.array([LAMP[i] / 2, 0.01]) for i, c in enumerate("rgb")}
     rows |= {f"error_{c}": np.array([0.1, 0.1]) for c in "rgb"} | {"reason": ["", "below 1 % of the power"]}
@@ -205,7 +220,13 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
 
 
 def finish(root, upto="publish"):
-    for name, stage in (("render", render), ("metrics", metrics), ("export", export), ("report", report), ("publish", publish)):
+    for name, stage in (
+        ("render", render),
+        ("metrics", metrics),
+        ("export", export),
+        ("report", report),
+        ("publish", publish),
+    ):
         job = FakeJob(name, root)
         stage.run(job)
         job.writer.finish()
@@ -229,7 +250,9 @@ def toy(llvm, tmp_path_factory):
 def test_recovered_scene(toy):
     scene = read_recovered(FakeJob("publish", toy))
     assert scene.object_names == ["walls", "box", "lamp"]
-    np.testing.assert_allclose(scene.emitter_radiance, [LAMP, [0, 0, 0]])  # light scale applied, dropped emitter is dark
+    np.testing.assert_allclose(
+        scene.emitter_radiance, [LAMP, [0, 0, 0]]
+    )  # light scale applied, dropped emitter is dark
     np.testing.assert_array_equal(np.flatnonzero(scene.emitter_id >= 0), [24, 25])
     np.testing.assert_allclose(scene.surface.object_values[:2], TRUE[:2], atol=1e-6)  # base mean through T_o
     np.testing.assert_allclose(scene.light.environment, 0)
@@ -277,7 +300,9 @@ def test_variants_and_gain(toy):
     assert summary["not_scored"] == []
     scores = [
         v
-        for variant, q, m, p, v in zip(*(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True)
+        for variant, q, m, p, v in zip(
+            *(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True
+        )
         if (variant, q, m, p) == ("result", "emission", "iou", "raw")
     ]
     assert min(scores) > 0.99
@@ -295,13 +320,15 @@ def test_object_mean_is_the_mean_of_the_predictions(toy):
         for k in range(K):
             total += rgb(channels, f"prior.{k:03d}.albedo")[box].astype(np.float64).sum(0)
         count += K * box.sum()
-    np.testing.assert_allclose(means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5)
+    np.testing.assert_allclose(
+        means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5
+    )
 
 
 def test_maps_hold_everything(toy):
     channels = read_exr(toy / "scenes/toy/maps/v0.exr")
     assert set(channels) == {
-        *("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "roughness", "metallic"),
+        *("R", "G", "B", "ldr.R", "ldr.G", "ldr.B", "albedo.R", "albedo.G", "albedo.B", "roughness", "metallic"),
         *("emission.R", "emission.G", "emission.B", "uncertainty", "instance.id"),
     }
     assert channels["instance.id"].dtype == np.uint32
@@ -311,7 +338,14 @@ def test_deliverable_is_complete_and_verifies(toy):
     scene = toy / "scenes/toy"
     names = {p.relative_to(scene).as_posix() for p in scene.rglob("*") if p.is_file()}
     expected = {"scene.glb", "mitsuba/scene.xml", "maps/v0.exr", "maps/v1.exr", "objects.parquet", "emitters.parquet"}
-    expected |= {"camera_response.parquet", "plan.yaml", "metrics.parquet", "timings.parquet", "report.html", "manifest.json"}
+    expected |= {
+        "camera_response.parquet",
+        "plan.yaml",
+        "metrics.parquet",
+        "timings.parquet",
+        "report.html",
+        "manifest.json",
+    }
     assert expected <= names and all(n in expected or n.startswith("mitsuba/meshes/") for n in names)
     manifest = json.loads((scene / "manifest.json").read_text())
     assert set(manifest["files"]) == names - {"manifest.json"}
@@ -367,10 +401,12 @@ def test_timings(toy):
 def test_plan_is_collected(toy):
     plan = yaml.safe_load((toy / "scenes/toy/plan.yaml").read_text())
     assert plan["scene"] == "toy"
-    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [("metallic", False, "base")]
+    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [
+        ("metallic", False, "base")
+    ]
 
 
-# ------------------------------------------------------------------------------------------------------------------ page
+# ---------------------------------------------------------------------------------------------------------------- page
 
 
 class Tags(HTMLParser):
@@ -411,9 +447,21 @@ def test_page_is_self_contained(toy):
 
 def test_page_says_what_matters(toy):
     text = "".join(parsed((toy / "scenes/toy/report.html").read_text()).text)
-    for wanted in ("by <nobody> & co", "a note with <angle> brackets", "no object looks like a <metal>", "below 1 % of the power"):
+    for wanted in (
+        "by <nobody> & co",
+        "a note with <angle> brackets",
+        "no object looks like a <metal>",
+        "below 1 % of the power",
+    ):
         assert wanted in text
-    for wanted in ("raw predictions (mean score)", "base texture (fused)", "PSNR", "alignment", "selected prediction", "12.5"):
+    for wanted in (
+        "raw predictions (mean score)",
+        "base texture (fused)",
+        "PSNR",
+        "alignment",
+        "selected prediction",
+        "12.5",
+    ):
         assert wanted in text
     assert "Dashed: what the camera did; difference 0.0000" in text
 

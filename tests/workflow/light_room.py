@@ -74,7 +74,7 @@ class Room:
             "metal": _box((2.8, 0.6, 0.0), (3.4, 1.2, 1.0), 8),
             "glossy": _box((0.6, 2.2, 0.0), (1.2, 2.7, 0.9), 8),
             "lamp": _quad((1.6, 1.2, z - 0.05), (0, 0.6, 0), (0.8, 0, 0), 2),
-            "bulb": _ball((0.7, 0.6, 1.5), 0.08),
+            "bulb": _ball((1.9, 2.3, 1.4), 0.12),
         }
         self.names = list(parts)
         self.vertices, self.faces = _join(list(parts.values()))

@@ -1,8 +1,8 @@
 """scene.glb: glTF 2.0, metallic-roughness, one mesh and material a part.
 
 Texture without a UV atlas: `baseColorFactor` is white and `COLOR_0` (linear, 16 bits) carries the albedo; roughness and
-metallic are the means of the part. The file is written here rather than by trimesh, which stores vertex colours in 8 bits:
-linear albedo 0.04 would have steps of 10 %.
+metallic are the means of the part. The file is written here rather than by trimesh, which stores vertex colours in
+8 bits: linear albedo 0.04 would have steps of 10 %.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """mitsuba/scene.xml: the recovered scene for Mitsuba 3, relightable with `mitsuba scene.xml` alone.
 
-Meshes are PLY with the material as vertex attributes, world coordinates in metres; all values linear; all paths relative.
+Meshes are PLY with the material as vertex attributes, in world coordinates and metres; values linear, paths relative.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ _NOTE = """
 
   The model of the workflow: k_d = (1 - m) a, k_s = 0.04 (1 - m) + m a, GGX, Schlick, no loss of the diffuse lobe.
   Mitsuba has no such BSDF; `principled` with specular 0.5 (the same F0 = 0.04) is the nearest one. Its diffuse lobe
-  has a retro-reflective term and its microfacets shadow less: surfaces are up to about 10 % brighter than in the workflow.
+  has a retro-reflective term and its microfacets shadow less: surfaces are about 10 % brighter than in the workflow.
 
-  Relight: change or remove the emitters below, or add your own.  Sizes: mitsuba scene.xml -Dspp=256 -Dresx=640 -Dresy=480
+  Relight: change or remove the emitters below, or add your own.
+  Sizes: mitsuba scene.xml -Dspp=256 -Dresx=640 -Dresy=480
   Other views: mitsuba -s 1 scene.xml  (one sensor a photograph, in order)
 """
 
@@ -121,7 +122,7 @@ def _sensor(view: View) -> str:
     matrix = " ".join(f"{v:.9g}" for v in pose.ravel())
     return "\n".join(
         [
-            f"\t<sensor type=\"perspective\" id={quoteattr('view-' + view.name)}>",
+            f'\t<sensor type="perspective" id={quoteattr("view-" + view.name)}>',
             f'\t\t<float name="fov" value="{fov:.9g}"/>',
             '\t\t<string name="fov_axis" value="x"/>',
             f'\t\t<float name="principal_point_offset_x" value="{centre[0]:.9g}"/>',

@@ -161,7 +161,8 @@ def up_axis(world_from_camera: Array) -> Array:
 def subdivide(vertices: Array, faces: Array, longest: float, max_faces: int) -> tuple[Array, Array, Array]:
     """Halve edges until none is longer than `longest` or the faces would be more than `max_faces`.
 
-    Edges are split for all faces that share them, so no cracks appear. The longest go first, in rounds that halve the limit.
+    Edges are split for all faces that share them, so no cracks appear. The longest go first: each round halves the
+    limit.
 
     Returns:
         vertices (n', 3), faces (m', 3), parent (m',): which face each one came from.
@@ -207,7 +208,7 @@ def vertex_normals(vertices: Array, faces: Array) -> Array:
     return np.where(length > 1e-9, total / np.maximum(length, 1e-300), [0.0, 0.0, 1.0])
 
 
-# -------------------------------------------------------------------------------------------------------------- internals
+# ----------------------------------------------------------------------------------------------------------- internals
 
 
 class _Names:
@@ -279,7 +280,7 @@ def _components(scene: RecoveredScene) -> Array:
 
 
 def _split(vertices: Array, faces: Array, middle: Array) -> tuple[Array, Array]:
-    """Split faces at the midpoints of their edges (v0v1, v1v2, v2v0); -1 = edge stays. Returns faces and their sources."""
+    """Split faces at the midpoints of their edges (v0v1, v1v2, v2v0), -1 = edge stays: faces and their sources."""
     count = (middle >= 0).sum(1)
     out, source = [faces[count == 0]], [np.flatnonzero(count == 0)]
 

@@ -27,7 +27,9 @@ def linear(image: Array, exposure: float = 1.0) -> Array:
     return color.to_uint8(color.tone_map(image, exposure))
 
 
-def scalar(values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "value", mask: Array | None = None) -> Array:
+def scalar(
+    values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "value", mask: Array | None = None
+) -> Array:
     """(H, W) in false colours; grey where `mask` is False."""
     picture = color.false_colour(values, low, high, scheme)
     return color.to_uint8(picture if mask is None else np.where(mask[..., None], picture, 0.35))
@@ -44,7 +46,7 @@ def ids(values: Array) -> Array:
 
 
 def difference(a: Array, b: Array, mask: Array, high: float = 0.25) -> Array:
-    """Mean absolute difference of the channels of two (H, W, 3) or (H, W) images, 0 ... `high`; grey outside `mask`."""
+    """Mean absolute difference of two (H, W, 3) or (H, W) images, 0 ... `high`; grey outside `mask`."""
     error = np.abs(np.asarray(a, np.float64) - b)
     return scalar(error.mean(-1) if error.ndim == 3 else error, 0.0, high, "error", mask)
 
@@ -74,7 +76,7 @@ def depth_edges(depth: Array, step: float = DEPTH_STEP) -> Array:
 
 
 def alignment(photo: Array, object_id: Array, depth: Array) -> Array:
-    """Edges of the mesh over the pale photograph: objects orange, depth steps cyan. They should lie on what they outline."""
+    """Edges of the mesh over the pale photograph, where they should lie on what they outline: objects, depth steps."""
     picture = 0.55 * np.repeat(np.clip(photo, 0, 1).mean(-1, keepdims=True), 3, -1) + 0.2
     picture[depth_edges(depth)] = DEPTH_EDGE
     picture[edges(object_id)] = SEGMENT_EDGE
@@ -118,7 +120,8 @@ def curves_svg(curves: Sequence[tuple[Array, Array, str, bool]], width: int = 30
         out.append(f'<text x="{left - 4}" y="{y + 3:.1f}" text-anchor="end">{tick:g}</text>')
     for x, y, colour, dashed in curves:
         points = " ".join(
-            f"{left + np.clip(a, 0, 1) * w:.1f},{top + (1 - np.clip(b, 0, 1)) * h:.1f}" for a, b in zip(x, y, strict=True)
+            f"{left + np.clip(a, 0, 1) * w:.1f},{top + (1 - np.clip(b, 0, 1)) * h:.1f}"
+            for a, b in zip(x, y, strict=True)
         )
         dash = ' stroke-dasharray="5 4"' if dashed else ""
         out.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"{dash}/>')

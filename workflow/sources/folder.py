@@ -1,7 +1,7 @@
 """Source `folder`: a scene of your own, in the form tools already write (docs/own-data.md).
 
-`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes distortion, reduces
-the photographs, traces the mesh and measures whether the two belong together.
+`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes
+distortion, reduces the photographs, traces the mesh and measures whether the two belong together.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Inputs:
     truth: dict[str, dict[str, Path]]
 
     def files(self) -> list[Path]:
-        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
-        for frame in self.transforms.frames:
+        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []),
+        *self.instances.values()] for frame in self.transforms.frames:
             out += [frame.image, *([frame.depth] if frame.depth else [])]
         return out + [path for maps in self.truth.values() for path in maps.values()]
 
@@ -146,6 +146,7 @@ class _Capture:
 
         views: list[View] = []
         used: list[Frame] = []
+        blind: list[tuple[Frame, View]] = []
         dropped: dict[str, float] = {}
         for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
             view = self._view(frame, pose, len(views), given[i])
@@ -153,6 +154,7 @@ class _Capture:
             share = float((face >= 0).mean())
             if share < MIN_COVERAGE:
                 dropped[frame.name] = share
+                blind.append((frame, view))
                 continue
             photo, valid = self._photo(frame, view, given[i])
             self.writer.photo(view.name, photo, valid, self.encoded)
@@ -160,14 +162,14 @@ class _Capture:
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
             if self.settings.exposure == "estimate":
-                points = view.world_from_camera[:3, 3] + depth[..., None] * alignment.directions(_pinhole(view), pose)
-                footprint = float(np.median(depth[face >= 0])) / view.fx
-                shared.add(photo, valid & (face >= 0), points, footprint)
+                points = view.world_from_camera[:3, 3] + depth[..., None] *
+                alignment.directions(_pinhole(view), pose) footprint = float(np.median(depth[face >= 0])) /
+                view.fx shared.add(photo, valid & (face >= 0), points, footprint)
             views.append(view)
             used.append(frame)
             self.job.progress(i + 1, len(frames), "photographs")
 
-        self._check_views(len(frames), dropped)
+        self._check_views(len(frames), dropped, blind)
         self._check_alignment(used, views)
         if self.settings.exposure == "estimate":
             views = self._estimated(shared, used, views)
@@ -281,17 +283,21 @@ class _Capture:
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
         self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
 
-    def _check_views(self, count: int, dropped: dict[str, float]) -> None:
+    def _check_views(self, count: int, dropped: dict[str, float], blind: list[tuple[Frame, View]]) -> None:
         if len(dropped) == count:
+            better = self._advice(blind)
             raise InputError(
                 f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that hit it:"
-                f" {max(dropped.values()):.1%} at most); mesh and poses are in different frames or units, or `source.axes:"
-                f" {self.source.axes}` is wrong (docs/own-data.md)"
+                f" {max(dropped.values()):.1%} at most); "
+                + (better or f"mesh and poses are in different frames or units, or `source.axes:
+                {self.source.axes}` is wrong") + " (docs/own-data.md)"
             )
         for name, share in dropped.items():
-            self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the mesh)")
+            self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the
+            mesh)")
         if count - len(dropped) == 1:
-            self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the prior alone")
+            self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the
+            prior alone")
 
     def _check_alignment(self, used: list[Frame], views: list[View]) -> None:
         if self.source.alignment == "off":
@@ -299,20 +305,24 @@ class _Capture:
             return
         self.notes += self.alignment.notes()
 
-        def traced(origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-            from iif_core.transport import trace
-
-            face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
-            return np.where(face >= 0, t, 0).reshape(rays.shape[:2])
-
-        def advice() -> str:
-            pairs = [(f, _pinhole(v)) for f, v in zip(used, views, strict=True) if f.depth is not None]
-            unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
-            return alignment.explain(pairs, traced, self.source.axes, self.metres, unit, tolerance)
-
         path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
-        alignment.raise_or_note(self.alignment.refuse(path, tolerance, advice), self.source.alignment, self.notes)
+        message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views,
+        strict=True)))) alignment.raise_or_note(message, self.source.alignment, self.notes)
         alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
+
+    def _advice(self, seen: list[tuple[Frame, View]]) -> str:
+        """Which other reading of the poses fits the depth images, in words; empty without depth images."""
+        pairs = [(frame, _pinhole(view)) for frame, view in seen if frame.depth is not None]
+        if not pairs:
+            return ""
+        unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
+        return alignment.explain(pairs, self._depth_along, self.source.axes, self.metres, unit, tolerance)
+
+    def _depth_along(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        from iif_core.transport import trace
+
+        face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
+        return np.where(face >= 0, t, 0).reshape(rays.shape[:2])
 
     def _given_exposures(self) -> list[float]:
         frames = self.inputs.transforms.frames
@@ -330,10 +340,12 @@ class _Capture:
         if apart:
             self.notes.append(f"exposure: {apart} view(s) share no surface with others and keep exposure 1")
         if groups > 1:
-            self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each has mean 1")
+            self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each
+            has mean 1")
         if gains.pairs:
             low, high = gains.gain.min(), gains.gain.max()
-            self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})")
+            self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual
+            {gains.residual:.3f})")
         if self.encoded:
             return [replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)]
         counts = dict(self.counts)
@@ -363,7 +375,8 @@ class _Capture:
         if self.inputs.instances and len(self.inputs.instances) < len(frames):
             self.notes.append(f"instances are given for {len(self.inputs.instances)} of {len(frames)} views")
         if self.mesh.from_nodes and self.mesh.names is not None:
-            self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as instances")
+            self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as
+            instances")
 
 
 def _pinhole(view: View) -> Pinhole:

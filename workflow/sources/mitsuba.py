@@ -181,6 +181,7 @@ class _Capture:
         from workflow.sources.mitsuba_scene import render
 
         integrator = render.path_integrator(self.source.max_bounces)
+        render.balance_lights(self.loaded.scene, self.loaded.scene.shapes())
         self.dropped = 0
         self.usable: list[Array] = []
         self.meter: list[tuple[Array, Array]] = []

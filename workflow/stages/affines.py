@@ -9,7 +9,7 @@ import numpy as np
 
 from iif_core import plan
 from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
-from iif_core.response import Response, family_for, response
+from iif_core.response import Response, response
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb, split_rgb
 from workflow.base_scene import (
     MATERIAL,
@@ -36,8 +36,7 @@ def run(job: Job) -> None:
     emits = read_light(job, len(scene.faces)).emits
     exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job, capture), strict=True))
     problem = _problem(job, capture, scene, emits, exposures)
-    family = family_for(settings.response, capture.facts["dynamic_range"])
-    start = response(family)
+    start = _starting_response(job)
     options = FitOptions(
         iterations=settings.iterations, ridge=settings.ridge, robust_width=settings.robust_width,
         scale="none" if capture.is_hdr else settings.scale,
@@ -71,6 +70,15 @@ def run(job: Job) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------------------ input
+
+
+def _starting_response(job: Job) -> Response:
+    """Where stage emission left the response; one row of parameters a channel, because cameras differ between channels."""
+    facts = job.read("emission").json("emission.json")["response"]
+    params = np.asarray(facts["parameters"], np.float64)
+    if not params.size:
+        return response(facts["family"])
+    return response(facts["family"], params if params.ndim == 2 else np.tile(params, (3, 1)))
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from iif_core.emitters import (
     group_emitters,
     hdr_threshold,
 )
-from iif_core.exposure import ExposureGains, estimate_gains
+from iif_core.exposure import ExposureGains, calibrate_response, estimate_gains
 from iif_core.nnls import EmissionRows, PrunedEmission, block_rows, prune_groups, solve_emission
 from iif_core.response import Response, family_for, response
 from workflow.artifacts.store import ids_from_disk
@@ -63,6 +63,7 @@ def run(job: Job) -> None:
     light = _Light(response(family), capture.is_hdr, job.settings.emission.saturation)
     notes: list[str] = []
     exposures, exposure_plan = _exposures(job, capture, scene, views, light, notes)
+    light = _calibrated(job, capture, scene, views, light, exposures, notes)
     statistics = _statistics(job, capture, scene, views)
     groups, candidates, threshold = _groups(job, scene, statistics, light)
     cache, misses = _radiance_cache(job, capture, scene, views, light, exposures, groups)
@@ -88,7 +89,7 @@ def run(job: Job) -> None:
             "active_set": {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated},
             "escape_share": {"primary": misses.share, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
-            "response": {"family": family, "parameters": np.ravel(light.curve.params).tolist()},
+            "response": {"family": family, "parameters": light.curve.params.tolist()},
             "plan": decisions,
             "notes": notes,
         },
@@ -134,16 +135,49 @@ def _exposures(
 def _estimate(
     job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, given: dict[int, float]
 ) -> ExposureGains:
+    """Gains of the photographs after the starting response and the given exposures."""
+    cell, owner, value = _shared_surface(job, capture, scene, views)
+    exposure = np.array([given[view.view_id] for view in views])
+    radiance, bound = light.radiance(value, 1.0)
+    radiance = (radiance / exposure[owner, None]).astype(np.float32)
+    return estimate_gains(np.where(bound.any(1), -1, cell), owner, radiance, len(views))
+
+
+def _calibrated(
+    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
+    notes: list[str],
+) -> _Light:
+    """The starting response, or the one that known exposures of shared surface imply."""
+    given = all(exposures[view.view_id] == view.exposure for view in views)
+    if light.is_hdr or not light.curve.names or not given or len(views) < 2:
+        return light
+    cell, owner, value = _shared_surface(job, capture, scene, views)
+    exposure = np.array([exposures[view.view_id] for view in views])
+    found = calibrate_response(cell, owner, value, exposure, light.curve, light.saturation)
+    if not found.pairs:
+        notes.append("exposures differ by less than a stop where views overlap: the response starts at the family's default")
+        return light
+    notes.append(
+        f"response from {found.pairs} pairs of differently exposed views of the same surface ({found.stops:.1f} stops):"
+        f" they disagree by {found.after:.3f} in log radiance, {found.before:.3f} with the default curve"
+    )
+    job.log.info(notes[-1])
+    return replace(light, curve=found.response)
+
+
+def _shared_surface(
+    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Surface cell, number of the view and sensor value of the interior pixels."""
     cells, owners, values = [], [], []
     for number, view in enumerate(views):
         pixels = view_pixels(job, capture, scene, view)
         cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
-        radiance, bound = light.radiance(pixels.value, given[view.view_id])
-        use = pixels.valid & pixels.interior & ~bound.any(1) & (cell >= 0)
+        use = pixels.valid & pixels.interior & (cell >= 0)
         cells.append(cell[use])
         owners.append(np.full(int(use.sum()), number, np.int32))
-        values.append(radiance[use].astype(np.float32))
-    return estimate_gains(np.concatenate(cells), np.concatenate(owners), np.concatenate(values), len(views))
+        values.append(pixels.value[use].astype(np.float32))
+    return np.concatenate(cells), np.concatenate(owners), np.concatenate(values)
 
 
 # ----------------------------------------------------------------------------------------------------------------- groups

@@ -1,11 +1,10 @@
-"""export: the recovered scene for other programs (glTF, Mitsuba) and as maps and tables."""
+"""export: the recovered scene for other programs (glTF, Mitsuba)."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
 from workflow.exporters.glb import glb_bytes
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, up_axis
@@ -23,7 +22,7 @@ MAX_SENSORS = 16
 
 
 def run(job: Job) -> None:
-    """Write scene.glb, mitsuba/, maps/<view>.exr and the tables of the deliverable."""
+    """Write scene.glb, mitsuba/, emitters.parquet and export.json."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     if len(recovered.surface.faces) > job.settings.export.max_faces_glb:
@@ -38,7 +37,6 @@ def run(job: Job) -> None:
     job.writer.bytes("scene.glb", glb_bytes(parts, scene.up, provenance))
     for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.light.environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
-    _maps(job, capture)
     _emitter_table(job, recovered)
     facts = {
         "up": scene.up.tolist(),
@@ -79,24 +77,6 @@ def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredSc
         back,
         np.asarray(up, np.float64) if up else up_axis(poses),
     )
-
-
-def _maps(job: Job, capture: CaptureReader) -> None:
-    """One EXR a view with everything; material channels half, radiance float, ids UINT."""
-    for done, view in enumerate(capture.views):
-        file = f"maps/{view.name}.exr"
-        rendered = job.read("render").exr(file)
-        channels = {**split_rgb(rgb(rendered)), **split_rgb(rgb(rendered, "emission"), "emission")}
-        if job.read("affines").has(file):
-            fitted = job.read("affines").exr(file)
-            channels |= split_rgb(rgb(fitted, "albedo"), "albedo", np.float16)
-            channels |= {name: fitted[name].astype(np.float16) for name in ("roughness", "metallic", "uncertainty")}
-        if job.read("segmentation").has(file):
-            channels["instance.id"] = job.read("segmentation").exr(file)["object.id"]
-        else:
-            channels["instance.id"] = ids_to_disk(np.full((view.height, view.width), -1))
-        job.writer.exr(file, channels, "relative")
-        job.progress(done + 1, len(capture.views), "views written")
 
 
 def _emitter_table(job: Job, recovered: Recovered) -> None:

@@ -1,4 +1,4 @@
-"""metrics: scores of the result, and of everything it should be better than, against ground truth and the photographs."""
+"""metrics: scores of the result, and of what it should be better than, against ground truth and photographs."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class _Rows:
 
 
 def run(job: Job) -> None:
-    """Score every view; write metrics.parquet (the result), variants.parquet (result and baselines) and summary.json."""
+    """Score every view; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
     capture = CaptureReader(job.read("capture"))
     rows = _Rows()
     means = _PredictionMeans(job, capture) if capture.has_truth else None
@@ -86,8 +86,11 @@ def _view_scores(
     file = f"maps/{view.name}.exr"
     rendered = job.read("render").exr(file)
     sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
-    yield "result", view.name, "rgb", metrics.score_map(
-        "rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr
+    yield (
+        "result",
+        view.name,
+        "rgb",
+        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr),
     )
     if capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), photo, valid & hit)
@@ -97,8 +100,11 @@ def _view_scores(
     if not capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), truth.radiance, valid & hit)
     masks = metrics.material_masks(truth.valid, hit, truth.emission, truth.roughness)
-    yield "result", view.name, "emission", metrics.score_map(
-        "emission", rgb(rendered, "emission"), truth.emission, masks["emission"]
+    yield (
+        "result",
+        view.name,
+        "emission",
+        metrics.score_map("emission", rgb(rendered, "emission"), truth.emission, masks["emission"]),
     )
     targets = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
     object_id = ids_from_disk(job.read("segmentation").exr(file)["object.id"])
@@ -231,7 +237,9 @@ def _summary(rows: _Rows, capture: CaptureReader) -> dict[str, Any]:
         "variants": {name: BASELINES[name] for name in means if name in BASELINES},
         "means": means,
         "gain_over_raw_predictions": {
-            q: {p: g for p, g in by_protocol.items() if g} for q, by_protocol in gains.items() if any(by_protocol.values())
+            q: {p: g for p, g in by_protocol.items() if g}
+            for q, by_protocol in gains.items()
+            if any(by_protocol.values())
         },
         "not_scored": rows.missing,
     }

@@ -1,4 +1,4 @@
-"""publish: the deliverable scenes/<scene>/, made of links to what the stages wrote. Tiny on purpose: it runs last and once."""
+"""publish: the deliverable scenes/<scene>/, made of links to what the stages wrote; tiny, because it comes last."""
 
 from __future__ import annotations
 
@@ -62,6 +62,7 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
     """(stage, file) of everything that is published under its own name; taken from manifests, never from a folder."""
     export = readers["export"]
     chosen = [("export", name) for name in export.names() if name != "export.json"]
+    chosen += [("render", name) for name in readers["render"].names("maps/")]
     chosen += [("report", "report.html"), ("report", "plan.yaml"), ("metrics", "metrics.parquet")]
     chosen += [("affines", "objects.parquet")]
     if readers["affines"].has("camera_response.parquet"):

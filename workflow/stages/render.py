@@ -16,7 +16,10 @@ _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of 
 
 
 def run(job: Job) -> None:
-    """Write radiance, sensor value (through the fitted response and the view's exposure) and emission of every view."""
+    """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps.
+
+    Sensor value: the re-rendering through the view's exposure and the fitted response, clipped to [0, 1].
+    """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, exposures = read_response(job.read("affines")), read_exposures(job, capture)
     geometry, material = scene.surface.traceable(scene.light.emits)
@@ -44,9 +47,22 @@ def run(job: Job) -> None:
         sensor = curve(np.clip(exposure * radiance, 0, 1))
         _, face_id = capture.gbuffer(view)
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
-        channels |= split_rgb(scene.emission_map(face_id, eye), "emission")
+        channels |= split_rgb(scene.emission_map(face_id, eye), "emission") | _fitted(job, view)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
+
+
+def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:
+    """Materials and uncertainty of stage affines (half) and object ids (UINT) of one view, as far as it has them."""
+    file = f"maps/{view.name}.exr"
+    channels: dict[str, np.ndarray] = {}
+    if job.read("affines").has(file):
+        names = ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic", "uncertainty")
+        fitted = job.read("affines").exr(file)
+        channels = {name: fitted[name].astype(np.float16) for name in names}
+    if job.read("segmentation").has(file):
+        channels["instance.id"] = job.read("segmentation").exr(file)["object.id"]
+    return channels
 
 
 def _directions(view: View) -> np.ndarray:

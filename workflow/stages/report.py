@@ -52,11 +52,11 @@ def run(job: Job) -> None:
     job.writer.bytes("report.html", render_page(page).encode())
 
 
-# ------------------------------------------------------------------------------------------------------------------- plan
+# ---------------------------------------------------------------------------------------------------------------- plan
 
 
 def collect_plan(job: Job) -> list[dict[str, Any]]:
-    """Plan items that the stages left under `plan` in their JSON documents, in workflow order, with the stage's name."""
+    """Plan items that the stages left under `plan` in their JSON documents, in workflow order, with the rule's name."""
     items = []
     for stage in job.stage.upstream:
         reader = job.read(stage)
@@ -66,7 +66,9 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
             document = reader.json(name)
             found = document.get("plan", []) if isinstance(document, dict) else []
             for item in found if isinstance(found, list) else []:
-                items.append({**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage})
+                items.append(
+                    {**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage}
+                )
     return items
 
 
@@ -76,7 +78,7 @@ def plan_text(job: Job, plan: list[dict[str, Any]]) -> str:
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
 
-# ------------------------------------------------------------------------------------------------------------------- text
+# ---------------------------------------------------------------------------------------------------------------- text
 
 
 def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
@@ -87,7 +89,9 @@ def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
 def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     means = summary["means"].get("result", {})
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
-    text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
+    text = (
+        f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
+    )
     gains = summary.get("gain_over_raw_predictions", {})
     parts = [f"{q} {g['raw']['psnr_db']:+.1f} dB" for q, g in gains.items() if "raw" in g]
     if parts:
@@ -105,7 +109,11 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
     held_out = sum(v.split == "test" for v in capture.views)
     extent = np.ptp(recovered.surface.vertices, axis=0)
     prior = job.read("prior").manifest.get("settings", {}).get("prior", {})
-    size = f"{first.width} x {first.height}" if len(sizes) == 1 else f"{len(sizes)} sizes, first {first.width} x {first.height}"
+    size = (
+        f"{first.width} x {first.height}"
+        if len(sizes) == 1
+        else f"{len(sizes)} sizes, first {first.width} x {first.height}"
+    )
     facts = [
         ("quality", job.quality),
         ("source", str(capture.facts.get("source", ""))),
@@ -128,7 +136,9 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
     materials += [(q, "raw", m) for q in ("roughness", "metallic") for m in ("l2", "psnr", "ssim")]
     oracle = [(q, "oracle_affine", m) for q in ("albedo", "roughness", "metallic") for m in ("l2", "psnr", "ssim")]
     light = [("rgb", "raw", m) for m in ("l2", "psnr", "ssim", "flip", "log_l2")] + [("rgb", "scaled", "log_l2")]
-    light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [("emission", "scaled", m) for m in ("l2", "log_l2")]
+    light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [
+        ("emission", "scaled", m) for m in ("l2", "log_l2")
+    ]
     tables = [
         score_table(
             "Materials against ground truth, mean over the views",
@@ -142,13 +152,13 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
             "With the best affine per image and object (an oracle)",
             means,
             oracle,
-            "Every variant may use the truth to correct each object: what remains is error inside objects. Not a result.",
+            "Every variant may correct each object by the truth: what remains is error inside objects. Not a result.",
         ),
     ]
     return [table for table in tables if table]
 
 
-# ------------------------------------------------------------------------------------------------------------------ views
+# --------------------------------------------------------------------------------------------------------------- views
 
 
 def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewRows]:
@@ -215,7 +225,9 @@ def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emissio
         if numbers:
             first = materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
             spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
-            disagreement = tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
+            disagreement = tile(
+                "disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions"
+            )
             start = None if capture.has_truth else photograph
             strips.append(Strip("raw prediction", [start, *first, disagreement, None]))
     strips.append(Strip("checks", _checks(job, view, file, sensor, depth, valid & hit, tile)))
@@ -245,7 +257,7 @@ def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> li
     return out[:6]
 
 
-# -------------------------------------------------------------------------------------------------- emitters and response
+# ----------------------------------------------------------------------------------------------- emitters and response
 
 
 def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
@@ -282,7 +294,7 @@ def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
 def _emitter_note(capture: CaptureReader, recovered: Recovered) -> str:
     text = "Radiance in the units of the photographs' exposure."
     if not capture.is_hdr:
-        text += " LDR photographs leave one factor between light and albedo open; it was fixed by the prior's mean albedo."
+        text += " LDR photographs leave one factor between light and albedo open; the prior's mean albedo decides it."
     if recovered.light_scale != 1:
         text += f" Light was multiplied by {recovered.light_scale:.3g} for that."
     return text

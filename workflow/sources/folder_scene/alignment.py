@@ -1,7 +1,8 @@
 """Do photographs, poses and mesh belong together? Measured, not believed.
 
-With depth images: the mesh's depth in the photograph's camera against the depth image, moved into that camera. Without:
-how well edges of the photograph lie on edges of the mesh, against the same picture shifted by a few pixels.
+With depth images: the mesh's depth in the photograph's camera against the depth image, moved into that
+camera. Without: how well edges of the photograph lie on edges of the mesh, against the same picture shifted
+by a few pixels.
 """
 
 from __future__ import annotations
@@ -52,13 +53,14 @@ class Conventions:
 def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Mesh depth / measured depth (n,) float64 where both are known, in the photograph's (pinhole) camera `view`.
 
-    The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in `mesh_depth`, so a depth
-    camera beside the colour camera is compared correctly (but for what only one of the two sees: use a median).
+    The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in
+    `mesh_depth`, so a depth camera beside the colour camera is compared correctly (but for what only one of
+    the two sees: use a median).
     """
     height, width = depth.shape
     step = max(1, int(np.sqrt(depth.size / DEPTH_SAMPLES)))
-    rows, columns = np.meshgrid(np.arange(step // 2, height, step), np.arange(step // 2, width, step), indexing="ij")
-    z = depth[rows, columns].astype(np.float64).ravel()
+    rows, columns = np.meshgrid(np.arange(step // 2, height, step), np.arange(step // 2, width, step),
+    indexing="ij") z = depth[rows, columns].astype(np.float64).ravel()
     camera = frame.depth_camera or frame.camera
     u = (columns.ravel() + 0.5) * camera.width / width
     v = (rows.ravel() + 0.5) * camera.height / height
@@ -180,9 +182,9 @@ def directions(camera: Pinhole, pose: np.ndarray) -> np.ndarray:
 def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Correlation of photograph edges with mesh edges for shifts of the photograph, (2 SHIFT + 1, 2 SHIFT + 1) float64.
 
-    Entry [SHIFT + dy, SHIFT + dx]: mesh pixel (u, v) against photograph pixel (u + dx, v + dy). photo (H, W, 3), valid
-    (H, W), depth (H, W) with 0 = miss, normal (H, W, 3) unit. All are reduced to EDGE_WIDTH first. Zeros when the picture
-    is too small or has no edges.
+    Entry [SHIFT + dy, SHIFT + dx]: mesh pixel (u, v) against photograph pixel (u + dx, v + dy). photo (H,
+    W, 3), valid (H, W), depth (H, W) with 0 = miss, normal (H, W, 3) unit. All are reduced to EDGE_WIDTH
+    first. Zeros when the picture is too small or has no edges.
     """
     from scipy.ndimage import gaussian_filter
 

@@ -17,6 +17,8 @@ MIN_AREA = 1e-12
 """m^2; smaller triangles are removed (METHOD H48)."""
 DIAGONAL = (0.5, 200.0)
 """Metres; a room outside of this is in another unit (METHOD H57)."""
+TYPICAL = 7.0
+"""Metres across a room: the unit that comes nearest is proposed."""
 
 
 @dataclass
@@ -119,8 +121,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[s
 def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
     """The `instance` property of the faces of a PLY."""
     data = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else ()
-    if "instance" not in (names or ()):
+    names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else
+    () if "instance" not in (names or ()):
         return None
     values = np.asarray(data["instance"])
     values = values["f1"] if values.dtype.names else values
@@ -136,8 +138,8 @@ def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
 def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarray | None) -> Mesh:
     finite = np.isfinite(vertices).all(1)[faces].all(1)
     corners = np.where(np.isfinite(vertices), vertices, 0)[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    kept = finite & (area >= MIN_AREA)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
+    axis=1) kept = finite & (area >= MIN_AREA)
     notes = []
     if (~finite).any():
         notes.append(f"mesh: {int((~finite).sum())} faces with NaN vertices removed")
@@ -171,9 +173,11 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
                 f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
                 f" into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
             )
-        fitting = [(n, diagonal / metres * m) for n, m in METRES.items() if 2.0 <= diagonal / metres * m <= 60.0]
-        advice = f"{fitting[0][0]}}}` makes it {fitting[0][1]:.3g} m" if fitting else "<metres per unit>}` can be a number"
-        raise InputError(f"{found}; `source: {{unit: {advice}")
+        across = {name: diagonal / metres * factor for name, factor in METRES.items()}
+        name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL)))
+        if low <= size <= high:
+            raise InputError(f"{found}; `source: {{unit: {name}}}` makes it {size:.3g} m")
+        raise InputError(f"{found}; give its unit as a number: `source: {{unit: <metres per unit>}}`")
     bounds = mesh.bounds
     outside = np.linalg.norm(np.maximum(np.maximum(bounds[0] - centres, centres - bounds[1]), 0), axis=1)
     far = outside > diagonal

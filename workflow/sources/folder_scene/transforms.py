@@ -1,7 +1,7 @@
 """`transforms.json` of nerfstudio and instant-ngp -> cameras in the project's conventions, checked before any work.
 
-Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the frame, what was
-found, what is allowed and what to do.
+Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the
+frame, what was found, what is allowed and what to do.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ RIGID_TOLERANCE = 5e-3
 class Frame:
     """One photograph, as the file describes it.
 
-    camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as written.
-    depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix: OpenCV axes).
+    camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as
+    written. depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix:
+    OpenCV axes).
     """
 
     name: str
@@ -133,8 +134,9 @@ def _load(path: Path) -> dict[str, Any]:
 def _frames(path: Path, document: dict[str, Any]) -> list[Any]:
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
-        found = "no `frames`" if frames is None else "`frames` is empty" if frames == [] else "`frames` is not a list"
-        raise InputError(f"{path}: {found}; at least one photograph with file_path and transform_matrix is needed")
+        found = "no `frames`" if frames is None else "`frames` is empty" if frames == [] else "`frames` is
+        not a list" raise InputError(f"{path}: {found}; at least one photograph with file_path and
+        transform_matrix is needed")
     return frames
 
 
@@ -243,8 +245,8 @@ def _same_sizes(
             sizes.setdefault(headers[image].size, []).append(image)
     if len(sizes) > 1:
         rows = sorted(sizes.items(), key=lambda item: -len(item[1]))
-        text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in rows[:4])
-        raise InputError(
+        text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in
+        rows[:4]) raise InputError(
             f"{path}: images of different sizes share one set of intrinsics ({text})."
             " Write w, h, fl_x, fl_y, cx, cy into each frame, or select one size with `source.frames`"
         )
@@ -260,7 +262,8 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
 
 
 def _frame(
-    path: Path, document: dict[str, Any], entry: dict[str, Any], image: Path, header: images.Header, offset: float
+    path: Path, document: dict[str, Any], entry: dict[str, Any], image: Path, header: images.Header, offset:
+    float
 ) -> Frame:
     where = f"frames[{entry['_index']}] ({entry['file_path']})"
     values = {key: value for key, value in document.items() if key != "frames"} | entry
@@ -323,7 +326,8 @@ def _size(
 
 
 def _camera(
-    path: Path, where: str, values: dict[str, Any], width: int, height: int, offset: float, strict: bool = False
+    path: Path, where: str, values: dict[str, Any], width: int, height: int, offset: float, strict: bool =
+    False
 ) -> Pinhole:
     fx, fy = (_number(path, where, values, key) for key in ("fl_x", "fl_y"))
     angle_x, angle_y = (_number(path, where, values, key) for key in ("camera_angle_x", "camera_angle_y"))
@@ -379,8 +383,9 @@ def _matrix(path: Path, where: str, entry: dict[str, Any], key: str) -> np.ndarr
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
-        found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
-        raise InputError(f"{path}: {where}: `{key}` {found}; expected 4 rows of 4 numbers, camera-to-world")
+        found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a
+        scalar'}" raise InputError(f"{path}: {where}: `{key}` {found}; expected 4 rows of 4 numbers,
+        camera-to-world")
     if not np.isfinite(matrix).all():
         raise InputError(f"{path}: {where}: `{key}` holds NaN or infinity: this image has no pose; remove the frame")
     rotation, last = matrix[:3, :3], matrix[3]

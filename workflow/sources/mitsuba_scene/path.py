@@ -2,8 +2,9 @@
 
     free space    positions that see each other, from the starting pose on, at eye height and with clearance all around
     surface       points drawn evenly over the area; reachable = seen from some free position
-    selection     greedy: the (position, direction) that adds most, a point counting 1, 0.6, 0.4 for its first, second and
-                  third view and next to nothing after (the gain only ever shrinks, so a lazy queue gives the exact greedy choice)
+    selection     greedy: the (position, direction) that adds most; a point counts 1, 0.6, 0.4 for its first, second and
+                  third view and next to nothing after (so a gain only ever shrinks, and a lazy queue makes the exact
+                  greedy choice)
 
 Lengths are scene units (metres); every limit shrinks with the room where it is too small for it. Deterministic in `seed`.
 """

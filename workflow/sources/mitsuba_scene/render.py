@@ -17,6 +17,9 @@ from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from workflow.normal_form import View
 
+from .flatten import texture_at
+from .scene import children
+
 Array = np.ndarray
 
 LANES = 1 << 19
@@ -26,6 +29,34 @@ LANES = 1 << 19
 def path_integrator(max_bounces: int) -> Any:
     """Mitsuba's `path` with that many surface interactions (its `max_depth` counts the camera's segment too)."""
     return mi.load_dict({"type": "path", "max_depth": max_bounces + 1})
+
+
+def balance_lights(scene: Any, shapes: list[Any]) -> None:
+    """Let the path tracer pick area lights by their power (nine parts in ten; one part evenly). Changes noise alone.
+
+    Lights that have no area keep their share.
+    """
+    lights = [(shape, shape.emitter()) for shape in shapes if shape.emitter() is not None]
+    power = np.array([_power(shape, light) for shape, light in lights])
+    if len(lights) < 2 or not power.sum() > 0:
+        return
+    weight = 0.1 + 0.9 * len(lights) * power / power.sum()
+    parameters = mi.traverse(scene)
+    keys = {f"{shape.id()}.emitter.sampling_weight": float(w) for (shape, _), w in zip(lights, weight, strict=True)}
+    for key, value in keys.items():
+        if key in parameters:
+            parameters[key] = value
+    parameters.update()
+
+
+def _power(shape: Any, light: Any) -> float:
+    """Area times mean radiance over a coarse grid of the texture (a weight, so coarse is enough)."""
+    texture = children(light).get("radiance")
+    if texture is None:
+        return 0.0
+    u, v = np.meshgrid((np.arange(8) + 0.5) / 8, (np.arange(8) + 0.5) / 8)
+    mean = texture_at(texture, np.column_stack([u.ravel(), v.ravel()])).mean()
+    return float(np.array(shape.surface_area()).ravel()[0] * mean)
 
 
 def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int) -> tuple[Array, Array, int]:

@@ -221,10 +221,8 @@ def _fitted(room: RoomBuilder) -> None:
     room.add("cornice", box((0.79, 3.615, 2.152), (2.53, 3.99, 2.19), 0.01), material=cream)
     plank = wood(BIRCH, BIRCH_DARK, EAST, NORTH, 0.40, origin=(0, 0, 0.3))
     room.add("north shelves", *(box((3.30, 3.73, z), (4.90, 3.992, z + 0.03), 0.004) for z in (1.46, 1.86)), material=plank)
-    room.add("shelf brackets", *(box((x, 3.76, z - 0.12), (x + 0.02, 3.99, z - 0.002), 0.003)
-                                 for x in (3.45, 4.08, 4.72) for z in (1.86,)),
-             *(tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.012)], 0.007, 8) for x in (3.45, 4.08, 4.72) for z in (1.46,)),
-             material=IRON)
+    room.add("shelf brackets", *(tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.010)], 0.007, 8)
+                                 for x in (3.45, 4.08, 4.72) for z in (1.46, 1.86)), material=IRON)
 
     room.add("fridge", box((0.06, 3.34, 0.03), (0.70, 3.96, 1.92), 0.012), material=STEEL)
     room.add("fridge doors", box((0.063, 3.295, 0.05), (0.697, 3.337, 0.70), 0.010),
@@ -255,7 +253,7 @@ def _cooker(room: RoomBuilder) -> None:
     burners = [(2.76, 3.58), (3.04, 3.58), (2.76, 3.81), (3.04, 3.81)]
     grates = []
     for x, y in burners:
-        grates.append(ring((x, y, 0.938), 0.085, 0.006, EAST, NORTH))
+        grates.append(ring((x, y, 0.938), 0.085, 0.006, EAST, NORTH, 20))
         grates += [box((x - 0.10, y - 0.005, 0.934), (x - 0.03, y + 0.005, 0.945)), box((x + 0.03, y - 0.005, 0.934), (x + 0.10, y + 0.005, 0.945)),
                    box((x - 0.005, y - 0.10, 0.9335), (x + 0.005, y - 0.03, 0.9445)), box((x - 0.005, y + 0.03, 0.9335), (x + 0.005, y + 0.10, 0.9445))]
         grates += [cylinder((x + dx, y + dy, 0.912), 0.006, 0.027, segments=8) for dx, dy in ((0.085, 0), (-0.085, 0), (0, 0.085), (0, -0.085))]

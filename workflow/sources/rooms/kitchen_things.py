@@ -107,7 +107,7 @@ def apple(centre: Sequence[float], radius: float) -> Shape:
 
 
 def _leaf(length: float, width: float, tilt: float, turn: float, at: Sequence[float]) -> Shape:
-    blade = stretch(sphere((0, 0, 0), 1.0, 12), (width / 2, length / 2, 0.0022))
+    blade = stretch(sphere((0, 0, 0), 1.0, 10), (width / 2, length / 2, 0.0022))
     return move(move(blade, (0, length / 2, 0)), at, turn, tilt)
 
 

@@ -1,0 +1,432 @@
+"""Every row of docs/bad-input.md, provoked: the message (or the recorded note) is the one that the page shows."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from iif_core.errors import InputError
+from tests.unit import own_scene as own
+from workflow import fingerprint, settings
+
+PAGE = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
+PENDING = {"no emitter seen"}
+"""Rows whose stage tests them elsewhere."""
+
+
+def rows():
+    """Case -> text of the page, over all its tables."""
+    out = {}
+    for line in PAGE.read_text().splitlines():
+        match = re.fullmatch(r"\| (.+?) \| (`{1,2}) ?(.+?) ?\2 \|", line)
+        if match:
+            out[match[1]] = match[3]
+    return out
+
+
+ROWS = rows()
+CASES = {}
+
+
+def case(name):
+    """Register how a row is provoked: a function of the project's root that returns the text the user gets."""
+
+    def register(function):
+        CASES[name] = function
+        return function
+
+    return register
+
+
+def shown(text, message):
+    """Whether the message begins as the page says, `…` being anything."""
+    pattern = ".*".join(re.escape(part) for part in text.split("…"))
+    return re.match(pattern, message, re.DOTALL) is not None
+
+
+def test_the_page_and_the_cases_are_the_same():
+    assert set(ROWS) - PENDING == set(CASES)
+
+
+
+
+def error(action):
+    with pytest.raises(InputError) as caught:
+        action()
+    return str(caught.value)
+
+
+def planned(root, **kwargs):
+    """The message while Snakemake plans: fingerprint of the capture, which checks the input files."""
+    own.project(root, **kwargs)
+    with own.working_in(root):
+        return error(lambda: fingerprint.fingerprint("capture", "own", "draft"))
+
+
+def changed(root, **keys):
+    """A bare scene whose transforms.json has other top-level keys (None removes one)."""
+    path = root / "data/own"
+    document = own.bare(path) | keys
+    own.write_transforms(path, {k: v for k, v in document.items() if v is not None})
+    return planned(root)
+
+
+def second_pose(root, change):
+    path = root / "data/own"
+    document = own.bare(path)
+    pose = np.array(document["frames"][1]["transform_matrix"])
+    document["frames"][1]["transform_matrix"] = change(pose).tolist()
+    own.write_transforms(path, document)
+    return planned(root)
+
+
+def captured(root, **kwargs):
+    """The message of the capture job."""
+    own.project(root, **kwargs)
+    return error(lambda: own.run(root, "capture"))
+
+
+def noted(root, word, **kwargs):
+    """The note with this word that the capture records."""
+    own.project(root, **kwargs)
+    notes = own.run(root, "capture").facts["notes"]
+    return next(note for note in notes if word in note)
+
+
+# --------------------------------------------------------------------------------------------------------------- settings
+
+
+def loaded(root, text, scene="own"):
+    (root / "config/scenes").mkdir(parents=True)
+    (root / "config/scenes/kitchen.yaml").write_text("source: {kind: builtin}\nprior: {kind: simulated}\n")
+    (root / "config/scenes/own.yaml").write_text("source: {kind: builtin}\nprior: {kind: simulated}\n" + text)
+    with own.working_in(root):
+        return error(lambda: settings.load(scene))
+
+
+case("unknown scene")(lambda root: loaded(root, "", "kichen"))
+case("misspelt key")(lambda root: loaded(root, "capture: {veiws: 3}\n"))
+case("empty view list: `capture.views: 0`")(lambda root: loaded(root, "capture: {views: 0}\n"))
+
+
+@case("K = 0: `prior.samples: 0`")
+def _(root):
+    (root / "config/scenes").mkdir(parents=True)
+    text = "source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n"
+    (root / "config/scenes/own.yaml").write_text(text)
+    with own.working_in(root):
+        return error(lambda: settings.load("own"))
+
+
+# ------------------------------------------------------------------------------------------------------------------ files
+
+
+case("folder absent")(lambda root: planned(root, source={"path": "data/nowhere"}))
+
+
+@case("transforms.json absent")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/transforms.json").unlink()
+    return planned(root)
+
+
+@case("transforms.json cut short")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/transforms.json"
+    path.write_text(path.read_text()[:-40])
+    return planned(root)
+
+
+case("empty view list: no frames")(lambda root: changed(root, frames=[]))
+
+
+@case("empty view list: glob without match")
+def _(root):
+    own.bare(root / "data/own")
+    return planned(root, source={"frames": "rgb/*"})
+
+
+@case("images absent")
+def _(root):
+    own.bare(root / "data/own")
+    for name in ("000", "002"):
+        (root / f"data/own/images/{name}.png").unlink()
+    return planned(root)
+
+
+@case("image damaged")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/images/001.png").write_bytes(b"\x89PNG\r\n\x1a\nnothing")
+    return planned(root)
+
+
+@case("image in a format not read")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][0]["file_path"] = "images/000.tif"
+    Image.new("RGB", (64, 48)).save(root / "data/own/images/000.tif")
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
+def first_as_jpeg(root, image, **options):
+    document = own.bare(root / "data/own")
+    document["frames"][0]["file_path"] = "images/000.jpg"
+    image.save(root / "data/own/images/000.jpg", **options)
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
+case("CMYK image")(lambda root: first_as_jpeg(root, Image.new("CMYK", (64, 48))))
+
+
+@case("EXIF rotation that the cameras do not explain")
+def _(root):
+    exif = Image.Exif()
+    exif[274] = 3
+    return first_as_jpeg(root, Image.new("RGB", (64, 48)), exif=exif)
+
+
+@case("two images of one name")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][1]["file_path"] = "more/000.png"
+    own.save_png(root / "data/own/more/000.png", np.zeros((48, 64, 3)))
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
+@case("images of different sizes")
+def _(root):
+    own.bare(root / "data/own")
+    own.save_png(root / "data/own/images/001.png", np.zeros((24, 32, 3)))
+    return planned(root)
+
+
+# ---------------------------------------------------------------------------------------------------------------- cameras
+
+TWICE = {"fl_x": 120.0, "fl_y": 124.0, "cx": 66.0, "cy": 46.0}
+case("intrinsics for another resolution")(lambda root: changed(root, w=128, h=96, **TWICE))
+case("the same, without `w` and `h`")(lambda root: changed(root, w=None, h=None, **TWICE))
+case("no focal length")(lambda root: changed(root, fl_x=None, fl_y=None))
+case("pose not 4x4")(lambda root: second_pose(root, lambda pose: pose[:3]))
+case("pose with NaN")(lambda root: second_pose(root, lambda pose: pose * np.nan))
+case("pose with a scale")(lambda root: second_pose(root, lambda pose: pose @ np.diag([2.0, 2, 2, 1])))
+case("pose with a reflection")(lambda root: second_pose(root, lambda pose: pose @ np.diag([-1.0, 1, 1, 1])))
+case("unknown lens model")(lambda root: changed(root, camera_model="EQUIRECTANGULAR"))
+case("lens coefficients on a pinhole")(lambda root: changed(root, camera_model="PINHOLE", k1=-0.1))
+
+
+# ----------------------------------------------------------------------------------------------------------- other files
+
+
+@case("EXR photographs declared LDR")
+def _(root):
+    path = root / "data/own"
+    document = own.bare(path)
+    for entry in document["frames"]:
+        entry["file_path"] = entry["file_path"].replace(".png", ".exr")
+        own.save_exr(path / entry["file_path"], dict.fromkeys("RGB", np.ones((48, 64), np.float32)))
+    own.write_transforms(path, document)
+    return planned(root)
+
+
+@case("8-bit photographs declared HDR")
+def _(root):
+    own.bare(root / "data/own")
+    return planned(root, capture={"dynamic_range": "hdr"})
+
+
+@case("mesh absent")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.ply").unlink()
+    return planned(root)
+
+
+@case("several meshes")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.obj").write_text("")
+    return planned(root)
+
+
+@case("instance files under other names")
+def _(root):
+    own.bare(root / "data/own")
+    own.save_png(root / "data/own/instances/frame_0.png", np.zeros((48, 64, 3)))
+    return planned(root)
+
+
+@case("truth incomplete")
+def _(root):
+    own.bare(root / "data/own")
+    albedo = dict.fromkeys("RGB", np.ones((48, 64), np.float32))
+    for i in range(3):
+        own.save_exr(root / f"data/own/truth/albedo/{i:03d}.exr", albedo)
+    return planned(root)
+
+
+@case("exposure missing or not positive")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/exposures.json").write_text(json.dumps({"000": 1, "001": -1, "002": 1}))
+    return planned(root)
+
+
+# ------------------------------------------------------------------------------------------------------------ capture job
+
+
+@case("mesh in millimetres")
+def _(root):
+    path = root / "data/own"
+    document = own.bare(path)
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(path / "mesh.ply", vertices * 1000, faces)
+    for entry in document["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3, 3] *= 1000
+        entry["transform_matrix"] = pose.tolist()
+    own.write_transforms(path, document)
+    return captured(root)
+
+
+@case("mesh in millimetres, cameras in metres")
+def _(root):
+    own.bare(root / "data/own")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(root / "data/own/mesh.ply", vertices * 1000, faces)
+    return captured(root)
+
+
+@case("point cloud instead of a mesh")
+def _(root):
+    own.bare(root / "data/own")
+    own.save_mesh(root / "data/own/mesh.ply", own.room_mesh()[0], np.zeros((0, 3), int))
+    return captured(root)
+
+
+def moved(root, which, by):
+    document = own.bare(root / "data/own")
+    for i in which:
+        pose = np.array(document["frames"][i]["transform_matrix"])
+        pose[:3, 3] += by
+        document["frames"][i]["transform_matrix"] = pose.tolist()
+    own.write_transforms(root / "data/own", document)
+
+
+@case("all cameras far from the mesh")
+def _(root):
+    moved(root, range(3), [100, 0, 0])
+    return captured(root)
+
+
+@case("all cameras look at nothing")
+def _(root):
+    document = own.bare(root / "data/own")
+    for entry in document["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3, 3] = [3, -0.5, 4]  # above the room, looking up
+        pose[:3, :3] = np.diag([1.0, -1.0, -1.0])
+        entry["transform_matrix"] = pose.tolist()
+    own.write_transforms(root / "data/own", document)
+    return captured(root)
+
+
+@case("camera axes wrong (depth images exist)")
+def _(root):
+    own.photographed(root / "data/own")
+    return captured(root, source={"axes": "opencv"})
+
+
+@case("unit wrong (depth images exist)")
+def _(root):
+    own.photographed(root / "data/own")
+    return captured(root, source={"unit": 3.0})
+
+
+@case("`given` without instance ids")
+def _(root):
+    own.photographed(root / "data/own", 2, depth=False)
+    own.project(root, segmentation={"kind": "given"})
+    return error(lambda: own.run(root, "capture", "segmentation"))
+
+
+# -------------------------------------------------------------------------------------------------------------- treatment
+
+
+@case("zero-area triangles")
+def _(root):
+    own.bare(root / "data/own")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(root / "data/own/mesh.ply", vertices, np.concatenate([faces, [[0, 0, 1], [2, 3, 3]]]))
+    return noted(root, "zero-area")
+
+
+@case("faces with NaN vertices")
+def _(root):
+    own.bare(root / "data/own")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(root / "data/own/mesh.ply", [*vertices, [np.nan] * 3], np.concatenate([faces, [[0, 1, len(vertices)]]]))
+    return noted(root, "NaN vertices")
+
+
+@case("NaN pixels")
+def _(root):
+    path = root / "data/own"
+    document = own.bare(path)
+    for i, entry in enumerate(document["frames"]):
+        entry["file_path"] = entry["file_path"].replace(".png", ".exr")
+        pixels = np.ones((48, 64), np.float32)
+        pixels[3, 4] = np.nan if i == 1 else 1
+        own.save_raw_exr(path / entry["file_path"], dict.fromkeys("RGB", pixels))
+    own.write_transforms(path, document)
+    return noted(root, "NaN or infinite", capture={"dynamic_range": "hdr"})
+
+
+@case("transparent pixels")
+def _(root):
+    own.bare(root / "data/own")
+    rgba = np.full((48, 64, 4), 255, np.uint8)
+    rgba[0, 0, 3] = 0
+    Image.fromarray(rgba, "RGBA").save(root / "data/own/images/001.png")
+    return noted(root, "transparent")
+
+
+@case("one camera outside the room looking at nothing")
+def _(root):
+    moved(root, [0], [0, 0, 50])
+    document = json.loads((root / "data/own/transforms.json").read_text())
+    document["frames"][0]["transform_matrix"][2][:3] = [0, 0, -1]
+    document["frames"][0]["transform_matrix"][0][:3] = [1, 0, 0]
+    document["frames"][0]["transform_matrix"][1][:3] = [0, -1, 0]
+    own.write_transforms(root / "data/own", document)
+    text = noted(root, "dropped")
+    kept = json.loads((root / "results/own/capture/capture.json").read_text())
+    assert kept["dropped_views"] == {"000": 0.0}
+    return text
+
+
+@case("one view only")
+def _(root):
+    own.bare(root / "data/own", 1)
+    return noted(root, "one view only")
+
+
+@case("edges of photographs and mesh apart (no depth images)")
+def _(root):
+    own.bare(root / "data/own")  # grey pictures have no edges at all
+    return noted(root, "WARNING")
+
+
+@pytest.mark.parametrize("name", sorted(CASES))
+def test_row(name, tmp_path):
+    message = CASES[name](tmp_path)
+    assert shown(ROWS[name], message), f"\npage:  {ROWS[name]}\nfound: {message}"
+    assert "Traceback" not in message and "\n" not in message.strip()

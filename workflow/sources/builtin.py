@@ -1,0 +1,175 @@
+"""Source `builtin`: a room that the project makes itself -> photographs, cameras, mesh and ground truth.
+
+The photographs are path traced with the workflow's own reflectance model and the same textures that the truth maps show, so
+that nothing stands between model and data but Monte Carlo noise, eight bits and a response that the solver is not told.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workflow.normal_form import CaptureWriter, Truth, View
+
+if TYPE_CHECKING:
+    from workflow.job import Job
+    from workflow.sources.rooms.room import Room
+
+Array = np.ndarray
+
+RESPONSE = "filmic"
+MAX_BOUNCES = 16
+_METER = 4096  # pixels a view that set the exposure
+_COVERAGE_POINTS = 8000
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """None: the room is made, not read."""
+    return []
+
+
+def capture(job: Job) -> None:
+    """Build the room, photograph it, and write the normal form with truth."""
+    from iif_core import native
+
+    native.prepare()
+    import mitsuba as mi
+
+    if not (mi.variant() or "").startswith(("llvm_ad_rgb", "cuda_ad_rgb")):
+        mi.set_variant("llvm_ad_rgb")
+    native.limit_threads(job.threads)
+    if job.settings.capture.denoise:
+        from workflow.sources.mitsuba_scene.render import require_denoiser
+
+        require_denoiser()
+    from workflow.sources import rooms
+
+    _Capture(job, rooms.build(job.settings.source.scene)).run()
+
+
+class _Capture:
+    """One capture: the room on the device, its views, and what is to be said about them."""
+
+    def __init__(self, job: Job, room: Room):
+        from iif_core.transport import Emitters, build_geometry
+
+        self.job, self.settings, self.room = job, job.settings.capture, room
+        self.writer = CaptureWriter(job.writer)
+        self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
+        front = np.ones(len(room.faces), np.int8)
+        self.emitters = Emitters(self.geometry, room.emission, front)
+        self.material = room.materials.drjit()
+
+    def run(self) -> None:
+        views = self._plan()
+        self.writer.mesh(
+            self.room.vertices, self.room.faces, self.room.object_id, list(self.room.names), self.room.emission
+        )
+        with tempfile.TemporaryFile() as scratch:
+            shape = (len(views), self.settings.height, self.settings.width, 3)
+            radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
+            meters = [self._view(view, radiance[i]) for i, view in enumerate(self._counted(views))]
+            views = self._photographs(views, radiance, meters)
+            del radiance
+        self.writer.cameras(views)
+        self._finish(views)
+
+    def _plan(self) -> list[View]:
+        width, height, every = self.settings.width, self.settings.height, self.settings.test_every
+        focal = 0.5 * width / np.tan(np.radians(self.room.field_of_view / 2))
+        return [
+            View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose,
+                 split="test" if every and i % every == every - 1 else "train")
+            for i, pose in enumerate(self.room.cameras(self.settings.views))
+        ]  # fmt: skip
+
+    def _counted(self, views: list[View]) -> Any:
+        for i, view in enumerate(views):
+            yield view
+            self.job.progress(i + 1, len(views), "rendered views")
+
+    def _view(self, view: View, radiance: Array) -> tuple[Array, Array]:
+        """Write G-buffer and truth of a view, keep its radiance; (radiance, mask) of the pixels that set the exposure."""
+        from iif_core.camera import direction_derivatives, pixel_directions
+        from iif_core.transport import render, trace
+
+        shape = (view.height, view.width)
+        origin = view.world_from_camera[:3, 3]
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = rays.reshape(-1, 3)
+        face, depth = trace(self.geometry, origin, rays)
+        hit = face >= 0
+        depth = np.where(hit, depth, 0).astype(np.float32)
+        on = np.maximum(face, 0)
+        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.room.object_id[on])
+        cosine = (self.geometry.normals[on] * rays).sum(1)
+        emission = np.where((hit & (cosine < 0))[:, None], self.room.emission[on], 0)
+
+        steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+        seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
+        image = render(self.geometry, self.material, self.emitters, origin, rays, self.settings.samples, MAX_BOUNCES, seed,
+                       jitter=steps)  # fmt: skip
+        if self.settings.denoise:
+            from workflow.sources.mitsuba_scene.render import denoise
+
+            normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.geometry.normals[on], 0)
+            image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
+        radiance[:] = image.reshape(*shape, 3)
+
+        self.writer.gbuffer(view.name, depth.reshape(shape), face.reshape(shape))
+        self.writer.truth(
+            view.name,
+            Truth(
+                np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
+                np.where(hit, roughness, 0).reshape(shape),
+                np.where(hit, metallic, 0).reshape(shape),
+                emission.reshape(*shape, 3),
+                image.reshape(*shape, 3),
+                hit.reshape(shape),
+            ),
+        )
+        step = max(1, len(image) // _METER)
+        return image[::step], ~emission.any(1)[::step]
+
+    def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
+        """Write the photographs; the views with their exposures."""
+        from iif_core.photography import expose, exposures, response_curve
+
+        self.response = None
+        if self.settings.dynamic_range == "hdr":
+            for view, image in zip(views, radiance, strict=True):
+                self.writer.photo(view.name, np.array(image), encoded=False)
+            return views
+        self.response = response_curve(RESPONSE)
+        gains = exposures([image for image, _ in meters], [mask for _, mask in meters])
+        views = [replace(view, exposure=float(gain)) for view, gain in zip(views, gains, strict=True)]
+        for view, image in zip(views, radiance, strict=True):
+            self.writer.photo(view.name, expose(image, view.exposure, self.response))
+        return views
+
+    def _finish(self, views: list[View]) -> None:
+        from workflow.sources.rooms.coverage import seen_from, surface_points
+
+        points = surface_points(self.room, _COVERAGE_POINTS)
+        views_of_point = sum(seen_from(self.geometry, points, self.room.field_of_view, v.height / v.width, v.world_from_camera)
+                             .astype(int) for v in views)  # fmt: skip
+        reachable = views_of_point > 0
+        for pose in self.room.cameras(len(self.room.shots)):
+            reachable = reachable | seen_from(self.geometry, points, self.room.field_of_view, 1.0, pose)
+        once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
+        self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
+        notes = [f"{len(self.room.names)} objects, {len(self.room.faces)} faces; paths of up to {MAX_BOUNCES} bounces"]
+        if self.response is not None:
+            notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ from view to view")
+        if self.settings.denoise:
+            notes.append("photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth")
+        facts = {
+            "room": self.room.name,
+            "coverage": {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": _COVERAGE_POINTS},
+        }
+        samples = None if self.response is None else self.response.samples()
+        self.writer.finish("builtin", self.settings.dynamic_range, True, notes, samples, facts)
