@@ -347,7 +347,9 @@ def _add_chunk(
     c2 = opt.robust_width**2
     product = errors[0] * errors[-1]
     trust = px.trust[part]
-    rho = 0.5 * np.where(product > 0, c2 * np.log1p(np.maximum(product, 0.0) / c2), product)
+    # Odd in the product: were only positive ones damped, loud noise of opposite signs would pay, and the response
+    # would be bent until it amplifies the noise.
+    rho = 0.5 * np.sign(product) * c2 * np.log1p(np.abs(product) / c2)
     pixel_data = (trust * rho).sum(1)
     inside = outside[:, 3:] == 0
     # 3/2: the paper adds these to a mean over three channels of the squared error, we sum half the squares.
@@ -358,7 +360,7 @@ def _add_chunk(
     cost += summed + np.bincount(obj, light, n_objects)
     if not jacobian:
         return
-    weight = trust / (1.0 + np.maximum(product, 0.0) / c2)
+    weight = trust / (1.0 + np.abs(product) / c2)
     one = np.concatenate([base[:, :3], np.ones((len(obj), 1))], 1)
     rough = np.stack([base[:, 3], np.ones(len(obj))], 1)
     metal = np.stack([base[:, 4], np.ones(len(obj))], 1)

@@ -21,11 +21,13 @@ plus the sums. Sums are float64. Last, the Laplace scale of a cell in closed for
 
 Results do not depend on the order of the predictions, nor on threads.
 """
+
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -87,8 +89,10 @@ class BaseProblem:
             raise InputError(f"predictions of view {view} have shape {maps.shape}; (K, H, W, 5) with K >= 1 is needed")
         maps = maps.reshape(maps.shape[0], -1, 5)
         if maps.shape[1] != np.size(self.cell_of_pixel[view]):
-            raise InputError(f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has "
-                             f"{np.size(self.cell_of_pixel[view])}")
+            raise InputError(
+                f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has "
+                f"{np.size(self.cell_of_pixel[view])}"
+            )
         return maps
 
 
@@ -124,8 +128,10 @@ class BaseOptions:
         if self.variant not in VARIANTS:
             raise InputError(f"base variant {self.variant!r}; allowed: {', '.join(VARIANTS)}")
         if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1:
-            raise InputError(f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), "
-                             f"anneal {self.anneal} (between 0 and 1)")
+            raise InputError(
+                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), "
+                f"anneal {self.anneal} (between 0 and 1)"
+            )
 
 
 @dataclass(frozen=True)
@@ -202,7 +208,8 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
     """Weights of K predictions by their error: alpha_k ~ exp(-(E_k - min E) / (temperature * median E)).
 
     `error` (..., K), K last, >= 0; `usable` (..., K) bool. Temperature 0 is the limit: the smallest error takes all,
-    equal ones share (so that the result does not depend on the order). Sum 1, or 0 where nothing is usable.
+    equal ones (to an rms of 1e-6) share, so that the result does not depend on the order. Sum 1, or 0 where nothing is
+    usable.
     """
     error = np.asarray(error, np.float64)
     usable = np.ones(error.shape, bool) if usable is None else np.broadcast_to(usable, error.shape)
@@ -216,7 +223,7 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
     if temperature > 0:
         weight = np.exp(-excess / (temperature * (median + 1e-6)))
     else:
-        weight = (excess <= 1e-9 * median + 1e-15).astype(np.float64)
+        weight = (excess <= 1e-9 * median + 1e-12).astype(np.float64)
     weight = np.where(usable, weight, 0.0)
     total = weight.sum(-1, keepdims=True)
     return weight / np.where(total > 0, total, 1.0)
@@ -278,6 +285,30 @@ def _in_order(work: Callable[[int], _T], n_views: int, threads: int) -> Iterator
 # ------------------------------------------------------------------------------------------------------------ sums
 
 
+def _transposed_product(a: NDArray, b: NDArray) -> NDArray:
+    """a' b of (m, i) and (m, j), summed over pieces of rows."""
+    step = _rows_per_product(a.shape[1] * b.shape[1])
+    out = np.zeros((a.shape[1], b.shape[1]))
+    for start in range(0, len(a), step):
+        out += a[start : start + step].T @ b[start : start + step]
+    return out
+
+
+def _product(a: NDArray, b: NDArray) -> NDArray:
+    """a b of (m, i) and (i, j), in pieces of rows."""
+    step = _rows_per_product(b.size)
+    out = np.empty((len(a), b.shape[1]))
+    for start in range(0, len(a), step):
+        np.matmul(a[start : start + step], b, out=out[start : start + step])
+    return out
+
+
+def _rows_per_product(work_per_row: int) -> int:
+    """Rows whose product OpenBLAS computes on one thread (below 2^18 multiplications): larger ones are shared out, and
+    then the rounding depends on the number of threads."""
+    return max(1, (1 << 17) // work_per_row)
+
+
 class _Sums:
     """Gram matrices of every (segment, prediction) and the regularised inverses, made in one pass."""
 
@@ -291,43 +322,54 @@ class _Sums:
     def add(self, segment: int, phi: NDArray, weight: NDArray, usable: NDArray, options: BaseOptions) -> None:
         if self.weight[segment] > 0:
             raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
-        by_k = np.ascontiguousarray(phi.transpose(1, 0, 2))  # (K, m, 6) float64
         self.weight[segment] = weight.sum()
         self.usable[segment] = usable
-        self.gram[segment] = (by_k * weight[:, None]).swapaxes(1, 2) @ by_k
+        for k in np.flatnonzero(usable):
+            one = np.ascontiguousarray(phi[:, k])
+            self.gram[segment, k] = _transposed_product(one, weight[:, None] * one)
         self.fit[segment] = self.gram[segment][:, _ALBEDO][:, :, _ALBEDO]
         inside = _inside(phi).T  # (K, m)
         remain = inside.sum(1)
         enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * len(phi))
         self.clipped[segment] = usable & enough & (remain < len(phi))
         for k in np.flatnonzero(self.clipped[segment]):
-            a = by_k[k][inside[k]][:, _ALBEDO]
-            self.fit[segment, k] = (a * weight[inside[k], None]).T @ a
+            one = phi[inside[k], k][:, _ALBEDO]
+            self.fit[segment, k] = _transposed_product(one, weight[inside[k], None] * one)
 
     def invert(self, options: BaseOptions) -> None:
         self.ridge = options.ridge * np.maximum(self.weight, options.ridge_pixels)
         ridge = self.ridge[:, None, None, None]
         self.inverse_albedo = np.linalg.inv(self.fit + ridge * np.eye(4))
         self.inverse_roughness, self.inverse_metallic = (
-            np.linalg.inv(self.gram[:, :, rows][:, :, :, rows] + ridge * np.eye(2)) for rows in (_ROUGHNESS, _METALLIC))
+            np.linalg.inv(self.gram[:, :, rows][:, :, :, rows] + ridge * np.eye(2)) for rows in (_ROUGHNESS, _METALLIC)
+        )
 
 
-def _identity(n_segments: int, k: int) -> NDArray:
-    """Corrections as one matrix (S, K, 6, 5): phi @ T = corrected values."""
-    t = np.zeros((n_segments, k, 6, 5))
-    t[..., range(5), range(5)] = 1
-    return t
+class _State:
+    """What a sweep changes: corrections (S, K, 6, 5) with phi @ T = corrected values, alpha and error (S, K, 3)."""
+
+    def __init__(self, n_segments: int, sums: _Sums):
+        k = sums.usable.shape[1]
+        self.affine = np.zeros((n_segments, k, 6, 5))
+        self.affine[..., range(5), range(5)] = 1
+        share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
+        self.alpha = np.repeat(share[:, :, None], 3, 2)
+        self.error = np.zeros((n_segments, k, 3))
 
 
 # ---------------------------------------------------------------------------------------------------------- solver
 
 
-def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
-               progress: Callable[[int, int], None] | None = None, threads: int = 1) -> BaseResult:
+def solve_base(
+    problem: BaseProblem,
+    options: BaseOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    threads: int = 1,
+) -> BaseResult:
     """Base texture of a problem by alternating closed forms; deterministic, independent of the order of predictions.
 
     `progress(done, total)` is called after every pass over the views. `threads` views are worked on at a time (and are
-    in memory); the result does not depend on it. BLAS threads of their own only get in the way: limit them to one.
+    in memory); the result does not depend on it.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
@@ -339,58 +381,78 @@ def solve_base(problem: BaseProblem, options: BaseOptions | None = None,
     total = sweeps + 2
 
     sums, texture, usable, dropped, counts = _first_pass(problem, options)
-    k = sums.usable.shape[1]
     _notify(progress, 1, total)
-    affine = _identity(problem.n_segments, k)
-    share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
-    alpha = np.repeat(share[:, :, None], 3, 2)
-    error = np.zeros((problem.n_segments, k, 3))
+    state = _State(problem.n_segments, sums)
     history: list[dict[str, float]] = []
 
     for sweep in range(sweeps):
         temperature = 0.0 if sweep == sweeps - 1 else options.temperature * options.anneal**sweep
-        cells = _CellSums(problem.n_cells)
         centre = texture if options.robust and sweep else None
-
-        def one_view(view: int, texture: NDArray = texture, temperature: float = temperature) -> tuple[_Block, NDArray]:
-            # writes only the rows of its own segments, so views can run side by side
-            block, _, _ = _block(problem, view, usable[view])
-            mixture = np.empty((len(block.cell), 5))
-            for segment, rows in block.ranges():
-                phi, t = block.phi[rows], texture[block.cell[rows]]
-                weighted = block.weight[rows, None] * t
-                cross = (phi.reshape(len(phi), -1).T @ weighted).reshape(k, 6, 5)
-                if not means:
-                    affine[segment] = _fit(sums, segment, phi, cross, weighted)
-                error[segment] = _errors(sums, segment, affine[segment], cross, (weighted * t).sum(0))
-                if options.variant == "full":
-                    alpha[segment] = selection_weights(error[segment].T, temperature, sums.usable[segment]).T
-                mixture[rows] = _mixture(phi, affine[segment], alpha[segment])
-            return replace(block, phi=_NOTHING), mixture
-
-        for block, mixture in _in_order(one_view, n_views, threads):
+        cells = _CellSums(problem.n_cells)
+        work = partial(_sweep_view, problem, options, sums, usable, texture, temperature, state)
+        for block, mixture in _in_order(work, n_views, threads):
             cells.add(block.cell, mixture, block.weight, centre, options)
         updated = cells.mean(texture)
         if not means:
-            updated, affine = _anchored(problem, sums, updated, affine, counts)
+            updated = _anchored(problem, sums, updated, state, counts)
         change = float(np.sqrt(np.mean((updated - texture)[cells.seen] ** 2))) if cells.seen.any() else 0.0
         texture = updated
-        history.append({"temperature": temperature, **_mean_errors(sums, alpha, error), "entropy": _entropy(sums, alpha),
-                        "gain": _mean_gain(sums, affine, alpha), "change": change})
+        history.append({"temperature": temperature, **_summary(sums, state), "change": change})
         _notify(progress, sweep + 2, total)
 
     texture = np.clip(texture, LOWEST, 1.0)
     if options.variant == "object_mean":
-        texture = object_means(texture, problem.object_of_cell, counts.weight)[0].astype(np.float64)[problem.object_of_cell]
-    scale = _scales(problem, options, texture, affine, alpha, usable, threads)
+        object_value, _ = object_means(texture, problem.object_of_cell, counts.weight)
+        texture = object_value.astype(np.float64)[problem.object_of_cell]
+    scale = _scales(problem, options, texture, state, usable, threads)
     _notify(progress, total, total)
     value, object_value, object_cells = _filled(problem, texture, counts)
     scale[counts.weight == 0] = _unseen_scale(scale, counts.weight > 0, options)
     return BaseResult(
-        value, scale, counts.observations, counts.views, object_value, object_cells, alpha.astype(np.float32),
-        affine[..., _ALBEDO, :3].swapaxes(-1, -2).astype(np.float32),
-        affine[..., _ROUGHNESS, 3].astype(np.float32), affine[..., _METALLIC, 4].astype(np.float32),
-        error.astype(np.float32), dropped, history)
+        value=value,
+        scale=scale,
+        observations=counts.observations,
+        views=counts.views,
+        object_value=object_value,
+        object_cells=object_cells,
+        weight=state.alpha.astype(np.float32),
+        affine_albedo=state.affine[..., _ALBEDO, :3].swapaxes(-1, -2).astype(np.float32),
+        affine_roughness=state.affine[..., _ROUGHNESS, 3].astype(np.float32),
+        affine_metallic=state.affine[..., _METALLIC, 4].astype(np.float32),
+        error=state.error.astype(np.float32),
+        dropped=dropped,
+        history=history,
+    )
+
+
+def _sweep_view(
+    problem: BaseProblem,
+    options: BaseOptions,
+    sums: _Sums,
+    usable: list[NDArray],
+    texture: NDArray,
+    temperature: float,
+    state: _State,
+    view: int,
+) -> tuple[_Block, NDArray]:
+    """T, error and alpha of a view's segments against the texture, and the mixture at its pixels.
+
+    Writes only the rows of its own segments in `state`, so views can run side by side.
+    """
+    block, _, _ = _block(problem, view, usable[view])
+    mixture = np.empty((len(block.cell), 5))
+    for segment, rows in block.ranges():
+        phi, t = block.phi[rows], texture[block.cell[rows]]
+        weighted = block.weight[rows, None] * t
+        cross = _transposed_product(phi.reshape(len(phi), -1), weighted).reshape(-1, 6, 5)
+        if options.variant in ("full", "uniform"):
+            state.affine[segment] = _fit(sums, segment, phi, cross, weighted)
+        state.error[segment] = _errors(sums, segment, state.affine[segment], cross, (weighted * t).sum(0))
+        if options.variant == "full":
+            weights = selection_weights(state.error[segment].T, temperature, sums.usable[segment])
+            state.alpha[segment] = weights.T
+        mixture[rows] = _mixture(phi, state.affine[segment], state.alpha[segment])
+    return replace(block, phi=_NOTHING), mixture
 
 
 @dataclass
@@ -400,7 +462,9 @@ class _Counts:
     weight: NDArray
 
 
-def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
+def _first_pass(
+    problem: BaseProblem, options: BaseOptions
+) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
     """Gram matrices, the first texture (cell mean of the predictions' median), usable predictions, counts."""
     n_views = len(problem.cell_of_pixel)
     counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
@@ -412,8 +476,10 @@ def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDAr
         if sums is None:
             sums = _Sums(problem.n_segments, len(usable))
         if len(usable) != sums.usable.shape[1]:
-            raise InputError(f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; "
-                             "give every view the same number")
+            raise InputError(
+                f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; "
+                "give every view the same number"
+            )
         usable_of_view.append(usable)
         if not usable.all():
             faults = prediction_faults(problem.view(view))
@@ -438,8 +504,10 @@ def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDAr
 
 
 def _check_ids(problem: BaseProblem, view: int) -> None:
-    for name, ids, n in (("cell", problem.cell_of_pixel[view], problem.n_cells),
-                         ("segment", problem.segment_of_pixel[view], problem.n_segments)):
+    for name, ids, n in (
+        ("cell", problem.cell_of_pixel[view], problem.n_cells),
+        ("segment", problem.segment_of_pixel[view], problem.n_segments),
+    ):
         highest = int(np.max(ids, initial=-1))
         if highest >= n:
             raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
@@ -452,7 +520,7 @@ def _fit(sums: _Sums, segment: int, phi: NDArray, cross: NDArray, weighted: NDAr
     albedo = cross[:, _ALBEDO, :3]
     for k in np.flatnonzero(sums.clipped[segment]):
         inside = _inside(phi[:, k])
-        albedo[k] = phi[inside, k][:, _ALBEDO].T @ weighted[inside, :3]
+        albedo[k] = _transposed_product(phi[inside, k][:, _ALBEDO], weighted[inside, :3])
     out[:, _ALBEDO, :3] = sums.inverse_albedo[segment] @ (albedo + ridge * np.eye(4, 3))
     for rows, inverse, channel in ((_ROUGHNESS, sums.inverse_roughness, 3), (_METALLIC, sums.inverse_metallic, 4)):
         right = cross[:, rows, channel] + ridge * np.array([1.0, 0.0])
@@ -473,7 +541,7 @@ def _mixture(phi: NDArray, affine: NDArray, alpha: NDArray) -> NDArray:
     active = np.flatnonzero((alpha > 0).any(1))
     if 2 * len(active) <= len(alpha):  # after the last sweep all but one
         phi, blended = phi[:, active], blended[active]
-    return phi.reshape(len(phi), -1) @ blended.reshape(-1, 5)
+    return _product(phi.reshape(len(phi), -1), blended.reshape(-1, 5))
 
 
 class _CellSums:
@@ -503,9 +571,8 @@ class _CellSums:
         return np.where(self.seen[:, None], mean.T, fallback)
 
 
-def _anchored(problem: BaseProblem, sums: _Sums, texture: NDArray, affine: NDArray,
-              counts: _Counts) -> tuple[NDArray, NDArray]:
-    """Texture and corrections, shifted so that each object's mean is that of all its usable predictions."""
+def _anchored(problem: BaseProblem, sums: _Sums, texture: NDArray, state: _State, counts: _Counts) -> NDArray:
+    """Texture (and corrections in `state`), shifted so that each object's mean is that of its usable predictions."""
     of_segment, of_cell = problem.object_of_segment, problem.object_of_cell
     n_objects = int(max(np.max(of_segment, initial=-1), np.max(of_cell, initial=-1))) + 1
     usable = np.maximum(sums.usable.sum(1), 1)
@@ -516,28 +583,39 @@ def _anchored(problem: BaseProblem, sums: _Sums, texture: NDArray, affine: NDArr
         wanted = np.bincount(of_segment, predicted[:, c], n_objects)
         found = np.bincount(of_cell, counts.weight * texture[:, c], n_objects)
         shift[:, c] = (wanted - found) / np.where(total > 0, total, np.inf)
-    affine = affine.copy()
-    affine[..., 5, :] += shift[of_segment][:, None, :]
-    return texture + shift[of_cell], affine
+    state.affine[..., 5, :] += shift[of_segment][:, None, :]
+    return texture + shift[of_cell]
 
 
-def _mean_gain(sums: _Sums, affine: NDArray, alpha: NDArray) -> float:
-    """Mean gain (trace of A / 3) of the selected albedo corrections, weighted by pixels (METHOD H14: watch it)."""
-    gain = affine[..., range(3), range(3)].mean(-1)
-    return float(sums.weight @ (alpha[..., 0] * gain).sum(1) / max(sums.weight.sum(), 1e-30))
+def _summary(sums: _Sums, state: _State) -> dict[str, float]:
+    """Error of each property after selection, entropy of the selection in nats, and mean gain; weighted by pixels.
+
+    The gain (trace of A / 3 of the selected albedo corrections) is to be watched: METHOD H14.
+    """
+    total = max(sums.weight.sum(), 1e-30)
+    mixed = (sums.weight[:, None] * (state.alpha * state.error).sum(1)).sum(0) / total
+    log = np.log(np.where(state.alpha > 0, state.alpha, 1.0))
+    entropy = -(sums.weight * (state.alpha * log).sum(1).mean(1)).sum() / total
+    gains = (state.alpha[..., 0] * state.affine[..., range(3), range(3)].mean(-1)).sum(1)
+    gain = (sums.weight * gains).sum() / total
+    errors = {f"error_{name}": float(mixed[p]) for p, name in enumerate(PROPERTIES)}
+    return {**errors, "entropy": float(entropy) + 0.0, "gain": float(gain)}  # + 0.0: no minus zero
 
 
-def _scales(problem: BaseProblem, options: BaseOptions, texture: NDArray, affine: NDArray, alpha: NDArray,
-            usable: list[NDArray], threads: int) -> NDArray:
-    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels, b_r the spread of the K values."""
+def _scales(
+    problem: BaseProblem, options: BaseOptions, texture: NDArray, state: _State, usable: list[NDArray], threads: int
+) -> NDArray:
+    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels, b_r the spread over k."""
+
     def one_view(view: int) -> tuple[_Block, NDArray]:
         block, use, _ = _block(problem, view, usable[view])
         part = np.empty((len(block.cell), 5))
         for segment, rows in block.ranges():
             phi = block.phi[rows]
-            mixture = np.clip(_mixture(phi, affine[segment], alpha[segment]), LOWEST, 1)
-            by_k = phi[:, use].astype(np.float32).swapaxes(0, 1)
-            corrected = np.clip(by_k @ affine[segment][use].astype(np.float32), LOWEST, 1)  # (K, m, 5)
+            mixture = np.clip(_mixture(phi, state.affine[segment], state.alpha[segment]), LOWEST, 1)
+            corrected = np.empty((int(use.sum()), len(phi), 5), np.float32)
+            for i, k in enumerate(np.flatnonzero(use)):
+                corrected[i] = np.clip(_product(phi[:, k], state.affine[segment, k]), LOWEST, 1)
             b_ref = laplace.reference_scale(mixture.astype(np.float32), corrected, options.scale_floor)
             part[rows] = laplace.scale_contribution(mixture - texture[block.cell[rows]], b_ref, options.scale_floor)
         return replace(block, phi=_NOTHING), part
@@ -557,14 +635,16 @@ def _unseen_scale(scale: NDArray, seen: NDArray, options: BaseOptions) -> NDArra
 
 
 def _filled(problem: BaseProblem, texture: NDArray, counts: _Counts) -> tuple[NDArray, NDArray, NDArray]:
-    object_value, object_cells = object_means(texture, problem.object_of_cell, counts.weight,
-                                              int(np.max(problem.object_of_segment, initial=-1)) + 1)
+    object_value, object_cells = object_means(
+        texture, problem.object_of_cell, counts.weight, int(np.max(problem.object_of_segment, initial=-1)) + 1
+    )
     value = np.where((counts.weight > 0)[:, None], texture, object_value[problem.object_of_cell])
     return value.astype(np.float32), object_value, object_cells
 
 
-def object_means(value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None,
-                 n_objects: int = 0) -> tuple[NDArray, NDArray]:
+def object_means(
+    value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None, n_objects: int = 0
+) -> tuple[NDArray, NDArray]:
     """Mean value of every object and the cells behind it: (O, 5) float32, (O,) int32.
 
     O is the largest object id + 1, or `n_objects` if that is more. `weight` (n_cells,): pixels (0 = not seen, does not
@@ -597,19 +677,7 @@ def covisible_parts(problem: BaseProblem) -> NDArray:
     size = problem.n_segments + problem.n_cells
     graph = coo_matrix((np.ones(len(cell), np.int8), (segment, problem.n_segments + cell)), (size, size))
     _, label = connected_components(graph, directed=False)
-    return np.unique(label[:problem.n_segments], return_inverse=True)[1].astype(np.int32)
-
-
-def _mean_errors(sums: _Sums, alpha: NDArray, error: NDArray) -> dict[str, float]:
-    total = max(sums.weight.sum(), 1e-30)
-    mixed = (alpha * error).sum(1)
-    return {f"error_{name}": float(sums.weight @ mixed[:, p] / total) for p, name in enumerate(PROPERTIES)}
-
-
-def _entropy(sums: _Sums, alpha: NDArray) -> float:
-    """Mean entropy of the selection in nats, weighted by pixels."""
-    log = np.log(np.where(alpha > 0, alpha, 1.0))
-    return float(sums.weight @ -(alpha * log).sum(1).mean(1) / max(sums.weight.sum(), 1e-30)) + 0.0
+    return np.unique(label[: problem.n_segments], return_inverse=True)[1].astype(np.int32)
 
 
 def _notify(progress: Callable[[int, int], None] | None, done: int, total: int) -> None:

@@ -197,6 +197,7 @@ def group_emitters(
     min_faces: int = 3,
     min_area: float = 1e-4,
     max_groups: int = 64,
+    min_observations: int = 8,
 ) -> EmitterGroups:
     """Candidates in groups that share one radiance (METHOD 8): connected, normals within `max_angle`, colours within
     `max_ratio`, same side. A connected piece below `small_area` is one group whatever its normals (bulbs, shades).
@@ -208,6 +209,7 @@ def group_emitters(
         candidate: (F,) bool; statistics, adjacency, normals (F, 3), areas (F,): of the same mesh.
         max_angle: degrees; max_ratio: of any channel between two groups; small_area, min_area: m^2.
         min_faces, min_area: a group needs one of the two.
+        min_observations: pixels that must have seen a group; a highlight on one face has fewer, and nothing bounds its radiance.
         max_groups: the strongest (area x radiance) are kept.
     """
     n_faces = len(candidate)
@@ -238,12 +240,12 @@ def group_emitters(
     pixels = np.bincount(label, statistics.count[ids])
     observed = np.stack([np.bincount(label, statistics.mean[ids, c] * statistics.count[ids]) for c in range(3)], -1)
     observed = observed / np.maximum(pixels, 1)[:, None]
-    solid = (count >= min_faces) | (area >= min_area)
+    solid = ((count >= min_faces) | (area >= min_area)) & (pixels >= min_observations)
     power = area * observed.sum(-1)
     order = np.lexsort((np.arange(len(count)), -power))
     kept = [g for g in order if solid[g]][:max_groups]
     dropped = [
-        (int(count[g]), float(area[g]), "too small" if not solid[g] else f"not among the {max_groups} strongest")
+        (int(count[g]), float(area[g]), "too small or hardly seen" if not solid[g] else f"not among the {max_groups} strongest")
         for g in order
         if g not in set(kept)
     ]

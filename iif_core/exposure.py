@@ -6,7 +6,6 @@ cells s_c leaves a small V x V problem in the gains g_v, solved by iteratively r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,7 +160,7 @@ class CalibratedResponse:
         response: fitted curve, one row of parameters a channel; the start where the data say nothing.
         stops: largest difference of exposure within the cells that were used, in stops.
         pairs: (cell, view) pairs used, of all channels.
-        before, after: weighted root mean square of the log differences within cells, at the start and at the end.
+        before, after: robust spread of log radiance within cells at the start and at the end, mean over channels.
     """
 
     response: Response
@@ -180,146 +179,123 @@ def calibrate_response(
     saturation: float = 0.99,
     min_stops: float = 1.0,
     min_pairs: int = 200,
-    iterations: int = 30,
-    ridge: float = 1e-4,
+    ridge: float = 2e-2,
 ) -> CalibratedResponse:
     """Camera response from surface that is seen under different, known exposures; needs no light and no material.
 
-    The same cell is equally bright in every view, so I_vc = f(e_v exp(s_c)). Robust Gauss-Newton over the parameters with
-    the cells eliminated; a pair counts by the sensor's resolution there (half an 8-bit step) and 5 % of
-    gloss and texture. Known exposures fix the exponent that a scene with unknown exposures would leave open.
-    Pairs near saturation are chosen by what the other views of the cell predict for them, not by their own value: leaving
-    out what came out bright would bend the curve near 1.
+    The same cell is equally bright in every view, so I_vc = f(e_v exp(s_c + n)). Maximum likelihood over the parameters and
+    the size of n (gloss, texture; Student's t) with the cells eliminated; half an 8-bit step limits dark pairs. Known
+    exposures fix the exponent that a scene with unknown exposures would leave open.
+    Saturated pairs enter as what they are, e exp(s) >= 1 up to noise: they fix the scale of x, which f(1) = 1 would otherwise
+    leave to extrapolation, and leaving them out would bend the curve near 1.
 
     Args:
         cell: (n,) surface cell, -1 = leave out; view: (n,) int; value: (n, 3) sensor values.
         exposure: (V,) of the views; start: family and starting parameters.
-        saturation: pairs that the other views predict above 0.85 of this are left out, as are those predicted below
-            four 8-bit steps.
+        saturation: values from here on are bounds.
         min_stops, min_pairs: below, or without free parameters, the start comes back.
-        ridge: pull to the start relative to the number of pairs.
+        ridge: pull to the start, per pair. Gloss differs from view to view and, in few views, goes along with exposure by
+            chance; where nothing is near saturation the scale of x hangs on the shape alone.
     """
     value = np.asarray(value, np.float64)
     start = start if start.params.ndim == 2 else start.with_params(np.tile(start.params, (3, 1)))
     if not start.names or not len(cell):
         return CalibratedResponse(start, 0.0, 0, 0.0, 0.0)
-    params, stops, pairs, squares, weights = start.params.copy(), 0.0, 0, [0.0, 0.0], 0.0
+    params, stops, pairs, spreads = start.params.copy(), 0.0, 0, []
     for c in range(3):
-        data = _exposed_pairs(cell, view, value[:, c], exposure, start.channel(c), 0.85 * saturation, min_stops)
+        data = _exposed_pairs(cell, view, value[:, c], exposure, saturation, min_stops)
         if len(data[0]) < min_pairs:
             continue
-        theta, before, after, weight = _fit_channel(*data[:4], start.channel(c), iterations, ridge)
-        params[c] = theta
-        stops, pairs, weights = max(stops, data[4]), pairs + len(data[0]), weights + weight
-        squares = [squares[0] + before, squares[1] + after]
-    scale = 1.0 / max(weights, 1e-300)
-    return CalibratedResponse(
-        start.with_params(params), stops, pairs, float(np.sqrt(squares[0] * scale)), float(np.sqrt(squares[1] * scale))
-    )
+        params[c], *widths = _fit_channel(*data[:4], start.channel(c), saturation, ridge)
+        stops, pairs = max(stops, data[4]), pairs + len(data[0])
+        spreads.append(widths)
+    before, after = np.mean(spreads, 0) if spreads else (0.0, 0.0)
+    return CalibratedResponse(start.with_params(params), stops, pairs, float(before), float(after))
 
 
 def _exposed_pairs(
-    cell: np.ndarray, view: np.ndarray, value: np.ndarray, exposure: np.ndarray, curve: Response, top: float, min_stops: float
+    cell: np.ndarray, view: np.ndarray, value: np.ndarray, exposure: np.ndarray, saturation: float, min_stops: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
-    """One row a (cell, view): cell 0 ... C - 1, mean value, log exposure, pixels; cells whose exposures span `min_stops`."""
+    """One row a (cell, view): cell 0 ... C - 1, mean value, log exposure, saturated; of cells whose exposures span
+    `min_stops` and that one view at least saw unsaturated; and the largest span in stops."""
     good = (cell >= 0) & np.isfinite(value)
     key, inverse = np.unique(cell[good].astype(np.int64) * len(exposure) + view[good], return_inverse=True)
-    count = np.bincount(inverse, minlength=len(key)).astype(np.float64)
-    mean = np.bincount(inverse, value[good], len(key)) / np.maximum(count, 1)
+    count = np.maximum(np.bincount(inverse, minlength=len(key)), 1)
+    mean = np.bincount(inverse, value[good], len(key)) / count
+    clipped = np.bincount(inverse, value[good] >= saturation, len(key)) > 0.5 * count
     owner = np.unique(key // len(exposure), return_inverse=True)[1]
     log_e = np.log(exposure[key % len(exposure)])
-    use = (mean > 2.0 / 255.0) & (mean < 1.0)
-    if not use.any():
-        return owner[:0], mean[:0], log_e[:0], count[:0], 0.0
-    predicted = curve(np.exp(_others(owner, np.log(np.maximum(curve.inverse(mean), 1e-9)) - log_e, use) + log_e))
-    use = (predicted < top) & (predicted > 4.0 / 255.0) & (mean > 0)
+    use = (mean > 2.0 / 255.0) & np.isfinite(log_e)
     low, high = np.full(len(key), np.inf), np.full(len(key), -np.inf)
     np.minimum.at(low, owner[use], log_e[use])
     np.maximum.at(high, owner[use], log_e[use])
     span = np.where(use, high[owner] - low[owner], 0.0) / np.log(2.0)
-    use &= span >= min_stops
+    clear = np.bincount(owner, use & ~clipped, len(key))[owner]
+    use &= (span >= min_stops) & (clear > 0)
     if not use.any():
-        return owner[:0], mean[:0], log_e[:0], count[:0], 0.0
-    return np.unique(owner[use], return_inverse=True)[1], mean[use], log_e[use], count[use], float(span[use].max())
+        return owner[:0], mean[:0], log_e[:0], clipped[:0], 0.0
+    owner = np.unique(owner[use], return_inverse=True)[1]
+    return owner, mean[use], log_e[use], clipped[use], float(span[use].max())
 
 
-def _others(owner: np.ndarray, log_radiance: np.ndarray, use: np.ndarray) -> np.ndarray:
-    """Mean of log radiance over the other usable pairs of the same cell; infinity where there are none."""
-    total = np.bincount(owner, np.where(use, log_radiance, 0.0))
-    number = np.bincount(owner, use)
-    rest = number[owner] - use
-    mean = (total[owner] - np.where(use, log_radiance, 0.0)) / np.maximum(rest, 1)
-    return np.where(rest > 0, mean, np.inf)
+_FREEDOM = 4.0  # of Student's t: gloss and misregistration have heavy tails
+_FIT_PAIRS = 12_000
 
 
 def _fit_channel(
-    cell: np.ndarray, value: np.ndarray, log_e: np.ndarray, count: np.ndarray, start: Response, iterations: int, ridge: float
-) -> tuple[np.ndarray, float, float, float]:
-    """Parameters of one channel, weighted squares before and after, sum of the weights.
+    cell: np.ndarray, value: np.ndarray, log_e: np.ndarray, clipped: np.ndarray, start: Response, saturation: float, ridge: float
+) -> tuple[np.ndarray, float, float]:
+    """Parameters of one channel and the spread of log radiance within cells before and after.
 
-    The residual is I - f(e exp(s)) with one unknown s a cell: in log radiance, noise of I would be divided by the slope of the
-    curve, and the fit would flatten the noise by steepening the curve.
+    Maximum likelihood for log f^-1(I) = s + log e + t-distributed n. The density of I brings in log dI/dn: without it, or with
+    a residual in sensor units at an estimated s, the fit would flatten the noise by bending the curve.
     """
-    n_cells, theta = int(cell.max()) + 1, start.params.copy()
+    from scipy.optimize import minimize
 
-    def sums(x: np.ndarray) -> np.ndarray:
-        return np.bincount(cell, x, n_cells)
+    if len(cell) > _FIT_PAIRS:  # whole cells, spread evenly
+        keep = cell % -(-len(cell) // _FIT_PAIRS) == 0
+        cell, value, log_e, clipped = np.unique(cell[keep], return_inverse=True)[1], value[keep], log_e[keep], clipped[keep]
+    n_cells = int(cell.max()) + 1
+    full, full_e = cell[clipped], log_e[clipped]
+    cell, value, log_e = cell[~clipped], value[~clipped], log_e[~clipped]
+    # A cell of m pairs spends one of them on its own level.
+    share = (1.0 - 1.0 / np.maximum(np.bincount(cell, minlength=n_cells), 1))[cell]
+    total = max(float(share.sum()), 1.0)
 
-    def state(p: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual, its derivative by s, its derivatives by the parameters (both negative)."""
-        x = np.exp(log_e + s[cell])
-        f, slope, dparams = start.with_params(p).evaluate(x)
-        return value - f, slope * x, dparams
+    def spread(params: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Deviation from the cell's robust level, its squared scale, log dI / d log x; log x of the saturated pairs."""
+        curve = start.with_params(params)
+        x = np.maximum(curve.inverse(value), 1e-9)
+        gain = np.maximum(x * curve.derivative(x), 1e-9)
+        scale2 = sigma**2 + (0.5 / 255.0 / gain) ** 2
+        y = np.log(x) - log_e
+        weight = 1.0 / scale2
+        for _ in range(4):
+            level = np.bincount(cell, weight * y, n_cells) / np.bincount(cell, weight, n_cells)
+            weight = 1.0 / (scale2 + (y - level[cell]) ** 2 / _FREEDOM)
+        top = float(np.log(curve.inverse(np.array(saturation))))
+        return y - level[cell], scale2, np.log(gain), level[full] + full_e - top
 
-    def variance(gain: np.ndarray) -> np.ndarray:
-        return (0.5 / 255.0) ** 2 + (0.05 * gain) ** 2
+    def objective(z: np.ndarray) -> float:
+        sigma = np.exp(np.clip(z[-1], -9.0, 1.0))
+        n, scale2, log_gain, above = spread(z[:-1], sigma)
+        tail = 0.5 * (_FREEDOM + 1.0) * np.log1p(n**2 / (_FREEDOM * scale2))
+        # Logistic stand-in for the normal distribution; 2 % of the saturated pairs may be highlights or errors.
+        reached = 0.02 + 0.98 / (1.0 + np.exp(np.clip(-1.702 * above / sigma, -60.0, 60.0)))
+        pull = ridge * ((z[:-1] - start.params) ** 2).sum()
+        # Parameters outside the monotone range are evaluated at its border; the distance keeps the search inside.
+        beyond = ((z[:-1] - start.with_params(z[:-1]).params) ** 2).sum()
+        likelihood = (share * (tail + 0.5 * np.log(scale2) + log_gain)).sum() - np.log(reached).sum()
+        return float(likelihood / total + pull + beyond)
 
-    trust = np.sqrt(count)  # pixels of one cell share texture and gloss: less than independent
-    logs = np.log(np.maximum(start.inverse(value), 1e-9)) - log_e
-    level = sums(trust * logs) / sums(trust)
-    level = _settle(state, sums, theta, level, trust)
-    residual, gain, dparams = state(theta, level)
-    first = residual
-    damping = 1e-3
-    robust = np.ones(len(cell))
-    for _ in range(iterations):
-        unit = residual / np.sqrt(variance(gain))
-        scale = max(2.385 * 1.4826 * float(np.median(np.abs(unit))), 1e-6)
-        robust = 1.0 / (1.0 + (unit / scale) ** 2)
-        w = trust * robust / variance(gain)
-        stiff = np.maximum(sums(w * gain**2), 1e-300)
-        through = np.stack([sums(w * gain * dparams[:, k]) for k in range(len(theta))], 1)
-        pull = ridge * float((w[:, None] * dparams**2).sum(0).max())
-        normal = dparams.T @ (w[:, None] * dparams) - through.T @ (through / stiff[:, None])
-        g_s = sums(w * gain * residual)
-        right = dparams.T @ (w * residual) - through.T @ (g_s / stiff) - pull * (theta - start.params)
-        cost = float((w * residual**2).sum() + pull * ((theta - start.params) ** 2).sum())
-        moved = False
-        for _ in range(12):
-            damped = normal + np.diag(np.diag(normal) * damping + pull + 1e-12 * np.trace(normal))
-            candidate = start.with_params(theta + np.linalg.solve(damped, right)).params
-            new_level = level + np.clip((g_s - through @ (candidate - theta)) / stiff, -1.0, 1.0)
-            new = state(candidate, new_level)
-            new_cost = float((w * new[0] ** 2).sum() + pull * ((candidate - start.params) ** 2).sum())
-            if new_cost < cost:
-                moved, damping = True, max(damping * 0.2, 1e-9)
-                break
-            damping *= 10.0
-        if not moved:
-            break
-        step = float(np.abs(candidate - theta).max())
-        theta, level, (residual, gain, dparams) = candidate, new_level, new
-        if step < 1e-9 and new_cost > (1 - 1e-9) * cost:
-            break
-    w = robust * trust / variance(gain)
-    # Sensor differences over the slope by log radiance: reported as differences in log radiance.
-    weight = float((w * gain**2).sum())
-    return theta, float((w * first**2).sum()), float((w * residual**2).sum()), weight
+    def width(n: np.ndarray) -> float:
+        return float(1.4826 * np.median(np.abs(n)))
 
-
-def _settle(state: Callable, sums: Callable, theta: np.ndarray, level: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """Cell levels at fixed parameters: a few Gauss-Newton steps."""
-    for _ in range(4):
-        residual, gain, _ = state(theta, level)
-        level = level + np.clip(sums(trust * gain * residual) / np.maximum(sums(trust * gain**2), 1e-300), -1.0, 1.0)
-    return level
+    before = width(spread(start.params, 0.1)[0])
+    z = np.r_[start.params, np.log(max(before, 1e-3))]
+    for size in (0.3, 0.05):  # a second simplex where the first one came to rest
+        simplex = np.concatenate([z[None], z + size * np.eye(len(z))])
+        options = {"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-9, "maxfev": 400}
+        z = minimize(objective, z, method="Nelder-Mead", options=options).x
+    theta = start.with_params(z[:-1]).params
+    return theta, before, width(spread(theta, np.exp(z[-1]))[0])

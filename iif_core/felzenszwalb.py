@@ -1,14 +1,14 @@
 """Objects from shape alone: Felzenszwalb and Huttenlocher's graph segmentation on the faces of a mesh.
 
-Faces that share an edge are joined by a graph edge whose weight says how much they look like different
-things (bend, concave more than convex; difference of colour). Edges are taken from the lightest on; the two
-regions at its ends merge when
+Faces that share an edge are joined by a graph edge whose weight says how much they look like different things (bend,
+concave more than convex; difference of colour). Edges are taken from the lightest on; the two regions at its ends
+merge when
 
     w <= min(Int(A) + k / |A|, Int(B) + k / |B|)
 
-with Int the heaviest edge merged so far inside a region and |.| its number of faces (IJCV 59(2), 2004, Eq.
-4 and 5). Small regions then join the neighbour across their lightest edge. Over-segmentation is the safe
-side: a piece of an object can still be corrected by its own affine, two objects in one cannot.
+with Int the heaviest edge merged so far inside a region and |.| its number of faces (IJCV 59(2), 2004, Eq. 4 and 5).
+Small regions then join the neighbour across their lightest edge. Over-segmentation is the safe side: a piece of an
+object can still be corrected by its own affine, two objects in one cannot.
 """
 
 from __future__ import annotations
@@ -41,9 +41,8 @@ def face_normals(vertices: ArrayLike, faces: ArrayLike) -> Array:
 def filtered_normals(normal: ArrayLike, area: ArrayLike, pairs: ArrayLike, rounds: int = FILTER_ROUNDS) -> Array:
     """Bilateral filter on face normals: calms the noise of a scan and keeps creases.
 
-    n_a <- sum over a and its neighbours b of area_b exp(-|n_a - n_b|^2 / (2 FILTER_WIDTH^2)) n_b,
-    normalised; repeated. normal (m, 3) unit or zero, area (m,) -> (m, 3) float64, zero where no normal is
-    known.
+    n_a <- sum over a and its neighbours b of area_b exp(-|n_a - n_b|^2 / (2 FILTER_WIDTH^2)) n_b, normalised; repeated.
+    normal (m, 3) unit or zero, area (m,) -> (m, 3) float64, zero where no normal is known.
     """
     normal, area, pairs = np.asarray(normal, np.float64), np.asarray(area, np.float64), np.asarray(pairs)
     a, b = pairs[:, 0], pairs[:, 1]
@@ -91,16 +90,15 @@ def edge_weights(
 def smooth_over_faces(values: ArrayLike, weight: ArrayLike, pairs: ArrayLike, rounds: int) -> Array:
     """Mean of each face and its neighbours, weighted and repeated: fills faces that nobody saw, calms noise.
 
-    values (m, c), weight (m,) >= 0 (0 = unknown) -> (m, c) float64, NaN where no weight came within
-    `rounds` steps.
+    values (m, c), weight (m,) >= 0 (0 = unknown) -> (m, c) float64, NaN where no weight came within `rounds` steps.
     """
     from scipy.sparse import coo_matrix, identity
 
     values, weight, pairs = np.asarray(values, np.float64), np.asarray(weight, np.float64), np.asarray(pairs)
     count = len(values)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
-    graph = (coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count)) +
-    identity(count)).tocsr() total = np.where(weight[:, None] > 0, values, 0) * weight[:, None]
+    graph = (coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), (count, count)) + identity(count)).tocsr()
+    total = np.where(weight[:, None] > 0, values, 0) * weight[:, None]
     for _ in range(rounds):
         total, weight = graph @ total, graph @ weight
     return np.where(weight[:, None] > 0, total / np.where(weight > 0, weight, 1)[:, None], np.nan)
@@ -123,8 +121,8 @@ def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float
     if not np.isfinite(weights).all():
         raise InputError(f"{int((~np.isfinite(weights)).sum())} edge weights are not finite; the mesh has NaN vertices")
     order = np.argsort(weights, kind="stable")
-    first, second, sorted_weights = pairs[order, 0].tolist(), pairs[order, 1].tolist(),
-    weights[order].tolist() parent, size, limit = list(range(count)), [1] * count, [float(scale)] * count
+    first, second, sorted_weights = pairs[order, 0].tolist(), pairs[order, 1].tolist(), weights[order].tolist()
+    parent, size, limit = list(range(count)), [1] * count, [float(scale)] * count
 
     # Plain lists and halved paths: the fastest union-find that Python offers, about a second for a million
     # edges.
@@ -182,9 +180,9 @@ def segment_mesh(
 ) -> Array:
     """Region of every face, (m,) int32 from 0 without gaps, in order of their lowest face; deterministic.
 
-    Corners at one position count as joined. Islands with fewer than `min_faces` faces that no edge ties to
-    anything (scans are full of them) join the region of the nearest face of a larger one if that is
-    ISLAND_GAP mean edges away or less, and stay on their own otherwise.
+    Corners at one position count as joined. Islands with fewer than `min_faces` faces that no edge ties to anything
+    (scans are full of them) join the region of the nearest face of a larger one if that is ISLAND_GAP mean edges away
+    or less, and stay on their own otherwise.
 
     Args:
         vertices, faces: (n, 3) metres and (m, 3) int.

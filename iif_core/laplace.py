@@ -8,6 +8,7 @@ scale of a cell has a closed form (METHOD 7c, b-step) and the location an M-esti
 Scales are floored where they enter: two predictions that agree exactly have scale 0, and a density of width 0 has
 no finite divergence. The floor 0.01 is the reference's; it is 2.5 steps of an 8-bit map.
 """
+
 from __future__ import annotations
 
 import numpy as np
@@ -38,8 +39,9 @@ def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_
     return np.log(b_p) - np.log(b_r) + (d + b_r * np.exp(-d / b_r)) / b_p - 1.0
 
 
-def kl_derivatives(distance: NDArray, b_ref: NDArray, b_pred: NDArray,
-                   floor: float = SCALE_FLOOR) -> tuple[NDArray, NDArray, NDArray]:
+def kl_derivatives(
+    distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR
+) -> tuple[NDArray, NDArray, NDArray]:
     """Slopes of `kl` with respect to d, b_ref and b_pred (of the floored scales; METHOD 2.3.4).
 
     dKL/dd   = (1 - e^(-d/b_r)) / b_p
@@ -96,8 +98,9 @@ def scale_contribution(distance: NDArray, b_ref: NDArray, floor: float = SCALE_F
     return d + b_r * np.exp(-d / b_r)
 
 
-def closed_form_scale(distance: NDArray, b_ref: NDArray, weight: NDArray | None = None, axis: int = 0,
-                      floor: float = SCALE_FLOOR) -> NDArray:
+def closed_form_scale(
+    distance: NDArray, b_ref: NDArray, weight: NDArray | None = None, axis: int = 0, floor: float = SCALE_FLOOR
+) -> NDArray:
     """Scale that minimises the summed divergence of its observations, b_p = mean(d + b_r e^(-d/b_r)), floored.
 
     Observations lie along `axis`; `weight` broadcasts. Where the weights sum to 0 the result is the floor.

@@ -2,8 +2,8 @@
 
     I_c = round(255 f_c(clip(e_v L_c, 0, 1))) / 255          (METHOD 1.3, 4.1; rounded, not truncated)
 
-The curves here are S-shaped tone curves over a gamma and belong to none of the families in `iif_core.response`, so that a
-solver which recovers them has not been handed the answer's form.
+The curves here are S-shaped tone curves over a gamma and belong to none of the families in
+`iif_core.response`, so that a solver which recovers them has not been handed the answer's form.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _THIRD = 2.0 ** (-1 / 3)
 
 @dataclass(frozen=True)
 class ResponseCurve:
-    """f_c(x) = y + s_c y (1 - y) (2 y - p_c), y = sRGB(x^g_c): an S-curve of strength s and pivot p over sRGB.
+    """f_c(x) = y + s_c y (1 - y) (2 y - p_c), y = sRGB(x^g_c): an S-curve of strength s, pivot p over sRGB.
 
     Strictly increasing with f(0) = 0 and f(1) = 1 for s_c max(p_c, 2 - p_c) < 1, which is checked.
 
@@ -44,8 +44,8 @@ class ResponseCurve:
         steep = [s * max(p, 2 - p) for s, p in zip(self.strength, self.pivot, strict=True)]
         if min(self.gamma) <= 0 or min(self.strength) < 0 or max(steep) >= 1:
             raise InputError(
-                f"response curve {self.name}: gamma {self.gamma}, strength {self.strength}, pivot {self.pivot} is not"
-                " increasing; needed: gamma > 0, strength >= 0, strength * max(pivot, 2 - pivot) < 1"
+                f"response {self.name}: gamma {self.gamma}, strength {self.strength}, pivot {self.pivot}"
+                " does not rise; needed: gamma > 0, strength >= 0, strength * max(pivot, 2 - pivot) < 1"
             )
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
@@ -93,14 +93,15 @@ def exposures(
 ) -> np.ndarray:
     """Exposure of every view: the brightest views get the shortest (METHOD 4.1), few pixels clip.
 
-    Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of near-equal size, the
-    brightest group with stops[0]. One common gain puts the geometric mean over views of stop x median luminance at `grey`.
-    A view with more than the share `saturated` of its valid pixels above 1 in any channel is then closed by whole
-    thirds of a stop until it has no more than that. A black view keeps its group's exposure.
+    Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of near-equal
+    size, the brightest group with stops[0]. One common gain puts the geometric mean over views of stop x
+    median luminance at `grey`. A view with more than the share `saturated` of its valid pixels above 1 in
+    any channel is then closed by whole thirds of a stop until it has no more than that. A black view keeps
+    its group's exposure.
 
     Args:
-        radiance: one (..., 3) array of linear radiance a view (sizes may differ; small metering pictures do), or one
-            stack (V, ..., 3); or mean radiances (V, 3).
+        radiance: one (..., 3) array of linear radiance a view (sizes may differ; small metering pictures do),
+            or one stack (V, ..., 3), or mean radiances (V, 3).
         valid: masks (...) of the pixels that should not clip, i.e. not lamps and windows; default: all.
         stops: relative exposures of the groups, ascending, positive.
         grey: linear value that a typical view's median luminance lands on.
@@ -119,7 +120,9 @@ def exposures(
     if stops.ndim != 1 or not len(stops) or not (stops > 0).all() or (np.diff(stops) < 0).any():
         raise InputError(f"exposures: stops {stops.tolist()}; they must be positive and ascending")
     if not (grey > 0 and 0 <= saturated < 1):
-        raise InputError(f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1")
+        raise InputError(
+            f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1"
+        )
     pixels = [_valid_pixels(v, r, None if valid is None else valid[v]) for v, r in enumerate(views)]
 
     luminance = [p @ _LUMINANCE for p in pixels]
@@ -127,23 +130,31 @@ def exposures(
     median = np.array([np.median(y) if len(y) else 0.0 for y in luminance])
     order = np.argsort(-mean, kind="stable")
     stop = np.empty(len(views))
-    stop[order] = stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
+    stop[order] = (
+        stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
+    )
     lit = median > 0
     gain = grey / np.exp(np.mean(np.log(stop[lit] * median[lit]))) if lit.any() else 1.0
-    return gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
+    return (
+        gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
+    )
 
 
 def _valid_pixels(view: int, radiance: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     if radiance.ndim < 1 or radiance.shape[-1] != 3:
         raise InputError(f"exposures: view {view} has shape {radiance.shape}; the last axis must be R, G, B")
     if not np.isfinite(radiance).all() or (radiance < 0).any():
-        raise InputError(f"exposures: view {view} has negative or non-finite radiance; render it again or mask it to 0")
+        raise InputError(
+            f"exposures: view {view} has negative or non-finite radiance; render it again or mask it to 0"
+        )
     flat = radiance.reshape(-1, 3)
     if mask is None:
         return flat
     mask = np.asarray(mask, bool)
     if mask.shape != radiance.shape[:-1]:
-        raise InputError(f"exposures: view {view}: mask of shape {mask.shape} for radiance of shape {radiance.shape}")
+        raise InputError(
+            f"exposures: view {view}: mask of shape {mask.shape} for radiance of shape {radiance.shape}"
+        )
     return flat[mask.ravel()]
 
 
@@ -175,6 +186,8 @@ def expose(
         raise InputError(f"exposure is {exposure}; it must be positive and finite")
     radiance = np.asarray(radiance, np.float64)
     if not np.isfinite(radiance).all():
-        raise InputError(f"{np.count_nonzero(~np.isfinite(radiance))} non-finite radiance values; nothing to photograph")
+        raise InputError(
+            f"{np.count_nonzero(~np.isfinite(radiance))} non-finite radiance values; nothing to photograph"
+        )
     curve = response_curve() if curve is None else curve
     return (np.rint(255 * curve(np.clip(exposure * radiance, 0, 1))) / 255).astype(np.float32)

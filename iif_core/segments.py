@@ -4,6 +4,7 @@ A *segment* is one object in one view: the unit that shares one affine correctio
 view by view, inside a view by ascending object id. Ids are int32, -1 = none. Faces get their object by the majority
 of the pixels that see them; a face nobody saw takes the label of the nearest labelled face across shared edges.
 """
+
 from __future__ import annotations
 
 from collections.abc import Iterable
@@ -136,8 +137,13 @@ class FaceVotes:
     background: int | None
 
 
-def vote_faces(face_id: NDArray, instance_id: NDArray, n_faces: int, faces_adjacency: NDArray | None = None,
-               background: int | None = None) -> FaceVotes:
+def vote_faces(
+    face_id: NDArray,
+    instance_id: NDArray,
+    n_faces: int,
+    faces_adjacency: NDArray | None = None,
+    background: int | None = None,
+) -> FaceVotes:
     """Object of every face by the majority of the pixels that see it (METHOD 2.2, in place of a neural field).
 
     `face_id`, `instance_id`: integer arrays of one shape (pixels of all views), negative = miss / not labelled, which
@@ -172,11 +178,21 @@ def vote_faces(face_id: NDArray, instance_id: NDArray, n_faces: int, faces_adjac
     object_id = np.unique(label)
     column = np.searchsorted(object_id, label)
     pixels = np.bincount(column, votes, len(object_id))
-    agreeing = np.bincount(np.searchsorted(object_id, label[pair_face]), count * (label[pair_face] == pair_instance),
-                           len(object_id)) if pair.size else np.zeros(len(object_id))
-    return FaceVotes(label.astype(np.int32), votes.astype(np.int32), object_id.astype(np.int32),
-                     pixels.astype(np.int64), (agreeing / np.maximum(pixels, 1)).astype(np.float32),
-                     int(background) if unreached.any() else None)
+    agreeing = (
+        np.bincount(
+            np.searchsorted(object_id, label[pair_face]), count * (label[pair_face] == pair_instance), len(object_id)
+        )
+        if pair.size
+        else np.zeros(len(object_id))
+    )
+    return FaceVotes(
+        label.astype(np.int32),
+        votes.astype(np.int32),
+        object_id.astype(np.int32),
+        pixels.astype(np.int64),
+        (agreeing / np.maximum(pixels, 1)).astype(np.float32),
+        int(background) if unreached.any() else None,
+    )
 
 
 def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
@@ -205,6 +221,7 @@ def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
 def _integer_map(values: NDArray, name: str) -> NDArray:
     values = np.asarray(values)
     if values.ndim != 2 or values.dtype.kind not in "iu":
-        raise InputError(f"{name} has shape {values.shape} and type {values.dtype}; it must be (H, W) of integers "
-                         "with -1 for none")
+        raise InputError(
+            f"{name} has shape {values.shape} and type {values.dtype}; it must be (H, W) of integers with -1 for none"
+        )
     return values.astype(np.int32, copy=False)

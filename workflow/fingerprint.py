@@ -91,7 +91,8 @@ def import_closure(*modules: str) -> list[str]:
         if module in seen or is_infrastructure(module):
             continue
         seen.add(module)
-        todo.extend(direct_imports(module))
+        package = module.rpartition(".")[0]  # importing a module runs its packages' __init__ first
+        todo.extend([*direct_imports(module), *([package] if package else [])])
     return sorted(seen)
 
 

@@ -37,7 +37,7 @@ STAGES: dict[str, Stage] = {
         ),
         Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),
         Stage("metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",)),
-        Stage("export", ("capture", "segmentation", "emission", "affines"), ("export",)),
+        Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(
             "report",
             ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),

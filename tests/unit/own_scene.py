@@ -13,8 +13,9 @@ import yaml
 from iif_core.camera import look_at, pixel_directions
 from iif_core.distortion import Distortion, Pinhole, undistort
 
-ROOM = ((1.0, -2.0, 0.5), (5.0, 1.0, 3.0))  # not at the origin: a turned or scaled frame must not fit by
-chance BLOCK = ((2.5, -0.8, 0.5), (3.3, -0.2, 1.3))
+# Not at the origin: a turned or scaled frame must not fit by chance.
+ROOM = ((1.0, -2.0, 0.5), (5.0, 1.0, 3.0))
+BLOCK = ((2.5, -0.8, 0.5), (3.3, -0.2, 1.3))
 CAMERA = Pinhole(60.0, 62.0, 33.0, 23.0, 64, 48)
 
 
@@ -58,20 +59,20 @@ def geometry():
 def pattern(points):
     """Colour in (0.1, 0.9) of a surface point (metres), smooth, the same from everywhere."""
     x, y, z = np.moveaxis(np.asarray(points, np.float64), -1, 0)
-    return np.stack([0.5 + 0.3 * np.sin(2.1 * x + 0.4), 0.5 + 0.3 * np.sin(1.7 * y + z), 0.5 + 0.3 * np.cos(2.3 * z + x)], -1)
+    waves = (np.sin(2.1 * x + 0.4), np.sin(1.7 * y + z), np.cos(2.3 * z + x))
+    return 0.5 + 0.3 * np.stack(waves, -1)
 
 
 def shoot(geometry, pose, camera=CAMERA, lens=None):
     """Picture, z-depth and face ids as this camera sees them, through a lens if given."""
     from iif_core.transport import trace
 
-    directions = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height,
-    pose) if lens is not None:
+    directions = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose)
+    if lens is not None:
         u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
         v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
         at, _ = undistort(lens, np.stack(np.meshgrid(u, v), -1))
-        directions = (np.concatenate([at, np.ones((*at.shape[:2], 1))], -1) @ pose[:3,
-        :3].T).astype(np.float32)
+        directions = (np.concatenate([at, np.ones((*at.shape[:2], 1))], -1) @ pose[:3, :3].T).astype(np.float32)
     face, t = trace(geometry, pose[:3, 3], directions.reshape(-1, 3))
     shape = directions.shape[:2]
     points = pose[:3, 3] + np.where(face >= 0, t, 0).reshape(shape)[..., None] * directions
@@ -97,8 +98,7 @@ def save_raw_exr(path, channels):
     import OpenEXR
 
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as
-    file:
+    with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, channels) as file:
         file.write(str(path))
 
 
@@ -112,8 +112,8 @@ def save_depth(path, depth, unit=0.001):
 def save_mesh(path, vertices, faces, instance=None):
     """ASCII PLY, with an `instance` face property if given."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    lines = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *(f"property double {c}" for c in
-    "xyz")] lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(vertices)}", *(f"property double {c}" for c in "xyz")]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     lines += ["property int instance"] if instance is not None else []
     lines += ["end_header", *(" ".join(repr(float(c)) for c in v) for v in vertices)]
     tail = [""] * len(faces) if instance is None else [f" {i}" for i in instance]
@@ -128,7 +128,14 @@ def frame(i, pose, folder="images", suffix=".png"):
 
 
 def intrinsics(camera=CAMERA):
-    return {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    return {
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+    }
 
 
 def bare(folder, count=3):
@@ -154,8 +161,7 @@ def photographed(folder, count=4, depth=True, lens: Distortion | None = None, hd
         picture = picture * (1.0 if gains is None else gains[i])
         entry = frame(i, pose, suffix=".exr" if hdr else ".png")
         if hdr:
-            save_exr(folder / entry["file_path"], {c: picture[..., k].astype(np.float32) for k, c in
-            enumerate("RGB")})
+            save_exr(folder / entry["file_path"], {c: picture[..., k].astype(np.float32) for k, c in enumerate("RGB")})
         else:
             save_png(folder / entry["file_path"], picture)
         if depth:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from iif_core.errors import InputError
@@ -51,8 +52,6 @@ def test_the_page_and_the_cases_are_the_same():
     assert set(ROWS) - PENDING == set(CASES)
 
 
-
-
 def error(action):
     with pytest.raises(InputError) as caught:
         action()
@@ -96,7 +95,8 @@ def noted(root, word, **kwargs):
     return next(note for note in notes if word in note)
 
 
-# --------------------------------------------------------------------------------------------------------------- settings
+# ---------------------------------------------------------------------------------------------------------------
+# settings
 
 
 def loaded(root, text, scene="own"):
@@ -121,7 +121,8 @@ def _(root):
         return error(lambda: settings.load("own"))
 
 
-# ------------------------------------------------------------------------------------------------------------------ files
+# ------------------------------------------------------------------------------------------------------------------
+# files
 
 
 case("folder absent")(lambda root: planned(root, source={"path": "data/nowhere"}))
@@ -209,7 +210,8 @@ def _(root):
     return planned(root)
 
 
-# ---------------------------------------------------------------------------------------------------------------- cameras
+# ----------------------------------------------------------------------------------------------------------------
+# cameras
 
 TWICE = {"fl_x": 120.0, "fl_y": 124.0, "cx": 66.0, "cy": 46.0}
 case("intrinsics for another resolution")(lambda root: changed(root, w=128, h=96, **TWICE))
@@ -223,7 +225,8 @@ case("unknown lens model")(lambda root: changed(root, camera_model="EQUIRECTANGU
 case("lens coefficients on a pinhole")(lambda root: changed(root, camera_model="PINHOLE", k1=-0.1))
 
 
-# ----------------------------------------------------------------------------------------------------------- other files
+# ----------------------------------------------------------------------------------------------------------- other
+# files
 
 
 @case("EXR photographs declared LDR")
@@ -280,7 +283,8 @@ def _(root):
     return planned(root)
 
 
-# ------------------------------------------------------------------------------------------------------------ capture job
+# ------------------------------------------------------------------------------------------------------------ capture
+# job
 
 
 @case("mesh in millimetres")
@@ -358,7 +362,8 @@ def _(root):
     return error(lambda: own.run(root, "capture", "segmentation"))
 
 
-# -------------------------------------------------------------------------------------------------------------- treatment
+# --------------------------------------------------------------------------------------------------------------
+# treatment
 
 
 @case("zero-area triangles")
@@ -373,7 +378,11 @@ def _(root):
 def _(root):
     own.bare(root / "data/own")
     vertices, faces, _ = own.room_mesh()
-    own.save_mesh(root / "data/own/mesh.ply", [*vertices, [np.nan] * 3], np.concatenate([faces, [[0, 1, len(vertices)]]]))
+    own.save_mesh(
+        root / "data/own/mesh.ply",
+        [*vertices, [np.nan] * 3],
+        np.concatenate([faces, [[0, 1, len(vertices)]]]),
+    )
     return noted(root, "NaN vertices")
 
 
@@ -430,3 +439,12 @@ def test_row(name, tmp_path):
     message = CASES[name](tmp_path)
     assert shown(ROWS[name], message), f"\npage:  {ROWS[name]}\nfound: {message}"
     assert "Traceback" not in message and "\n" not in message.strip()
+
+
+def test_every_example_of_the_guide_is_valid():
+    guide = (PAGE.parent / "own-data.md").read_text()
+    examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
+    kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
+    assert kinds == {"builtin", "mitsuba", "folder"}
+    matrix = json.loads(re.search(r"```json\n(.*?)```", guide, re.DOTALL)[1])["frames"][0]["transform_matrix"]
+    assert np.linalg.det(np.array(matrix)[:3, :3]) == pytest.approx(1, abs=0.02)

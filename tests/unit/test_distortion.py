@@ -53,9 +53,7 @@ def test_there_and_back(lens):
     st.floats(0, 2 * math.pi),
 )
 def test_undistort_finds_or_refuses(kind, k, p, radius, angle):
-    lens = Distortion(
-        kind, (*k[:3], k[3] if kind == "fisheye" else 0.0), tuple(p) if kind != "fisheye" else (0.0, 0.0)
-    )
+    lens = Distortion(kind, (*k[:3], k[3] if kind == "fisheye" else 0.0), tuple(p) if kind != "fisheye" else (0.0, 0.0))
     target = np.array([radius * math.cos(angle), radius * math.sin(angle)])
     point, found = undistort(lens, target)
     assert np.isfinite(point).all()
@@ -72,9 +70,7 @@ def test_turning_radius():
     assert undistort(lens, [0.6, 0.0])[1] and not undistort(lens, [0.7, 0.0])[1]
     assert Distortion("fisheye").turning_radius == math.inf
     # Equidistant: r_d = atan r stays below pi / 2.
-    np.testing.assert_allclose(
-        undistort(Distortion("fisheye"), [1.0, 0.0])[0], [math.tan(1.0), 0.0], rtol=1e-12
-    )
+    np.testing.assert_allclose(undistort(Distortion("fisheye"), [1.0, 0.0])[0], [math.tan(1.0), 0.0], rtol=1e-12)
     assert not undistort(Distortion("fisheye"), [1.6, 0.0])[1]
 
 
@@ -92,18 +88,14 @@ def test_pinhole_of_a_pinhole_is_itself():
 
 
 def smooth(x, y):
-    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.5 + 0.2 * x * y], -1).astype(
-        np.float32
-    )
+    return np.stack([0.5 + 0.3 * np.sin(3 * x), 0.5 + 0.3 * np.cos(2 * y), 0.5 + 0.2 * x * y], -1).astype(np.float32)
 
 
 @pytest.mark.parametrize("lens", [BARREL, PINCUSHION, FISHEYE])
 def test_picture_of_a_known_scene(lens):
     # A function of the direction, photographed through the lens, must come out as that function through the pinhole.
     source = Pinhole(150.0, 155.0, 102.0, 73.5, 200, 150)
-    u, v = np.meshgrid(
-        (np.arange(200) + 0.5 - source.cx) / source.fx, (np.arange(150) + 0.5 - source.cy) / source.fy
-    )
+    u, v = np.meshgrid((np.arange(200) + 0.5 - source.cx) / source.fx, (np.arange(150) + 0.5 - source.cy) / source.fy)
     direction, found = undistort(lens, np.stack([u, v], -1))
     photograph = np.where(found[..., None], smooth(direction[..., 0], direction[..., 1]), 0)
     target = pinhole_inside(lens, source)
@@ -151,9 +143,7 @@ def test_invalid_pixels_spread_to_what_they_touch_and_ids_are_not_mixed():
 def test_directions_beyond_the_turning_point_are_not_seen():
     lens = Distortion("radial_tangential", (-1 / 3, 0, 0, 0))
     source = Pinhole(100.0, 100.0, 60.0, 60.0, 120, 120)
-    wide = Pinhole(
-        100.0, 100.0, 160.0, 160.0, 320, 320
-    )  # looks far past r = 1, where the lens maps back inside
+    wide = Pinhole(100.0, 100.0, 160.0, 160.0, 320, 320)  # looks far past r = 1, where the lens maps back inside
     _, seen = undistort_image(np.ones((120, 120), np.float32), lens, source, wide)
     x = (np.arange(320) + 0.5 - 160) / 100
     r = np.hypot(*np.meshgrid(x, x))
@@ -162,9 +152,7 @@ def test_directions_beyond_the_turning_point_are_not_seen():
 
 def test_one_pixel_and_bad_coefficients():
     one = Pinhole(1.0, 1.0, 0.5, 0.5, 1, 1)
-    got, seen = undistort_image(
-        np.full((1, 1, 3), 0.25, np.float32), Distortion("radial_tangential"), one, one
-    )
+    got, seen = undistort_image(np.full((1, 1, 3), 0.25, np.float32), Distortion("radial_tangential"), one, one)
     assert seen.all() and (got == 0.25).all()
     for make in (
         lambda: Distortion("equidistant"),

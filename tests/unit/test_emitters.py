@@ -151,7 +151,7 @@ def test_small_and_surplus_groups_are_dropped_with_a_reason():
     colour = np.repeat(2.0 ** np.arange(6), 2)  # six groups of two faces, 1 mm^2
     stats = _statistics([30] * 12, colour)
     out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas)
-    assert out.size == 0 and len(out.dropped) == 6 and out.dropped[0][2] == "too small"
+    assert out.size == 0 and len(out.dropped) == 6 and out.dropped[0][2] == "too small or hardly seen"
     assert (out.of_face == -1).all() and (out.side == 0).all()
     normals, areas = face_geometry(vertices, faces)
     out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas, max_groups=2)

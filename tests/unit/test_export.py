@@ -428,6 +428,29 @@ def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
     assert (structure(shifted) * structure(ours)).mean() < 0.9
 
 
+def test_glb_looks_the_same_when_it_comes_back(mi, glb, tmp_path):
+    """Our renderer, fed with what another program reads from the file; roughness is a mean there, so not to the bit."""
+    trimesh = pytest.importorskip("trimesh")
+    (tmp_path / "scene.glb").write_bytes(glb)
+    loaded = trimesh.load(tmp_path / "scene.glb", process=False)
+    parts = parts_of(room())
+    back = []
+    for name, mesh in loaded.geometry.items():
+        material = mesh.visual.material
+        colour = np.asarray(mesh.visual.vertex_attributes["color"], np.float32)[:, :3] / 65535
+        n = len(mesh.vertices)
+        strength = 9.0 if material.emissiveFactor is not None and np.any(material.emissiveFactor) else 0.0
+        facts = {"vertices": np.asarray(mesh.vertices, np.float32), "faces": np.asarray(mesh.faces, np.int32)}
+        facts |= {"albedo": colour, "roughness": np.full(n, material.roughnessFactor, np.float32)}
+        facts |= {"metallic": np.full(n, material.metallicFactor, np.float32)}
+        facts["radiance"] = strength * np.asarray(material.emissiveFactor if strength else np.zeros(3), np.float32)
+        back.append(replace(parts[name], **facts))
+    camera = view(24, 18, 20.0)
+    before, after = own_render(list(parts.values()), camera, 64), own_render(back, camera, 64)
+    assert after.mean() == pytest.approx(before.mean(), rel=0.02)
+    assert np.abs(after - before).mean() < 0.08 * before.mean()  # most of it is noise
+
+
 def test_mitsuba_emitters(mi, tmp_path):
     """A lamp seen head-on has the radiance that was given; one that shines both ways does so from both sides."""
     files = mitsuba_files(list(parts_of(room(lamp_side=0)).values()), [view()], np.zeros(3))

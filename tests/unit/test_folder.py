@@ -18,7 +18,8 @@ def read(path, source=None, capture=None):
     return transforms.read(document["source"], document["capture"])
 
 
-# ---------------------------------------------------------------------------------------------------------------- cameras
+# ----------------------------------------------------------------------------------------------------------------
+# cameras
 
 
 def test_opengl_poses_become_opencv(tmp_path):
@@ -35,7 +36,12 @@ def test_opengl_poses_become_opencv(tmp_path):
 
 @pytest.mark.parametrize(
     ("stated", "setting", "offset"),
-    [(None, "auto", 0), ("integer coordinates", "auto", 0.5), ("half-integer", "auto", 0), (None, "integer", 0.5)],
+    [
+        (None, "auto", 0),
+        ("integer coordinates", "auto", 0.5),
+        ("half-integer", "auto", 0),
+        (None, "integer", 0.5),
+    ],
 )
 def test_pixel_centres(tmp_path, stated, setting, offset):
     document = own.bare(tmp_path)
@@ -68,7 +74,14 @@ def test_paths_without_extension_globs_and_spread(tmp_path):
     assert [f.name for f in read(tmp_path, {"frames": "images/00[0-2]"}).frames] == ["000", "001", "002"]
     assert transforms.spread(3, 5) == [0, 1, 2] and transforms.spread(100, 1) == [50]
     got = folder.raw_inputs(own.settings_of(tmp_path, capture={"views": 4}))
-    assert [p.name for p in got] == ["transforms.json", "mesh.ply", "001.png", "003.png", "005.png", "007.png"]
+    assert [p.name for p in got] == [
+        "transforms.json",
+        "mesh.ply",
+        "001.png",
+        "003.png",
+        "005.png",
+        "007.png",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -87,7 +100,8 @@ def test_lenses(tmp_path, keys, kind, k):
     assert (lens.kind, lens.k) == (kind, k)
 
 
-# --------------------------------------------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------------------------------------------
+# pictures
 
 
 def png16(path, values):
@@ -134,7 +148,9 @@ def test_eight_bits_grey_palette_and_alpha(tmp_path):
     assert grey.shape == (6, 9, 3) and np.abs(grey[..., 0] - rgba[..., 0] / 255).max() < 0.02
     flat = Image.fromarray(np.full((4, 4, 3), (10, 200, 30), np.uint8)).convert("P", palette=Image.Palette.ADAPTIVE)
     flat.save(tmp_path / "p.png")
-    np.testing.assert_allclose(images.load_photo(tmp_path / "p.png").pixels[0, 0], np.array([10, 200, 30]) / 255, atol=1e-6)
+    np.testing.assert_allclose(
+        images.load_photo(tmp_path / "p.png").pixels[0, 0], np.array([10, 200, 30]) / 255, atol=1e-6
+    )
 
 
 def test_exr_pictures_and_bad_pixels(tmp_path):
@@ -235,7 +251,8 @@ def test_ids(tmp_path):
         images.load_ids(tmp_path / "e.png")
 
 
-# ------------------------------------------------------------------------------------------------------------------- mesh
+# -------------------------------------------------------------------------------------------------------------------
+# mesh
 
 
 def test_ply_with_instances_units_and_waste(tmp_path):
@@ -280,7 +297,8 @@ def test_obj(tmp_path):
     np.testing.assert_allclose(np.sort(got.vertices[got.faces].mean(1), 0), np.sort(vertices[faces].mean(1), 0))
 
 
-# ---------------------------------------------------------------------------------------------------------------- capture
+# ----------------------------------------------------------------------------------------------------------------
+# capture
 
 
 @pytest.fixture(scope="module")
@@ -338,7 +356,8 @@ def test_distortion_is_removed(tmp_path, lens):
     own.write_transforms(path, document)
     capture = own.run(tmp_path, "capture")
     target = pinhole_inside(lens, own.CAMERA)
-    for view, (pose, *_) in zip(capture, shots, strict=True):
+    assert len(capture.views) == len(shots)
+    for view in capture:
         assert (view.width, view.height, view.fx) == (target.width, target.height, target.fx)
         photo, valid = capture.photo(view)
         depth, _ = capture.gbuffer(view)
@@ -372,7 +391,9 @@ def test_hdr_exposure_nan_instances_and_truth(tmp_path):
     for i, view in enumerate(capture):
         photo, valid = capture.photo(view)
         assert view.exposure == 1.0
-        np.testing.assert_allclose(photo[valid], own.pattern(capture.points(view, capture.gbuffer(view)[0]))[valid], atol=2e-5)
+        np.testing.assert_allclose(
+            photo[valid], own.pattern(capture.points(view, capture.gbuffer(view)[0]))[valid], atol=2e-5
+        )
         truth = capture.truth(view)
         assert (truth.albedo == 0.25).all() and (truth.roughness == 0.5).all() and (truth.metallic == 0).all()
         np.testing.assert_array_equal(truth.radiance, photo)
@@ -387,13 +408,12 @@ def test_estimated_exposure(tmp_path):
     gains = np.array([1.0, 2.0, 0.4, 1.2])
     own.photographed(path, 4, depth=False, hdr=True, gains=gains)
     capture = own.run(tmp_path, "capture")
-    scale = [
-        np.median(capture.photo(v)[0] / own.pattern(capture.points(v, capture.gbuffer(v)[0]))) for v in capture
-    ]
+    scale = [np.median(capture.photo(v)[0] / own.pattern(capture.points(v, capture.gbuffer(v)[0]))) for v in capture]
     np.testing.assert_allclose(np.array(scale) / scale[0], 1.0, atol=0.03)
 
 
-# -------------------------------------------------------------------------------------------------------------- alignment
+# --------------------------------------------------------------------------------------------------------------
+# alignment
 
 
 def fails(root):
@@ -446,6 +466,23 @@ def test_unrelated_depth_is_refused_without_advice(tmp_path):
     assert "No usual convention fits" in fails(tmp_path)
 
 
+def test_one_bad_pose_is_named(tmp_path):
+    path = own.project(tmp_path)
+    document, _ = own.photographed(path, 6)
+    pose = np.array(document["frames"][4]["transform_matrix"])
+    pose[:3, 3] += [0.9, 0.5, 0.3]
+    document["frames"][4]["transform_matrix"] = pose.tolist()
+    own.write_transforms(path, document)
+    notes = own.run(tmp_path, "capture").facts["notes"]
+    assert any("disagree in view(s) 004: is the pose right?" in note for note in notes)
+
+
+def test_agreement_of_a_few_pixels_by_chance_does_not_count():
+    assert alignment.disagreement(np.ones(50)) == 0
+    assert alignment.disagreement(np.r_[np.ones(5), np.full(45, np.nan)]) == np.inf
+    assert alignment.disagreement(np.zeros(0)) == np.inf
+
+
 def test_depth_of_another_camera(tmp_path):
     """A depth sensor 5 cm to the side with other intrinsics: compared where it looks, not pixel by pixel."""
     from iif_core.distortion import Pinhole
@@ -487,3 +524,17 @@ def test_stage_reads_back(scene):
     root, _, _ = scene
     reader = StageReader(root / "results/own/capture", "capture", "own")
     assert set(reader.names("photos/")) == {f"photos/{i:03d}.exr" for i in range(4)}
+
+
+@pytest.mark.needs_scene
+def test_red_kitchen_passes_the_door(tmp_path, test_scene):
+    """A real capture: photographs, poses and mesh agree with its depth images and not with a shifted picture."""
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data/own").symlink_to(test_scene("redkitchen"))
+    own.project(tmp_path, capture={"views": 8, "width": 160, "height": 160, "exposure": "estimate"})
+    facts = own.run(tmp_path, "capture").facts["alignment"]
+    assert facts["depth_median_disagreement"] < 0.01
+    assert max(facts["depth_disagreement_of_views"].values()) < 0.03
+    assert facts["edge_correlation"] > 0.2
+    own.project(tmp_path, {"axes": "opencv"}, {"views": 4, "width": 160, "height": 160})
+    assert "`source.axes: opengl` fits" in fails(tmp_path)

@@ -1,4 +1,5 @@
 """Laplace divergence and scales: check values, quadrature, slopes, limits."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,9 +23,12 @@ def test_kl_equals_quadrature(d, b_r, b_p):
     def integrand(x):
         p = np.exp(-abs(x) / b_r) / (2 * b_r)
         return p * (np.log(b_p / b_r) - abs(x) / b_r + abs(x - d) / b_p)
+
     breaks = sorted({0.0, d})
     edges = [-60 * b_r, *breaks, d + 60 * b_r]
-    by_quadrature = sum(quad(integrand, a, b, epsabs=1e-12, limit=200)[0] for a, b in zip(edges, edges[1:], strict=False))
+    by_quadrature = sum(
+        quad(integrand, a, b, epsabs=1e-12, limit=200)[0] for a, b in zip(edges, edges[1:], strict=False)
+    )
     assert laplace.kl(d, b_r, b_p) == pytest.approx(by_quadrature, rel=1e-8, abs=1e-9)
 
 
@@ -70,8 +74,9 @@ def test_joint_scaling_leaves_kl():
 def test_closed_form_scale_minimises_the_sum():
     rng = np.random.default_rng(4)
     d, b_r, w = rng.random(40), 0.02 + 0.3 * rng.random(40), rng.random(40)
-    found = minimize_scalar(lambda b: np.sum(w * laplace.kl(d, b_r, b)), bounds=(0.01, 3), method="bounded",
-                            options={"xatol": 1e-10}).x
+    found = minimize_scalar(
+        lambda b: np.sum(w * laplace.kl(d, b_r, b)), bounds=(0.01, 3), method="bounded", options={"xatol": 1e-10}
+    ).x
     assert laplace.closed_form_scale(d, b_r, w) == pytest.approx(found, rel=1e-5)
     slope = np.sum(w * laplace.kl_derivatives(d, b_r, laplace.closed_form_scale(d, b_r, w))[2])
     assert abs(slope) < 1e-9
@@ -106,7 +111,7 @@ def test_lower_median():
 
 def test_reference_scale():
     v = np.array([[0.1], [0.2], [0.5], [0.9]])
-    assert laplace.reference_scale(np.array([0.2]), v) == pytest.approx(0.1)     # |.| = .1 0 .3 .7 -> .1
+    assert laplace.reference_scale(np.array([0.2]), v) == pytest.approx(0.1)  # |.| = .1 0 .3 .7 -> .1
     assert laplace.reference_scale(np.array([0.4]), np.array([[0.4]])) == laplace.SCALE_FLOOR  # K = 1
 
 

@@ -3,7 +3,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
-from iif_core.nnls import EmissionRows, block_rows, prune_groups, solve_emission
+from iif_core.nnls import EmissionRows, block_rows, object_gains, prune_groups, scale_rows, solve_emission
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 
@@ -191,3 +191,41 @@ def test_pruning_with_nothing():
     rows = _rows(np.zeros((4, 0, 3)), np.zeros((4, 0, 3)), np.ones((4, 3)))
     none = np.zeros((0, 3))
     assert prune_groups(rows, none, np.zeros(0), none, np.zeros(0, bool)).kept.shape == (0,)
+
+
+@pytest.mark.parametrize("pinned", [False, True])
+def test_light_and_object_gains_together(pinned):
+    """Objects that face the lights differently, with albedos off by up to 2: solved plainly the light is wrong."""
+    rng = np.random.default_rng(10)
+    n, owner = 2000, np.repeat(np.arange(5), 400)
+    lean = rng.uniform(0.05, 1, (5, 3))[owner]
+    a = (rng.random((n, 3)) * lean)[:, :, None] * np.ones(3)
+    h = rng.uniform(0, 2, (n, 3))
+    gain = np.exp(rng.uniform(-0.7, 0.7, (5, 3)))
+    y = gain[owner] * (np.einsum("ngc,gc->nc", a, TRUE) + h)
+    if pinned:  # one row sees each emitter
+        a = np.concatenate([a, np.eye(3)[:, :, None] * np.ones(3)])
+        h, y, owner = np.r_[h, np.zeros((3, 3))], np.r_[y, TRUE], np.r_[owner, [-1] * 3]
+    weight = 1 / (y + 0.1) ** 2
+    weight[n:] *= 1e6
+    rows = _rows(a, a, y - h, weight)
+    found = object_gains(rows, y, owner, np.ones((3, 3)), pinned, rounds=200, shrink=1e-6)
+    of_row = np.where((owner >= 0)[:, None], found[owner], 1.0)
+    radiance = solve_emission(scale_rows(rows, y, of_row), np.ones((3, 3)), ridge=1e-9).radiance
+    plain = solve_emission(rows, np.ones((3, 3)), ridge=1e-9).radiance
+
+    def colour_free(e):
+        return e if pinned else e / e.mean(0)
+
+    truth = TRUE if pinned else TRUE / TRUE.mean(0)
+    assert np.abs(colour_free(radiance) / truth - 1).max() < 0.03
+    if not pinned:
+        assert np.abs(colour_free(plain) / truth - 1).max() > 0.2
+        np.testing.assert_allclose((found / gain).std(0) / (found / gain).mean(0), 0, atol=0.02)
+    else:
+        np.testing.assert_allclose(found, gain, rtol=0.02)
+
+
+def test_gains_without_reflecting_rows():
+    a, y = _random(10)
+    assert object_gains(_rows(a, a, y), y, np.full(10, -1), np.ones((3, 3)), False).shape == (0, 3)

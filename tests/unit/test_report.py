@@ -41,7 +41,7 @@ class FakeJob:
 
     def __init__(self, stage, root, scene="toy"):
         self.scene, self.root = scene, root
-        self.stage = SimpleNamespace(name=stage, upstream=tuple(STAGES)[: tuple(STAGES).index(stage)])
+        self.stage = SimpleNamespace(name=stage, upstream=STAGES[stage].upstream)
         self.settings = SimpleNamespace(
             render=SimpleNamespace(samples=256, max_bounces=4),
             export=SimpleNamespace(max_faces_glb=100_000),
@@ -473,8 +473,10 @@ def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
     finish(tmp_path)
     table = read_parquet(tmp_path / "scenes/toy/metrics.parquet")
     assert set(table["quantity"]) == {"rgb"} and set(table["view"]) == {"v0", "v1"}
-    text = "".join(parsed((tmp_path / "scenes/toy/report.html").read_text()).text)
+    page = (tmp_path / "scenes/toy/report.html").read_text()
+    text = "".join(parsed(page).text)
     assert "no ground truth" in text and "albedo error" not in text
+    assert page.count(": photograph") == 2  # each view shows what it was made from
     assert (tmp_path / "scenes/toy/camera_response.parquet").exists() == (dynamic_range == "ldr")
     values = dict(zip(zip(table["metric"], table["protocol"], strict=True), table["value"], strict=True))
     assert values["psnr", "raw"] > 27

@@ -12,7 +12,12 @@ from workflow.artifacts.store import ids_from_disk
 
 def tables(root):
     reader = StageReader(root / "results/own/segmentation", "segmentation", "own")
-    return reader, reader.table("faces.parquet")["object_id"], reader.table("objects.parquet"), reader.table("segments.parquet")
+    return (
+        reader,
+        reader.table("faces.parquet")["object_id"],
+        reader.table("objects.parquet"),
+        reader.table("segments.parquet"),
+    )
 
 
 def check_consistent(root, capture):
@@ -55,7 +60,12 @@ def test_given_by_face_keeps_what_nobody_sees(tmp_path):
     vertices, faces, thing = own.room_mesh()
     hidden, box = own.box((2.6, -0.7, 0.6), (2.9, -0.4, 0.9), inward=False)  # inside the block
     ids = np.concatenate([np.where(thing == 1, 40, -1), np.full(12, 7)])
-    own.save_mesh(path / "mesh.ply", np.concatenate([vertices, hidden]), np.concatenate([faces, box + len(vertices)]), ids)
+    own.save_mesh(
+        path / "mesh.ply",
+        np.concatenate([vertices, hidden]),
+        np.concatenate([faces, box + len(vertices)]),
+        ids,
+    )
     capture = own.run(tmp_path, "capture", "segmentation")
     labels, objects = check_consistent(tmp_path, capture)
     assert objects["name"].tolist() == ["instance 7", "instance 40", "unlabelled"]

@@ -1,7 +1,8 @@
 """Source `builtin`: a room that the project makes itself -> photographs, cameras, mesh and ground truth.
 
-The photographs are path traced with the workflow's own reflectance model and the same textures that the truth maps show, so
-that nothing stands between model and data but Monte Carlo noise, eight bits and a response that the solver is not told.
+The photographs are path traced with the workflow's own reflectance model and the same textures that the
+truth maps show, so that nothing stands between model and data but Monte Carlo noise, eight bits and a
+response that the solver is not told.
 """
 
 from __future__ import annotations
@@ -67,7 +68,11 @@ class _Capture:
     def run(self) -> None:
         views = self._plan()
         self.writer.mesh(
-            self.room.vertices, self.room.faces, self.room.object_id, list(self.room.names), self.room.emission
+            self.room.vertices,
+            self.room.faces,
+            self.room.object_id,
+            list(self.room.names),
+            self.room.emission,
         )
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
@@ -80,12 +85,15 @@ class _Capture:
 
     def _plan(self) -> list[View]:
         width, height, every = self.settings.width, self.settings.height, self.settings.test_every
+
+        def split(i: int) -> str:
+            return "test" if every and i % every == every - 1 else "train"
+
         focal = 0.5 * width / np.tan(np.radians(self.room.field_of_view / 2))
         return [
-            View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose,
-                 split="test" if every and i % every == every - 1 else "train")
+            View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split(i))
             for i, pose in enumerate(self.room.cameras(self.settings.views))
-        ]  # fmt: skip
+        ]
 
     def _counted(self, views: list[View]) -> Any:
         for i, view in enumerate(views):
@@ -93,26 +101,30 @@ class _Capture:
             self.job.progress(i + 1, len(views), "rendered views")
 
     def _view(self, view: View, radiance: Array) -> tuple[Array, Array]:
-        """Write G-buffer and truth of a view, keep its radiance; (radiance, mask) of the pixels that set the exposure."""
+        """Write G-buffer and truth, fill in `radiance`; radiance and mask of the pixels for metering."""
         from iif_core.camera import direction_derivatives, pixel_directions
         from iif_core.transport import render, trace
 
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = pixel_directions(
+            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
+        )
         rays = rays.reshape(-1, 3)
         face, depth = trace(self.geometry, origin, rays)
         hit = face >= 0
         depth = np.where(hit, depth, 0).astype(np.float32)
         on = np.maximum(face, 0)
-        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.room.object_id[on])
+        albedo, roughness, metallic = self.room.materials.numpy(
+            origin + depth[:, None] * rays, self.room.object_id[on]
+        )
         cosine = (self.geometry.normals[on] * rays).sum(1)
         emission = np.where((hit & (cosine < 0))[:, None], self.room.emission[on], 0)
 
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
-        image = render(self.geometry, self.material, self.emitters, origin, rays, self.settings.samples, MAX_BOUNCES, seed,
-                       jitter=steps)  # fmt: skip
+        scene = (self.geometry, self.material, self.emitters)
+        image = render(*scene, origin, rays, self.settings.samples, MAX_BOUNCES, seed, jitter=steps)
         if self.settings.denoise:
             from workflow.sources.mitsuba_scene.render import denoise
 
@@ -135,7 +147,9 @@ class _Capture:
         step = max(1, len(image) // _METER)
         return image[::step], ~emission.any(1)[::step]
 
-    def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
+    def _photographs(
+        self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]
+    ) -> list[View]:
         """Write the photographs; the views with their exposures."""
         from iif_core.photography import expose, exposures, response_curve
 
@@ -155,21 +169,33 @@ class _Capture:
         from workflow.sources.rooms.coverage import seen_from, surface_points
 
         points = surface_points(self.room, _COVERAGE_POINTS)
-        views_of_point = sum(seen_from(self.geometry, points, self.room.field_of_view, v.height / v.width, v.world_from_camera)
-                             .astype(int) for v in views)  # fmt: skip
-        reachable = views_of_point > 0
-        for pose in self.room.cameras(len(self.room.shots)):
-            reachable = reachable | seen_from(self.geometry, points, self.room.field_of_view, 1.0, pose)
+        opening = self.room.field_of_view
+
+        def count(cameras: list[Array], aspect: float) -> Array:
+            return np.sum(
+                [seen_from(self.geometry, points, opening, aspect, pose) for pose in cameras], axis=0
+            )
+
+        views_of_point = count([v.world_from_camera for v in views], views[0].height / views[0].width)
+        reachable = (views_of_point > 0) | (count(self.room.cameras(len(self.room.shots)), 1.0) > 0)
         once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
-        self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
-        notes = [f"{len(self.room.names)} objects, {len(self.room.faces)} faces; paths of up to {MAX_BOUNCES} bounces"]
+        self.job.log.info(
+            "of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice
+        )
+        notes = [f"{len(self.room.names)} objects, {len(self.room.faces)} faces; up to {MAX_BOUNCES} bounces"]
         if self.response is not None:
-            notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ from view to view")
+            notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
-            notes.append("photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth")
+            notes.append(
+                "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
+            )
         facts = {
             "room": self.room.name,
-            "coverage": {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": _COVERAGE_POINTS},
+            "coverage": {
+                "seen_once": round(once, 4),
+                "seen_twice": round(twice, 4),
+                "points": _COVERAGE_POINTS,
+            },
         }
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("builtin", self.settings.dynamic_range, True, notes, samples, facts)

@@ -1,7 +1,7 @@
 """Source `folder`: a scene of your own, in the form tools already write (docs/own-data.md).
 
-`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes
-distortion, reduces the photographs, traces the mesh and measures whether the two belong together.
+`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes distortion,
+reduces the photographs, traces the mesh and measures whether the two belong together.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Inputs:
     truth: dict[str, dict[str, Path]]
 
     def files(self) -> list[Path]:
-        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []),
-        *self.instances.values()] for frame in self.transforms.frames:
+        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
+        for frame in self.transforms.frames:
             out += [frame.image, *([frame.depth] if frame.depth else [])]
         return out + [path for maps in self.truth.values() for path in maps.values()]
 
@@ -162,9 +162,9 @@ class _Capture:
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
             if self.settings.exposure == "estimate":
-                points = view.world_from_camera[:3, 3] + depth[..., None] *
-                alignment.directions(_pinhole(view), pose) footprint = float(np.median(depth[face >= 0])) /
-                view.fx shared.add(photo, valid & (face >= 0), points, footprint)
+                points = view.world_from_camera[:3, 3] + depth[..., None] * alignment.directions(_pinhole(view), pose)
+                footprint = float(np.median(depth[face >= 0])) / view.fx
+                shared.add(photo, valid & (face >= 0), points, footprint)
             views.append(view)
             used.append(frame)
             self.job.progress(i + 1, len(frames), "photographs")
@@ -229,7 +229,9 @@ class _Capture:
             )
         return pixels
 
-    def _resized(self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _resized(
+        self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted and reduced by area."""
         if not frame.lens.is_identity:
             pixels, valid = undistort_image(pixels, frame.lens, frame.camera, self._target(frame), valid)
@@ -273,7 +275,9 @@ class _Capture:
         meaningful = known & valid & (face >= 0)
         self.writer.truth(view.name, Truth(**maps, valid=meaningful))
 
-    def _compare(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, face: np.ndarray) -> None:
+    def _compare(
+        self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, face: np.ndarray
+    ) -> None:
         if self.source.alignment == "off":
             return
         if frame.depth is not None:
@@ -287,27 +291,25 @@ class _Capture:
         if len(dropped) == count:
             better = self._advice(blind)
             raise InputError(
-                f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that hit it:"
-                f" {max(dropped.values()):.1%} at most); "
-                + (better or f"mesh and poses are in different frames or units, or `source.axes:
-                {self.source.axes}` is wrong") + " (docs/own-data.md)"
+                f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that"
+                f" hit it: {max(dropped.values()):.1%} at most); "
+                + (better or f"mesh and poses differ in frame or unit, or `source.axes: {self.source.axes}` is wrong")
+                + " (docs/own-data.md)"
             )
         for name, share in dropped.items():
-            self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the
-            mesh)")
+            self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the mesh)")
         if count - len(dropped) == 1:
-            self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the
-            prior alone")
+            self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the prior alone")
 
     def _check_alignment(self, used: list[Frame], views: list[View]) -> None:
         if self.source.alignment == "off":
             self.notes.append("alignment was not checked (`source.alignment: off`)")
             return
-        self.notes += self.alignment.notes()
+        self.notes += self.alignment.notes(self.source.alignment_tolerance)
 
         path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
-        message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views,
-        strict=True)))) alignment.raise_or_note(message, self.source.alignment, self.notes)
+        message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views, strict=True))))
+        alignment.raise_or_note(message, self.source.alignment, self.notes)
         alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
@@ -340,12 +342,12 @@ class _Capture:
         if apart:
             self.notes.append(f"exposure: {apart} view(s) share no surface with others and keep exposure 1")
         if groups > 1:
-            self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each
-            has mean 1")
+            self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each has mean 1")
         if gains.pairs:
             low, high = gains.gain.min(), gains.gain.max()
-            self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual
-            {gains.residual:.3f})")
+            self.notes.append(
+                f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})"
+            )
         if self.encoded:
             return [replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)]
         counts = dict(self.counts)
@@ -369,14 +371,13 @@ class _Capture:
         first = frames[0].camera
         if (views[0].width, views[0].height) != (first.width, first.height):
             self.notes.append(
-                f"photographs of {first.width}x{first.height} reduced to {views[0].width}x{views[0].height} by the mean of"
-                f" {'sensor values' if self.encoded else 'radiance'} over each pixel's area"
+                f"photographs of {first.width}x{first.height} reduced to {views[0].width}x{views[0].height} by the mean"
+                f" of {'sensor values' if self.encoded else 'radiance'} over each pixel's area"
             )
         if self.inputs.instances and len(self.inputs.instances) < len(frames):
             self.notes.append(f"instances are given for {len(self.inputs.instances)} of {len(frames)} views")
         if self.mesh.from_nodes and self.mesh.names is not None:
-            self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as
-            instances")
+            self.notes.append(f"the {len(self.mesh.names)} nodes of {self.inputs.mesh.name} serve as instances")
 
 
 def _pinhole(view: View) -> Pinhole:

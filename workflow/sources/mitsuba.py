@@ -1,7 +1,8 @@
 """Source `mitsuba`: any Mitsuba 3 XML -> photographs, cameras, mesh and ground truth.
 
-The photographs are Mitsuba's path tracing of the scene as it is (its own BSDFs, glass, bump maps); mesh and material truth
-are what the workflow's model can say about it (`mitsuba_scene.materials`). What lies between is in `capture.json` as notes.
+The photographs are Mitsuba's path tracing of the scene as it is (its own BSDFs, glass, bump maps); mesh and material
+truth are what the workflow's model can say about it (`mitsuba_scene.materials`). What lies between is in `capture.json`
+as notes.
 """
 
 from __future__ import annotations
@@ -26,8 +27,10 @@ FIELD_OF_VIEW = 75.0
 """Degrees across the wider side, of the views that are not the scene's own."""
 RESPONSE = "filmic"
 _METER = 4096  # pixels a view that set the exposure
-_OFF = 0.01
-"""Share of the depth by which the mesh may differ from the original surface (tessellation) before truth is void there."""
+_OFF = 1e-4
+"""Share of the depth by which mesh and original surface may differ before truth is void there (glass in between)."""
+_OFF_ROUND = 0.01
+"""The same on spheres, cylinders and disks, which are tessellated."""
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -74,13 +77,19 @@ class _Capture:
             self.mesh = flatten.compact(everything, keep)
         if not len(self.mesh.faces):
             raise InputError(f"{xml}: every face is transparent; a capture needs opaque surface")
-        self.job.log.info("mesh: %d faces of %d shapes", len(self.mesh.faces), len(np.unique(self.mesh.shape)))
+        self.job.log.info(
+            "mesh: %d faces of %d shapes", len(self.mesh.faces), len(np.unique(self.mesh.shape))
+        )
 
-        views = self._plan(flatten.compact(everything, keep), bool(transparent.any()) and self.source.drop_transparent)
+        views = self._plan(
+            flatten.compact(everything, keep), bool(transparent.any()) and self.source.drop_transparent
+        )
         del everything
         shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
         names = [self.mesh.shapes[i].name for i in shapes]
-        self.writer.mesh(self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission)
+        self.writer.mesh(
+            self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission
+        )
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
@@ -105,14 +114,18 @@ class _Capture:
                 }
             elif emitter.class_name() not in ("AreaLight", "DirectionalArea"):
                 loose[emitter.class_name()] = loose.get(emitter.class_name(), 0) + 1
-        self.notes += [f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()]
+        self.notes += [
+            f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()
+        ]
 
     def _note_faces(self, transparent: Array, thin: Array) -> None:
         if transparent.any():
             what = "left out of the mesh" if self.source.drop_transparent else "kept in the mesh"
-            self.notes.append(f"{transparent.sum()} transparent faces {what}; no material truth where a ray meets one")
+            self.notes.append(f"{transparent.sum()} transparent faces {what}; no truth where a ray meets one")
         if thin.any():
-            self.notes.append(f"{thin.sum()} faces of low opacity left out of the mesh; no material truth where a ray meets one")
+            self.notes.append(
+                f"{thin.sum()} faces of low opacity left out of the mesh; no truth where a ray meets one"
+            )
 
     def _plan(self, solid_mesh: Any, glass: bool) -> list[View]:
         """Geometry for tracing, and the views."""
@@ -120,7 +133,11 @@ class _Capture:
         from workflow.sources.mitsuba_scene import path
 
         self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, self.mesh.shape)
-        solid = build_geometry(solid_mesh.vertices, solid_mesh.faces, solid_mesh.shape) if glass else self.geometry
+        solid = (
+            build_geometry(solid_mesh.vertices, solid_mesh.faces, solid_mesh.shape)
+            if glass
+            else self.geometry
+        )
         width, height = self.settings.width, self.settings.height
         sensors = self._sensors()
         up = path.upright(-sensors[0][0][:3, 1])
@@ -144,11 +161,15 @@ class _Capture:
             focal = width / 2 / sensors[i][1] if found.given[i] else 1 / (2 * wide)
             test = self.settings.test_every and i % self.settings.test_every == self.settings.test_every - 1
             split = "test" if test else "train"
-            views.append(View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split))
+            views.append(
+                View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split)
+            )
         share = found.facts
         self.job.log.info(
             "%d views; of the reachable surface %.1f %% are seen, %.1f %% three times or more",
-            len(views), 100 * share["coverage_1"], 100 * share["coverage_3"],
+            len(views),
+            100 * share["coverage_1"],
+            100 * share["coverage_3"],
         )
         return views
 
@@ -171,7 +192,7 @@ class _Capture:
             tangent = float(np.tan(np.radians(np.array(parameters["x_fov"]).ravel()[0]) / 2))
             out.append((look_at(origin, origin + forward, upward), tangent))
         if not out:
-            raise InputError(f"{self.source.path}: no perspective sensor; add <sensor type='perspective'> inside the room")
+            raise InputError(f"{self.source.path}: no perspective sensor; add one inside the room")
         return out
 
     # ------------------------------------------------------------------------------------------------------ views
@@ -188,8 +209,12 @@ class _Capture:
         for i, view in enumerate(views):
             depth, face, truth = self._gbuffer(view)
             if i == 0 and not (face >= 0).any():
-                raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
-            image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
+                raise InputError(
+                    f"{self.source.path}: the scene's sensor sees no surface; point it into the room"
+                )
+            image, valid, dropped = render.render_view(
+                self.loaded.scene, integrator, view, self.settings.samples, self.job.seed
+            )
             if self.settings.denoise:
                 image = render.denoise(image, truth.albedo, self._normals(view, face))
             self.dropped += dropped
@@ -209,16 +234,22 @@ class _Capture:
         from workflow.sources.mitsuba_scene import materials, render
 
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = pixel_directions(
+            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
+        )
         rays = rays.reshape(-1, 3)
         face, t = trace(self.geometry, origin, rays)
         hit = np.flatnonzero(face >= 0)
+        if view.view_id == 0 and not len(hit):
+            raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
         on = face[hit]
         point = origin + t[hit, None].astype(np.float64) * rays[hit]
         surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
         front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
         original = render.original_distance(self.loaded.scene, origin, rays[hit])
-        undisturbed = np.abs(original - t[hit]) <= _OFF * t[hit]
+        tessellated = np.array([shape.plugin in ("sphere", "cylinder", "disk") for shape in self.mesh.shapes])
+        slack = np.where(tessellated[self.mesh.shape[on]], _OFF_ROUND, _OFF)
+        undisturbed = np.abs(original - t[hit]) <= slack * t[hit]
         two_sided = self.table.of_faces(self.mesh, "two_sided")[on]
 
         def raster(values: Array) -> Array:
@@ -242,13 +273,16 @@ class _Capture:
         """World normals towards the camera (H, W, 3), 0 where nothing is hit."""
         from iif_core.camera import pixel_directions
 
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = pixel_directions(
+            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
+        )
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
         return np.where((normal * rays).sum(-1, keepdims=True) > 0, -normal, normal)
 
     def _photographs(self, views: list[View], radiance: Array) -> list[View]:
         """Sensor values (LDR) or radiance (HDR) of every view; the views with their exposures."""
         from iif_core.photography import expose, exposures, response_curve
+        from workflow.sources.folder_scene.exposure import SharedSurface
 
         encoded = self.settings.dynamic_range == "ldr"
         self.response = response_curve(RESPONSE) if encoded else None
@@ -256,18 +290,47 @@ class _Capture:
             metered, dark = zip(*self.meter, strict=True)
             given = exposures(metered, dark)
             views = [replace(view, exposure=float(e)) for view, e in zip(views, given, strict=True)]
+        shared = SharedSurface(len(views), encoded)
         for i, view in enumerate(views):
             pixels = view.width * view.height
             valid = np.unpackbits(self.usable[i], count=pixels).view(bool).reshape(view.height, view.width)
             image = expose(radiance[i], view.exposure, self.response) if encoded else np.array(radiance[i])
             self.writer.photo(view.name, image, valid, encoded)
-        return views
+            if self.settings.exposure == "estimate":
+                self._share(shared, view, image, valid)
+        return self._estimated(shared, views) if self.settings.exposure == "estimate" else views
+
+    def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
+        from iif_core.camera import pixel_directions
+        from iif_core.transport.geometry import trace
+
+        rays = pixel_directions(
+            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
+        )
+        face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
+        hit = (face >= 0).reshape(valid.shape)
+        points = view.world_from_camera[:3, 3] + np.where(hit, t.reshape(valid.shape), 0)[..., None] * rays
+        footprint = float(np.median(t[face >= 0])) / view.fx if hit.any() else 1.0
+        shared.add(image, valid & hit, points, footprint)
+
+    def _estimated(self, shared: Any, views: list[View]) -> list[View]:
+        """The views with exposures estimated from their photographs; the true ones are kept among the facts."""
+        gains = shared.gains()
+        self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
+        self.notes.append(
+            f"exposures estimated from surface that views share (residual {gains.residual:.3f})"
+        )
+        return [replace(view, exposure=float(g)) for view, g in zip(views, gains.gain, strict=True)]
 
     def _finish(self) -> None:
         if self.dropped:
-            self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
+            self.notes.append(
+                f"{self.dropped} path samples were not finite and are left out of the photographs"
+            )
         if self.settings.denoise:
-            self.notes.append("photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth")
+            self.notes.append(
+                "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
+            )
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
         for note in self.notes:

@@ -20,13 +20,23 @@ from iif_core.emitters import (
     hdr_threshold,
 )
 from iif_core.exposure import ExposureGains, calibrate_response, estimate_gains
-from iif_core.nnls import EmissionRows, PrunedEmission, block_rows, prune_groups, solve_emission
+from iif_core.nnls import (
+    EmissionRows,
+    EmissionSolution,
+    PrunedEmission,
+    block_rows,
+    object_gains,
+    prune_groups,
+    scale_rows,
+    solve_emission,
+)
 from iif_core.response import Response, family_for, response
 from workflow.artifacts.store import ids_from_disk
 from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, read_base_scene, view_pixels
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
+GAINS = 1
 TILE = 8
 """Pixels of one object in one tile of this edge are averaged into one row (COMPUTE 4)."""
 STATISTICS_PIXELS = 20_000_000
@@ -72,7 +82,7 @@ def run(job: Job) -> None:
         job.settings.emission.environment, misses.share, secondary, misses.relative_brightness if misses.pixels else None
     )
     solution, table = _solve(job, capture, scene, views, light, exposures, groups, cache, misses, environment["included"])
-    _write(job, groups, table, solution, cache)
+    _write(job, groups, table, cache)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     for faces, area, reason in groups.dropped[:20]:
         notes.append(f"candidate of {faces} faces, {area:.2g} m^2, left out before the solve: {reason}")
@@ -352,27 +362,29 @@ def _choose_rows(
 def _solve(
     job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
     groups: EmitterGroups, voxels: RadianceVoxels, misses: _Misses, with_environment: bool,
-) -> tuple[Any, dict[str, Any]]:
+) -> tuple[EmissionSolution, dict[str, Any]]:
     """Transport rows of a subset of pixels, twice; pruned non-negative least squares; the table of emitters."""
-    settings = job.settings.emission
     rows = _choose_rows(job, capture, scene, views, light, exposures, groups)
+    environment = groups.size if with_environment else None
     n_groups = groups.size + int(with_environment)
     initial = _initial(light, groups, rows, misses, with_environment)
-    halves = _trace(job, scene, rows, groups, voxels, n_groups, groups.size if with_environment else None)
-    cross = light.is_hdr
-    blocks = _blocks(rows, halves, n_groups, groups.size if with_environment else None, misses, reflecting=True)
+    halves = _trace(job, scene, rows, groups, voxels, n_groups, environment)
     area = np.r_[groups.area, np.zeros(n_groups - groups.size)]
-    observed = _observed(rows, n_groups)
     protected = np.arange(n_groups) >= groups.size
-    pruned = prune_groups(blocks, initial, area, observed, protected, settings.prune, cross=cross)
+    system = _system(rows, halves, n_groups, environment, misses, reflecting=True).with_gains(initial)
+    pruned = prune_groups(
+        system.rows, initial, area, _observed(rows, n_groups), protected, job.settings.emission.prune
+    )
     # What remains is treated as black from here on: its pixels show its emission alone.
-    final = _blocks(rows, halves, n_groups, groups.size if with_environment else None, misses, reflecting=False)
-    part = solve_emission(final.columns(pruned.kept), initial[pruned.kept], cross)
+    kept = pruned.kept
+    final = _system(rows, halves, n_groups, environment, misses, reflecting=False)
+    final = replace(final, rows=final.rows.columns(kept)).with_gains(initial[kept])
+    part = solve_emission(final.rows, initial[kept])
     radiance, error = np.zeros((n_groups, 3)), np.zeros((n_groups, 3))
-    radiance[pruned.kept], error[pruned.kept] = part.radiance, part.error
+    radiance[kept], error[kept] = part.radiance, part.error
     job.log.info(
-        "%d of %d groups kept; residual %.3f, condition %.3g", int(pruned.kept[: groups.size].sum()), groups.size,
-        part.residual, part.condition,
+        "%d of %d groups kept; residual %.3f, condition %.3g", int(kept[: groups.size].sum()), groups.size, part.residual,
+        part.condition,
     )
     return replace(part, radiance=radiance, error=error), _table(groups, rows, pruned, radiance, error, misses, n_groups)
 
@@ -413,46 +425,72 @@ def _trace(
     return halves
 
 
-def _blocks(
+@dataclass(frozen=True)
+class _System:
+    """Averaged rows with what they observed, the object that reflects (-1: emission itself), and which are anchors."""
+
+    rows: EmissionRows
+    observed: np.ndarray
+    owner: np.ndarray
+    anchor: np.ndarray
+
+    def with_gains(self, initial: np.ndarray) -> _System:
+        """Rows scaled by the albedo gains of the objects that go with the light."""
+        pinned = bool((self.anchor & ~self.rows.lower_bound.any(1)).any()) or GAINS == 2
+        if GAINS == 0: return self
+        gain = object_gains(self.rows, self.observed, self.owner, initial, pinned)
+        of_row = np.ones(self.observed.shape)
+        known = self.owner >= 0
+        of_row[known] = gain[self.owner[known]]
+        return replace(self, rows=scale_rows(self.rows, self.observed, of_row))
+
+
+def _system(
     rows: _Rows, halves: list[tuple[np.ndarray, np.ndarray]], n_groups: int, environment_group: int | None, misses: _Misses,
     reflecting: bool,
-) -> EmissionRows:
-    """Averages over (view, tile, object) with their weights; directly seen emitters and sky as rows of their own."""
+) -> _System:
+    """Averages over (view, tile, object) with their weights; directly seen emitters and sky as rows of their own.
+
+    `reflecting`: emitters also reflect, and are not trusted more than other rows; otherwise they are black anchors.
+    """
     on_emitter = rows.group >= 0
     direct = np.zeros((len(rows.group), n_groups, 3), np.float32)
     direct[np.flatnonzero(on_emitter), rows.group[on_emitter]] = 1.0
-    keep = 1.0 if reflecting else np.where(on_emitter, 0.0, 1.0).astype(np.float32)[:, None]
-    first, second = (direct + a * (keep if reflecting else keep[..., None]) for a, _ in halves)
-    targets = [rows.radiance - h * keep for _, h in halves]
+    reflects = np.ones(len(rows.group), np.float32) if reflecting else np.where(on_emitter, 0.0, 1.0).astype(np.float32)
+    first, second = (direct + a * reflects[:, None, None] for a, _ in halves)
+    targets = [rows.radiance - h * reflects[:, None] for _, h in halves]
     ones = np.ones((len(rows.group), 3))
-    key = np.stack([rows.view, rows.tile, rows.pixels.object_id, rows.group], 1)
-    block = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-    system = block_rows(EmissionRows(first, second, *targets, ones, rows.bound), block)
-    seen = block_rows(EmissionRows(direct[:, :0], direct[:, :0], rows.radiance, rows.radiance, ones, rows.bound), block)
-    brightness = seen.mean_target.mean(1, keepdims=True)
+    owner = np.where(on_emitter, -1, rows.pixels.object_id)
+    keys, block = np.unique(np.stack([owner, rows.group, rows.view, rows.tile], 1), axis=0, return_inverse=True)
+    system = block_rows(EmissionRows(first, second, *targets, ones, rows.bound), block.ravel())
+    empty = direct[:, :0]
+    # The same blocks again for y itself, and for the number of the block.
+    seen = block_rows(EmissionRows(empty, empty, rows.radiance, rows.radiance, ones, rows.bound), block.ravel())
+    number = np.repeat(block.ravel().astype(np.float64)[:, None], 3, 1)
+    label = block_rows(EmissionRows(empty, empty, number, number, ones, rows.bound), block.ravel()).target[:, 0]
+    key = keys[np.round(label).astype(np.int64)] if len(keys) else keys.reshape(0, 4)
+    brightness = seen.target.mean(1, keepdims=True)
     floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
     weight = system.weight / np.maximum(brightness + floor, 1e-12) ** 2
-    anchor = np.max(system.first, axis=(1, 2), initial=0.0) >= 1.0  # only directly seen emission has a full column
+    out = _System(replace(system, weight=weight), seen.target, key[:, 0].astype(np.int64), key[:, 1] >= 0)
     if environment_group is not None and misses.pixels:
-        system, weight, anchor = _add_sky(system, weight, anchor, n_groups, environment_group, misses)
-    system = replace(system, weight=weight)
-    return system if reflecting else _strengthen(system, anchor)
+        out = _with_sky(out, n_groups, environment_group, misses)
+    return out if reflecting else replace(out, rows=_strengthen(out.rows, out.anchor))
 
 
-def _add_sky(
-    system: EmissionRows, weight: np.ndarray, anchor: np.ndarray, n_groups: int, group: int, misses: _Misses
-) -> tuple[EmissionRows, np.ndarray, np.ndarray]:
+def _with_sky(system: _System, n_groups: int, group: int, misses: _Misses) -> _System:
+    """One more row: the mean of the camera rays that leave the mesh."""
     row = np.zeros((1, n_groups, 3), np.float32)
     row[0, group] = 1.0
     sky = misses.radiance[None]
-    flag = np.full((1, 3), misses.bounded)
-    own = np.full((1, 3), misses.pixels / max(float(sky.mean()), 1e-6) ** 2)
+    weight = np.full((1, 3), misses.pixels / max(float(sky.mean()), 1e-6) ** 2)
+    old = system.rows
     added = EmissionRows(
-        np.concatenate([system.first, row]), np.concatenate([system.second, row]), np.concatenate([system.target, sky]),
-        np.concatenate([system.target_second, sky]), np.concatenate([system.weight, own]),
-        np.concatenate([system.lower_bound, flag]),
+        np.concatenate([old.first, row]), np.concatenate([old.second, row]), np.concatenate([old.target, sky]),
+        np.concatenate([old.target_second, sky]), np.concatenate([old.weight, weight]),
+        np.concatenate([old.lower_bound, np.full((1, 3), misses.bounded)]),
     )
-    return added, np.concatenate([weight, own]), np.r_[anchor, True]
+    return _System(added, np.concatenate([system.observed, sky]), np.r_[system.owner, -1], np.r_[system.anchor, True])
 
 
 def _strengthen(system: EmissionRows, anchor: np.ndarray) -> EmissionRows:
@@ -508,7 +546,7 @@ def _side_of(groups: EmitterGroups, group: int) -> int:
     return int(sides[0]) if len(sides) and (sides == sides[0]).all() else 0
 
 
-def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], solution: Any, cache: RadianceVoxels) -> None:
+def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: RadianceVoxels) -> None:
     units = {"area_m2": "m^2", "radiance_r": "relative", "error_r": "relative"}
     job.writer.table("emitters.parquet", table, units)
     face = np.flatnonzero(groups.of_face >= 0)

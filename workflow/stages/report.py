@@ -164,12 +164,21 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
 def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewRows]:
     count = min(job.settings.report.views, len(capture.views))
     chosen = np.unique(np.linspace(0, len(capture.views) - 1, count).round().astype(int))
-    emission_exposure = 0.8 / max(float(recovered.emitter_radiance.max(initial=0)), 1e-6)
+    emission_exposure = _emission_exposure(recovered)
     exposures, rows = read_exposures(job, capture), []
     for done, i in enumerate(chosen):
         rows.append(_view(job, capture, capture.views[i], float(exposures[i]), emission_exposure))
         job.progress(done + 1, len(chosen), "views drawn")
     return rows
+
+
+def _emission_exposure(recovered: Recovered) -> float:
+    """Factor that shows the emitters at the middle of the emitting area just below white; brighter ones clip."""
+    lit = np.flatnonzero(recovered.light.emits)
+    peak, area = recovered.light.radiance[lit].max(-1), recovered.surface.areas[lit]
+    order = np.argsort(peak, kind="stable")
+    half = np.searchsorted(np.cumsum(area[order]), 0.5 * area.sum())
+    return 0.8 / max(float(peak[order][min(half, len(lit) - 1)]), 1e-6) if len(lit) else 1.0
 
 
 def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emission_exposure: float) -> ViewRows:
@@ -219,17 +228,15 @@ def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emissio
             picture = pic.difference(result["albedo"], truth.albedo, truth.valid & hit & ~(truth.emission > 0).any(-1))
             error = tile("albedo error", picture, f"0 to {ERROR_RANGE}, linear")
         strips.append(Strip("truth", [photograph, *materials(maps), emission, error]))
-    if job.read("prior").has(file):
-        channels = job.read("prior").exr(file)
-        numbers = prediction_numbers(channels)
-        if numbers:
-            first = materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
-            spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
-            disagreement = tile(
-                "disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions"
-            )
-            start = None if capture.has_truth else photograph
-            strips.append(Strip("raw prediction", [start, *first, disagreement, None]))
+    predictions = job.read("prior").exr(file) if job.read("prior").has(file) else {}
+    numbers = prediction_numbers(predictions)
+    if numbers:
+        first = materials(material_maps(predictions, f"prior.{numbers[0]:03d}."))
+        spread = np.std([rgb(predictions, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
+        spread_tile = tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
+        strips.append(Strip("raw prediction", [None if capture.has_truth else photograph, *first, spread_tile]))
+    elif not capture.has_truth:
+        strips.append(Strip("photograph", [photograph]))
     strips.append(Strip("checks", _checks(job, view, file, sensor, depth, valid & hit, tile)))
     captions = [f"{view.width} x {view.height}", f"exposure {exposure:.3g}"]
     if view.split == "test":
@@ -246,8 +253,9 @@ def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> li
         out.append(tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
         out.append(tile("objects", pic.ids(object_id), lossless=True))
         table = job.read("base").table("selection.parquet")
-        k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
-        out.append(tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
+        if len(table["k"]):
+            k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
+            out.append(tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
     if job.read("affines").has(file):
         uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
         note = f"of the albedo, 0 to {UNCERTAINTY_RANGE}"

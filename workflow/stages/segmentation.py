@@ -19,7 +19,7 @@ COLOUR_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Objects:
-    """object_of_face (m,) int32 from 0 without gaps, and for every object its name and the share of pixels that agree."""
+    """object_of_face (m,) int32 from 0 without gaps; name of every object and the share of pixels that agree."""
 
     object_of_face: np.ndarray
     names: list[str]
@@ -56,8 +56,8 @@ def run(job: Job) -> None:
         job.progress(i + 1, len(capture.views), "maps")
 
     corners = vertices.astype(np.float64)[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-    axis=1) face_id = np.arange(len(faces), dtype=np.int32)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face_id = np.arange(len(faces), dtype=np.int32)
     job.writer.table("faces.parquet", {"face_id": face_id, "object_id": objects.object_of_face})
     job.writer.table(
         "objects.parquet",
@@ -92,8 +92,7 @@ def _object_map(face_id: np.ndarray, object_of_face: np.ndarray) -> np.ndarray:
 def given_objects(capture: CaptureReader, vertices: np.ndarray, faces: np.ndarray) -> Objects:
     """Objects from ids of the faces, else from ids in the views by the majority of the pixels that see a face.
 
-    Faces without an id form one object `unlabelled`; so do faces that no vote reaches. Objects that no view
-    sees stay.
+    Faces without an id form one object `unlabelled`; so do faces that no vote reaches. Objects that no view sees stay.
     """
     instance = capture.faces()["instance_id"]
     if (instance >= 0).any():
@@ -105,8 +104,8 @@ def given_objects(capture: CaptureReader, vertices: np.ndarray, faces: np.ndarra
         # np.unique puts -1 first: roll it to the end so that given objects keep their order.
         unlabelled = int(ids[0] < 0)
         labels = (labels.ravel() - unlabelled) % len(ids)
-        texts = [str(names.get(i, f"instance {i}")) for i in ids[unlabelled:].tolist()] + ["unlabelled"] *
-        unlabelled return Objects(labels.astype(np.int32), texts, np.ones(len(ids)))
+        texts = [str(names.get(i, f"instance {i}")) for i in ids[unlabelled:].tolist()] + ["unlabelled"] * unlabelled
+        return Objects(labels.astype(np.int32), texts, np.ones(len(ids)))
     face_ids, instance_ids = [], []
     for view in capture:
         given = capture.given_instances(view)

@@ -1,8 +1,7 @@
 """Do photographs, poses and mesh belong together? Measured, not believed.
 
-With depth images: the mesh's depth in the photograph's camera against the depth image, moved into that
-camera. Without: how well edges of the photograph lie on edges of the mesh, against the same picture shifted
-by a few pixels.
+With depth images: the mesh's depth in the photograph's camera against the depth image, moved into that camera. Without:
+how well edges of the photograph lie on edges of the mesh, against the same picture shifted by a few pixels.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 
 DEPTH_SAMPLES = 20_000
 """Depth pixels compared a view."""
+MIN_COMPARED = 0.2
 TRIAL_VIEWS = 6
 TRIAL_WIDTH = 96
 EDGE_WIDTH = 160
@@ -32,11 +32,15 @@ WEAK_CORRELATION = 0.05
 
 @dataclass(frozen=True)
 class Conventions:
-    """How `transform_matrix` is read: `axes`, `metres`, and a change of the matrix before that (None = as written)."""
+    """How `transform_matrix` is read: `axes`, `metres`, and a change of the matrix before that (None = as written).
+
+    A change of the world (`of_world`) holds for the depth images' own poses too.
+    """
 
     axes: str
     metres: float
     change: Callable[[np.ndarray], np.ndarray] | None = None
+    of_world: bool = False
 
     def pose(self, frame: Frame) -> np.ndarray:
         """`world_from_camera` of the photograph."""
@@ -47,20 +51,22 @@ class Conventions:
         """`world_from_camera` of the depth image, where the file gives it its own."""
         if frame.depth_matrix is None:
             return self.pose(frame)
-        return opencv_pose(frame.depth_matrix, "opencv", self.metres)
+        matrix = self.change(frame.depth_matrix) if self.change and self.of_world else frame.depth_matrix
+        return opencv_pose(matrix, "opencv", self.metres)
 
 
-def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Mesh depth / measured depth (n,) float64 where both are known, in the photograph's (pinhole) camera `view`.
+def depth_ratio(
+    frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray
+) -> np.ndarray:
+    """Mesh depth / measured depth (n,) float64 in the photograph's (pinhole) camera `view`, one entry a measured pixel.
 
-    The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in
-    `mesh_depth`, so a depth camera beside the colour camera is compared correctly (but for what only one of
-    the two sees: use a median).
+    The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in `mesh_depth`, so a
+    depth camera beside the colour camera is compared correctly (but for what only one of the two sees: use a median).
     """
     height, width = depth.shape
     step = max(1, int(np.sqrt(depth.size / DEPTH_SAMPLES)))
-    rows, columns = np.meshgrid(np.arange(step // 2, height, step), np.arange(step // 2, width, step),
-    indexing="ij") z = depth[rows, columns].astype(np.float64).ravel()
+    rows, columns = np.meshgrid(np.arange(step // 2, height, step), np.arange(step // 2, width, step), indexing="ij")
+    z = depth[rows, columns].astype(np.float64).ravel()
     camera = frame.depth_camera or frame.camera
     u = (columns.ravel() + 0.5) * camera.width / width
     v = (rows.ravel() + 0.5) * camera.height / height
@@ -76,12 +82,18 @@ def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_dept
     inside = (z > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     u, v, z = u[inside].astype(int), v[inside].astype(int), z[inside]
     hit = mesh_depth[v, u]
-    return (hit / z)[hit > 0]
+    ratio = np.full(len(inside), np.nan)
+    ratio[inside] = np.where(hit > 0, hit / z, np.nan)
+    return ratio
 
 
 def disagreement(ratio: np.ndarray) -> float:
-    """Median |mesh depth / measured depth - 1|; inf without samples."""
-    return float(np.median(np.abs(ratio - 1))) if len(ratio) else float("inf")
+    """Median |mesh depth / measured depth - 1| where both exist; inf when that is less than MIN_COMPARED of the pixels.
+
+    A camera that looks elsewhere, or from very far away, may agree in the few pixels that land on the mesh by chance.
+    """
+    both = ratio[np.isfinite(ratio)]
+    return float(np.median(np.abs(both - 1))) if len(both) and len(both) >= MIN_COMPARED * len(ratio) else float("inf")
 
 
 def _turned(world: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -108,16 +120,16 @@ def candidates(axes: str, metres: float) -> list[tuple[str, Conventions]]:
         ),
         (
             "turning the mesh from y-up to z-up (x, -z, y) fits",
-            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP)),
+            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP), of_world=True),
         ),
         (
             "turning the mesh from z-up to y-up (x, z, -y) fits",
-            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP.T)),
+            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP.T), of_world=True),
         ),
     ]
     for factor in (1000.0, 100.0, 0.01, 0.001):
         text = f"camera positions times {factor:g} fits (mesh and poses are in different units)"
-        out.append((text, Conventions(axes, metres, _moved(factor))))
+        out.append((text, Conventions(axes, metres, _moved(factor), of_world=True)))
     return out
 
 
@@ -147,8 +159,8 @@ def explain(
 
     as_is = ratios(Conventions(axes, metres))
     scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres)]
-    if len(as_is):
-        factor = float(np.median(as_is))
+    if np.isfinite(as_is).any():
+        factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
     best, text = min(scores)
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
@@ -182,9 +194,9 @@ def directions(camera: Pinhole, pose: np.ndarray) -> np.ndarray:
 def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Correlation of photograph edges with mesh edges for shifts of the photograph, (2 SHIFT + 1, 2 SHIFT + 1) float64.
 
-    Entry [SHIFT + dy, SHIFT + dx]: mesh pixel (u, v) against photograph pixel (u + dx, v + dy). photo (H,
-    W, 3), valid (H, W), depth (H, W) with 0 = miss, normal (H, W, 3) unit. All are reduced to EDGE_WIDTH
-    first. Zeros when the picture is too small or has no edges.
+    Entry [SHIFT + dy, SHIFT + dx]: mesh pixel (u, v) against photograph pixel (u + dx, v + dy). photo (H, W, 3), valid
+    (H, W), depth (H, W) with 0 = miss, normal (H, W, 3) unit. All are reduced to EDGE_WIDTH first. Zeros when the
+    picture is too small or has no edges.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -230,20 +242,19 @@ class Alignment:
 
     @property
     def depth_disagreement(self) -> float:
-        """Median over all compared pixels of all views; inf when depth images exist but none could be compared."""
+        """Median over all compared pixels of all views; inf when depth images are absent or too few pixels meet."""
         return disagreement(np.concatenate(list(self.ratios.values()))) if self.ratios else float("inf")
 
     def report(self) -> dict[str, Any]:
         """Measured numbers, for capture.json and the notes."""
         out: dict[str, Any] = {}
-        samples = sum(len(r) for r in self.ratios.values())
-        if samples:
+        if np.isfinite(self.depth_disagreement):
             joined = np.concatenate(list(self.ratios.values()))
             out["depth_median_disagreement"] = round(self.depth_disagreement, 6)
-            out["depth_median_ratio"] = round(float(np.median(joined)), 6)
-            out["depth_samples"] = samples
-            each = {n: round(disagreement(r), 6) for n, r in self.ratios.items() if len(r)}
-            out["depth_disagreement_of_views"] = each
+            out["depth_median_ratio"] = round(float(np.nanmedian(joined)), 6)
+            out["depth_samples"] = int(np.isfinite(joined).sum())
+            each = {name: disagreement(ratio) for name, ratio in self.ratios.items()}
+            out["depth_disagreement_of_views"] = {n: round(d, 6) for n, d in each.items() if np.isfinite(d)}
         if self.edges:
             mean = np.mean(list(self.edges.values()), 0)
             dy, dx = np.unravel_index(int(mean.argmax()), mean.shape)
@@ -252,13 +263,22 @@ class Alignment:
             out["edge_best_shift"] = [int(dx) - SHIFT, int(dy) - SHIFT]
         return out
 
-    def notes(self) -> list[str]:
+    def doubtful(self, tolerance: float) -> list[str]:
+        """Views whose own disagreement is above tolerance: one bad pose does not move the median of all."""
+        return [name for name, ratio in self.ratios.items() if disagreement(ratio) > tolerance]
+
+    def notes(self, tolerance: float) -> list[str]:
         """The numbers in words."""
         r, out = self.report(), []
+        doubtful = self.doubtful(tolerance) if "depth_median_disagreement" in r else []
+        if doubtful:
+            out.append(
+                f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?"
+            )
         if "depth_median_disagreement" in r:
             out.append(
-                f"alignment: mesh depth differs from the depth images by {r['depth_median_disagreement']:.2%} (median of"
-                f" {r['depth_samples']} pixels)"
+                f"alignment: mesh depth differs from the depth images by {r['depth_median_disagreement']:.2%} (median"
+                f" of {r['depth_samples']} pixels)"
             )
         if "edge_correlation" in r:
             dx, dy = r["edge_best_shift"]
@@ -289,11 +309,11 @@ class Alignment:
         if not self.ratios or self.depth_disagreement <= tolerance:
             return ""
         number = self.depth_disagreement
-        found = f"{number:.1%}" if np.isfinite(number) else "no pixel could be compared"
+        found = f"{number:.1%}" if np.isfinite(number) else f"less than {MIN_COMPARED:.0%} of the depth pixels meet it"
         better = advice()
         return (
             f"{path}: mesh and depth images disagree (median relative difference {found}, tolerance {tolerance:.0%})."
-            f" {better + '.' if better else 'No usual convention fits: check that mesh, poses and depth belong together.'}"
+            f" {better or 'No usual convention fits: check that mesh, poses and depth belong together'}."
             " To go on anyway: `source.alignment: warn`"
         )
 

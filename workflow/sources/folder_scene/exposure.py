@@ -52,7 +52,7 @@ class SharedSurface:
         self.footprints: list[float] = []
 
     def add(self, photo: np.ndarray, usable: np.ndarray, points: np.ndarray, footprint: float) -> None:
-        """One view: (H, W, 3) sensor values or radiance, (H, W) bool hit and valid, (H, W, 3) metres, metres a pixel."""
+        """One view: photo (H, W, 3), usable (H, W) bool hit and valid, points (H, W, 3) and footprint in metres."""
         if self.encoded:
             usable = usable & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
         else:

@@ -63,7 +63,9 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     try:
         with Image.open(path) as image:
             if image.mode not in MODES:
-                raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
+                raise InputError(
+                    f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it"
+                )
             orientation = int(image.getexif().get(274, 1) or 1)
             return Header(image.size, orientation if 1 <= orientation <= 8 else 1)
     except InputError:
@@ -109,7 +111,9 @@ def _exr(path: Path) -> dict[str, np.ndarray]:
     try:
         return read_exr(path)
     except Exception as error:
-        raise InputError(f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts") from None
+        raise InputError(
+            f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts"
+        ) from None
 
 
 def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
@@ -127,16 +131,15 @@ def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
 def load_photo(path: Path, turn: int = 1) -> Photo:
     """A photograph: 8/16-bit to [0, 1], EXR as it is; grey becomes RGB.
 
-    Pixels with alpha < 0.5, and NaN or infinite ones, are not valid and become 0. EXR colour is divided by
-    its alpha (EXR stores it multiplied). Negative EXR values become 0.
+    Pixels with alpha < 0.5, and NaN or infinite ones, are not valid and become 0. EXR colour is divided by its alpha
+    (EXR stores it multiplied). Negative EXR values become 0.
     """
     if path.suffix.lower() == ".exr":
         values = _exr_colour(path, _exr(path))
         alpha = values[..., 3] if values.shape[-1] == 4 else None
         colour = values[..., :3]
         if alpha is not None:
-            colour = colour / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[...,
-            None]
+            colour = colour / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None]
     else:
         stored = _stored(path)
         stored = stored[..., None] if stored.ndim == 2 else stored
@@ -160,8 +163,8 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
 
 def load_map(path: Path, channels: int) -> np.ndarray:
     """(H, W, 3) or (H, W) float32 of an EXR map; not-finite values are kept for the caller to mask."""
-    values = _exr_colour(path, found) if "R" in (found := _exr(path)) else _one_channel(path, found)[...,
-    None] if channels == 3:
+    values = _exr_colour(path, found) if "R" in (found := _exr(path)) else _one_channel(path, found)[..., None]
+    if channels == 3:
         return np.repeat(values, 3, -1) if values.shape[-1] == 1 else values[..., :3]
     return values[..., 0]
 
@@ -175,8 +178,8 @@ def _one_channel(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
 def load_ids(path: Path, turn: int = 1) -> np.ndarray:
     """(H, W) int32 ids of a one-channel png (8 or 16 bit) or EXR, -1 = none.
 
-    None is written as a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0
-    is an id. Raises InputError for colour pictures and for ids between integers (anti-aliased, METHOD H44).
+    None is written as a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0 is an id.
+    Raises InputError for colour pictures and for ids between integers (anti-aliased, METHOD H44).
     """
     if path.suffix.lower() == ".exr":
         stored = _one_channel(path, _exr(path))
@@ -219,7 +222,9 @@ def load_depth(path: Path, unit: float | None) -> np.ndarray:
         if stored.ndim != 2:
             stored = stored[..., 0]
         if stored.dtype == np.uint8:
-            raise InputError(f"{path}: 8 bits are too few for depth; give 16-bit png or EXR, or remove `depth_file_path`")
+            raise InputError(
+                f"{path}: 8 bits are too few for depth; give 16-bit png or EXR, or remove `depth_file_path`"
+            )
         depth = stored.astype(np.float32)
         scale = 0.001 if unit is None else unit
         known = (depth > 0) & (depth < 65535)
@@ -251,8 +256,7 @@ def _overlap(size: int, wanted: int) -> Any:
 def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the valid part of every target pixel's area; valid where at least half of that area is.
 
-    image (H, W, C) float32 with finite values, valid (H, W) bool -> (height, width, C) float32, (height,
-    width) bool.
+    image (H, W, C) float32 with finite values, valid (H, W) bool -> (height, width, C) float32, (height, width) bool.
     """
     if image.shape[:2] == (height, width):
         return np.where(valid[..., None], image, 0), valid
@@ -262,8 +266,8 @@ def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -
         return np.asarray((columns @ (rows @ values).T).T)
 
     covered = mean(valid.astype(np.float64))
-    total = np.stack([mean(np.where(valid, image[..., c], 0).astype(np.float64)) for c in
-    range(image.shape[2])], -1) kept = covered >= 0.5 - 1e-9
+    total = np.stack([mean(np.where(valid, image[..., c], 0).astype(np.float64)) for c in range(image.shape[2])], -1)
+    kept = covered >= 0.5 - 1e-9
     out = np.where(kept[..., None], total / np.maximum(covered, 1e-9)[..., None], 0)
     return out.astype(np.float32), kept
 

@@ -23,7 +23,8 @@ TYPICAL = 7.0
 
 @dataclass
 class Mesh:
-    """vertices (n, 3) float64 in metres, faces (m, 3) int32, instance (m,) int32 with -1 = none or None, and their names.
+    """vertices (n, 3) float64 in metres, faces (m, 3) int32, instance (m,) int32 with -1 = none or None, and their
+    names.
 
     `from_nodes`: the instances are the file's nodes, not ids that somebody gave.
     """
@@ -75,7 +76,9 @@ def load(path: Path, metres: float) -> Mesh:
     if len(faces) == 0:
         raise InputError(f"{path}: no faces (a point cloud?); a triangle mesh is needed")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path}: faces name vertices {faces.min()} ... {faces.max()}, it has 0 ... {len(vertices) - 1}")
+        raise InputError(
+            f"{path}: faces name vertices {faces.min()} ... {faces.max()}, it has 0 ... {len(vertices) - 1}"
+        )
     mesh = _cleaned(path, vertices * metres, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True
@@ -121,8 +124,8 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[s
 def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
     """The `instance` property of the faces of a PLY."""
     data = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
-    names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else
-    () if "instance" not in (names or ()):
+    names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else ()
+    if "instance" not in (names or ()):
         return None
     values = np.asarray(data["instance"])
     values = values["f1"] if values.dtype.names else values
@@ -138,8 +141,8 @@ def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
 def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarray | None) -> Mesh:
     finite = np.isfinite(vertices).all(1)[faces].all(1)
     corners = np.where(np.isfinite(vertices), vertices, 0)[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-    axis=1) kept = finite & (area >= MIN_AREA)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    kept = finite & (area >= MIN_AREA)
     notes = []
     if (~finite).any():
         notes.append(f"mesh: {int((~finite).sum())} faces with NaN vertices removed")
@@ -171,7 +174,7 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
         if diagonal > high and 0.1 < cameras < 1e-2 * diagonal:
             raise InputError(
                 f"{found}, but the cameras span {cameras:.3g} m: mesh and poses are in different units; bring the mesh"
-                f" into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
+                " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
             )
         across = {name: diagonal / metres * factor for name, factor in METRES.items()}
         name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL)))
@@ -183,7 +186,7 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
     far = outside > diagonal
     if 2 * int(far.sum()) > len(centres):
         raise InputError(
-            f"{path}: {int(far.sum())} of {len(centres)} cameras are more than the scene's size ({diagonal:.3g} m) away from"
-            f" the mesh (median {np.median(outside):.3g} m); mesh and poses are in different units or frames: export both"
-            " from the same tool (docs/own-data.md, mesh and poses in one frame)"
+            f"{path}: {int(far.sum())} of {len(centres)} cameras are more than the scene's size ({diagonal:.3g} m) away"
+            f" from the mesh (median {np.median(outside):.3g} m); mesh and poses are in different units or frames:"
+            " export both from the same tool (docs/own-data.md, mesh and poses in one frame)"
         )

@@ -1,7 +1,7 @@
 """`transforms.json` of nerfstudio and instant-ngp -> cameras in the project's conventions, checked before any work.
 
-Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the
-frame, what was found, what is allowed and what to do.
+Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the frame,
+what was found, what is allowed and what to do.
 """
 
 from __future__ import annotations
@@ -32,9 +32,8 @@ RIGID_TOLERANCE = 5e-3
 class Frame:
     """One photograph, as the file describes it.
 
-    camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as
-    written. depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix:
-    OpenCV axes).
+    camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as written.
+    depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix: OpenCV axes).
     """
 
     name: str
@@ -66,7 +65,9 @@ def metres_per_unit(unit: str | float) -> float:
     except ValueError:
         factor = math.nan
     if not (math.isfinite(factor) and factor > 0):
-        raise InputError(f"`source.unit`: found {unit!r}; allowed: {', '.join(METRES)} or metres per unit (a number > 0)")
+        raise InputError(
+            f"`source.unit`: found {unit!r}; allowed: {', '.join(METRES)} or metres per unit (a number > 0)"
+        )
     return factor
 
 
@@ -134,9 +135,8 @@ def _load(path: Path) -> dict[str, Any]:
 def _frames(path: Path, document: dict[str, Any]) -> list[Any]:
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
-        found = "no `frames`" if frames is None else "`frames` is empty" if frames == [] else "`frames` is
-        not a list" raise InputError(f"{path}: {found}; at least one photograph with file_path and
-        transform_matrix is needed")
+        found = "no `frames`" if frames is None else "`frames` is empty" if frames == [] else "`frames` is not a list"
+        raise InputError(f"{path}: {found}; at least one photograph with file_path and transform_matrix is needed")
     return frames
 
 
@@ -152,7 +152,9 @@ def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) ->
     kept = [e for e in entries if fnmatch.fnmatchcase(e["file_path"], pattern)]
     if not kept:
         example = entries[0]["file_path"]
-        raise InputError(f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})")
+        raise InputError(
+            f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})"
+        )
     return kept
 
 
@@ -192,8 +194,8 @@ def _all_present(path: Path, missing: list[tuple[dict[str, Any], Path]]) -> None
     if missing:
         names = _some([image for _, image in missing])
         raise InputError(
-            f"{path}: {len(missing)} image(s) not found: {names}. `file_path` counts from the folder of transforms.json,"
-            f" with extension ({', '.join(images.EXTENSIONS)}) or without"
+            f"{path}: {len(missing)} image(s) not found: {names}. `file_path` counts from the folder of"
+            f" transforms.json, with extension ({', '.join(images.EXTENSIONS)}) or without"
         )
 
 
@@ -201,7 +203,9 @@ def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
     hdr = [f for f in files if f.suffix.lower() == ".exr"]
     if hdr and len(hdr) < len(files):
         other = next(f for f in files if f.suffix.lower() != ".exr")
-        raise InputError(f"{path}: mixes HDR ({hdr[0].name}) and LDR ({other.name}) images; choose with `source.frames`")
+        raise InputError(
+            f"{path}: mixes HDR ({hdr[0].name}) and LDR ({other.name}) images; choose with `source.frames`"
+        )
     if hdr and dynamic_range == "ldr":
         raise InputError(
             f"{path}: the images are EXR, which hold linear radiance, but `capture.dynamic_range` is ldr;"
@@ -245,8 +249,8 @@ def _same_sizes(
             sizes.setdefault(headers[image].size, []).append(image)
     if len(sizes) > 1:
         rows = sorted(sizes.items(), key=lambda item: -len(item[1]))
-        text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in
-        rows[:4]) raise InputError(
+        text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in rows[:4])
+        raise InputError(
             f"{path}: images of different sizes share one set of intrinsics ({text})."
             " Write w, h, fl_x, fl_y, cx, cy into each frame, or select one size with `source.frames`"
         )
@@ -262,8 +266,7 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
 
 
 def _frame(
-    path: Path, document: dict[str, Any], entry: dict[str, Any], image: Path, header: images.Header, offset:
-    float
+    path: Path, document: dict[str, Any], entry: dict[str, Any], image: Path, header: images.Header, offset: float
 ) -> Frame:
     where = f"frames[{entry['_index']}] ({entry['file_path']})"
     values = {key: value for key, value in document.items() if key != "frames"} | entry
@@ -292,9 +295,7 @@ def _frame(
     )
 
 
-def _size(
-    path: Path, where: str, values: dict[str, Any], image: Path, header: images.Header
-) -> tuple[int, int, int]:
+def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: images.Header) -> tuple[int, int, int]:
     """Width and height of the picture that the intrinsics speak of, and the EXIF turn that makes it."""
     stored = header.size
     width, height = (_number(path, where, values, key, size) for key, size in zip("wh", stored, strict=True))
@@ -326,8 +327,7 @@ def _size(
 
 
 def _camera(
-    path: Path, where: str, values: dict[str, Any], width: int, height: int, offset: float, strict: bool =
-    False
+    path: Path, where: str, values: dict[str, Any], width: int, height: int, offset: float, strict: bool = False
 ) -> Pinhole:
     fx, fy = (_number(path, where, values, key) for key in ("fl_x", "fl_y"))
     angle_x, angle_y = (_number(path, where, values, key) for key in ("camera_angle_x", "camera_angle_y"))
@@ -348,8 +348,9 @@ def _camera(
     reach = 0.25 if strict else 1.0  # without w, h the principal point is the only sign of another resolution
     if abs(cx - width / 2) > reach * width or abs(cy - height / 2) > reach * height:
         raise InputError(
-            f"{path}: {where}: the principal point ({cx:g}, {cy:g}) is not near the middle of the {width}x{height} image;"
-            " fl_x, fl_y, cx, cy seem to be for another resolution: give `w` and `h` with them, and images of that size"
+            f"{path}: {where}: the principal point ({cx:g}, {cy:g}) is not near the middle of the {width}x{height}"
+            " image; fl_x, fl_y, cx, cy seem to be for another resolution: give `w` and `h` with them, and images of"
+            " that size"
         )
     return Pinhole(fx, fy, cx, cy, width, height)
 
@@ -383,15 +384,16 @@ def _matrix(path: Path, where: str, entry: dict[str, Any], key: str) -> np.ndarr
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
-        found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a
-        scalar'}" raise InputError(f"{path}: {where}: `{key}` {found}; expected 4 rows of 4 numbers,
-        camera-to-world")
+        found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
+        raise InputError(f"{path}: {where}: `{key}` {found}; expected 4 rows of 4 numbers, camera-to-world")
     if not np.isfinite(matrix).all():
         raise InputError(f"{path}: {where}: `{key}` holds NaN or infinity: this image has no pose; remove the frame")
     rotation, last = matrix[:3, :3], matrix[3]
     determinant = float(np.linalg.det(rotation))
     if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(f"{path}: {where}: last row of `{key}` is {last.tolist()}; expected 0 0 0 1 (row-major matrix)")
+        raise InputError(
+            f"{path}: {where}: last row of `{key}` is {last.tolist()}; expected 0 0 0 1 (row-major matrix)"
+        )
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE or determinant < 0:
         kind = "a reflection" if determinant < 0 else "a scale or shear"
         raise InputError(

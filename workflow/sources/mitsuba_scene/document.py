@@ -1,10 +1,11 @@
-"""The files that a Mitsuba XML refers to, found without Mitsuba: what to hash, and what to miss before any job starts."""
+"""The files that a Mitsuba XML refers to, found without Mitsuba: what to hash, and what is missing."""
 
 from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from xml.parsers import expat
 
 from iif_core.errors import InputError
 
@@ -23,7 +24,7 @@ def referenced_files(xml: Path) -> list[Path]:
     and a shape. Standard library only.
 
     Raises:
-        InputError: XML absent, not well-formed (with line and column) or not a scene; a named file absent (all are listed).
+        InputError: XML absent, not well-formed (with line and column) or not a scene; named files absent.
     """
     if not xml.is_file():
         raise InputError(f"{xml}: scene not found. {WHERE_FROM}")
@@ -38,7 +39,11 @@ def referenced_files(xml: Path) -> list[Path]:
             f"{xml}: names {len(names)} file(s) that are not there: {', '.join(names[:_SHOWN])}{more}."
             f" Looked in {xml.parent}. Put them beside the XML under these names. {WHERE_FROM}"
         )
-    for tag, remedy in (("sensor", "add a <sensor> inside the room: the camera path starts there"), ("shape", "add surface")):
+    remedies = {
+        "sensor": "add a <sensor> inside the room: the camera path starts there",
+        "shape": "add surface",
+    }
+    for tag, remedy in remedies.items():
         if tag not in tags:
             raise InputError(f"{xml}: has no <{tag}>; {remedy}")
     return sorted(found)
@@ -58,7 +63,7 @@ def _collect(
     except ET.ParseError as error:
         line, column = error.position
         raise InputError(
-            f"{xml}, line {line}, column {column + 1}: not well-formed XML ({ET.ErrorString(error.code)})."
+            f"{xml}, line {line}, column {column + 1}: not well-formed XML ({expat.ErrorString(error.code)})."
             " Mend that line; `mitsuba` refuses the file too"
         ) from None
     except UnicodeDecodeError as error:
@@ -85,7 +90,9 @@ def _collect(
             missing[name] = None
         elif element.tag == "include":
             if depth >= _DEEPEST:
-                raise InputError(f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?")
+                raise InputError(
+                    f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?"
+                )
             _collect(path, folders, defaults, found, missing, tags, depth + 1)
         else:
             found[path] = None

@@ -11,12 +11,23 @@ import numpy as np
 
 from iif_core.errors import InputError
 
-from .scene import LoadedScene, Shape, children, parameter
+from .scene import LoadedScene, Shape, children
 
 Array = np.ndarray
 
 SEGMENTS = 64  # around a sphere, cylinder or disk: the chord leaves the circle by 0.12 % of the radius
-SUPPORTED = ("ply", "obj", "serialized", "cube", "blender", "merge", "rectangle", "disk", "sphere", "cylinder", "instance")
+SUPPORTED = (
+    "ply",
+    "obj",
+    "serialized",
+    "cube",
+    "merge",
+    "rectangle",
+    "disk",
+    "sphere",
+    "cylinder",
+    "instance",
+)
 _FLAT = 1e-7
 """A face whose doubled area is below this share of its longest edge squared has no normal in float32."""
 
@@ -73,18 +84,26 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
             else:
                 skipped_lights[light.class_name()] = skipped_lights.get(light.class_name(), 0) + 1
         ids = np.full(len(faces), index, np.int32)
-        parts.append((vertices.astype(np.float32), faces.astype(np.int64) + offset, uv, ids, primitive, emission))
+        parts.append(
+            (vertices.astype(np.float32), faces.astype(np.int64) + offset, uv, ids, primitive, emission)
+        )
         offset += len(vertices)
     if not offset or not any(len(part[1]) for part in parts):
-        raise InputError(f"the scene has no surface that can become triangles; supported shapes: {', '.join(SUPPORTED)}")
+        raise InputError(
+            f"the scene has no surface that can become triangles; supported: {', '.join(SUPPORTED)}"
+        )
 
     columns = [np.concatenate([part[i] for part in parts]) for i in range(6)]
     parts.clear()
     vertices, faces, uv, ids, primitive, emission = columns
-    notes = [f"{n} {plugin} shapes left out of the mesh (not triangles); the photographs show them" for plugin, n in unsupported.items()]
+    left_out = "shapes left out of the mesh (not triangles); the photographs show them"
+    notes = [f"{n} {plugin} {left_out}" for plugin, n in unsupported.items()]
     if tessellated:
         notes.append(f"{tessellated} disks, spheres and cylinders became triangles, {SEGMENTS} around")
-    notes += [f"{n} shapes with the light {kind}: no emission truth on the mesh" for kind, n in skipped_lights.items()]
+    notes += [
+        f"{n} shapes with the light {kind}: no emission truth on the mesh"
+        for kind, n in skipped_lights.items()
+    ]
 
     vertices, faces = _weld(vertices, faces)
     keep, degenerate, repeated = _proper(vertices, faces, emission.any(1))
@@ -94,7 +113,9 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
         notes.append(f"{repeated} faces over the same three vertices as another face left out")
     if not keep.any():
         raise InputError(f"all {len(keep)} faces of the scene are without area")
-    mesh = FlatMesh(vertices, faces[keep], uv[keep], ids[keep], primitive[keep], emission[keep], loaded.shapes, notes)
+    mesh = FlatMesh(
+        vertices, faces[keep], uv[keep], ids[keep], primitive[keep], emission[keep], loaded.shapes, notes
+    )
     return compact(mesh)
 
 
@@ -121,7 +142,7 @@ def compact(mesh: FlatMesh, keep: Array | None = None) -> FlatMesh:
 
 
 def _triangles(shape: Shape, textured_light: bool) -> tuple[Array, Array, Array, Array] | None:
-    """Vertices (n, 3) float64, faces (m, 3), corner uv (m, 3, 2), primitive (m,); None for what is not surface of triangles."""
+    """Vertices (n, 3) float64, faces (m, 3), corner uv (m, 3, 2), primitive (m,); None if it has no triangles."""
     if shape.plugin == "rectangle":
         local, faces, uv = _grid_rectangle(16 if textured_light else 1)
     elif shape.plugin == "disk":
@@ -151,7 +172,8 @@ def _mesh_triangles(shape: Shape) -> tuple[Array, Array, Array, Array]:
     else:  # Mitsuba's uv is then the barycentric position
         uv = np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (len(faces), 3, 2)).copy()
     if not np.isfinite(vertices).all():
-        raise InputError(f"shape {shape.name}: {np.count_nonzero(~np.isfinite(vertices).all(1))} vertices are not finite; mend the mesh")
+        wrong = np.count_nonzero(~np.isfinite(vertices).all(1))
+        raise InputError(f"shape {shape.name}: {wrong} vertices are not finite; mend the mesh")
     flip = np.full(len(faces), mesh.has_flipped_normals())
     if mesh.emitter() is not None and len(faces):  # a light shines on the side of its shading normal
         si = interaction_at_centres(mesh, primitive)
@@ -264,7 +286,9 @@ def _emission(shape: Shape, light: Any, uv: Array, primitive: Array) -> Array:
         return np.zeros((0, 3), np.float32)
     texture = children(light)["radiance"]
     if not texture.is_spatially_varying():
-        return np.broadcast_to(texture_at(texture, np.zeros((1, 2), np.float32)), (len(uv), 3)).astype(np.float32)
+        return np.broadcast_to(texture_at(texture, np.zeros((1, 2), np.float32)), (len(uv), 3)).astype(
+            np.float32
+        )
     total = np.zeros((len(uv), 3))
     for b1, b2 in _BARYCENTRIC:
         total += texture_at(texture, (1 - b1 - b2) * uv[:, 0] + b1 * uv[:, 1] + b2 * uv[:, 2])
@@ -274,7 +298,7 @@ def _emission(shape: Shape, light: Any, uv: Array, primitive: Array) -> Array:
 def texture_at(texture: Any, uv: Array) -> Array:
     """Linear RGB (n, 3) float32 of a Mitsuba texture at uv (n, 2), transformation, wrapping and filter included."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
-    si.uv = mi.Point2f(mi.Float(np.ascontiguousarray(uv[:, 0], np.float32)), mi.Float(np.ascontiguousarray(uv[:, 1], np.float32)))
+    si.uv = mi.Point2f(*(mi.Float(np.ascontiguousarray(uv[:, axis], np.float32)) for axis in range(2)))
     value = np.array(mi.Color3f(texture.eval(si)), np.float32).T
     return np.broadcast_to(value, (len(uv), 3))
 

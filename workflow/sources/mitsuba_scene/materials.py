@@ -2,12 +2,13 @@
 
     diffuse                    a = reflectance, r = 1, m = 0
     plastic, roughplastic      a = diffuse_reflectance, r = sqrt(alpha) (smooth: alpha = 0), m = 0
-    conductor, roughconductor  a = F0(eta, k) specular_reflectance, F0 = ((eta - 1)^2 + k^2) / ((eta + 1)^2 + k^2), m = 1
+    conductor, roughconductor  a = F0 specular_reflectance, F0 = ((eta - 1)^2 + k^2) / ((eta + 1)^2 + k^2), m = 1
     principled                 a = base_color, r = roughness (Mitsuba's alpha = roughness^2), m = metallic
     blendbsdf                  linear in its weight; twosided, bumpmap, normalmap, mask: the BSDF inside
     dielectric, ...            transparent: no truth;  anything else: neutral grey, no truth
 
-Textures are evaluated by Mitsuba itself (linear values; `to_uv`, `raw`, wrapping and filter respected). Target model: METHOD 3.
+Textures are evaluated by Mitsuba itself (linear values; `to_uv`, `raw`, wrapping, filter). The target model
+is METHOD 3.
 """
 
 from __future__ import annotations
@@ -31,7 +32,12 @@ OPAQUE = 0.5
 _TRANSPARENT = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 _PLASTIC = {"SmoothPlastic", "RoughPlastic", "PolarizedPlastic"}
 _CONDUCTOR = {"SmoothConductor", "RoughConductor"}
-_WRAPPER = {"TwoSidedBRDF": "brdf_0", "MaskBSDF": "nested_bsdf", "BumpMap": "nested_bsdf", "NormalMap": "nested_bsdf"}
+_WRAPPER = {
+    "TwoSidedBRDF": "brdf_0",
+    "MaskBSDF": "nested_bsdf",
+    "BumpMap": "nested_bsdf",
+    "NormalMap": "nested_bsdf",
+}
 _PRINCIPLED_EXTRAS = ("anisotropic", "spec_tint", "sheen", "clearcoat", "flatness", "diff_trans")
 _CHUNK = 1 << 22
 
@@ -48,11 +54,12 @@ class Surface:
     @staticmethod
     def neutral(n: int) -> Surface:
         """Grey of middle roughness that is no truth."""
-        return Surface(np.full((n, 3), 0.5, np.float32), np.full(n, 0.5, np.float32), np.zeros(n, np.float32), np.zeros(n, bool))
+        half = np.full(n, 0.5, np.float32)
+        return Surface(np.full((n, 3), 0.5, np.float32), half, np.zeros(n, np.float32), np.zeros(n, bool))
 
 
 class Points:
-    """Surface points that textures are evaluated at: uv (n, 2), positions (n, 3), and which primitive of which shape."""
+    """Where textures are evaluated: uv (n, 2), positions (n, 3), and which primitive of which shape."""
 
     def __init__(self, uv: Array, position: Array, primitive: Array, shape: Array, shapes: list[Shape]):
         self.count = len(uv)
@@ -61,9 +68,11 @@ class Points:
         si.p = mi.Point3f(*(mi.Float(np.ascontiguousarray(position[:, i], np.float32)) for i in range(3)))
         si.prim_index = mi.UInt32(np.maximum(primitive, 0).astype(np.uint32))
         si.wi = mi.Vector3f(0, 0, 1)
-        if self.count:
+        if len(shape):
             used, which = np.unique(shape, return_inverse=True)
-            ids = [int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[i].object)))[0]) for i in used]
+            ids = [
+                int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[i].object)))[0]) for i in used
+            ]
             si.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(np.array(ids, np.uint32)[which]))
         self.si = si
 
@@ -103,8 +112,12 @@ class Material:
         self.notes: set[str] = set().union(*(inner.notes for inner in self.inner.values()))
         nested = [inner for name, inner in self.inner.items() if name != "brdf_1"]
         self.masked = self.kind == "MaskBSDF" or any(inner.masked for inner in nested)
-        self.transparent = self.kind in _TRANSPARENT or (bool(nested) and all(inner.transparent for inner in nested))
-        self.two_sided = self.kind in ("TwoSidedBRDF", "Null") or self.transparent or any(i.two_sided for i in nested)
+        self.transparent = self.kind in _TRANSPARENT or (
+            bool(nested) and all(inner.transparent for inner in nested)
+        )
+        self.two_sided = (
+            self.kind in ("TwoSidedBRDF", "Null") or self.transparent or any(i.two_sided for i in nested)
+        )
         self.known = True
         self._read_kind()
 
@@ -113,13 +126,19 @@ class Material:
         if self.kind in _TRANSPARENT:
             note("dielectric, thindielectric, roughdielectric: transparent, no material truth")
         elif self.kind == "SmoothDiffuse":
-            note("diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack")
+            note(
+                "diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack"
+            )
         elif self.kind in _PLASTIC:
-            note("plastic, roughplastic: base colour = diffuse_reflectance; inner scattering and the loss under the coat are not in it")
+            note("plastic, roughplastic: base colour = diffuse_reflectance, without the loss under the coat")
             eta = parameter(self.bsdf, "eta")
             if eta is None and "eta" in self.textures:
                 eta = self._points_zero().scalar(self.textures["eta"], 1.5)
-            f0 = float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2) if eta is not None else 0.04
+            f0 = (
+                float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2)
+                if eta is not None
+                else 0.04
+            )
             if abs(f0 - 0.04) > 0.004:
                 note("plastic, roughplastic of another index than 1.5: F0 = 0.04 stands in its place")
             if "specular_reflectance" in self.textures:
@@ -127,11 +146,15 @@ class Material:
             if self.kind == "SmoothPlastic":
                 note(f"plastic: mirror-smooth coat, r = {MIN_ROUGHNESS}")
         elif self.kind in _CONDUCTOR:
-            note("conductor, roughconductor: base colour = F0(eta, k) x specular_reflectance, r = sqrt(alpha), Schlick's Fresnel")
+            note(
+                "conductor, roughconductor: base colour = F0(eta, k) x specular_reflectance; Fresnel is Schlick's"
+            )
         elif self.kind == "Principled":
             zero = self._points_zero()
             if any(zero.scalar(self.textures.get(name), 0).max() > 0 for name in _PRINCIPLED_EXTRAS):
-                note("principled with anisotropy, tint, sheen, clearcoat or flatness: those lobes are left out")
+                note(
+                    "principled with anisotropy, tint, sheen, clearcoat or flatness: those lobes are left out"
+                )
             self.transparent = bool(zero.scalar(self.textures.get("spec_trans"), 0)[0] > 0.5)
             self.two_sided |= self.transparent
             note("principled: base_color, roughness, metallic as they are; its diffuse lobe is Disney's")
@@ -141,7 +164,9 @@ class Material:
             self.two_sided = True
             note("principledthin: base_color and roughness; light that goes through is left out")
         elif self.kind == "MaskBSDF":
-            note(f"mask: faces of opacity below {OPAQUE} left out, the others opaque (the photographs see through them in part)")
+            note(
+                f"mask: faces of opacity below {OPAQUE} left out, the others opaque (in the photographs only in part)"
+            )
         elif self.kind == "Null":
             note("null: no surface, left out")
         elif self.kind in ("BumpMap", "NormalMap"):
@@ -157,13 +182,15 @@ class Material:
 
     def _points_zero(self) -> Points:
         """One point in the middle of the texture, for what is asked once per BSDF."""
-        return Points(np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), [])
+        return Points(
+            np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), []
+        )
 
     def opacity(self, points: Points) -> Array:
         """(n,) in [0, 1]: product of the masks above the surface; 0 for `null`."""
         if self.kind == "Null":
             return np.zeros(points.count, np.float32)
-        own = points.scalar(self.textures.get("opacity"), 1) if self.kind == "MaskBSDF" else np.ones(points.count, np.float32)
+        own = points.scalar(self.textures.get("opacity"), 1)  # only a mask has one
         name = _WRAPPER.get(self.kind)
         return own * self.inner[name].opacity(points) if name in self.inner else own
 
@@ -171,7 +198,9 @@ class Material:
         """Albedo, roughness and metallic at points; roughness in [0.02, 1], the others clipped to [0, 1]."""
         surface = self._evaluate(points)
         surface.albedo = np.clip(np.nan_to_num(surface.albedo), 0, 1).astype(np.float32)
-        surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(np.float32)
+        surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(
+            np.float32
+        )
         surface.metallic = np.clip(np.nan_to_num(surface.metallic), 0, 1).astype(np.float32)
         return surface
 
@@ -188,17 +217,21 @@ class Material:
         if self.kind in _CONDUCTOR:
             eta, k = colour("eta", 0), colour("k", 1)
             f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
-            return Surface(f0 * colour("specular_reflectance", 1), np.sqrt(self._alpha(points)), zero + 1, sure)
+            return Surface(
+                f0 * colour("specular_reflectance", 1), np.sqrt(self._alpha(points)), zero + 1, sure
+            )
         if self.kind in ("Principled", "PrincipledThin"):
             metallic = points.scalar(self.textures.get("metallic"), 0)
-            truth = sure & (not self.transparent)
-            return Surface(colour("base_color", 0.5), points.scalar(self.textures.get("roughness"), 0.5), metallic, truth)
+            roughness = points.scalar(self.textures.get("roughness"), 0.5)
+            return Surface(colour("base_color", 0.5), roughness, metallic, sure & (not self.transparent))
         if self.kind == "BlendBSDF":
             w = np.clip(points.scalar(self.textures.get("weight"), 0.5), 0, 1)
             a, b = self.inner["bsdf_0"].evaluate(points), self.inner["bsdf_1"].evaluate(points)
             mix = lambda x, y: x + (w if x.ndim == 1 else w[:, None]) * (y - x)  # noqa: E731
             truth = (a.truth | (w >= 1)) & (b.truth | (w <= 0))
-            return Surface(mix(a.albedo, b.albedo), mix(a.roughness, b.roughness), mix(a.metallic, b.metallic), truth)
+            return Surface(
+                mix(a.albedo, b.albedo), mix(a.roughness, b.roughness), mix(a.metallic, b.metallic), truth
+            )
         surface = Surface.neutral(n)
         if self.kind in _TRANSPARENT:
             surface.albedo[:] = 1
@@ -212,7 +245,9 @@ class Material:
         pair = []
         for name in ("alpha_u", "alpha_v") if self._has("alpha_u") else ("alpha", "alpha"):
             value = self.textures.get(name)
-            pair.append(np.maximum(points.scalar(parameter(self.bsdf, name) if value is None else value, 0.1), 0))
+            pair.append(
+                np.maximum(points.scalar(parameter(self.bsdf, name) if value is None else value, 0.1), 0)
+            )
         return np.sqrt(pair[0] * pair[1])
 
     def _has(self, name: str) -> bool:
@@ -248,7 +283,8 @@ class MaterialTable:
         samples = np.array([[1 / 3, 1 / 3], [0.6, 0.2], [0.2, 0.6], [0.2, 0.2]])
         total = np.zeros(len(faces))
         for b in samples:
-            total += self._each(mesh, faces, np.tile(b, (len(faces), 1)), lambda material, points: material.opacity(points))
+            for rows, part in self._groups(mesh, faces, np.tile(b, (len(faces), 1)), Material.opacity):
+                total[rows] += part
         out[faces] = total / len(samples)
         return out
 
@@ -256,18 +292,9 @@ class MaterialTable:
         """Materials at points of faces (n,) with weights (n, 2) of their second and third corners."""
         out = Surface.neutral(len(face))
 
-        def fill(material: Material, points: Points) -> Surface:
-            return material.evaluate(points)
-
-        for rows, part in self._groups(mesh, face, barycentric, fill):
+        for rows, part in self._groups(mesh, face, barycentric, Material.evaluate):
             out.albedo[rows], out.roughness[rows] = part.albedo, part.roughness
             out.metallic[rows], out.truth[rows] = part.metallic, part.truth
-        return out
-
-    def _each(self, mesh: FlatMesh, face: Array, barycentric: Array, function: Any) -> Array:
-        out = np.zeros(len(face), np.float32)
-        for rows, part in self._groups(mesh, face, barycentric, function):
-            out[rows] = part
         return out
 
     def _groups(self, mesh: FlatMesh, face: Array, barycentric: Array, function: Any) -> Any:

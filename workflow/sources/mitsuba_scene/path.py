@@ -6,7 +6,7 @@
                   third view and next to nothing after (so a gain only ever shrinks, and a lazy queue makes the exact
                   greedy choice)
 
-Lengths are scene units (metres); every limit shrinks with the room where it is too small for it. Deterministic in `seed`.
+Lengths are scene units (metres); limits shrink with the room where it is too small for them. Deterministic in `seed`.
 """
 
 from __future__ import annotations
@@ -33,9 +33,11 @@ PITCHES = (-30.0, -8.0, 14.0)
 CANDIDATES = 768
 POSITIONS = 128
 SPHERE = 384
-POINTS = 24000
+POINTS = 16000
 GRAZING = 0.15
 """Cosine below which a surface is not counted as seen."""
+PLAUSIBLE = (0.3, 30.0)
+"""Median distance seen from the sensor in a scene whose unit is the metre; else all lengths scale with it."""
 _GAIN = (1.0, 0.6, 0.4)
 _LATER = 0.02
 
@@ -87,17 +89,26 @@ def plan(
     sphere = fibonacci_sphere(SPHERE)
     notes: list[str] = []
 
-    _, around = solid(np.broadcast_to(start, (4 * SPHERE, 3)), fibonacci_sphere(4 * SPHERE))
+    directions = fibonacci_sphere(4 * SPHERE)
+    _, around = solid(np.broadcast_to(start, directions.shape), directions)
     seen = np.isfinite(around)
     reach = float(np.median(around[seen])) if seen.any() else 1.0
     escape = float(1 - seen.mean())
-    positions, distances, room = _free_positions(solid, start, up, sphere, around, reach, escape, count, rng)
-    if room["clearance_m"] < CLEARANCE:
-        notes.append(f"cameras keep {room['clearance_m']:.2f} m from surfaces: fewer than enough places allow {CLEARANCE} m")
-    if not 0.3 <= reach <= 30:
-        notes.append(f"the median distance seen from the sensor is {reach:.3g} m: check that the scene's unit is the metre")
+    unit = 1.0
+    if not PLAUSIBLE[0] <= reach <= PLAUSIBLE[1]:
+        unit = reach / 2.5
+        notes.append(
+            f"the median distance seen from the sensor is {reach:.3g} m: is the scene's unit the metre?"
+        )
+    room = _Room(start, up, directions, around, reach, escape, unit)
+    positions, distances, facts = _free_positions(solid, room, sphere, count, rng)
+    if len(positions) and facts["clearance_m"] < CLEARANCE * unit:
+        wanted = CLEARANCE * unit
+        notes.append(
+            f"cameras keep {facts['clearance_m']:.3g} m from surfaces: too few places have {wanted:.3g} m"
+        )
 
-    points, normals = _surface_points(vertices, faces, room["low"], room["high"], rng)
+    points, normals = _surface_points(vertices, faces, *room.box(), rng)
     sees = _visibility(visible, positions, points, normals)
     own = _visibility(visible, np.array([pose[:3, 3] for pose, _ in given]), points, normals)
     reachable = own.any(0) | sees.any(0)
@@ -106,7 +117,9 @@ def plan(
     counts = np.zeros(len(points), np.int64)
     for (pose, own_lens), row in zip(given, own, strict=True):
         counts += row & _in_frustum(pose, own_lens, points)
-    views, poses = _views(positions, distances, sphere, sees, points, lens, up, min(NEAR, 0.5 * reach), escape)
+    views, poses = _views(
+        positions, distances, sphere, sees, points, lens, up, min(NEAR * unit, 0.5 * reach), escape
+    )
     chosen = _greedy(views, counts, count - len(given))
     if len(given) + len(chosen) < count:
         notes.append(f"only {len(given) + len(chosen)} of {count} views: the free space allows no more")
@@ -119,7 +132,7 @@ def plan(
         "escape_share": round(escape, 4),
         "coverage_1": round(float((counts >= 1).sum() / area), 4),
         "coverage_3": round(float((counts >= 3).sum() / area), 4),
-        **{key: value for key, value in room.items() if key not in ("low", "high")},
+        **facts,
     }
     all_poses = np.concatenate([np.array([pose for pose, _ in given]), poses[chosen].reshape(-1, 4, 4)])
     return Path(all_poses, np.arange(len(all_poses)) < len(given), facts, notes)
@@ -146,20 +159,45 @@ def _basis(up: Array) -> tuple[Array, Array]:
     return e1, np.cross(up, e1)
 
 
+@dataclass(frozen=True)
+class _Room:
+    """What the starting pose sees around it: distances along directions, their median, the share that escapes.
+
+    unit: metres as the scene seems to mean them (1 where its size is plausible).
+    """
+
+    start: Array
+    up: Array
+    directions: Array
+    around: Array
+    reach: float
+    escape: float
+    unit: float
+
+    @property
+    def seen(self) -> Array:
+        """Points (n, 3) of the surface around; the unit sphere where there is none."""
+        hit = np.isfinite(self.around)
+        return self.start + (self.directions[hit] * self.around[hit, None] if hit.any() else self.directions)
+
+    def box(self) -> tuple[Array, Array]:
+        """Corners of a box about what is seen, without the farthest half per cent on each side."""
+        low, high = np.percentile(self.seen, [0.5, 99.5], axis=0)
+        return low - 0.05 * self.reach, high + 0.05 * self.reach
+
+
 def _free_positions(
-    solid: Trace, start: Array, up: Array, sphere: Array, around: Array, reach: float, escape: float, count: int, rng: Any
+    solid: Trace, room: _Room, sphere: Array, count: int, rng: Any
 ) -> tuple[Array, Array, dict[str, Any]]:
-    """Positions (n, 3) where a camera can stand, distances (n, SPHERE) of what surrounds each, and facts of the room."""
+    """Positions (n, 3) where a camera can stand, distances (n, SPHERE) of what surrounds each, and facts."""
+    start, up = room.start, room.up
     e1, e2 = _basis(up)
-    hit = np.isfinite(around)
-    directions = fibonacci_sphere(len(around))
-    seen = start + directions[hit] * around[hit, None] if hit.any() else start + directions
-    across = np.column_stack([seen @ e1, seen @ e2])
+    across = np.column_stack([room.seen @ e1, room.seen @ e2])
     low, high = np.percentile(across, [1, 99], axis=0)
     drop = _distance(solid, start[None], -up)[0]
     if not np.isfinite(drop):
-        drop = 1.5 if hit.any() else 1.0
-    eye = _eye_heights(drop, _distance(solid, start[None], up)[0])
+        drop = 1.5 * room.unit
+    eye = _eye_heights(drop, _distance(solid, start[None], up)[0], room.unit)
 
     # Low-discrepancy across the room (Roberts' R3), the third coordinate over the eye heights.
     ratio = 1.2207440846057596
@@ -167,17 +205,15 @@ def _free_positions(
     flat = low + (high - low) * sequence[:, :2]
     columns = flat[:, :1] * e1 + flat[:, 1:] * e2 + (start @ up) * up
     below = _distance(solid, columns, -up)
-    reachable = _sees(solid, start, columns)
-    floors = (columns @ up - below)[reachable & np.isfinite(below)]
+    floors = (columns @ up - below)[_sees(solid, start, columns) & np.isfinite(below)]
     floor = min(float(np.percentile(floors, 10)) if len(floors) else np.inf, float(start @ up - drop))
     height = floor + eye[0] + (eye[1] - eye[0]) * sequence[:, 2]
     positions = columns + (height - start @ up)[:, None] * up
 
     distances = _spheres(solid, positions, sphere)
-    finite = np.isfinite(distances)
-    nearest = np.where(finite, distances, np.inf).min(1)
-    inside = (1 - finite.mean(1)) <= escape + 0.15
-    clearance = min(CLEARANCE, 0.25 * reach)
+    nearest = distances.min(1)
+    inside = np.isinf(distances).mean(1) <= room.escape + 0.15
+    clearance = min(CLEARANCE * room.unit, 0.25 * room.reach)
     enough = min(max(8, count), POSITIONS)
     for _ in range(8):
         roomy = np.flatnonzero(inside & (nearest >= clearance))
@@ -187,22 +223,21 @@ def _free_positions(
         clearance *= 0.75
     kept = kept[:POSITIONS]
     facts = {
-        "clearance_m": round(float(min(clearance, nearest[kept].min())) if len(kept) else 0.0, 4),
-        "floor_m": round(floor, 4),
-        "eye_heights_m": [round(e, 4) for e in eye],
-        "low": np.percentile(seen, 0.5, axis=0) - 0.05 * reach,
-        "high": np.percentile(seen, 99.5, axis=0) + 0.05 * reach,
+        "clearance_m": round(float(min(clearance, nearest[kept].min())) if len(kept) else 0.0, 6),
+        "floor_m": round(floor, 6),
+        "eye_heights_m": [round(e, 6) for e in eye],
     }
     return positions[kept], distances[kept], facts
 
 
-def _eye_heights(below: float, above: float) -> tuple[float, float]:
-    """Eye heights above the floor: 1.0 ... 1.9 m, less under a low ceiling, and the sensor's own height among them."""
-    low, high = EYE_HEIGHTS
+def _eye_heights(below: float, above: float, unit: float) -> tuple[float, float]:
+    """Eye heights above the floor: 1.0 ... 1.9 m and the sensor's own, no higher than 0.85 of the room."""
+    low, high = EYE_HEIGHTS[0] * unit, EYE_HEIGHTS[1] * unit
+    if not 0.5 * unit <= below <= 4 * unit:
+        low, high = 0.6 * below, 1.15 * below
+    low, high = min(low, below), max(high, below)
     if np.isfinite(above):
-        low, high = min(low, 0.4 * (below + above)), min(high, 0.75 * (below + above))
-    if not low <= below <= high:  # a room of another scale, or a sensor above a table or below a lamp
-        low, high = min(low, max(below, 0.3 * high)), max(high, min(below, 1.2 * high))
+        low, high = min(low, 0.4 * (below + above)), min(high, 0.85 * (below + above))
     return float(low), float(high)
 
 
@@ -271,30 +306,50 @@ def _visibility(trace: Trace, positions: Array, points: Array, normals: Array) -
 
 
 def _in_frustum(pose: Array, lens: Lens, points: Array) -> Array:
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    z = local[:, 2]
-    return (z > 0) & (np.abs(local[:, 0]) <= lens.x * z) & (np.abs(local[:, 1]) <= lens.y * z)
+    return _in_frusta(pose[None, :3, :3], lens, points - pose[:3, 3])[0]
+
+
+def _in_frusta(rotations: Array, lens: Lens, rays: Array) -> Array:
+    """(rotations, rays) bool: rays (n, 3) from the camera that fall into the picture of each rotation (k, 3, 3)."""
+    # einsum: matrices this thin are slower through a threaded BLAS.
+    columns, rays = rotations.astype(np.float32), np.ascontiguousarray(rays.T, np.float32)
+    x, y, z = (np.einsum("ka,an->kn", columns[:, :, axis], rays) for axis in range(3))
+    return (z > 0) & (np.abs(x) <= lens.x * z) & (np.abs(y) <= lens.y * z)
 
 
 def _views(
-    positions: Array, distances: Array, sphere: Array, sees: Array, points: Array, lens: Lens, up: Array, near: float, escape: float
+    positions: Array,
+    distances: Array,
+    sphere: Array,
+    sees: Array,
+    points: Array,
+    lens: Lens,
+    up: Array,
+    near: float,
+    escape: float,
 ) -> tuple[Array, Array]:
     """Candidate views: seen points (packed bits) and pose; views of a near wall or of nothing are left out."""
     e1, e2 = _basis(up)
     packed, poses = [], []
     for index, position in enumerate(positions):
         turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # so that not all positions share their yaws
-        for yaw in turn + 2 * np.pi * np.arange(YAWS) / YAWS:
-            across = np.cos(yaw) * e1 + np.sin(yaw) * e2
-            for pitch in np.radians(PITCHES):
-                pose = look_at(position, position + np.cos(pitch) * across + np.sin(pitch) * up, up)
-                inside = _in_frustum(pose, lens, position + sphere)
-                distance = distances[index, inside]
-                hit = np.isfinite(distance)
-                if hit.mean() < 1 - escape - 0.35 or not hit.any() or np.median(distance[hit]) < near:
-                    continue
-                packed.append(np.packbits(sees[index] & _in_frustum(pose, lens, points)))
-                poses.append(pose)
+        yaw, pitch = np.meshgrid(turn + 2 * np.pi * np.arange(YAWS) / YAWS, np.radians(PITCHES), indexing="ij")
+        across = np.cos(yaw).reshape(-1, 1) * e1 + np.sin(yaw).reshape(-1, 1) * e2
+        forward = np.cos(pitch).reshape(-1, 1) * across + np.sin(pitch).reshape(-1, 1) * up
+        candidates = np.array([look_at(position, position + f, up) for f in forward])
+        rotations = candidates[:, :3, :3]
+        around = _in_frusta(rotations, lens, sphere)
+        seen = np.flatnonzero(sees[index])
+        ahead = _in_frusta(rotations, lens, points[seen] - position)
+        for pose, inside, mask in zip(candidates, around, ahead, strict=True):
+            distance = distances[index, inside]
+            hit = np.isfinite(distance)
+            if hit.mean() < 1 - escape - 0.35 or not hit.any() or np.median(distance[hit]) < near:
+                continue
+            flags = np.zeros(len(points), bool)
+            flags[seen[mask]] = True
+            packed.append(np.packbits(flags))
+            poses.append(pose)
     if not poses:
         return np.zeros((0, (len(points) + 7) // 8), np.uint8), np.zeros((0, 4, 4))
     return np.array(packed), np.array(poses)
@@ -305,7 +360,8 @@ def _greedy(views: Array, counts: Array, wanted: int) -> Array:
     n = len(counts)
 
     def worth() -> Array:
-        return np.where(counts < len(_GAIN), np.array(_GAIN)[np.minimum(counts, len(_GAIN) - 1)], _LATER / np.maximum(counts, 1))
+        first = np.array(_GAIN)[np.minimum(counts, len(_GAIN) - 1)]
+        return np.where(counts < len(_GAIN), first, _LATER / np.maximum(counts, 1))
 
     def gain(view: int) -> float:
         return float(weight[np.unpackbits(views[view], count=n).view(bool)].sum())

@@ -116,7 +116,9 @@ def _bsdf_name(state: Any, index: int) -> str:
 class _Entry:
     plugin: str
     name: str
-    members: tuple[tuple[str, str, dict[str, Any]], ...]  # of an instance: plugin, name, dictionary of its group's shapes
+    members: tuple[
+        tuple[str, str, dict[str, Any]], ...
+    ]  # of an instance: plugin, name, dictionary of each shape
 
 
 def _name_shapes(state: Any) -> dict[str, _Entry]:
@@ -125,7 +127,9 @@ def _name_shapes(state: Any) -> dict[str, _Entry]:
     names = {}
     for index in shapes:
         props = state.nodes[index].props
-        own = props.id() or (Path(str(props["filename"])).stem if "filename" in props else props.plugin_name())
+        own = props.id() or (
+            Path(str(props["filename"])).stem if "filename" in props else props.plugin_name()
+        )
         bsdf = [i for i in _references(state.nodes[index]) if state.nodes[i].type == mi.ObjectType.BSDF]
         names[index] = f"{_bsdf_name(state, bsdf[0])}/{own}" if bsdf else own
     out = {}
@@ -135,7 +139,9 @@ def _name_shapes(state: Any) -> dict[str, _Entry]:
         if node.props.plugin_name() == "instance":
             for group in _references(node):
                 inside = [i for i in _references(state.nodes[group]) if i in names]
-                members += [(state.nodes[i].props.plugin_name(), names[i], _as_dict(state, i)) for i in inside]
+                members += [
+                    (state.nodes[i].props.plugin_name(), names[i], _as_dict(state, i)) for i in inside
+                ]
         out[f"@{index}"] = _Entry(node.props.plugin_name(), names[index], tuple(members))
     for index in shapes:
         state.nodes[index].props.set_id(f"@{index}")
@@ -153,7 +159,8 @@ def _shapes(scene: Any, entries: dict[str, _Entry]) -> list[Shape]:
 
     for thing in scene.shapes():
         name = thing.class_name().lower()
-        entry = entries.get(thing.id(), _Entry(name, thing.id() or name, ()))  # a `merge` shape is replaced by its result
+        # A `merge` shape has been replaced by its result, which no node stands for.
+        entry = entries.get(thing.id(), _Entry(name, thing.id() or name, ()))
         if entry.plugin != "instance":
             add(entry.plugin, entry.name, thing, None)
             continue
@@ -169,7 +176,9 @@ def _as_dict(state: Any, index: int) -> dict[str, Any]:
     out: dict[str, Any] = {"type": props.plugin_name()}
     for key in props.keys():
         value = props[key]
-        out[key] = _as_dict(state, value.index()) if isinstance(value, mi.Properties.ResolvedReference) else value
+        out[key] = (
+            _as_dict(state, value.index()) if isinstance(value, mi.Properties.ResolvedReference) else value
+        )
     return out
 
 
@@ -186,5 +195,7 @@ def _notes(state: Any) -> list[str]:
     if beckmann:
         out.append(f"{beckmann} rough BSDFs have the Beckmann distribution: their alpha is taken for GGX's")
     if plugins:
-        out.append(f"{plugins['medium']} participating media: not rendered (the photographs are made with surfaces only)")
+        out.append(
+            f"{plugins['medium']} participating media: not rendered, the photographs show surfaces alone"
+        )
     return out

@@ -26,8 +26,10 @@ def surface_points(room: Room, count: int, seed: int = 0) -> np.ndarray:
     return chosen[:, 0] * (1 - root) + chosen[:, 1] * (root * (1 - v)) + chosen[:, 2] * (root * v)
 
 
-def seen_from(geometry: Geometry, points: np.ndarray, field_of_view: float, aspect: float, pose: np.ndarray) -> np.ndarray:
-    """(n,) bool: the points that a camera sees; horizontal `field_of_view` in degrees, `aspect` = height / width."""
+def seen_from(
+    geometry: Geometry, points: np.ndarray, field_of_view: float, aspect: float, pose: np.ndarray
+) -> np.ndarray:
+    """(n,) bool: the points a camera sees. `field_of_view` horizontal, degrees; `aspect` height / width."""
     from iif_core.transport import trace
 
     focal = 0.5 / np.tan(np.radians(field_of_view / 2))

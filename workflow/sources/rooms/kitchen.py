@@ -2,7 +2,7 @@
 
 Plan (x east, y north, z up, metres; the room is 5 x 4 x 2.7):
 
-    north wall   fridge | drawers, doors, oven with hob and hood, doors | corner      open shelves right of the hood
+    north wall   fridge | drawers, doors, oven with hob and hood, doors | corner; open shelves on the right
     east wall    worktop with a ceramic sink under the window
     south wall   sideboard under a shelf of books, door
     west wall    picture, clock
@@ -22,7 +22,6 @@ from workflow.sources.rooms.palette import (
     BLACK_GLASS,
     BRASS,
     CHROME,
-    COPPER,
     EAST,
     FLOOR,
     IRON,
@@ -41,7 +40,7 @@ from workflow.sources.rooms.palette import (
     tiles,
     wood,
 )
-from workflow.sources.rooms.patterns import Material, facing
+from workflow.sources.rooms.patterns import Material
 from workflow.sources.rooms.room import Room, RoomBuilder
 from workflow.sources.rooms.shapes import (
     Shape,
@@ -50,6 +49,7 @@ from workflow.sources.rooms.shapes import (
     cylinder,
     grid_sheet,
     lathe,
+    mm,
     move,
     ring,
     sheet,
@@ -85,25 +85,52 @@ def _shell(room: RoomBuilder) -> None:
     x, y, z = SIZE
     o, step = _OVER, 0.25
     wall = plain("#e6dccb", 0.85, "#ddd1bd", grain=1.6, vary=0.08)
-    room.add("floor", sheet((-o, -o, 0), (x + 2 * o, 0, 0), (0, y + 2 * o, 0), step), material=FLOOR, is_part=False)
-    room.add("ceiling", sheet((-o, y + o, z), (x + 2 * o, 0, 0), (0, -y - 2 * o, 0), step),
-             material=plain("#eeeae2", 0.9, "#e8e3d9", grain=1.2), is_part=False)
-    room.add("north wall", sheet((-o, y, -o), (x + 2 * o, 0, 0), (0, 0, z + 2 * o), step), material=wall, is_part=False)
-    room.add("south wall", sheet((x + o, 0, -o), (-x - 2 * o, 0, 0), (0, 0, z + 2 * o), step), material=wall, is_part=False)
-    room.add("west wall", sheet((0, -o, -o), (0, y + 2 * o, 0), (0, 0, z + 2 * o), step),
-             material=plain("#8fa393", 0.82, "#849a8a", grain=1.8, vary=0.08), is_part=False)
+    room.add(
+        "floor", sheet((-o, -o, 0), (x + 2 * o, 0, 0), (0, y + 2 * o, 0), step), material=FLOOR, is_part=False
+    )
+    room.add(
+        "ceiling",
+        sheet((-o, y + o, z), (x + 2 * o, 0, 0), (0, -y - 2 * o, 0), step),
+        material=plain("#eeeae2", 0.9, "#e8e3d9", grain=1.2),
+        is_part=False,
+    )
+    room.add(
+        "north wall",
+        sheet((-o, y, -o), (x + 2 * o, 0, 0), (0, 0, z + 2 * o), step),
+        material=wall,
+        is_part=False,
+    )
+    room.add(
+        "south wall",
+        sheet((x + o, 0, -o), (-x - 2 * o, 0, 0), (0, 0, z + 2 * o), step),
+        material=wall,
+        is_part=False,
+    )
+    room.add(
+        "west wall",
+        sheet((0, -o, -o), (0, y + 2 * o, 0), (0, 0, z + 2 * o), step),
+        material=plain("#8fa393", 0.82, "#849a8a", grain=1.8, vary=0.08),
+        is_part=False,
+    )
     y0, y1, z0, z1 = WINDOW
     across = [(y + o - edge) / (y + 2 * o) for edge in (y + o, y1, y0, -o)]
     up = [(edge + o) / (z + 2 * o) for edge in (-o, z0, z1, z + o)]
     room.add(
         "east wall",
-        grid_sheet((x, y + o, -o), (0, -y - 2 * o, 0), (0, 0, z + 2 * o), _refined(across, 0.06), _refined(up, 0.09),
-                   (across[1], across[2], up[1], up[2])),
+        grid_sheet(
+            (x, y + o, -o),
+            (0, -y - 2 * o, 0),
+            (0, 0, z + 2 * o),
+            _refined(across, 0.06),
+            _refined(up, 0.09),
+            (across[1], across[2], up[1], up[2]),
+        ),
         sheet((x, y1, z0), (0, y0 - y1, 0), (_REVEAL, 0, 0)),
         sheet((x, y0, z1), (0, y1 - y0, 0), (_REVEAL, 0, 0)),
         sheet((x, y0, z0), (0, 0, z1 - z0), (_REVEAL, 0, 0)),
         sheet((x, y1, z1), (0, 0, z0 - z1), (_REVEAL, 0, 0)),
-        material=wall, is_part=False,
+        material=wall,
+        is_part=False,
     )
     d, h = 0.018, 0.09
     room.add(
@@ -112,12 +139,16 @@ def _shell(room: RoomBuilder) -> None:
         box((0.024, 0.004, 0.002), (3.36, 0.004 + d, h), 0.004),
         box((4.39, 0.004, 0.002), (4.975, 0.004 + d, h), 0.004),
         box((4.978, 0.004, 0.002), (4.996, 1.46, h), 0.004),
-        material=WHITE_PAINT, is_part=False,
+        material=WHITE_PAINT,
+        is_part=False,
     )
 
 
 def _refined(edges: list[float], step: float) -> np.ndarray:
-    pieces = [np.linspace(a, b, max(2, round((b - a) / step) + 1))[:-1] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    pieces = [
+        np.linspace(a, b, max(2, round((b - a) / step) + 1))[:-1]
+        for a, b in zip(edges[:-1], edges[1:], strict=True)
+    ]
     return np.concatenate([*pieces, edges[-1:]])
 
 
@@ -128,18 +159,31 @@ def _window(room: RoomBuilder) -> None:
     casing = [
         box((front, y0 - side, z0 + 0.03), (x + 0.02, y0 + 0.01, z1 + side), 0.004),
         box((front, y1 - 0.01, z0 + 0.03), (x + 0.02, y1 + side, z1 + side), 0.004),
-        box((front + 0.003, y0 - side + 0.005, z1 - 0.01), (x + 0.018, y1 + side - 0.005, z1 + side - 0.003), 0.004),
+        box(
+            (front + 0.003, y0 - side + 0.005, z1 - 0.01),
+            (x + 0.018, y1 + side - 0.005, z1 + side - 0.003),
+            0.004,
+        ),
     ]
     bar, deep = 0.045, (x + 0.07, x + 0.115)
     ys = (y0 + 0.012, (2 * y0 + y1) / 3, (y0 + 2 * y1) / 3, y1 - 0.012)
     bars = [box((deep[0], yc - bar / 2, z0 - 0.01), (deep[1], yc + bar / 2, z1 + 0.01), 0.006) for yc in ys]
-    bars += [box((deep[0] + 0.006, y0 - 0.01, zc - bar / 2), (deep[1] - 0.006, y1 + 0.01, zc + bar / 2), 0.006)
-             for zc in (z0 + 0.045, z0 + 0.70, z1 - 0.012)]
-    room.add("window frame", *casing, *bars, material=WHITE_PAINT)
-    room.add("window sill", box((x - 0.13, y0 - 0.11, z0 - 0.012), (x + 0.10, y1 + 0.11, z0 + 0.022), 0.006), material=MARBLE)
+    bars += [
+        box((deep[0] + 0.006, y0 - 0.01, zc - bar / 2), (deep[1] - 0.006, y1 + 0.01, zc + bar / 2), 0.006)
+        for zc in (z0 + 0.045, z0 + 0.70, z1 - 0.012)
+    ]
+    room.add("window frame", *casing, *bars, material=plain("#4f6d61", 0.42, "#4a675c", grain=2.0))
+    room.add(
+        "window sill",
+        box((x - 0.13, y0 - 0.11, z0 - 0.012), (x + 0.10, y1 + 0.11, z0 + 0.022), 0.006),
+        material=MARBLE,
+    )
     # Sky above, garden below: three rows of panes, each with its own radiance, facing west.
-    rows = ((z0 - 0.01, z0 + 0.40, (3.6, 4.0, 3.4)), (z0 + 0.40, z0 + 0.78, (5.0, 5.4, 5.5)),
-            (z0 + 0.78, z1 + 0.01, (5.6, 6.3, 7.3)))
+    rows = (
+        (z0 - 0.01, z0 + 0.40, (3.6, 4.0, 3.4)),
+        (z0 + 0.40, z0 + 0.78, (5.0, 5.4, 5.5)),
+        (z0 + 0.78, z1 + 0.01, (5.6, 6.3, 7.3)),
+    )
     width, pane = y1 - y0 + 0.02, x + 0.13
     room.add_emitter(
         "window panes",
@@ -150,17 +194,36 @@ def _window(room: RoomBuilder) -> None:
 
 def _door(room: RoomBuilder) -> None:
     x0, x1, top = 3.45, 4.30, 2.05
-    room.add("door frame",
-             box((x0 - 0.09, 0.004, 0.002), (x0, 0.045, top + 0.09), 0.006),
-             box((x1, 0.004, 0.002), (x1 + 0.09, 0.045, top + 0.09), 0.006),
-             box((x0 - 0.004, 0.006, top), (x1 + 0.004, 0.042, top + 0.085), 0.006), material=WHITE_PAINT)
+    room.add(
+        "door frame",
+        box((x0 - 0.09, 0.004, 0.002), (x0, 0.045, top + 0.09), 0.006),
+        box((x1, 0.004, 0.002), (x1 + 0.09, 0.045, top + 0.09), 0.006),
+        box((x0 - 0.004, 0.006, top), (x1 + 0.004, 0.042, top + 0.085), 0.006),
+        material=WHITE_PAINT,
+    )
     blue = plain("#6f8fa3", 0.38, "#678699")
-    panels = [box((x0 + a, 0.024, b), (x0 + c, 0.034, d), 0.008)
-              for a, c in ((0.10, 0.39), (0.46, 0.75)) for b, d in ((0.22, 0.92), (1.08, 1.92))]
-    room.add("door", box((x0 + 0.004, 0.006, 0.006), (x1 - 0.004, 0.026, top - 0.004)), *panels, material=blue)
-    room.add("door handle", box((x0 + 0.045, 0.027, 0.93), (x0 + 0.085, 0.033, 1.10), 0.002),
-             tube([(x0 + 0.065, 0.030, 1.03), (x0 + 0.065, 0.075, 1.03), (x0 + 0.09, 0.085, 1.03), (x0 + 0.18, 0.085, 1.03)],
-                  0.009), material=BRASS)
+    panels = [
+        box((x0 + a, 0.024, b), (x0 + c, 0.034, d), 0.008)
+        for a, c in ((0.10, 0.39), (0.46, 0.75))
+        for b, d in ((0.22, 0.92), (1.08, 1.92))
+    ]
+    room.add(
+        "door", box((x0 + 0.004, 0.006, 0.006), (x1 - 0.004, 0.026, top - 0.004)), *panels, material=blue
+    )
+    room.add(
+        "door handle",
+        box((x0 + 0.045, 0.027, 0.93), (x0 + 0.085, 0.033, 1.10), 0.002),
+        tube(
+            [
+                (x0 + 0.065, 0.030, 1.03),
+                (x0 + 0.065, 0.075, 1.03),
+                (x0 + 0.09, 0.085, 1.03),
+                (x0 + 0.18, 0.085, 1.03),
+            ],
+            0.009,
+        ),
+        material=BRASS,
+    )
 
 
 def _front(low: tuple[float, float], high: tuple[float, float], wall: str) -> Shape:
@@ -172,7 +235,9 @@ def _front(low: tuple[float, float], high: tuple[float, float], wall: str) -> Sh
     return box((4.416, low[0] + 0.003, low[1] + 0.003), (4.437, high[0] - 0.003, high[1] - 0.003), 0.004)
 
 
-def _bow(a: tuple[float, float, float], b: tuple[float, float, float], out: tuple[float, float, float]) -> Shape:
+def _bow(
+    a: tuple[float, float, float], b: tuple[float, float, float], out: tuple[float, float, float]
+) -> Shape:
     """A bar handle from a to b that stands off by `out`."""
     a, b, out = np.array(a), np.array(b), np.array(out)
     return tube([a, a + out, b + out, b], 0.006, 10)
@@ -181,9 +246,15 @@ def _bow(a: tuple[float, float, float], b: tuple[float, float, float], out: tupl
 def _fitted(room: RoomBuilder) -> None:
     green = plain("#5c7d70", 0.40, "#557669", grain=2.0)
     cream = plain("#e9e0cc", 0.40, "#e2d8c2", grain=2.0)
-    room.add("north cabinets", box((0.78, 3.44, 0.10), (2.585, 3.975, 0.858)), box((3.215, 3.44, 0.10), (4.37, 3.975, 0.858)),
-             material=green)
-    fronts = [_front((0.78, z0), (1.38, z1), "north") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))]
+    room.add(
+        "north cabinets",
+        box((0.78, 3.44, 0.10), (2.585, 3.975, 0.858)),
+        box((3.215, 3.44, 0.10), (4.37, 3.975, 0.858)),
+        material=green,
+    )
+    fronts = [
+        _front((0.78, z0), (1.38, z1), "north") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))
+    ]
     fronts += [_front((x0, 0.11), (x1, 0.85), "north") for x0, x1 in ((1.38, 1.98), (1.98, 2.585))]
     fronts += [_front((3.215, z0), (3.82, z1), "north") for z0, z1 in ((0.11, 0.48), (0.48, 0.85))]
     fronts += [_front((3.82, 0.11), (4.37, 0.85), "north")]
@@ -194,55 +265,128 @@ def _fitted(room: RoomBuilder) -> None:
     bows += [_bow((3.42, 3.418, z), (3.62, 3.418, z), out) for z in (0.42, 0.79)]
     room.add("north handles", *bows, material=BRASS)
 
-    room.add("east cabinets", box((4.44, 1.50, 0.10), (4.975, 1.925, 0.858)), box((4.44, 2.575, 0.10), (4.975, 3.41, 0.858)),
-             box((4.44, 1.930, 0.10), (4.975, 2.570, 0.615)), material=green)
-    fronts = [_front((1.50, 0.11), (1.925, 0.85), "east"), _front((1.93, 0.11), (2.25, 0.61), "east"),
-              _front((2.25, 0.11), (2.57, 0.61), "east")]
-    fronts += [_front((2.575, z0), (3.385, z1), "east") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))]
+    room.add(
+        "east cabinets",
+        box((4.44, 1.50, 0.10), (4.975, 1.925, 0.858)),
+        box((4.44, 2.575, 0.10), (4.975, 3.41, 0.858)),
+        box((4.44, 1.930, 0.10), (4.975, 2.570, 0.615)),
+        material=green,
+    )
+    fronts = [
+        _front((1.50, 0.11), (1.925, 0.85), "east"),
+        _front((1.93, 0.11), (2.25, 0.61), "east"),
+        _front((2.25, 0.11), (2.57, 0.61), "east"),
+    ]
+    fronts += [
+        _front((2.575, z0), (3.385, z1), "east") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))
+    ]
     room.add("east fronts", *fronts, material=green)
     out = (-0.035, 0, 0)
-    bows = [_bow((4.418, y, z0), (4.418, y, z1), out) for y, z0, z1 in ((1.87, 0.62, 0.78), (2.20, 0.42, 0.56), (2.30, 0.42, 0.56))]
+    bows = [
+        _bow((4.418, y, z0), (4.418, y, z1), out)
+        for y, z0, z1 in ((1.87, 0.62, 0.78), (2.20, 0.42, 0.56), (2.30, 0.42, 0.56))
+    ]
     bows += [_bow((4.418, 2.88, z), (4.418, 3.08, z), out) for z in (0.32, 0.57, 0.79)]
     room.add("east handles", *bows, material=BRASS)
-    room.add("plinths", box((0.80, 3.50, 0.002), (4.42, 3.96, 0.099)), box((4.50, 1.52, 0.002), (4.96, 3.49, 0.099)),
-             material=plain("#3c4743", 0.6))
+    room.add(
+        "plinths",
+        box((0.80, 3.50, 0.002), (4.42, 3.96, 0.099)),
+        box((4.50, 1.52, 0.002), (4.96, 3.49, 0.099)),
+        material=plain("#3c4743", 0.6),
+    )
 
-    room.add("worktop", box((0.75, 3.392, 0.861), (4.992, 3.988, 0.901), 0.005),
-             box((4.388, 1.465, 0.861), (4.992, 1.928, 0.901), 0.005), box((4.388, 2.572, 0.861), (4.992, 3.390, 0.901), 0.005),
-             box((4.872, 1.930, 0.861), (4.992, 2.570, 0.901), 0.005), material=MARBLE)
-    room.add("north tiles", box((0.75, 3.984, 0.903), (4.980, 3.997, 1.446)),
-             material=tiles("y", "#dfe6df", "#a9c0b6", (0.75, 3.98, 0.906)))
-    room.add("east tiles", box((4.984, 1.47, 0.903), (4.997, 3.982, 1.012)),
-             material=tiles("x", "#dfe6df", "#a9c0b6", (4.98, 1.47, 0.906)))
+    room.add(
+        "worktop",
+        box((0.75, 3.392, 0.861), (4.992, 3.988, 0.901), 0.005),
+        box((4.388, 1.465, 0.861), (4.992, 1.928, 0.901), 0.005),
+        box((4.388, 2.572, 0.861), (4.992, 3.390, 0.901), 0.005),
+        box((4.872, 1.930, 0.861), (4.992, 2.570, 0.901), 0.005),
+        material=MARBLE,
+    )
+    room.add(
+        "north tiles",
+        box((0.75, 3.984, 0.903), (4.980, 3.997, 1.446)),
+        material=tiles("y", "#dfe6df", "#a9c0b6", (0.75, 3.98, 0.906)),
+    )
+    room.add(
+        "east tiles",
+        box((4.984, 1.47, 0.903), (4.997, 3.982, 1.012)),
+        material=tiles("x", "#dfe6df", "#a9c0b6", (4.98, 1.47, 0.906)),
+    )
 
     room.add("wall cabinets", box((0.82, 3.66, 1.45), (2.50, 3.985, 2.15)), material=cream)
-    room.add("wall cabinet fronts", *(_front((x, 1.45), (x + 0.56, 2.15), "upper") for x in (0.82, 1.38, 1.94)), material=cream)
-    room.add("wall cabinet knobs", *(sphere((x, 3.622, 1.53), 0.014, 12) for x in (1.33, 1.43, 2.45)), material=BRASS)
+    room.add(
+        "wall cabinet fronts",
+        *(_front((x, 1.45), (x + 0.56, 2.15), "upper") for x in (0.82, 1.38, 1.94)),
+        material=cream,
+    )
+    room.add(
+        "wall cabinet knobs",
+        *(sphere((x, 3.622, 1.53), 0.014, 12) for x in (1.33, 1.43, 2.45)),
+        material=BRASS,
+    )
     room.add("cornice", box((0.79, 3.615, 2.152), (2.53, 3.99, 2.19), 0.01), material=cream)
     plank = wood(BIRCH, BIRCH_DARK, EAST, NORTH, 0.40, origin=(0, 0, 0.3))
-    room.add("north shelves", *(box((3.30, 3.73, z), (4.90, 3.992, z + 0.03), 0.004) for z in (1.46, 1.86)), material=plank)
-    room.add("shelf brackets", *(tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.010)], 0.007, 8)
-                                 for x in (3.45, 4.08, 4.72) for z in (1.46, 1.86)), material=IRON)
+    room.add(
+        "north shelves",
+        *(box((3.30, 3.73, z), (4.90, 3.992, z + 0.03), 0.004) for z in (1.46, 1.86)),
+        material=plank,
+    )
+    room.add(
+        "shelf brackets",
+        *(
+            tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.010)], 0.007, 8)
+            for x in (3.45, 4.08, 4.72)
+            for z in (1.46, 1.86)
+        ),
+        material=IRON,
+    )
 
     room.add("fridge", box((0.06, 3.34, 0.03), (0.70, 3.96, 1.92), 0.012), material=STEEL)
-    room.add("fridge doors", box((0.063, 3.295, 0.05), (0.697, 3.337, 0.70), 0.010),
-             box((0.063, 3.295, 0.71), (0.697, 3.337, 1.915), 0.010), material=STEEL)
-    room.add("fridge handles", _bow((0.64, 3.297, 0.42), (0.64, 3.297, 0.66), (0, -0.05, 0)),
-             _bow((0.64, 3.297, 0.78), (0.64, 3.297, 1.20), (0, -0.05, 0)), material=CHROME)
+    room.add(
+        "fridge doors",
+        box((0.063, 3.295, 0.05), (0.697, 3.337, 0.70), 0.010),
+        box((0.063, 3.295, 0.71), (0.697, 3.337, 1.915), 0.010),
+        material=STEEL,
+    )
+    room.add(
+        "fridge handles",
+        _bow((0.64, 3.297, 0.42), (0.64, 3.297, 0.66), (0, -0.05, 0)),
+        _bow((0.64, 3.297, 0.78), (0.64, 3.297, 1.20), (0, -0.05, 0)),
+        material=CHROME,
+    )
 
     walnut = wood(WALNUT, WALNUT_DARK, EAST, UP, 0.38)
-    room.add("sideboard", box((1.25, 0.03, 0.14), (2.95, 0.43, 0.80)), box((1.22, 0.028, 0.802), (2.98, 0.465, 0.832), 0.006),
-             *(tube([(x, y, 0.15), (x, y, 0.003)], (0.026, 0.016)) for x in (1.32, 2.88) for y in (0.09, 0.37)), material=walnut)
-    room.add("sideboard doors", *(box((x + 0.003, 0.432, 0.155), (x + 0.562, 0.450, 0.790), 0.004) for x in (1.253, 1.817, 2.382)),
-             material=wood(OAK, OAK_DARK, UP, EAST, 0.38, origin=(0.3, 0.1, 0)))
-    room.add("sideboard knobs", *(sphere((x, 0.462, 0.50), 0.016, 12) for x in (1.77, 1.87, 2.43)), material=BRASS)
-    room.add("book shelves", *(box((1.45, 0.006, z), (2.85, 0.235, z + 0.028), 0.004) for z in (1.36, 1.76)),
-             *(box((x, 0.008, 1.39), (x + 0.024, 0.225, 1.758)) for x in (1.52, 2.756)), material=plank)
+    room.add(
+        "sideboard",
+        box((1.25, 0.03, 0.14), (2.95, 0.43, 0.80)),
+        box((1.22, 0.028, 0.802), (2.98, 0.465, 0.832), 0.006),
+        *(tube([(x, y, 0.15), (x, y, 0.003)], (0.026, 0.016)) for x in (1.32, 2.88) for y in (0.09, 0.37)),
+        material=walnut,
+    )
+    room.add(
+        "sideboard doors",
+        *(box((x + 0.003, 0.432, 0.155), (x + 0.562, 0.450, 0.790), 0.004) for x in (1.253, 1.817, 2.382)),
+        material=wood(OAK, OAK_DARK, UP, EAST, 0.38, origin=(0.3, 0.1, 0)),
+    )
+    room.add(
+        "sideboard knobs", *(sphere((x, 0.462, 0.50), 0.016, 12) for x in (1.77, 1.87, 2.43)), material=BRASS
+    )
+    room.add(
+        "book shelves",
+        *(box((1.45, 0.006, z), (2.85, 0.235, z + 0.028), 0.004) for z in (1.36, 1.76)),
+        *(box((x, 0.008, 1.39), (x + 0.024, 0.225, 1.758)) for x in (1.52, 2.756)),
+        material=plank,
+    )
 
 
 def _cooker(room: RoomBuilder) -> None:
-    room.add("oven", box((2.600, 3.425, 0.105), (3.200, 3.96, 0.857), 0.004), box((2.602, 3.404, 0.715), (3.198, 3.424, 0.850), 0.004),
-             material=STEEL)
+    room.add(
+        "oven",
+        box((2.600, 3.425, 0.105), (3.200, 3.96, 0.857), 0.004),
+        box((2.602, 3.404, 0.715), (3.198, 3.424, 0.850), 0.004),
+        material=STEEL,
+    )
     room.add("oven door", box((2.606, 3.400, 0.135), (3.194, 3.424, 0.700), 0.006), material=BLACK_GLASS)
     room.add("oven handle", _bow((2.66, 3.402, 0.655), (3.14, 3.402, 0.655), (0, -0.045, 0)), material=CHROME)
     knobs = []
@@ -254,23 +398,57 @@ def _cooker(room: RoomBuilder) -> None:
     grates = []
     for x, y in burners:
         grates.append(ring((x, y, 0.938), 0.085, 0.006, EAST, NORTH, 20))
-        grates += [box((x - 0.10, y - 0.005, 0.934), (x - 0.03, y + 0.005, 0.945)), box((x + 0.03, y - 0.005, 0.934), (x + 0.10, y + 0.005, 0.945)),
-                   box((x - 0.005, y - 0.10, 0.9335), (x + 0.005, y - 0.03, 0.9445)), box((x - 0.005, y + 0.03, 0.9335), (x + 0.005, y + 0.10, 0.9445))]
-        grates += [cylinder((x + dx, y + dy, 0.912), 0.006, 0.027, segments=8) for dx, dy in ((0.085, 0), (-0.085, 0), (0, 0.085), (0, -0.085))]
+        grates += [
+            box((x - 0.10, y - 0.005, 0.934), (x - 0.03, y + 0.005, 0.945)),
+            box((x + 0.03, y - 0.005, 0.934), (x + 0.10, y + 0.005, 0.945)),
+            box((x - 0.005, y - 0.10, 0.9335), (x + 0.005, y - 0.03, 0.9445)),
+            box((x - 0.005, y + 0.03, 0.9335), (x + 0.005, y + 0.10, 0.9445)),
+        ]
+        grates += [
+            cylinder((x + dx, y + dy, 0.912), 0.006, 0.027, segments=8)
+            for dx, dy in ((0.085, 0), (-0.085, 0), (0, 0.085), (0, -0.085))
+        ]
     room.add("grates", *grates, material=IRON)
-    room.add("burners", *(lathe([(0, 0), (0.035, 0), (0.030, 0.012), (0, 0.014)], (x, y, 0.912)) for x, y in burners), material=plain("#2b2b2e", 0.6))
-    room.add("hood", box((2.57, 3.44, 1.55), (3.23, 3.985, 1.602), 0.005),
-             wedge((2.585, 3.455, 1.601), (3.215, 3.983, 1.601), (2.77, 3.68, 1.86), (3.03, 3.981, 1.86)),
-             box((2.775, 3.685, 1.85), (3.025, 3.979, 2.715)), material=STEEL)
+    room.add(
+        "burners",
+        *(lathe(mm("0,0 35,0 30,12 0,14"), (x, y, 0.912)) for x, y in burners),
+        material=plain("#2b2b2e", 0.6),
+    )
+    room.add(
+        "hood",
+        box((2.57, 3.44, 1.55), (3.23, 3.985, 1.602), 0.005),
+        wedge((2.585, 3.455, 1.601), (3.215, 3.983, 1.601), (2.77, 3.68, 1.86), (3.03, 3.981, 1.86)),
+        box((2.775, 3.685, 1.85), (3.025, 3.979, 2.715)),
+        material=STEEL,
+    )
 
 
 def _sink(room: RoomBuilder) -> None:
     room.add("sink", tub((4.372, 1.932, 0.622), (4.868, 2.568, 0.896), 0.028, 0.035), material=WHITE_GLAZE)
-    room.add("drain", lathe([(0, 0), (0.035, 0), (0.032, 0.004), (0, 0.003)], (4.62, 2.25, 0.658)), material=CHROME)
-    spout = [(4.93, 2.25, 0.90), (4.93, 2.25, 1.16), *arc((4.84, 2.25, 1.16), 0.09, 15, 180, EAST, UP), (4.75, 2.25, 1.10)]
-    room.add("tap", tube(spout, 0.013), cylinder((4.93, 2.25, 0.902), 0.026, 0.03, 0.004),
-             *(tube([(4.93, 2.25 + s * 0.02, 0.955), (4.93, 2.25 + s * 0.06, 0.96), (4.93, 2.25 + s * 0.075, 1.0)], 0.008) for s in (-1, 1)),
-             material=CHROME)
+    room.add("drain", lathe(mm("0,0 35,0 32,4 0,3"), (4.62, 2.25, 0.658)), material=CHROME)
+    spout = [
+        (4.93, 2.25, 0.90),
+        (4.93, 2.25, 1.16),
+        *arc((4.84, 2.25, 1.16), 0.09, 15, 180, EAST, UP),
+        (4.75, 2.25, 1.10),
+    ]
+    room.add(
+        "tap",
+        tube(spout, 0.013),
+        cylinder((4.93, 2.25, 0.902), 0.026, 0.03, 0.004),
+        *(
+            tube(
+                [
+                    (4.93, 2.25 + s * 0.02, 0.955),
+                    (4.93, 2.25 + s * 0.06, 0.96),
+                    (4.93, 2.25 + s * 0.075, 1.0),
+                ],
+                0.008,
+            )
+            for s in (-1, 1)
+        ),
+        material=CHROME,
+    )
 
 
 def _chair(x: float, y: float, sign: float, turn: float) -> tuple[list[Shape], Shape]:
@@ -278,10 +456,20 @@ def _chair(x: float, y: float, sign: float, turn: float) -> tuple[list[Shape], S
     parts = [box((-0.20, -0.20, 0.425), (0.20, 0.20, 0.452), 0.006)]
     for u in (-0.17, 0.17):
         parts.append(tube([(u, -0.17 * sign, 0.432), (1.08 * u, -0.19 * sign, 0.002)], (0.019, 0.014), 10))
-        parts.append(tube([(1.08 * u, 0.20 * sign, 0.002), (u, 0.178 * sign, 0.44), (0.97 * u, 0.225 * sign, 0.86)],
-                          (0.014, 0.019, 0.015), 10))
-    parts += [box((-0.168, min(a, b) * 1.0, z), (0.168, max(a, b), z + h), 0.004)
-              for a, b, z, h in ((0.192 * sign, 0.208 * sign, 0.60, 0.05), (0.205 * sign, 0.222 * sign, 0.76, 0.075))]
+        parts.append(
+            tube(
+                [(1.08 * u, 0.20 * sign, 0.002), (u, 0.178 * sign, 0.44), (0.97 * u, 0.225 * sign, 0.86)],
+                (0.014, 0.019, 0.015),
+                10,
+            )
+        )
+    parts += [
+        box((-0.168, min(a, b) * 1.0, z), (0.168, max(a, b), z + h), 0.004)
+        for a, b, z, h in (
+            (0.192 * sign, 0.208 * sign, 0.60, 0.05),
+            (0.205 * sign, 0.222 * sign, 0.76, 0.075),
+        )
+    ]
     cushion = box((-0.185, -0.185, 0.4535), (0.185, 0.150 if sign > 0 else 0.185, 0.487), 0.012)
     if sign < 0:
         cushion = box((-0.185, -0.150, 0.4535), (0.185, 0.185, 0.487), 0.012)
@@ -291,41 +479,105 @@ def _chair(x: float, y: float, sign: float, turn: float) -> tuple[list[Shape], S
 def _seating(room: RoomBuilder) -> None:
     x0, x1, y0, y1 = 1.02, 2.48, 1.32, 2.18
     top = wood(WALNUT, WALNUT_DARK, EAST, NORTH, 0.33, 7.0, origin=(0, 0, 0.21))
-    legs = [wedge((x - 0.022, y - 0.022, 0.014), (x + 0.022, y + 0.022, 0.014), (x - 0.035, y - 0.035, 0.70), (x + 0.035, y + 0.035, 0.70))
-            for x in (x0 + 0.09, x1 - 0.09) for y in (y0 + 0.09, y1 - 0.09)]
+    legs = [
+        wedge(
+            (x - 0.022, y - 0.022, 0.014),
+            (x + 0.022, y + 0.022, 0.014),
+            (x - 0.035, y - 0.035, 0.70),
+            (x + 0.035, y + 0.035, 0.70),
+        )
+        for x in (x0 + 0.09, x1 - 0.09)
+        for y in (y0 + 0.09, y1 - 0.09)
+    ]
     rails = [box((x0 + 0.09, y, 0.64), (x1 - 0.09, y + 0.02, 0.715)) for y in (y0 + 0.08, y1 - 0.10)]
     rails += [box((x, y0 + 0.09, 0.641), (x + 0.02, y1 - 0.09, 0.716)) for x in (x0 + 0.08, x1 - 0.10)]
     room.add("table", box((x0, y0, 0.712), (x1, y1, 0.745), 0.008), *legs, *rails, material=top)
     cloth = {"#c58b2e": "#b87f27", "#3f6f86": "#38667c"}
-    for number, (x, y, sign, turn) in enumerate(((1.38, 1.12, -1, 4), (2.12, 1.16, -1, -7), (1.42, 2.42, 1, -5), (2.16, 2.52, 1, 12)), 1):
+    for number, (x, y, sign, turn) in enumerate(
+        ((1.38, 1.12, -1, 4), (2.12, 1.16, -1, -7), (1.42, 2.42, 1, -5), (2.16, 2.52, 1, 12)), 1
+    ):
         parts, cushion = _chair(x, y, sign, turn)
-        room.add(f"chair {number}", *parts, material=wood(BIRCH, BIRCH_DARK, UP, EAST, 0.40, 9.0, origin=(x, y, 0.1 * number)))
+        room.add(
+            f"chair {number}",
+            *parts,
+            material=wood(BIRCH, BIRCH_DARK, UP, EAST, 0.40, 9.0, origin=(x, y, 0.1 * number)),
+        )
         light, dark = list(cloth.items())[number % 2]
-        room.add(f"cushion {number}", cushion,
-                 material=Material(paint(light), paint(dark), roughness=(0.93, 0, 0), grain=(28.0, 28.0, 28.0)))
-    room.add("rug", box((0.62, 0.86, 0.001), (2.90, 2.66, 0.0125)),
-             material=Material(paint("#a5483a"), paint("#e0d2b4"), paint("#33505c"), roughness=(0.95, 0, 0), kind="rug",
-                               size=(1.14, 0.90), origin=(1.76, 1.76, 0.5), grain=(24.0, 24.0, 24.0)))
+        room.add(
+            f"cushion {number}",
+            cushion,
+            material=Material(paint(light), paint(dark), roughness=(0.93, 0, 0), grain=(28.0, 28.0, 28.0)),
+        )
+    room.add(
+        "rug",
+        box((0.62, 0.86, 0.001), (2.90, 2.66, 0.0125)),
+        material=Material(
+            paint("#a5483a"),
+            paint("#e0d2b4"),
+            paint("#33505c"),
+            roughness=(0.95, 0, 0),
+            kind="rug",
+            size=(1.14, 0.90),
+            origin=(1.76, 1.76, 0.5),
+            grain=(24.0, 24.0, 24.0),
+        ),
+    )
 
 
 def _lamps(room: RoomBuilder) -> None:
     lx, ly = LAMP
-    shade = [(0, 0.235), (0.03, 0.232), (0.055, 0.20), (0.12, 0.14), (0.19, 0.05), (0.215, 0.0), (0.209, 0.0), (0.184, 0.048),
-             (0.115, 0.134), (0.05, 0.192), (0.026, 0.212), (0, 0.214)]
+    shade = [
+        (0, 0.235),
+        (0.03, 0.232),
+        (0.055, 0.20),
+        (0.12, 0.14),
+        (0.19, 0.05),
+        (0.215, 0.0),
+        (0.209, 0.0),
+        (0.184, 0.048),
+        (0.115, 0.134),
+        (0.05, 0.192),
+        (0.026, 0.212),
+        (0, 0.214),
+    ]
     outward = [(r, z) for r, z in reversed(shade)]
-    room.add("hanging lamp", lathe(outward, (lx, ly, 1.62), 36), cylinder((lx, ly, 1.85), 0.018, 0.05, segments=12),
-             material=plain("#d39a2c", 0.28, "#cc9226"))
-    room.add("lamp cord", tube([(lx, ly, 1.895), (lx, ly, 2.67)], 0.005, 8), lathe([(0, 0), (0.03, 0.0), (0.055, 0.028), (0, 0.03)], (lx, ly, 2.665)),
-             material=plain("#2c2c2e", 0.5))
+    room.add(
+        "hanging lamp",
+        lathe(outward, (lx, ly, 1.62), 36),
+        cylinder((lx, ly, 1.85), 0.018, 0.05, segments=12),
+        material=plain("#d39a2c", 0.28, "#cc9226"),
+    )
+    room.add(
+        "lamp cord",
+        tube([(lx, ly, 1.895), (lx, ly, 2.67)], 0.005, 8),
+        lathe(mm("0,0 30,0 55,28 0,30"), (lx, ly, 2.665)),
+        material=plain("#2c2c2e", 0.5),
+    )
     room.add_emitter("bulb", sphere((lx, ly, 1.662), 0.085, 16), radiance=(10.5, 8.2, 5.6))
     room.add("bulb socket", cylinder((lx, ly, 1.744), 0.018, 0.092, segments=12), material=BRASS)
     for number, (x, y) in enumerate(((3.35, 2.55), (3.35, 0.95)), 1):
-        frame = [box((x - 0.33, y + s * 0.30 - 0.015, 2.655), (x + 0.33, y + s * 0.30 + 0.015, 2.698), 0.003) for s in (-1, 1)]
-        frame += [box((x + s * 0.315 - 0.015, y - 0.283, 2.656), (x + s * 0.315 + 0.015, y + 0.283, 2.697), 0.003) for s in (-1, 1)]
+        frame = [
+            box((x - 0.33, y + s * 0.30 - 0.015, 2.655), (x + 0.33, y + s * 0.30 + 0.015, 2.698), 0.003)
+            for s in (-1, 1)
+        ]
+        frame += [
+            box((x + s * 0.315 - 0.015, y - 0.283, 2.656), (x + s * 0.315 + 0.015, y + 0.283, 2.697), 0.003)
+            for s in (-1, 1)
+        ]
         room.add(f"ceiling panel frame {number}", *frame, material=WHITE_PAINT)
-        room.add_emitter(f"ceiling panel {number}", sheet((x - 0.304, y + 0.292, 2.672), (0.608, 0, 0), (0, -0.584, 0), 0.3),
-                         radiance=(9.6, 8.7, 7.3))
-    room.add_emitter("cabinet light", sheet((0.95, 3.80, 1.438), (1.43, 0, 0), (0, -0.07, 0), 0.25), radiance=(4.2, 3.5, 2.5))
+        room.add_emitter(
+            f"ceiling panel {number}",
+            sheet((x - 0.322, y + 0.307, 2.652), (0.644, 0, 0), (0, -0.614, 0), 0.33),
+            radiance=(9.6, 8.7, 7.3),
+        )
+    room.add(
+        "cabinet light body", box((0.94, 3.722, 1.4385), (2.39, 3.808, 1.449), 0.003), material=WHITE_PAINT
+    )
+    room.add_emitter(
+        "cabinet light",
+        sheet((0.95, 3.80, 1.438), (1.43, 0, 0), (0, -0.07, 0), 0.25),
+        radiance=(4.2, 3.5, 2.5),
+    )
 
 
 # (position, target), ordered so that each view adds the most surface that fewer than two views have seen.

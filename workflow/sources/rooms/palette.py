@@ -1,4 +1,4 @@
-"""Finishes that several things share: paints, woods, metals, glazes. Colours are given as sRGB and kept linear."""
+"""Finishes that several things share: paints, woods, metals, glazes. Written as sRGB, kept linear."""
 
 from __future__ import annotations
 
@@ -17,48 +17,133 @@ def paint(code: str) -> Colour:
     return r, g, b
 
 
-def plain(code: str, roughness: float = 0.5, second: str | None = None, metallic: float = 0.0,
-          grain: float = 7.0, vary: float = 0.0) -> Material:
-    """One paint, clouded towards `second` at `grain` cycles a metre; roughness rises by `vary` in the clouds."""
+def plain(
+    code: str,
+    roughness: float = 0.5,
+    second: str | None = None,
+    metallic: float = 0.0,
+    grain: float = 7.0,
+    vary: float = 0.0,
+) -> Material:
+    """One paint, clouded towards `second` at `grain` cycles a metre; `vary` is added to roughness there."""
     first = paint(code)
     clouded = paint(second) if second else first
-    return Material(first, clouded, roughness=(roughness, vary, 0.0), metallic=metallic, grain=(grain, grain, grain))
+    return Material(
+        first, clouded, roughness=(roughness, vary, 0.0), metallic=metallic, grain=(grain, grain, grain)
+    )
 
 
-def wood(light: str, dark: str, along: Sequence[float], across: Sequence[float], roughness: float = 0.42,
-         density: float = 8.0, origin: Sequence[float] = (0.0, 0.0, 0.0)) -> Material:
+def patterned(
+    kind: str,
+    *codes: str,
+    size: tuple[float, float],
+    axes: tuple[Sequence[float], Sequence[float]] = (EAST, NORTH),
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+    roughness: float = 0.5,
+    vary: float = 0.0,
+    grain: float = 6.0,
+) -> Material:
+    """Two or three paints in a pattern of `patterns.KINDS`."""
+    return Material(
+        *(paint(code) for code in codes),
+        roughness=(roughness, vary, 0.0),
+        kind=kind,
+        size=size,
+        axes=axes,
+        origin=origin,
+        grain=(grain, grain, grain),
+    )
+
+
+def wood(
+    light: str,
+    dark: str,
+    along: Sequence[float],
+    across: Sequence[float],
+    roughness: float = 0.42,
+    density: float = 8.0,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Material:
     """Solid wood with its grain `along` one direction."""
-    return Material(paint(light), paint(dark), roughness=(roughness, 0.14, 0.0), kind="wood", axes=(along, across),
-                    origin=origin, grain=(0.11 * density, density, density), fine=3.0)
+    return Material(
+        paint(light),
+        paint(dark),
+        roughness=(roughness, 0.14, 0.0),
+        kind="wood",
+        axes=(along, across),
+        origin=origin,
+        grain=(0.11 * density, density, density),
+        fine=3.0,
+    )
 
 
 OAK, OAK_DARK = "#d2a878", "#a5784a"
 WALNUT, WALNUT_DARK = "#8f6142", "#5b3a26"
 BIRCH, BIRCH_DARK = "#e6cfa6", "#c9a877"
 
-STEEL = Material((0.60, 0.59, 0.57), (0.53, 0.52, 0.51), roughness=(0.30, 0.10, 0.0), metallic=1.0,
-                 grain=(1.0, 1.0, 14.0))
+STEEL = Material(
+    (0.60, 0.59, 0.57), (0.53, 0.52, 0.51), roughness=(0.30, 0.10, 0.0), metallic=1.0, grain=(1.0, 1.0, 14.0)
+)
 CHROME = plain("#d6d8da", 0.15, metallic=1.0)
-COPPER = Material((0.93, 0.58, 0.43), (0.74, 0.40, 0.28), roughness=(0.20, 0.16, 0.0), metallic=1.0, grain=(9.0, 9.0, 9.0))
-BRASS = Material((0.88, 0.68, 0.36), (0.78, 0.57, 0.27), roughness=(0.28, 0.12, 0.0), metallic=1.0, grain=(12.0,) * 3)
+COPPER = Material(
+    (0.93, 0.58, 0.43), (0.74, 0.40, 0.28), roughness=(0.20, 0.16, 0.0), metallic=1.0, grain=(9.0, 9.0, 9.0)
+)
+BRASS = Material(
+    (0.88, 0.68, 0.36), (0.78, 0.57, 0.27), roughness=(0.28, 0.12, 0.0), metallic=1.0, grain=(12.0,) * 3
+)
 IRON = plain("#35353a", 0.55, metallic=1.0)
 BLACK_GLASS = plain("#16171a", 0.07)
 WHITE_GLAZE = plain("#ece8df", 0.16)
 WHITE_PAINT = plain("#ece8de", 0.42, "#e4dfd3")
 LINEN = Material(paint("#d8cbb2"), paint("#c9b999"), roughness=(0.92, 0.0, 0.0), grain=(30.0, 30.0, 30.0))
 
-FLOOR = Material(paint("#bf9062"), paint("#8a5d3a"), paint("#5a3d28"), roughness=(0.34, 0.14, 0.3), kind="cells",
-                 size=(1.30, 0.145), axes=(EAST, NORTH), origin=(0.17, 0.03, 0.003), grain=(0.9, 7.0, 7.0))
-MARBLE = Material(paint("#e9e6e0"), paint("#d5d2cc"), paint("#8d8a88"), roughness=(0.17, 0.05, 0.05), kind="marble",
-                  grain=(2.6, 3.4, 3.0), fine=3.5)
-TERRAZZO = Material(paint("#dcd6ca"), paint("#c9a58a"), paint("#6f7f7a"), roughness=(0.24, 0.03, 0.05),
-                    kind="terrazzo", grain=(19.0, 19.0, 19.0), fine=1.3)
+FLOOR = Material(
+    paint("#bf9062"),
+    paint("#8a5d3a"),
+    paint("#5a3d28"),
+    roughness=(0.34, 0.14, 0.3),
+    kind="cells",
+    size=(1.30, 0.145),
+    axes=(EAST, NORTH),
+    origin=(0.17, 0.03, 0.003),
+    grain=(0.9, 7.0, 7.0),
+)
+MARBLE = Material(
+    paint("#e9e6e0"),
+    paint("#d5d2cc"),
+    paint("#8d8a88"),
+    roughness=(0.17, 0.05, 0.05),
+    kind="marble",
+    grain=(2.6, 3.4, 3.0),
+    fine=3.5,
+)
+TERRAZZO = Material(
+    paint("#dcd6ca"),
+    paint("#c9a58a"),
+    paint("#6f7f7a"),
+    roughness=(0.24, 0.03, 0.05),
+    kind="terrazzo",
+    grain=(19.0, 19.0, 19.0),
+    fine=1.3,
+)
 
 
-def tiles(axis: str, light: str, dark: str, origin: Sequence[float], size: tuple[float, float] = (0.15, 0.10)) -> Material:
+def tiles(
+    axis: str, light: str, dark: str, origin: Sequence[float], size: tuple[float, float] = (0.15, 0.10)
+) -> Material:
     """Glazed tiles with grout, on a wall across `axis`."""
-    return Material(paint(light), paint(dark), paint("#bdb4a5"), roughness=(0.11, 0.05, 0.6), kind="cells", size=size,
-                    axes=facing(axis), origin=origin, amount=0.3, grain=(9.0, 9.0, 9.0))
+    return Material(
+        paint(light),
+        paint(dark),
+        paint("#bdb4a5"),
+        roughness=(0.11, 0.05, 0.6),
+        kind="cells",
+        size=size,
+        axes=facing(axis),
+        origin=origin,
+        amount=0.3,
+        grain=(9.0, 9.0, 9.0),
+    )
 
 
 def recoloured(material: Material, light: str, dark: str) -> Material:

@@ -1,12 +1,12 @@
-"""Solid textures, written once for NumPy (truth maps) and Dr.Jit (renderer) on the namespace of `iif_core.xp`.
+"""Solid textures, written once for NumPy (truth maps) and Dr.Jit (renderer) on `iif_core.xp`.
 
-An object's material is a row of numbers. A pattern turns a point in the object's own frame into two blends (t, s):
+An object's material is a row of numbers. A pattern makes two blends (t, s) of a point in the object's frame:
 
     albedo = mix(mix(first, second, t), third, s)      roughness = r0 + r_t t + r_s s      metallic = m
 
-Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 holds exactly, so that both
-libraries see the same texture. Finest features are about 1.5 cm (seams and grout 0.8 cm): above the footprint of a pixel
-at reading distance, so that photographs do not alias.
+Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 holds exactly,
+so that both libraries see the same texture. Finest features are about 1.5 cm (seams and grout 0.8 cm): above
+the footprint of a pixel at reading distance, so that photographs do not alias.
 """
 
 from __future__ import annotations
@@ -20,7 +20,19 @@ import numpy as np
 from iif_core.xp import Namespace
 
 Colour = tuple[float, float, float]
-KINDS = ("plain", "wood", "cells", "checks", "marble", "terrazzo", "stripes", "rug", "painting", "rings", "spines")
+KINDS = (
+    "plain",
+    "wood",
+    "cells",
+    "checks",
+    "marble",
+    "terrazzo",
+    "stripes",
+    "rug",
+    "painting",
+    "rings",
+    "spines",
+)
 
 _SQUARE = {"z": ((1, 0, 0), (0, 1, 0)), "y": ((1, 0, 0), (0, 0, 1)), "x": ((0, 1, 0), (0, 0, 1))}
 
@@ -83,8 +95,17 @@ def _row(material: Material) -> list[float]:
     origin = np.asarray(material.origin, float)
     frame = [value for axis in (u, v, np.cross(u, v)) for value in (*axis, -float(axis @ origin))]
     return [
-        *material.first, *second, *(material.third or second), *material.roughness, material.metallic,
-        float(KINDS.index(material.kind)), *material.size, *frame, *material.grain, material.fine, material.amount,
+        *material.first,
+        *second,
+        *(material.third or second),
+        *material.roughness,
+        material.metallic,
+        float(KINDS.index(material.kind)),
+        *material.size,
+        *frame,
+        *material.grain,
+        material.fine,
+        material.amount,
     ]
 
 
@@ -92,8 +113,8 @@ def _row(material: Material) -> list[float]:
 class MaterialTable:
     """The materials of all objects; position = object id.
 
-    Called as `table.numpy(points (n, 3), object_id (n,))` for truth, and `table.drjit()` gives the renderer's callable
-    `material(point, face, object_id, active) -> (base_color, roughness, metallic)`.
+    Called as `table.numpy(points (n, 3), object_id (n,))` for truth, and `table.drjit()` gives the
+    renderer's callable `material(point, face, object_id, active) -> (base_color, roughness, metallic)`.
     """
 
     materials: tuple[Material, ...]
@@ -138,8 +159,10 @@ class MaterialTable:
         return material
 
 
-def evaluate(xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]) -> tuple[tuple[Any, Any, Any], Any, Any]:
-    """(albedo, roughness, metallic) at world points (x, y, z); `column(name)` is each point's entry of the table."""
+def evaluate(
+    xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]
+) -> tuple[tuple[Any, Any, Any], Any, Any]:
+    """(albedo, roughness, metallic) at world points (x, y, z); `column(name)`: their table entries."""
     x, y, z = point
     u, v, w = (
         column(f"{a}_x") * x + column(f"{a}_y") * y + column(f"{a}_z") * z + column(f"{a}_1") for a in "uvw"
@@ -151,13 +174,16 @@ def evaluate(xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]) 
     t, s = _blends(xp, (u, v, w), coarse, detail, column)
     t, s = (xp.minimum(xp.maximum(b, 0.0), 1.0) for b in (t, s))
     albedo = tuple(
-        (column(f"first_{c}") * (1 - t) + column(f"second_{c}") * t) * (1 - s) + column(f"third_{c}") * s for c in "rgb"
+        (column(f"first_{c}") * (1 - t) + column(f"second_{c}") * t) * (1 - s) + column(f"third_{c}") * s
+        for c in "rgb"
     )
     roughness = column("r_0") + column("r_t") * t + column("r_s") * s
     return albedo, xp.minimum(xp.maximum(roughness, 0.02), 1.0), column("metallic")
 
 
-def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, column: Callable[[str], Any]) -> tuple[Any, Any]:
+def _blends(
+    xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, column: Callable[[str], Any]
+) -> tuple[Any, Any]:
     u, v, _ = local
     kind, su, sv, amount = (column(name) for name in ("kind", "size_u", "size_v", "amount"))
     zero = 0 * u
@@ -168,7 +194,7 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     grain = xp.abs(2 * (rings - xp.floor(rings)) - 1)
     grain = 0.45 * grain * grain * (3 - 2 * grain) + 0.3 * coarse + 0.25 * detail
 
-    # cells: boards (rows shifted at random) and tiles (every other row shifted by amount_v halves): su x sv, seams 8 mm
+    # cells of su x sv: boards (rows shifted at random, seams 5 mm), tiles (odd rows by half, grout 8 mm)
     row = xp.floor(v / sv)
     odd = row - 2 * xp.floor(row * 0.5)
     boards = su > 4 * sv
@@ -195,9 +221,13 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     # rug: nested frames and a lattice of diamonds; size = half extents
     across = xp.maximum(xp.abs(u) / su, xp.abs(v) / sv)
     frame = xp.floor(across * 12)
-    lattice = xp.abs(2 * (u / 0.24 - xp.floor(u / 0.24)) - 1) + xp.abs(2 * (v / 0.24 - xp.floor(v / 0.24)) - 1)
+    lattice = xp.abs(2 * (u / 0.24 - xp.floor(u / 0.24)) - 1) + xp.abs(
+        2 * (v / 0.24 - xp.floor(v / 0.24)) - 1
+    )
     border = frame >= 9
-    rug_t = xp.where(border, xp.where(frame == 10, 1.0 + zero, zero), xp.where(lattice < 0.75, 1.0 + zero, 0.12 * detail))
+    rug_t = xp.where(
+        border, xp.where(frame == 10, 1.0 + zero, zero), xp.where(lattice < 0.75, 1.0 + zero, 0.12 * detail)
+    )
     rug_s = xp.where(border, zero, xp.where(xp.abs(lattice - 1.1) < 0.12, 1.0 + zero, zero))
 
     # painting: sky, a sun and two ridges; size = half extents
@@ -205,8 +235,12 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     far = 0.05 + 0.16 * xp.sin(4.1 * pu + 0.6) + 0.06 * xp.sin(9.7 * pu)
     near = -0.42 + 0.13 * xp.sin(3.1 * pu + 2.2) + 0.03 * detail
     sun = (pu - 0.38) * (pu - 0.38) * (su * su) / (sv * sv) + (pv - 0.5) * (pv - 0.5)
-    paint_t = xp.where(pv < near, 1.0 + zero, xp.where(pv < far, 0.62 + 0.2 * detail, 0.25 - 0.25 * pv + 0.1 * coarse))
-    paint_s = xp.where(pv < near, 0.18 * detail, xp.where(pv < far, zero, xp.where(sun < 0.05, 1.0 + zero, zero)))
+    paint_t = xp.where(
+        pv < near, 1.0 + zero, xp.where(pv < far, 0.62 + 0.2 * detail, 0.25 - 0.25 * pv + 0.1 * coarse)
+    )
+    paint_s = xp.where(
+        pv < near, 0.18 * detail, xp.where(pv < far, zero, xp.where(sun < 0.05, 1.0 + zero, zero))
+    )
 
     # rings about w: disc of radius su plain, then a band to sv in the second colour, twelve ticks outside it
     radius = xp.sqrt(u * u + v * v)
@@ -251,7 +285,8 @@ def _step(xp: Namespace, low: float, high: float, x: Any) -> Any:
 
 
 def _permute(xp: Namespace, x: Any) -> Any:
-    """(34 x + 1) x mod 289 of integers 0 <= x < 578; exact in float32."""
+    """(34 x + 1) x mod 289 of integers 0 <= x < 578; exact in float32, which needs the first reduction."""
+    x = xp.where(x >= 289, x - 289, x)
     x = (34 * x + 1) * x
     return x - 289 * xp.floor((x + 0.5) * (1 / 289))
 
@@ -268,7 +303,7 @@ def _hash(xp: Namespace, i: Any, j: Any, k: Any) -> Any:
 
 
 def noise(xp: Namespace, x: Any, y: Any, z: Any) -> Any:
-    """Value noise in [0, 1], mean 1/2: smooth between random values at the integers; stretched to use the range."""
+    """Value noise in [0, 1], mean 1/2: smooth between random values at the integers, stretched."""
     i, j, k = xp.floor(x), xp.floor(y), xp.floor(z)
     fx, fy, fz = (f * f * (3 - 2 * f) for f in (x - i, y - j, z - k))
     i0, j0, k0 = (_modulo(xp, c) for c in (i, j, k))

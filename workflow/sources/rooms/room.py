@@ -1,4 +1,4 @@
-"""A room: one mesh with object ids, names, materials, one-sided emission, and cameras that a person would choose."""
+"""A room: one mesh with object ids, names, materials, one-sided emission, cameras a person would choose."""
 
 from __future__ import annotations
 
@@ -60,10 +60,12 @@ class Room:
         """Whether a camera may stand here: inside the room and `margin` metres away from everything."""
         p = np.asarray(position, float)
         inside = (p > margin).all() and (p < self.size - margin).all()
-        return bool(inside and not ((p > self.parts[:, 0] - margin) & (p < self.parts[:, 1] + margin)).all(1).any())
+        return bool(
+            inside and not ((p > self.parts[:, 0] - margin) & (p < self.parts[:, 1] + margin)).all(1).any()
+        )
 
     def cameras(self, count: int) -> list[np.ndarray]:
-        """`world_from_camera` (4x4) of `count` cameras: the hand-chosen ones, then the same moved a little, each different.
+        """`world_from_camera` (4x4) of `count` different cameras: the hand-chosen, then these moved a bit.
 
         Raises:
             InputError: no room is left for so many cameras.
@@ -72,7 +74,9 @@ class Room:
         attempt = 0
         while len(poses) < count:
             if attempt > 20 * count:
-                raise InputError(f"capture.views: {count} cameras do not fit into the room {self.name}; ask for fewer")
+                raise InputError(
+                    f"capture.views: {count} cameras do not fit into the room {self.name}; ask for fewer"
+                )
             base = self.shots[attempt % len(self.shots)]
             spread = (0.5 + _STEP * (attempt + 1)) % 1 - 0.5
             position = np.asarray(base[0]) + spread * (0.7, 0.7, 0.4)
@@ -92,13 +96,15 @@ class RoomBuilder:
         self._parts: list[np.ndarray] = []
 
     def add(self, name: str, *shapes: Shape, material: Material, is_part: bool = True) -> None:
-        """An object made of one or more shapes. `is_part=False`: cameras need not keep away (walls, floor)."""
+        """An object of one or more shapes. `is_part=False`: cameras need not keep away (walls, floor)."""
         shape = merge(*shapes)
         self._objects.append((name, shape, material, np.zeros((len(shape[1]), 3))))
         if is_part:
             self._parts += [np.stack([s[0].min(0), s[0].max(0)]) for s in shapes]
 
-    def add_emitter(self, name: str, *shapes: Shape, radiance: Sequence[Sequence[float]] | Sequence[float]) -> None:
+    def add_emitter(
+        self, name: str, *shapes: Shape, radiance: Sequence[Sequence[float]] | Sequence[float]
+    ) -> None:
         """An emitter; `radiance` (3,) for all shapes or one row a shape."""
         shape = merge(*shapes)
         per_shape = np.broadcast_to(np.asarray(radiance, float), (len(shapes), 3))
@@ -106,7 +112,9 @@ class RoomBuilder:
         self._objects.append((name, shape, BLACK, emission))
         self._parts += [np.stack([s[0].min(0), s[0].max(0)]) for s in shapes]
 
-    def finish(self, shots: Sequence[tuple[Sequence[float], Sequence[float]]], field_of_view: float = 72.0) -> Room:
+    def finish(
+        self, shots: Sequence[tuple[Sequence[float], Sequence[float]]], field_of_view: float = 72.0
+    ) -> Room:
         """The room with its cameras."""
         names = tuple(name for name, *_ in self._objects)
         if len(set(names)) != len(names):
@@ -114,8 +122,15 @@ class RoomBuilder:
         vertices, faces = merge(*(shape for _, shape, _, _ in self._objects))
         object_id = np.repeat(np.arange(len(names)), [len(shape[1]) for _, shape, _, _ in self._objects])
         return Room(
-            self.name, vertices.astype(np.float32), faces.astype(np.int32), object_id.astype(np.int32), names,
+            self.name,
+            vertices.astype(np.float32),
+            faces.astype(np.int32),
+            object_id.astype(np.int32),
+            names,
             MaterialTable(tuple(material for _, _, material, _ in self._objects)),
             np.concatenate([emission for *_, emission in self._objects]).astype(np.float32),
-            self.size, np.array(self._parts).reshape(-1, 2, 3), tuple(shots), field_of_view,
+            self.size,
+            np.array(self._parts).reshape(-1, 2, 3),
+            tuple(shots),
+            field_of_view,
         )

@@ -1,6 +1,6 @@
-"""Shapes as (vertices (n, 3) float64 in metres, faces (m, 3) int64), counter-clockwise seen from outside; z is up.
+"""Shapes as (vertices (n, 3) float64, faces (m, 3) int64), metres, z up, counter-clockwise from outside.
 
-Everything but `sheet` is closed, so that its signed volume is positive.
+Everything but the sheets is closed, so that its signed volume is positive.
 """
 
 from __future__ import annotations
@@ -42,9 +42,15 @@ def sheet(origin: Point, edge_u: Point, edge_v: Point, step: float = 0.5) -> Sha
     return grid_sheet(origin, edge_u, edge_v, np.linspace(0, 1, nu + 1), np.linspace(0, 1, nv + 1))
 
 
-def grid_sheet(origin: Point, edge_u: Point, edge_v: Point, u: np.ndarray, v: np.ndarray,
-               hole: tuple[float, float, float, float] | None = None) -> Shape:
-    """A rectangle with grid lines at fractions u and v; `hole` = (u0, u1, v0, v1) on grid lines is left out."""
+def grid_sheet(
+    origin: Point,
+    edge_u: Point,
+    edge_v: Point,
+    u: np.ndarray,
+    v: np.ndarray,
+    hole: tuple[float, float, float, float] | None = None,
+) -> Shape:
+    """A rectangle with grid lines at fractions u and v; `hole` (u0, u1, v0, v1) on grid lines is left out."""
     origin, edge_u, edge_v = (np.asarray(p, float) for p in (origin, edge_u, edge_v))
     gu, gv = np.meshgrid(u, v, indexing="ij")
     vertices = origin + gu.reshape(-1, 1) * edge_u + gv.reshape(-1, 1) * edge_v
@@ -91,8 +97,11 @@ def _hull(points: np.ndarray) -> Shape:
         faces += [(ring[0], ring[i], ring[i + 1]) for i in range(1, len(ring) - 1)]
     faces = np.array(faces)
     corner = points[faces]
-    outward = np.einsum("ij,ij->i", np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
-                        corner.mean(1) - middle)
+    outward = np.einsum(
+        "ij,ij->i",
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]),
+        corner.mean(1) - middle,
+    )
     assert (outward > 0).all()
     return points, faces
 
@@ -100,15 +109,30 @@ def _hull(points: np.ndarray) -> Shape:
 def wedge(base_low: Point, base_high: Point, top_low: Point, top_high: Point) -> Shape:
     """A frustum: rectangle (x0, y0)-(x1, y1) at z below, another above; points are (x, y, z)."""
     (x0, y0, z0), (x1, y1, _), (u0, v0, z1), (u1, v1, _) = base_low, base_high, top_low, top_high
-    return _hull(np.array([
-        [x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0], [u0, v0, z1], [u1, v0, z1], [u1, v1, z1], [u0, v1, z1],
-    ], float))
+    return _hull(
+        np.array(
+            [
+                [x0, y0, z0],
+                [x1, y0, z0],
+                [x1, y1, z0],
+                [x0, y1, z0],
+                [u0, v0, z1],
+                [u1, v0, z1],
+                [u1, v1, z1],
+                [u0, v1, z1],
+            ],
+            float,
+        )
+    )
 
 
 def tub(low: Point, high: Point, wall: float, floor: float) -> Shape:
     """An open box with walls `wall` and a floor `floor` thick, closed as a solid."""
     low, high = np.asarray(low, float), np.asarray(high, float)
-    xi, yi = [low[0], low[0] + wall, high[0] - wall, high[0]], [low[1], low[1] + wall, high[1] - wall, high[1]]
+    xi, yi = (
+        [low[0], low[0] + wall, high[0] - wall, high[0]],
+        [low[1], low[1] + wall, high[1] - wall, high[1]],
+    )
     around = [(0, 0), (3, 0), (3, 3), (0, 3)]
     inner = [(1, 1), (2, 1), (2, 2), (1, 2)]
     rings = [(around, low[2]), (around, high[2]), (inner, high[2]), (inner, low[2] + floor)]
@@ -121,18 +145,29 @@ def tub(low: Point, high: Point, wall: float, floor: float) -> Shape:
     return vertices, np.array(faces)
 
 
+def mm(profile: str, radius: float = 1.0, height: float = 1.0) -> list[tuple[float, float]]:
+    """A profile written as `radius,height` pairs in millimetres ("0,0 40,0 40,90 0,90"), scaled."""
+    pairs = (pair.split(",") for pair in profile.split())
+    return [(float(r) / 1000 * radius, float(z) / 1000 * height) for r, z in pairs]
+
+
 def lathe(profile: Sequence[tuple[float, float]], centre: Point = (0, 0, 0), segments: int = 28) -> Shape:
     """A profile of (radius, z) turned about the vertical through `centre`.
 
-    The profile starts and ends on the axis (radius 0), between them radius > 0, and walks up the outside (solid), or up
-    the outside and down the inside (bowl).
+    The profile starts and ends on the axis (radius 0), between them radius > 0, and walks up the outside
+    (solid), or up the outside and down the inside (bowl).
     """
     profile = np.asarray(profile, float)
     angle = 2 * np.pi * np.arange(segments) / segments
     rim = profile[1:-1]
-    rings = np.stack([
-        np.cos(angle) * rim[:, :1], np.sin(angle) * rim[:, :1], np.broadcast_to(rim[:, 1:], (len(rim), segments))
-    ], -1)
+    rings = np.stack(
+        [
+            np.cos(angle) * rim[:, :1],
+            np.sin(angle) * rim[:, :1],
+            np.broadcast_to(rim[:, 1:], (len(rim), segments)),
+        ],
+        -1,
+    )
     vertices = np.concatenate([[[0, 0, profile[0, 1]]], rings.reshape(-1, 3), [[0, 0, profile[-1, 1]]]])
     k, after = np.arange(segments), (np.arange(segments) + 1) % segments
     last = len(vertices) - 1
@@ -148,8 +183,14 @@ def lathe(profile: Sequence[tuple[float, float]], centre: Point = (0, 0, 0), seg
 def cylinder(base: Point, radius: float, height: float, bevel: float = 0.0, segments: int = 28) -> Shape:
     """An upright cylinder on `base`."""
     if bevel:
-        profile = [(0, 0), (radius - bevel, 0), (radius, bevel), (radius, height - bevel), (radius - bevel, height),
-                   (0, height)]
+        profile = [
+            (0, 0),
+            (radius - bevel, 0),
+            (radius, bevel),
+            (radius, height - bevel),
+            (radius - bevel, height),
+            (0, height),
+        ]
     else:
         profile = [(0, 0), (radius, 0), (radius, height), (0, height)]
     return lathe(profile, base, segments)
@@ -168,15 +209,18 @@ def tube(path: Sequence[Point], radius: float | Sequence[float], segments: int =
     radii = np.broadcast_to(np.asarray(radius, float), len(path))
     steps = np.diff(path, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    along = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    side = np.cross(along[0], np.eye(3)[np.argmin(np.abs(along[0]))])
+    mitres = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
+    before = np.concatenate([steps[:1], steps])
+    side = np.cross(steps[0], np.eye(3)[np.argmin(np.abs(steps[0]))])
+    side /= np.linalg.norm(side)
     angle = 2 * np.pi * np.arange(segments) / segments
     rings = []
-    for point, tangent, r in zip(path, along, radii, strict=True):
-        side = side - (side @ tangent) * tangent  # carried along without twist
-        side /= np.linalg.norm(side)
-        rings.append(point + r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(tangent, side)))
+    for k, (point, mitre, r) in enumerate(zip(path, mitres, radii, strict=True)):
+        step = before[k]
+        if k > 1:  # carried around the corner without twist
+            side = side - (side @ step) / (1 + before[k - 1] @ step) * (before[k - 1] + step)
+        spokes = r * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * np.cross(step, side))
+        rings.append(point + spokes - (spokes @ mitre / (step @ mitre))[:, None] * step)
     vertices = np.concatenate([*rings, path[:1], path[-1:]])
     k, after = np.arange(segments), (np.arange(segments) + 1) % segments
     first, last = len(vertices) - 2, len(vertices) - 1
@@ -189,20 +233,25 @@ def tube(path: Sequence[Point], radius: float | Sequence[float], segments: int =
     return vertices, np.concatenate(faces)
 
 
-def arc(centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8) -> list:
+def arc(
+    centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8
+) -> list:
     """Points on a circle from `start` to `stop` degrees, in the plane of two unit axes."""
     angle = np.radians(np.linspace(start, stop, count))
     centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
     return list(centre + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v))
 
 
-def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28) -> Shape:
+def ring(
+    centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28
+) -> Shape:
     """A torus about `centre` in the plane of two unit axes."""
     centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
     around, across = 2 * np.pi * np.arange(segments) / segments, 2 * np.pi * np.arange(10) / 10
     spoke = np.cos(around)[:, None] * u + np.sin(around)[:, None] * v
     vertices = (
-        centre + spoke[:, None] * (radius + thickness * np.cos(across))[None, :, None]
+        centre
+        + spoke[:, None] * (radius + thickness * np.cos(across))[None, :, None]
         + np.cross(u, v) * (thickness * np.sin(across))[None, :, None]
     ).reshape(-1, 3)
     i, j = (g.ravel() for g in np.meshgrid(np.arange(segments), np.arange(10), indexing="ij"))

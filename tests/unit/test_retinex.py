@@ -1,0 +1,100 @@
+"""Retinex prior: planted scenes, the mesh's help, edge cases."""
+
+import numpy as np
+import pytest
+
+from iif_core import retinex
+from iif_core.errors import InputError
+
+
+def patches(smooth_light=True):
+    """A 48 x 64 wall of 12 tiles under light that falls off smoothly; (albedo, linear photograph, tile ids)."""
+    rng = np.random.default_rng(0)
+    tile = np.kron(np.arange(12).reshape(3, 4), np.ones((16, 16), int))
+    albedo = (0.15 + 0.7 * rng.random((12, 3)))[tile]
+    y, x = np.mgrid[:48, :64] / 64
+    light = 0.2 + np.exp(-4 * ((x - 0.2) ** 2 + (y - 0.3) ** 2)) if smooth_light else np.ones((48, 64))
+    return albedo, 0.5 * albedo * light[..., None], tile
+
+
+def log_error(found, truth):
+    difference = np.log(found) - np.log(truth)
+    return (difference - difference.mean((0, 1))).std()
+
+
+def test_removes_smooth_light():
+    albedo, photo, _ = patches()
+    before = log_error(photo, albedo)
+    predictions = retinex.retinex_predictions(photo, 5)
+    errors = [log_error(p[..., :3], albedo) for p in predictions]
+    assert min(errors) < 0.15 * before
+    assert predictions.shape == (5, 48, 64, 5) and predictions.dtype == np.float32
+
+
+def test_mesh_tells_material_from_light():
+    """A dark corner: the same wall turns by 90 degrees and gets a third of the light. Only normals can tell."""
+    albedo = np.full((32, 32, 3), 0.5)
+    light = np.where(np.arange(32) < 16, 0.9, 0.3)[None, :, None]
+    normals = np.where(np.arange(32)[None, :, None] < 16, [0, 0, 1.0], [1.0, 0, 0]) * np.ones((32, 1, 1))
+    plain = retinex.retinex_predictions(albedo * light, 3)[0, ..., :3]
+    helped = retinex.retinex_predictions(albedo * light, 3, object_id=np.zeros((32, 32), int), normals=normals)
+    assert plain[:, 20].mean() < 0.5 * plain[:, 5].mean()
+    np.testing.assert_allclose(helped[..., :3], 0.4, atol=1e-6)
+
+
+def test_steps_between_objects_are_material():
+    light = np.where(np.arange(32) < 16, 0.5, 0.52)[None, :, None] * np.ones((32, 32, 3))  # weaker than any threshold
+    ids = np.where(np.arange(32) < 16, 3, 7)[None, :] * np.ones((32, 1), int)
+    found = retinex.retinex_predictions(light, 1, object_id=ids)[0, ..., :3]
+    np.testing.assert_allclose(found[:, 20] / found[:, 5], 0.52 / 0.5, rtol=1e-5)
+
+
+def test_integration_is_the_inverse_of_differences():
+    image = np.random.default_rng(1).normal(size=(13, 9, 3))
+    found = retinex._integrated([np.diff(image, axis=0), np.diff(image, axis=1)], (13, 9))
+    np.testing.assert_allclose(found, image - image.mean((0, 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("mean", [0.1, 0.4, 0.8])
+def test_mean_albedo_is_as_asked(mean):
+    _, photo, _ = patches()
+    for prediction in retinex.retinex_predictions(photo, 3, mean)[..., :3]:
+        assert prediction.mean() == pytest.approx(mean, rel=1e-4)
+
+
+def test_hypotheses_differ_and_materials_are_neutral():
+    _, photo, _ = patches()
+    grain = np.exp(0.15 * np.random.default_rng(0).standard_normal((48, 64, 1)))
+    predictions = retinex.retinex_predictions(photo * grain, 4)
+    assert np.abs(np.diff(predictions[..., :3], axis=0)).max((1, 2, 3)).min() > 1e-3
+    assert (np.diff(predictions[:, 0, 0, 3]) > 0).all() and predictions[..., 4].max() <= 0.1
+
+
+@pytest.mark.parametrize(
+    "photo",
+    [np.zeros((8, 8, 3)), np.ones((8, 8, 3)), np.full((8, 8, 3), np.nan), np.ones((1, 1, 3)), np.full((1, 5, 3), 0.3)],
+)
+def test_dull_photographs_give_a_plain_albedo(photo):
+    predictions = retinex.retinex_predictions(photo, 2)
+    np.testing.assert_allclose(predictions[..., :3], 0.4, atol=1e-6)
+
+
+def test_pixels_that_do_not_count_do_not_spread():
+    _, photo, _ = patches(smooth_light=False)
+    valid = np.ones((48, 64), bool)
+    valid[20:24, 30:34] = False
+    spoilt = photo.copy()
+    spoilt[~valid] = [[np.inf, 5.0, np.nan]]
+    first = retinex.retinex_predictions(spoilt, 2, valid=valid)
+    spoilt[~valid] = 0.01
+    np.testing.assert_array_equal(first, retinex.retinex_predictions(spoilt, 2, valid=valid))
+    assert np.isfinite(first).all()
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(InputError, match="H, W, 3"):
+        retinex.retinex_predictions(np.zeros((4, 4)), 1)
+    with pytest.raises(InputError, match="object ids"):
+        retinex.retinex_predictions(np.zeros((4, 4, 3)), 1, object_id=np.zeros((3, 4), int))
+    with pytest.raises(InputError, match="samples"):
+        retinex.retinex_predictions(np.zeros((4, 4, 3)), 0)

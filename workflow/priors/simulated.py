@@ -1,0 +1,48 @@
+"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (iif_core.simulate)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.simulate import shading_proxy, simulate_predictions
+from workflow.normal_form import CaptureReader, View
+
+
+def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
+    """K spoilt copies of the truth of a view, (K, H, W, 5) float32; errors belong to the instances of the capture.
+
+    Raises:
+        InputError: the capture has no ground truth.
+    """
+    if not capture.has_truth:
+        raise InputError(
+            "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"
+            " use `prior: {kind: files}` or `{kind: retinex}`, or a source with truth (builtin, mitsuba)"
+        )
+    truth = capture.truth(view)
+    _, face_id = capture.gbuffer(view)
+    instance = capture.given_instances(view)
+    if instance is None:
+        instance = np.where(face_id >= 0, _instance_of_face(capture)[face_id], -1)
+    material = truth.valid & ~(truth.emission > 0).any(-1)
+    shading = shading_proxy(truth.radiance, truth.albedo, np.where(material, instance.clip(0), -1))
+    return simulate_predictions(
+        truth.albedo,
+        truth.roughness,
+        truth.metallic,
+        instance,
+        settings.prior.samples,
+        view.view_id,
+        seed,
+        settings.prior.strength,
+        shading,
+    )
+
+
+@lru_cache(1)
+def _instance_of_face(capture: CaptureReader) -> np.ndarray:
+    return capture.faces()["instance_id"].astype(np.int32)
