@@ -160,7 +160,7 @@ class CalibratedResponse:
         response: fitted curve, one row of parameters a channel; the start where the data say nothing.
         stops: largest difference of exposure within the cells that were used, in stops.
         pairs: (cell, view) pairs used, of all channels.
-        before, after: robust spread of log radiance within cells at the start and at the end, mean over channels.
+        before, after: robust spread of log radiance within cells at the start and at the end.
     """
 
     response: Response
@@ -180,6 +180,7 @@ def calibrate_response(
     min_stops: float = 1.0,
     min_pairs: int = 200,
     ridge: float = 2e-2,
+    channel_ridge: float = 1e-1,
 ) -> CalibratedResponse:
     """Camera response from surface that is seen under different, known exposures; needs no light and no material.
 
@@ -196,21 +197,28 @@ def calibrate_response(
         min_stops, min_pairs: below, or without free parameters, the start comes back.
         ridge: pull to the start, per pair. Gloss differs from view to view and, in few views, goes along with exposure by
             chance; where nothing is near saturation the scale of x hangs on the shape alone.
+        channel_ridge: pull of each channel to the curve of all channels, per pair.
     """
     value = np.asarray(value, np.float64)
     start = start if start.params.ndim == 2 else start.with_params(np.tile(start.params, (3, 1)))
     if not start.names or not len(cell):
         return CalibratedResponse(start, 0.0, 0, 0.0, 0.0)
-    params, stops, pairs, spreads = start.params.copy(), 0.0, 0, []
-    for c in range(3):
-        data = _exposed_pairs(cell, view, value[:, c], exposure, saturation, min_stops)
-        if len(data[0]) < min_pairs:
-            continue
-        params[c], *widths = _fit_channel(*data[:4], start.channel(c), saturation, ridge)
-        stops, pairs = max(stops, data[4]), pairs + len(data[0])
-        spreads.append(widths)
-    before, after = np.mean(spreads, 0) if spreads else (0.0, 0.0)
-    return CalibratedResponse(start.with_params(params), stops, pairs, float(before), float(after))
+    channels = [_exposed_pairs(cell, view, value[:, c], exposure, saturation, min_stops) for c in range(3)]
+    enough = [c for c in range(3) if len(channels[c][0]) >= min_pairs]
+    if not enough:
+        return CalibratedResponse(start, 0.0, 0, 0.0, 0.0)
+    # One curve for all channels first; each channel then has to earn its difference.
+    offsets = np.cumsum([0] + [int(channels[c][0].max()) + 1 for c in enough])
+    joined = [np.concatenate([channels[c][k] + (offsets[i] if k == 0 else 0) for i, c in enumerate(enough)]) for k in (0, 1, 2)]
+    clipped = np.concatenate([channels[c][3] for c in enough])
+    common = start.channel(0).with_params(start.params.mean(0))
+    shared, before, after = _fit_channel(*joined, clipped, common, saturation, ridge)
+    params, spreads = np.tile(shared, (3, 1)), []
+    for c in enough:
+        params[c], _, own = _fit_channel(*channels[c][:4], common.with_params(shared), saturation, channel_ridge)
+        spreads.append(own)
+    pairs, stops = sum(len(channels[c][0]) for c in enough), max(channels[c][4] for c in enough)
+    return CalibratedResponse(start.with_params(params), stops, pairs, before, float(np.mean(spreads)))
 
 
 def _exposed_pairs(
@@ -239,7 +247,8 @@ def _exposed_pairs(
 
 
 _FREEDOM = 4.0  # of Student's t: gloss and misregistration have heavy tails
-_FIT_PAIRS = 12_000
+_FIT_PAIRS = 10_000
+_GRID = np.linspace(0.0, 1.0, 2049) ** 3  # the curve is tabulated for the search: 1e-6 of its range
 
 
 def _fit_channel(
@@ -265,15 +274,16 @@ def _fit_channel(
     def spread(params: np.ndarray, sigma: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Deviation from the cell's robust level, its squared scale, log dI / d log x; log x of the saturated pairs."""
         curve = start.with_params(params)
-        x = np.maximum(curve.inverse(value), 1e-9)
-        gain = np.maximum(x * curve.derivative(x), 1e-9)
+        f, slope, _ = curve.evaluate(_GRID)
+        x = np.maximum(np.interp(value, f, _GRID), 1e-9)
+        gain = np.maximum(x * np.interp(x, _GRID, slope), 1e-9)
         scale2 = sigma**2 + (0.5 / 255.0 / gain) ** 2
         y = np.log(x) - log_e
         weight = 1.0 / scale2
         for _ in range(4):
             level = np.bincount(cell, weight * y, n_cells) / np.bincount(cell, weight, n_cells)
             weight = 1.0 / (scale2 + (y - level[cell]) ** 2 / _FREEDOM)
-        top = float(np.log(curve.inverse(np.array(saturation))))
+        top = float(np.log(np.interp(saturation, f, _GRID)))
         return y - level[cell], scale2, np.log(gain), level[full] + full_e - top
 
     def objective(z: np.ndarray) -> float:

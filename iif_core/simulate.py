@@ -12,7 +12,7 @@ The model reproduces the kinds of error, not their cause:
 Every random number is a hash of (seed, what, object, view, k): it does not depend on the order, on chunking, on image
 size, or on which other objects are in view. `strength` multiplies every error: 0 gives the truth, bit for bit.
 
-Calibration. `RGBX` gives, at strength 1, the raw errors the paper reports for RGB-X. Measured on the truth of the Country
+Calibration. `RGBX` gives, at strength 1, the raw errors the paper reports for RGB-X. Measured on truth of the Country
 Kitchen (10 views of 128 x 128, METHOD 2.11 masks, two samples of five views; mean and spread over seeds 0-5):
 
 |          | albedo PSNR dB | roughness L2  | metallic L2   |

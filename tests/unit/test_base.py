@@ -1,7 +1,11 @@
 """The base solver: recovers planted textures, keeps its gauge, survives bad predictions."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -566,3 +570,32 @@ def test_a_segment_in_two_views_is_refused():
 def test_bad_options_are_refused(options):
     with pytest.raises(InputError, match="base"):
         BaseOptions(**options)
+
+
+def test_same_bytes_whatever_the_threads_of_blas():
+    """Odd sizes, large enough for OpenBLAS to share out; its thread count is fixed when NumPy is imported."""
+    program = """
+import hashlib, numpy as np
+from iif_core.base import BaseProblem, solve_base
+rng = np.random.default_rng(0)
+maps = rng.random((2, 8, 40001, 5)).astype(np.float32)
+cell = [rng.permutation(40001) // 3 for _ in range(2)]
+segment = [np.full(40001, i) for i in range(2)]
+problem = BaseProblem(list(maps), cell, segment, 13334, np.zeros(13334, int), np.zeros(2, int))
+result = solve_base(problem)
+print(hashlib.sha256(result.value.tobytes() + result.scale.tobytes() + repr(result.history).encode()).hexdigest())
+"""
+    digests = set()
+    for threads in ("1", "2"):
+        environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        done = subprocess.run(
+            [sys.executable, "-c", program],
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=Path(__file__).resolve().parents[2],
+        )
+        assert done.returncode == 0, done.stderr
+        digests.add(done.stdout)
+    assert len(digests) == 1

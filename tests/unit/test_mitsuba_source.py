@@ -206,7 +206,8 @@ def test_a_textured_light_is_averaged_over_its_faces(load, tmp_path):
     picture[:, 1] = 4
     mi.Bitmap(picture).write(str(tmp_path / "glow.exr"))
     body = """<shape type="rectangle"><emitter type="area"><texture name="radiance" type="bitmap">
-      <string name="filename" value="glow.exr"/><string name="filter_type" value="nearest"/></texture></emitter></shape>"""
+      <string name="filename" value="glow.exr"/><string name="filter_type" value="nearest"/></texture>
+      </emitter></shape>"""
     _, mesh, _ = load(body)
     centre, _ = normals_of(mesh)
     assert len(mesh.faces) == 2 * 16 * 16
@@ -228,6 +229,7 @@ def material_of(load, bsdf: str):
 
 
 RGB = '<rgb name="{}" value="0.2,0.4,0.6"/>'
+BLUE = [0.2, 0.4, 0.6]
 GOLDISH = '<rgb name="eta" value="0.2,0.4,1.4"/><rgb name="k" value="3.9,2.4,1.6"/>'
 F0 = [((e - 1) ** 2 + k * k) / ((e + 1) ** 2 + k * k) for e, k in ((0.2, 3.9), (0.4, 2.4), (1.4, 1.6))]
 
@@ -236,7 +238,7 @@ F0 = [((e - 1) ** 2 + k * k) / ((e + 1) ** 2 + k * k) for e, k in ((0.2, 3.9), (
     ("bsdf", "albedo", "roughness", "metallic", "truth"),
     [
         ("<bsdf type='diffuse'/>", [0.5] * 3, 1, 0, True),
-        (f"<bsdf type='twosided'><bsdf type='diffuse'>{RGB.format('reflectance')}</bsdf></bsdf>", [0.2, 0.4, 0.6], 1, 0, True),
+        (f"<bsdf type='twosided'><bsdf type='diffuse'>{RGB.format('reflectance')}</bsdf></bsdf>", BLUE, 1, 0, True),
         (f"<bsdf type='plastic'>{RGB.format('diffuse_reflectance')}</bsdf>", [0.2, 0.4, 0.6], 0.02, 0, True),
         (
             f"<bsdf type='roughplastic'>{RGB.format('diffuse_reflectance')}<float name='alpha' value='0.09'/></bsdf>",
@@ -271,15 +273,17 @@ F0 = [((e - 1) ** 2 + k * k) / ((e + 1) ** 2 + k * k) for e, k in ((0.2, 3.9), (
             True,
         ),
         (
-            f"<bsdf type='blendbsdf'><float name='weight' value='0.25'/><bsdf type='diffuse'>{RGB.format('reflectance')}"
-            "</bsdf><bsdf type='conductor'><string name='material' value='none'/></bsdf></bsdf>",
+            f"<bsdf type='blendbsdf'><float name='weight' value='0.25'/>"
+            f"<bsdf type='diffuse'>{RGB.format('reflectance')}</bsdf>"
+            "<bsdf type='conductor'><string name='material' value='none'/></bsdf></bsdf>",
             [0.4, 0.55, 0.7],
             0.75 + 0.25 * 0.02,
             0.25,
             True,
         ),
         (
-            f"<bsdf type='mask'><float name='opacity' value='0.7'/><bsdf type='diffuse'>{RGB.format('reflectance')}</bsdf></bsdf>",
+            f"<bsdf type='mask'><float name='opacity' value='0.7'/>"
+            f"<bsdf type='diffuse'>{RGB.format('reflectance')}</bsdf></bsdf>",
             [0.2, 0.4, 0.6],
             1,
             0,
@@ -435,7 +439,8 @@ def test_a_tiny_room_and_an_open_floor_still_give_a_path(load):
     _, small, _ = load(box((0, 0, 0), (0.9, 0.8, 2.2)))
     found, *_ = plan(small, 4, start=(0.45, 0.4, 1.5))
     assert len(found.poses) == 4 and 0 < found.facts["clearance_m"] < 0.35
-    _, floor, _ = load('<shape type="rectangle"><transform name="to_world"><scale value="5"/></transform></shape>' + TABLE)
+    ground = '<shape type="rectangle"><transform name="to_world"><scale value="5"/></transform></shape>'
+    _, floor, _ = load(ground + TABLE)
     found, *_ = plan(floor, 4, start=(1.0, 1.0, 1.5))
     assert len(found.poses) == 4 and found.facts["escape_share"] > 0.3
     assert (found.poses[:, 2, 3] > 0.9).all()
@@ -625,7 +630,7 @@ def test_lights_that_are_not_surface_are_noted(llvm, tmp_path, monkeypatch):
 
 def test_one_sided_surface_has_no_truth_behind(llvm, tmp_path, monkeypatch):
     card = """<shape type="rectangle" id="card"><transform name="to_world"><rotate y="1" angle="90"/>
-      <translate x="2.2" y="1.6" z="1.3"/></transform><bsdf type="diffuse"/></shape>"""  # faces +x, away from the sensor
+      <translate x="2.2" y="1.6" z="1.3"/></transform><bsdf type="diffuse"/></shape>"""  # away from the sensor
     reader = capture(tmp_path, monkeypatch, ROOM + card)
     view = next(iter(reader))
     card_id = reader.reader.table("instances.parquet")["name"].tolist().index("diffuse/card")

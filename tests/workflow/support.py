@@ -2,12 +2,14 @@
 
 import hashlib
 import re
+import subprocess
 from pathlib import Path
 
 
-def planned(stderr: str) -> set[str]:
-    """Rules that a dry run would execute."""
-    return set(re.findall(r"^(?:local)?rule (\w+):", stderr, re.M)) - {"scenes"}
+def planned(result: subprocess.CompletedProcess) -> set[str]:
+    """Rules in the job table of a dry run."""
+    table = (result.stdout + result.stderr).partition("Job stats:")[2].partition("total")[0]
+    return set(re.findall(r"^(\w+) +\d+ *$", table, re.M)) - {"scenes"}
 
 
 def manifests(folder: Path) -> dict[str, str]:

@@ -24,7 +24,7 @@ def test_touched_code_inputs_and_scene_file_rerun_nothing(workflow):
 def test_a_setting_reruns_its_stage_and_those_below(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text().replace("render: {samples: 8}", "render: {samples: 9}"))
-    rules = planned(workflow.run("scenes/tiny", "-n").stderr)
+    rules = planned(workflow.run("scenes/tiny", "-n"))
     assert rules == {"render", "metrics", "report", "publish"}
 
 
@@ -87,7 +87,7 @@ def test_killed_job_resumes_to_the_same_result(finished, workflow):
     deadline = time.monotonic() + 120
     victim = None
     while victim is None and time.monotonic() < deadline:
-        out = subprocess.run(["pgrep", "-f", "-m workflow (shading|affines|base) tiny"], capture_output=True, text=True)
+        out = subprocess.run(["pgrep", "-f", "--", "-m workflow (shading|affines|base) tiny"], capture_output=True, text=True)
         mine = [int(pid) for pid in out.stdout.split() if _works_in(int(pid), workflow.folder)]
         victim = mine[0] if mine else None
         time.sleep(0.02)

@@ -36,7 +36,6 @@ from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, 
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
-GAINS = 1
 TILE = 8
 """Pixels of one object in one tile of this edge are averaged into one row (COMPUTE 4)."""
 STATISTICS_PIXELS = 20_000_000
@@ -436,8 +435,8 @@ class _System:
 
     def with_gains(self, initial: np.ndarray) -> _System:
         """Rows scaled by the albedo gains of the objects that go with the light."""
-        pinned = bool((self.anchor & ~self.rows.lower_bound.any(1)).any()) or GAINS == 2
-        if GAINS == 0: return self
+        # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
+        pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
         gain = object_gains(self.rows, self.observed, self.owner, initial, pinned)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0

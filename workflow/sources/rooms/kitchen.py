@@ -464,15 +464,14 @@ def _chair(x: float, y: float, sign: float, turn: float) -> tuple[list[Shape], S
             )
         )
     parts += [
-        box((-0.168, min(a, b) * 1.0, z), (0.168, max(a, b), z + h), 0.004)
+        box((-0.168, min(a, b), z), (0.168, max(a, b), z + h), 0.004)
         for a, b, z, h in (
             (0.192 * sign, 0.208 * sign, 0.60, 0.05),
             (0.205 * sign, 0.222 * sign, 0.76, 0.075),
         )
     ]
-    cushion = box((-0.185, -0.185, 0.4535), (0.185, 0.150 if sign > 0 else 0.185, 0.487), 0.012)
-    if sign < 0:
-        cushion = box((-0.185, -0.150, 0.4535), (0.185, 0.185, 0.487), 0.012)
+    front, back = (-0.185, 0.150) if sign > 0 else (-0.150, 0.185)
+    cushion = box((-0.185, front, 0.4535), (0.185, back, 0.487), 0.012)
     return [move(p, (x, y, 0), turn) for p in parts], move(cushion, (x, y, 0), turn)
 
 
@@ -492,7 +491,7 @@ def _seating(room: RoomBuilder) -> None:
     rails = [box((x0 + 0.09, y, 0.64), (x1 - 0.09, y + 0.02, 0.715)) for y in (y0 + 0.08, y1 - 0.10)]
     rails += [box((x, y0 + 0.09, 0.641), (x + 0.02, y1 - 0.09, 0.716)) for x in (x0 + 0.08, x1 - 0.10)]
     room.add("table", box((x0, y0, 0.712), (x1, y1, 0.745), 0.008), *legs, *rails, material=top)
-    cloth = {"#c58b2e": "#b87f27", "#3f6f86": "#38667c"}
+    cloth = (("#c58b2e", "#b87f27"), ("#3f6f86", "#38667c"))
     for number, (x, y, sign, turn) in enumerate(
         ((1.38, 1.12, -1, 4), (2.12, 1.16, -1, -7), (1.42, 2.42, 1, -5), (2.16, 2.52, 1, 12)), 1
     ):
@@ -502,7 +501,7 @@ def _seating(room: RoomBuilder) -> None:
             *parts,
             material=wood(BIRCH, BIRCH_DARK, UP, EAST, 0.40, 9.0, origin=(x, y, 0.1 * number)),
         )
-        light, dark = list(cloth.items())[number % 2]
+        light, dark = cloth[number % 2]
         room.add(
             f"cushion {number}",
             cushion,

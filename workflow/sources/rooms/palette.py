@@ -95,7 +95,7 @@ IRON = plain("#35353a", 0.55, metallic=1.0)
 BLACK_GLASS = plain("#16171a", 0.07)
 WHITE_GLAZE = plain("#ece8df", 0.16)
 WHITE_PAINT = plain("#ece8de", 0.42, "#e4dfd3")
-LINEN = Material(paint("#d8cbb2"), paint("#c9b999"), roughness=(0.92, 0.0, 0.0), grain=(30.0, 30.0, 30.0))
+
 
 FLOOR = Material(
     paint("#bf9062"),

@@ -73,12 +73,6 @@ def facing(axis: str) -> tuple[Sequence[float], Sequence[float]]:
     return _SQUARE[axis]
 
 
-def turned(degrees: float) -> tuple[Sequence[float], Sequence[float]]:
-    """(u, v) axes in the floor plane, turned about z."""
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    return (c, s, 0.0), (-s, c, 0.0)
-
-
 _COLUMNS = (
     *(f"{colour}_{c}" for colour in ("first", "second", "third") for c in "rgb"),
     *("r_0", "r_t", "r_s", "metallic", "kind", "size_u", "size_v"),
