@@ -118,11 +118,13 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
 
 
 def solve_emission(
-    rows: EmissionRows, initial: np.ndarray, cross: bool = True, ridge: float = 1e-4, max_rounds: int = 20
+    rows: EmissionRows, initial: np.ndarray, cross: bool = True, ridge: float = 1e-4, max_rounds: int = 20,
+    prior_width: float = 5.0,
 ) -> EmissionSolution:
     """Radiance of every emitter group: weighted non-negative least squares with one-sided rows (METHOD 7a).
 
-    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the diagonal).
+    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the diagonal)
+                        + v sum_g (E_g - E0_g)^2 / (prior_width E0_g)^2,  v = residual variance of a row of weight 1.
     Bounds that are violated join as equalities until the set rests.
 
     Args:
@@ -131,6 +133,8 @@ def solve_emission(
         cross: normal matrix from both estimates of A (unbiased); False: from their mean (biased low, always definite).
         ridge: pull towards E0 relative to the diagonal of the normal matrix.
         max_rounds: of the active set.
+        prior_width: standard deviation of E relative to E0 before looking at what it lights; keeps small groups whose light
+            reaches few pixels from taking any value at all. Infinity switches it off.
 
     Returns:
         `EmissionSolution`; always finite.
@@ -151,7 +155,7 @@ def solve_emission(
         return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
     square, square_target = 0.0, 0.0
     for c in range(3):
-        channel = _solve_channel(rows, c, initial[:, c], cross, ridge, max_rounds)
+        channel = _solve_channel(rows, c, initial[:, c], cross, ridge, max_rounds, prior_width)
         radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
         condition = max(condition, channel.condition)
         violated += channel.violated
@@ -204,19 +208,20 @@ def _normal(
 
 
 def _definite(
-    h: np.ndarray, k: np.ndarray, ridge: float
+    h: np.ndarray, k: np.ndarray, ridge: float, prior: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """H with every eigenvalue lifted above the noise level and the ridge; the lift; the condition number."""
+    """H with every eigenvalue lifted above the noise level and the ridge; the lift, prior (diagonal) included; the condition
+    number of H."""
     values, vectors = np.linalg.eigh(h)
     noise = float(np.linalg.norm(k, 2)) if k.any() else 0.0
     floor = max(noise, ridge, 1e-10)
     lift = np.maximum(floor - values, 0.0) + ridge
-    lifted = (vectors * lift) @ vectors.T
+    lifted = (vectors * lift) @ vectors.T + np.diag(prior)
     return h + lifted, lifted, float(values[-1] / max(values[0], floor))
 
 
 def _solve_channel(
-    rows: EmissionRows, c: int, initial: np.ndarray, cross: bool, ridge: float, max_rounds: int
+    rows: EmissionRows, c: int, initial: np.ndarray, cross: bool, ridge: float, max_rounds: int, prior_width: float
 ) -> _Channel:
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
@@ -227,7 +232,10 @@ def _solve_channel(
     answer, error, share, condition = initial.copy(), initial.copy(), np.zeros(len(initial)), 1.0
     joined = bound & (mean_a @ answer < target)
     seen: list[bytes] = []
-    rounds, converged = 0, False
+    rounds, converged, variance = 0, False, 0.0
+    largest = float(initial.max(initial=0.0))
+    # Without any initial brightness there is no scale for the prior, and it is left out.
+    width = prior_width * np.maximum(initial, 0.1 * largest) if largest > 0 else np.full(len(initial), np.inf)
     while rounds < max_rounds and not converged:
         rounds += 1
         active = ~bound | joined
@@ -236,7 +244,8 @@ def _solve_channel(
         if known.any():
             scale = np.sqrt(diagonal[known])
             unit = np.outer(scale, scale)
-            matrix, lifted, condition = _definite(h[np.ix_(known, known)] / unit, k[np.ix_(known, known)] / unit, ridge)
+            scaled_h, scaled_k = h[np.ix_(known, known)] / unit, k[np.ix_(known, known)] / unit
+            matrix, lifted, condition = _definite(scaled_h, scaled_k, ridge, variance / (width[known] * scale) ** 2)
             start = initial[known] * scale
             right = b[known] / scale + lifted @ start
             lower = np.linalg.cholesky(matrix)
@@ -251,11 +260,15 @@ def _solve_channel(
             error, share = initial.copy(), np.zeros(len(initial))
             share[known] = 1.0 - prior_part
             error[known] = np.sqrt(np.clip(np.diag(covariance), 0, None) + (prior_part * start) ** 2) / scale
-        now = bound & (mean_a @ answer < target)
-        converged = bool((now == joined).all())
+        difference = target - mean_a @ answer
+        now = bound & (difference > 0)
+        # The first round has no residual to weigh the prior with.
+        converged = rounds > 1 and bool((now == joined).all())
+        used = np.where(bound & ~now, 0.0, weight)
+        variance = float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
         joined = now
         mark = np.packbits(now).tobytes()
-        if mark in seen:  # a cycle between two sets: both are within a rounding of the optimum
+        if rounds > 1 and mark in seen and not converged:  # a cycle between two sets: both are within a rounding of the optimum
             break
         seen.append(mark)
     difference = target - mean_a @ answer
@@ -319,7 +332,7 @@ def object_gains(
     for _ in range(rounds):
         of_row = np.ones(observed.shape)
         of_row[index] = gain[own]
-        radiance = solve_emission(scale_rows(rows, observed, of_row), initial, cross).radiance
+        radiance = solve_emission(scale_rows(rows, observed, of_row), initial, cross, max_rounds=5).radiance
         p1 = np.einsum("ngc,gc->nc", a1, radiance) + h1
         p2 = np.einsum("ngc,gc->nc", a2, radiance) + h2
         new = np.ones_like(gain)

@@ -159,7 +159,7 @@ class Base(Section):
     """`full`: affines and selection; `uniform`: affines, no selection; the means: baselines."""
     cell_edge: float | None = Field(None, gt=0)
     """Edge of a surface cell in metres; default: `cell_footprints` pixel footprints."""
-    cell_footprints: float = Field(1.0, gt=0)
+    cell_footprints: float = Field(0.6, gt=0)
     """Cell edge in median pixel footprints."""
     sweeps: int = Field(12, ge=1, le=200)
     """Alternations."""

@@ -26,6 +26,8 @@ from workflow.normal_form import CaptureReader, View
 SATURATION = 0.99
 RESPONSE_SAMPLES = 101
 PROBE_PIXELS = 20_000
+THIN_PIXELS = 50
+"""Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
 _SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
 
 
@@ -90,10 +92,13 @@ class _Chosen:
     value: np.ndarray
 
 
-def _eligible(job: Job, capture: CaptureReader, scene: BaseScene, view: View, emits: np.ndarray) -> _Chosen:
-    """Interior, valid pixels of surface that does not shine."""
+def _eligible(
+    job: Job, capture: CaptureReader, scene: BaseScene, view: View, emits: np.ndarray, thin: np.ndarray | None = None
+) -> _Chosen:
+    """Valid pixels of surface that does not shine: interior ones, and all of those of `thin` objects (O,)."""
     pixels = view_pixels(job, capture, scene, view)
-    use = pixels.valid & pixels.interior & (pixels.object_id >= 0) & ~emits[pixels.face]
+    use = pixels.valid & (pixels.object_id >= 0) & ~emits[pixels.face]
+    use &= pixels.interior if thin is None else pixels.interior | thin[np.maximum(pixels.object_id, 0)]
     return _Chosen(pixels.index[use], pixels.object_id[use], pixels.value[use])
 
 
@@ -118,12 +123,13 @@ def _problem(
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
         counts += np.bincount(_eligible(job, capture, scene, view, emits).object_id, minlength=len(counts))
+    thin = counts < THIN_PIXELS
     share = fair_shares(counts, job.settings.affines.pixels)
     shading, levels = job.read("shading"), job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
     for done, view in enumerate(views):
-        chosen = _eligible(job, capture, scene, view, emits)
+        chosen = _eligible(job, capture, scene, view, emits, thin)
         rng = np.random.default_rng([job.seed, _SEEDS, view.view_id])
         keep = rng.random(len(chosen.index)) < share[chosen.object_id]
         index = chosen.index[keep]

@@ -45,6 +45,8 @@ ANCHOR_PIXELS = 64
 ANCHOR_WEIGHT = 100.0
 """Weight of what is directly seen of a group relative to everything that its light does elsewhere: a face that is looked at
 says what it emits; light it sends elsewhere also depends on albedos that the prior only guessed."""
+METAL = 0.9
+"""Predicted metalness from which a surface counts as metal in the solve."""
 _SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
 
 
@@ -73,8 +75,8 @@ def run(job: Job) -> None:
     notes: list[str] = []
     exposures, exposure_plan = _exposures(job, capture, scene, views, light, notes)
     light = _calibrated(job, capture, scene, views, light, exposures, notes)
-    statistics = _statistics(job, capture, scene, views)
-    groups, candidates, threshold = _groups(job, scene, statistics, light)
+    statistics, threshold = _statistics(job, capture, scene, views, light)
+    groups, candidates = _groups(job, scene, statistics, threshold)
     cache, misses = _radiance_cache(job, capture, scene, views, light, exposures, groups)
     secondary = _secondary_escape(job, capture, scene, views)
     environment = plan.environment(
@@ -192,44 +194,50 @@ def _shared_surface(
 # ----------------------------------------------------------------------------------------------------------------- groups
 
 
-def _statistics(job: Job, capture: CaptureReader, scene: BaseScene, views: list[View]) -> FaceStatistics:
-    """Statistics of the faces over interior pixels; over all pixels for faces with too few of those (small lamps)."""
+def _statistics(
+    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light
+) -> tuple[FaceStatistics, float]:
+    """Statistics of the faces, and the threshold in units of the photograph.
+
+    Pixels at the border of an object mix with what is beside it, so interior ones count. An object too thin to have any (a
+    filament) is judged by all of its pixels, if nearly all of them are bright: the frame of a window is not.
+    """
     total = sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
-    face, value, front, interior = [], [], [], []
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("face", "value", "front", "interior")}
     for done, view in enumerate(views):
         pixels = view_pixels(job, capture, scene, view)
         pixels = pixels.take(np.flatnonzero(pixels.valid)[::stride])
-        face.append(pixels.face)
-        value.append(pixels.value.astype(np.float32))
-        front.append(pixels.from_front)
-        interior.append(pixels.interior)
+        parts["face"].append(pixels.face)
+        parts["value"].append(pixels.value.astype(np.float32))
+        parts["front"].append(pixels.from_front)
+        parts["interior"].append(pixels.interior)
         job.progress(done + 1, len(views), "views searched for emitters")
-    joined = np.concatenate(face), np.concatenate(value), np.concatenate(front)
-    inside = np.concatenate(interior)
-    every = face_statistics(*joined, len(scene.faces))
-    inner = face_statistics(*(part[inside] for part in joined), len(scene.faces))
-    enough = inner.count >= job.settings.emission.min_observations
-    return FaceStatistics(
-        np.where(enough, inner.count, every.count),
-        np.where(enough, inner.low, every.low),
-        np.where(enough[:, None], inner.mean, every.mean),
-        np.where(enough, inner.front, every.front),
-    )
+    face, value, front, inside = (np.concatenate(part) for part in parts.values())
+    every = face_statistics(face, value, front, len(scene.faces))
+    inner = face_statistics(face[inside], value[inside], front[inside], len(scene.faces))
+    threshold = hdr_threshold(every) if light.is_hdr else light.saturation
+    owner = scene.object_id[face] + 1
+    size = scene.n_objects + 1
+    pixels_of = np.maximum(np.bincount(owner, minlength=size), 1)
+    bright = np.bincount(owner, value.max(1) >= threshold, size) / pixels_of
+    thin = np.bincount(owner, inside, size) < job.settings.emission.min_observations
+    allow = (thin & (bright >= 0.9))[scene.object_id + 1] & (scene.object_id >= 0)
+    merged = {
+        name: np.where(allow.reshape(-1, *[1] * (getattr(every, name).ndim - 1)), getattr(every, name), getattr(inner, name))
+        for name in ("count", "low", "mean", "front")
+    }
+    return FaceStatistics(**merged), float(threshold)
 
 
-def _groups(
-    job: Job, scene: BaseScene, statistics: FaceStatistics, light: _Light
-) -> tuple[EmitterGroups, int, float]:
-    """Groups, number of candidate groups, threshold in units of the photograph."""
-    threshold = hdr_threshold(statistics) if light.is_hdr else light.saturation
+def _groups(job: Job, scene: BaseScene, statistics: FaceStatistics, threshold: float) -> tuple[EmitterGroups, int]:
+    """Groups, and the number of candidate groups."""
     adjacency = face_adjacency(scene.faces)
-    candidate = emitter_candidates(
-        statistics, adjacency, scene.areas, threshold, job.settings.emission.min_observations
-    )
-    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas)
+    least = job.settings.emission.min_observations
+    candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
+    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, min_observations=least)
     job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
-    return groups, groups.size + len(groups.dropped), float(threshold)
+    return groups, groups.size + len(groups.dropped)
 
 
 # ------------------------------------------------------------------------------------------------------------------ cache
@@ -395,7 +403,11 @@ def _initial(
     out = np.zeros((groups.size, 3))
     for g in range(groups.size):
         own = rows.group == g
-        out[g] = rows.radiance[own].mean(0) if own.any() else (groups.observed[g] if light.is_hdr else 1.0)
+        if not own.any():
+            out[g] = groups.observed[g] if light.is_hdr else 1.0
+        else:
+            # Of bounds at different exposures the high ones say most.
+            out[g] = rows.radiance[own].mean(0) if light.is_hdr else np.quantile(rows.radiance[own], 0.9, axis=0)
     return np.concatenate([out, misses.radiance[None]]) if with_environment else out
 
 
@@ -409,13 +421,15 @@ def _trace(
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
+    # Predicted metalness is rarely right and would darken the diffuse light of half the room; only the certain is believed.
     pixels, base = rows.pixels, rows.base
+    metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
     halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
         halves.append(
             transport_matrix(
-                geometry, material, pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], base[:, 4],
+                geometry, material, pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic,
                 groups.of_face, n_groups, side, max(1, job.settings.emission.samples // 2),
                 job.settings.emission.max_bounces, ((job.seed << 32) | _SEEDS) * 2 + half, cache, environment_group,
             )
