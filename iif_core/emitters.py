@@ -1,7 +1,9 @@
 """Which surface shines by itself, in which groups, and the radiance cache of everything that does not.
 
-A face is a candidate when nearly all of its pixels in all views are saturated (LDR) or far brighter than the room (HDR). That
-is generous on purpose: the linear solve that follows gives a surface which merely reflects an emission near zero, and such
+A face is a candidate when nearly all of its pixels in all views are saturated (LDR) or far brighter than the room
+(HDR). That
+is generous on purpose: the linear solve that follows gives a surface which merely reflects an emission near zero,
+    and such
 groups are dropped again.
 """
 
@@ -45,7 +47,8 @@ def face_statistics(
         value: (n, 3) sensor value (LDR) or radiance (HDR); rows with non-finite values are left out.
         from_front: (n,) bool, the camera is on the side of the face normal.
         n_faces: F.
-        quantile: lower quantile; the observation of rank floor(quantile * count), so the minimum below 1 / quantile pixels.
+        quantile: lower quantile; the observation of rank floor(quantile * count), so the minimum below 1 /
+            quantile pixels.
     """
     good = (face >= 0) & np.isfinite(value).all(-1)
     face, value, from_front = face[good], np.asarray(value)[good], from_front[good]
@@ -63,7 +66,8 @@ def face_statistics(
 
 
 def face_adjacency(faces: np.ndarray) -> np.ndarray:
-    """Pairs of faces that share an edge (two vertex ids): (m, 2) int32, first < second; edges of more faces are chained."""
+    """Pairs of faces that share an edge (two vertex ids): (m, 2) int32, first < second; edges of more faces are
+    chained."""
     faces = np.asarray(faces, np.int64)
     if not len(faces):
         return np.zeros((0, 2), np.int32)
@@ -87,9 +91,9 @@ def face_geometry(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
 def hdr_threshold(statistics: FaceStatistics, ratio: float = 5.0) -> float:
     """Radiance above which a face may be an emitter: `ratio` times the median over pixels.
 
-    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may fill up to
-    half of the pixels. A white diffuse surface in a room reflects at most a few times the median; lamps and windows exceed it
-    by 10 to 50. Infinite when nothing was seen.
+    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may
+    fill up to half of the pixels. A white diffuse surface in a room reflects at most a few times the median; lamps
+    and windows exceed it by 10 to 50. Infinite when nothing was seen.
     """
     seen = statistics.count > 0
     if not seen.any():
@@ -110,7 +114,8 @@ def emitter_candidates(
 
     A face counts when its low quantile reaches `threshold` over at least `min_observations` pixels. Faces seen by fewer
     pixels are pooled: neighbours (also across a few unseen faces) that all reach the threshold count when together
-    they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to 90 % joins
+    they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to
+        90 % joins
     them, up to four times their area or `SMALL_AREA`: the gaps between them, and the far side of a lamp.
     """
     solid, unseen = areas > 1e-12, statistics.count == 0
@@ -202,14 +207,15 @@ def group_emitters(
     """Candidates in groups that share one radiance (METHOD 8): connected, normals within `max_angle`, colours within
     `max_ratio`, same side. A connected piece below `small_area` is one group whatever its normals (bulbs, shades).
 
-    Merging is greedy from the most similar neighbours on and compares the means of the groups, so that a gradient is cut
-    into steps instead of being chained into one group.
+    Merging is greedy from the most similar neighbours on and compares the means of the groups, so that a gradient
+    is cut into steps instead of being chained into one group.
 
     Args:
         candidate: (F,) bool; statistics, adjacency, normals (F, 3), areas (F,): of the same mesh.
         max_angle: degrees; max_ratio: of any channel between two groups; small_area, min_area: m^2.
         min_faces, min_area: a group needs one of the two.
-        min_observations: pixels that must have seen a group; a highlight on one face has fewer, and nothing bounds its radiance.
+        min_observations: pixels that must have seen a group; a highlight on one face has fewer, and nothing bounds
+            its radiance.
         max_groups: the strongest (area x radiance) are kept.
     """
     n_faces = len(candidate)
@@ -231,8 +237,14 @@ def group_emitters(
     weight = np.maximum(statistics.count[ids], 1e-3).astype(np.float64)
     colour = np.where(unseen[:, None], 0.0, statistics.mean[ids]) * weight[:, None]
     parent = _merge(
-        local[pair], normals[ids], areas[ids], colour, np.where(unseen, 0.0, weight), piece_area < small_area,
-        np.cos(np.radians(max_angle)), max_ratio,
+        local[pair],
+        normals[ids],
+        areas[ids],
+        colour,
+        np.where(unseen, 0.0, weight),
+        piece_area < small_area,
+        np.cos(np.radians(max_angle)),
+        max_ratio,
     )
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
     count = np.bincount(label)
@@ -245,7 +257,11 @@ def group_emitters(
     order = np.lexsort((np.arange(len(count)), -power))
     kept = [g for g in order if solid[g]][:max_groups]
     dropped = [
-        (int(count[g]), float(area[g]), "too small or hardly seen" if not solid[g] else f"not among the {max_groups} strongest")
+        (
+            int(count[g]),
+            float(area[g]),
+            "too small or hardly seen" if not solid[g] else f"not among the {max_groups} strongest",
+        )
         for g in order
         if g not in set(kept)
     ]
@@ -256,14 +272,25 @@ def group_emitters(
     side[of_face < 0] = 0
     kept_index = np.array(kept, np.int64)
     return EmitterGroups(
-        of_face, side, count[kept_index].astype(np.int32), area[kept_index], observed[kept_index].astype(np.float64),
-        pixels[kept_index].astype(np.int64), dropped,
+        of_face,
+        side,
+        count[kept_index].astype(np.int32),
+        area[kept_index],
+        observed[kept_index].astype(np.float64),
+        pixels[kept_index].astype(np.int64),
+        dropped,
     )
 
 
 def _merge(
-    pair: np.ndarray, normals: np.ndarray, areas: np.ndarray, colour: np.ndarray, weight: np.ndarray, small: np.ndarray,
-    min_cosine: float, max_ratio: float,
+    pair: np.ndarray,
+    normals: np.ndarray,
+    areas: np.ndarray,
+    colour: np.ndarray,
+    weight: np.ndarray,
+    small: np.ndarray,
+    min_cosine: float,
+    max_ratio: float,
 ) -> np.ndarray:
     """Union-find over neighbouring faces; returns the root of each."""
     n = len(areas)
@@ -306,8 +333,8 @@ class RadianceVoxels:
     Attributes:
         edge: m; origin: (3,) corner of voxel (0, 0, 0).
         ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black (METHOD H27).
-        radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored one, a lower
-            bound (H60).
+        radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored
+            one, a lower bound (H60).
         samples: (n,) int32 observations behind `radiance`.
         censored: (n,) bool, `radiance` is a lower bound.
     """
@@ -347,8 +374,10 @@ class RadianceSums:
         value, clipped = np.asarray(radiance, np.float64)[good], np.asarray(censored)[good]
         row = np.concatenate(
             [
-                np.where(clipped[:, None], 0.0, value), (~clipped)[:, None],
-                np.where(clipped[:, None], value, 0.0), clipped[:, None],
+                np.where(clipped[:, None], 0.0, value),
+                (~clipped)[:, None],
+                np.where(clipped[:, None], value, 0.0),
+                clipped[:, None],
             ],
             1,
         )
@@ -371,6 +400,4 @@ class RadianceSums:
         radiance = np.where(bound[:, None], self._value[:, 4:7], mean)
         ijk = unpack_keys(self._key)[0]
         samples = np.where(bound, clipped, count).astype(np.int32)
-        return RadianceVoxels(
-            self.edge, self.origin, ijk, radiance.astype(np.float32), samples, bound
-        )
+        return RadianceVoxels(self.edge, self.origin, ijk, radiance.astype(np.float32), samples, bound)

@@ -1,7 +1,8 @@
 """Exposure of every view, and the camera response, from surface that several views share.
 
-A surface cell c that views v and w both see is, up to gloss, equally bright in both: log y_vc = g_v + s_c. Minimising over the
-cells s_c leaves a small V x V problem in the gains g_v, solved by iteratively re-weighted least squares (Cauchy).
+A surface cell c that views v and w both see is, up to gloss, equally bright in both: log y_vc = g_v + s_c.
+Minimising over the cells s_c leaves a small V x V problem in the gains g_v, solved by iteratively re-weighted
+least squares (Cauchy).
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ class ExposureGains:
     """Result of `estimate_gains`.
 
     Attributes:
-        gain: (V,) float64, what the linearised photographs are multiplied by; geometric mean 1 within each group of views
-            that overlap; 1 where not estimated.
+        gain: (V,) float64, what the linearised photographs are multiplied by; geometric mean 1 within each group
+            of views that overlap; 1 where not estimated.
         error: (V,) float64 standard error of log gain (0 where not estimated).
         estimated: (V,) bool.
         group: (V,) int32, views with the same number are tied together by shared surface; -1 = no overlap.
@@ -44,8 +45,8 @@ def estimate_gains(
     Args:
         cell: (n,) int, surface cell that a pixel sees; -1 = leave out.
         view: (n,) int in [0, n_views).
-        value: (n,) or (n, 3) linearised sensor value f^-1(I), unsaturated; not-positive and non-finite values are left out.
-            The three channels share the gain.
+        value: (n,) or (n, 3) linearised sensor value f^-1(I), unsaturated; not-positive and non-finite values are
+            left out. The three channels share the gain.
         n_views: V.
         iterations: re-weighted solves.
         min_pairs: (cell, view) pairs on shared cells that a view needs.
@@ -114,7 +115,13 @@ def _components(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
 
 
 def _solve(
-    cell: np.ndarray, view: np.ndarray, log_y: np.ndarray, weight: np.ndarray, group: np.ndarray, n_views: int, iterations: int
+    cell: np.ndarray,
+    view: np.ndarray,
+    log_y: np.ndarray,
+    weight: np.ndarray,
+    group: np.ndarray,
+    n_views: int,
+    iterations: int,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     from scipy.sparse import coo_matrix
 
@@ -184,19 +191,19 @@ def calibrate_response(
 ) -> CalibratedResponse:
     """Camera response from surface that is seen under different, known exposures; needs no light and no material.
 
-    The same cell is equally bright in every view, so I_vc = f(e_v exp(s_c + n)). Maximum likelihood over the parameters and
-    the size of n (gloss, texture; Student's t) with the cells eliminated; half an 8-bit step limits dark pairs. Known
-    exposures fix the exponent that a scene with unknown exposures would leave open.
-    Saturated pairs enter as what they are, e exp(s) >= 1 up to noise: they fix the scale of x, which f(1) = 1 would otherwise
-    leave to extrapolation, and leaving them out would bend the curve near 1.
+    The same cell is equally bright in every view, so I_vc = f(e_v exp(s_c + n)). Maximum likelihood over the
+    parameters and the size of n (gloss, texture; Student's t) with the cells eliminated; half an 8-bit step limits
+    dark pairs. Known exposures fix the exponent that a scene with unknown exposures would leave open.
+    Saturated pairs enter as what they are, e exp(s) >= 1 up to noise: they fix the scale of x, which f(1) = 1
+    would otherwise leave to extrapolation, and leaving them out would bend the curve near 1.
 
     Args:
         cell: (n,) surface cell, -1 = leave out; view: (n,) int; value: (n, 3) sensor values.
         exposure: (V,) of the views; start: family and starting parameters.
         saturation: values from here on are bounds.
         min_stops, min_pairs: below, or without free parameters, the start comes back.
-        ridge: pull to the start, per pair. Gloss differs from view to view and, in few views, goes along with exposure by
-            chance; where nothing is near saturation the scale of x hangs on the shape alone.
+        ridge: pull to the start, per pair. Gloss differs from view to view and, in few views, goes along with
+            exposure by chance; where nothing is near saturation the scale of x hangs on the shape alone.
         channel_ridge: pull of each channel to the curve of all channels, per pair.
     """
     value = np.asarray(value, np.float64)
@@ -209,7 +216,10 @@ def calibrate_response(
         return CalibratedResponse(start, 0.0, 0, 0.0, 0.0)
     # One curve for all channels first; each channel then has to earn its difference.
     offsets = np.cumsum([0] + [int(channels[c][0].max()) + 1 for c in enough])
-    joined = [np.concatenate([channels[c][k] + (offsets[i] if k == 0 else 0) for i, c in enumerate(enough)]) for k in (0, 1, 2)]
+    joined = [
+        np.concatenate([channels[c][k] + (offsets[i] if k == 0 else 0) for i, c in enumerate(enough)])
+        for k in (0, 1, 2)
+    ]
     clipped = np.concatenate([channels[c][3] for c in enough])
     common = start.channel(0).with_params(start.params.mean(0))
     shared, before, after = _fit_channel(*joined, clipped, common, saturation, ridge)
@@ -252,18 +262,29 @@ _GRID = np.linspace(0.0, 1.0, 2049) ** 3  # the curve is tabulated for the searc
 
 
 def _fit_channel(
-    cell: np.ndarray, value: np.ndarray, log_e: np.ndarray, clipped: np.ndarray, start: Response, saturation: float, ridge: float
+    cell: np.ndarray,
+    value: np.ndarray,
+    log_e: np.ndarray,
+    clipped: np.ndarray,
+    start: Response,
+    saturation: float,
+    ridge: float,
 ) -> tuple[np.ndarray, float, float]:
     """Parameters of one channel and the spread of log radiance within cells before and after.
 
-    Maximum likelihood for log f^-1(I) = s + log e + t-distributed n. The density of I brings in log dI/dn: without it, or with
-    a residual in sensor units at an estimated s, the fit would flatten the noise by bending the curve.
+    Maximum likelihood for log f^-1(I) = s + log e + t-distributed n. The density of I brings in log dI/dn: without
+    it, or with a residual in sensor units at an estimated s, the fit would flatten the noise by bending the curve.
     """
     from scipy.optimize import minimize
 
     if len(cell) > _FIT_PAIRS:  # whole cells, spread evenly
         keep = cell % -(-len(cell) // _FIT_PAIRS) == 0
-        cell, value, log_e, clipped = np.unique(cell[keep], return_inverse=True)[1], value[keep], log_e[keep], clipped[keep]
+        cell, value, log_e, clipped = (
+            np.unique(cell[keep], return_inverse=True)[1],
+            value[keep],
+            log_e[keep],
+            clipped[keep],
+        )
     n_cells = int(cell.max()) + 1
     full, full_e = cell[clipped], log_e[clipped]
     cell, value, log_e = cell[~clipped], value[~clipped], log_e[~clipped]

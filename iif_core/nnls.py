@@ -1,10 +1,10 @@
 """Emission from photographs: light is linear in emission, so the emitters follow from non-negative least squares.
 
-With materials and geometry fixed, pixel p shows L_p = h_p + sum_g A_pg E_g in each colour channel (METHOD 7a). A is traced,
-so it is noisy, and a plain normal matrix E[A'A] = A'A + noise shrinks the answer (errors in variables): 50 % noise turns
-(5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W A2 + A2' W A1) / 2.
-H may then be indefinite; its antisymmetric part (A1' W A2 - A2' W A1) / 2 is nothing but noise of the same size, so
-directions of H below that size are handed to the prior instead of being inverted.
+With materials and geometry fixed, pixel p shows L_p = h_p + sum_g A_pg E_g in each colour channel (METHOD 7a). A
+is traced, so it is noisy, and a plain normal matrix E[A'A] = A'A + noise shrinks the answer (errors in variables):
+50 % noise turns (5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W A2 + A2'
+W A1) / 2. H may then be indefinite; its antisymmetric part (A1' W A2 - A2' W A1) / 2 is nothing but noise of the
+same size, so directions of H below that size are handed to the prior instead of being inverted.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ class EmissionRows:
 
     Attributes:
         first, second: (n, G, 3) float32, two independent estimates of A (`second` may be `first` when A is exact).
-        target, target_second: (n, 3) observed radiance minus h of the same two estimates. h and A of one trace share their
-            noise, so the right-hand side crosses them too: b = (A1' W t2 + A2' W t1) / 2.
+        target, target_second: (n, 3) observed radiance minus h of the same two estimates. h and A of one trace
+            share their noise, so the right-hand side crosses them too: b = (A1' W t2 + A2' W t1) / 2.
         weight: (n, 3) >= 0, weight of the squared residual.
-        lower_bound: (n, 3) bool: the sensor was saturated, the target is a lower bound and only a prediction below it counts.
+        lower_bound: (n, 3) bool: the sensor was saturated, the target is a lower bound and only a prediction below
+            it counts.
     """
 
     first: np.ndarray
@@ -64,11 +65,11 @@ class EmissionSolution:
 
     Attributes:
         radiance: (G, 3) float64 >= 0.
-        error: (G, 3) standard error: sandwich estimate from the residuals, widened by the initial value in as far as the
-            data leave a group to it.
+        error: (G, 3) standard error: sandwich estimate from the residuals, widened by the initial value in as far
+            as the data leave a group to it.
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
-        condition: largest / smallest eigenvalue of the normal matrix scaled to unit diagonal (worst channel), cut at the
-            noise level.
+        condition: largest / smallest eigenvalue of the normal matrix scaled to unit diagonal (worst channel), cut
+            at the noise level.
         residual: weighted root mean square of target - A E, relative to that of the target.
         violated: number of lower bounds that the answer does not reach.
         iterations: rounds of the active set; `converged` says whether it came to rest.
@@ -89,7 +90,8 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
 
     Args:
         rows: pixel rows.
-        block: (n,) int; pixels of one block should see one object in one small tile of one view (rows of different objects
+        block: (n,) int; pixels of one block should see one object in one small tile of one view (rows of different
+            objects
             must not be averaged: they differ for a reason). Lower bounds and equalities never mix.
 
     Returns:
@@ -112,29 +114,39 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
         return np.add.reduceat(values[order] * (share[:, None] if values.ndim == 3 else share), starts, 0)
 
     return EmissionRows(
-        mean(rows.first), mean(rows.second), mean(rows.target), mean(rows.target_second), total,
+        mean(rows.first),
+        mean(rows.second),
+        mean(rows.target),
+        mean(rows.target_second),
+        total,
         rows.lower_bound[order][starts],
     )
 
 
 def solve_emission(
-    rows: EmissionRows, initial: np.ndarray, cross: bool = True, ridge: float = 1e-4, max_rounds: int = 20,
+    rows: EmissionRows,
+    initial: np.ndarray,
+    cross: bool = True,
+    ridge: float = 1e-4,
+    max_rounds: int = 20,
     prior_width: float = 5.0,
 ) -> EmissionSolution:
     """Radiance of every emitter group: weighted non-negative least squares with one-sided rows (METHOD 7a).
 
-    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the diagonal)
+    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the
+    diagonal)
                         + v sum_g (E_g - E0_g)^2 / (prior_width E0_g)^2,  v = residual variance of a row of weight 1.
     Bounds that are violated join as equalities until the set rests.
 
     Args:
         rows: the system (see `block_rows`).
-        initial: (G, 3) E0 >= 0: where the answer stays when the data say nothing (unseen group, noise, duplicate columns).
+        initial: (G, 3) E0 >= 0: where the answer stays when the data say nothing (unseen group, noise, duplicate
+            columns).
         cross: normal matrix from both estimates of A (unbiased); False: from their mean (biased low, always definite).
         ridge: pull towards E0 relative to the diagonal of the normal matrix.
         max_rounds: of the active set.
-        prior_width: standard deviation of E relative to E0 before looking at what it lights; keeps small groups whose light
-            reaches few pixels from taking any value at all. Infinity switches it off.
+        prior_width: standard deviation of E relative to E0 before looking at what it lights; keeps small groups
+            whose light reaches few pixels from taking any value at all. Infinity switches it off.
 
     Returns:
         `EmissionSolution`; always finite.
@@ -207,11 +219,9 @@ def _normal(
     return h, k, b, diagonal
 
 
-def _definite(
-    h: np.ndarray, k: np.ndarray, ridge: float, prior: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """H with every eigenvalue lifted above the noise level and the ridge; the lift, prior (diagonal) included; the condition
-    number of H."""
+def _definite(h: np.ndarray, k: np.ndarray, ridge: float, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """H with every eigenvalue lifted above the noise level and the ridge; the lift, prior (diagonal) included; the
+    condition number of H."""
     values, vectors = np.linalg.eigh(h)
     noise = float(np.linalg.norm(k, 2)) if k.any() else 0.0
     floor = max(noise, ridge, 1e-10)
@@ -265,17 +275,28 @@ def _solve_channel(
         # The first round has no residual to weigh the prior with.
         converged = rounds > 1 and bool((now == joined).all())
         used = np.where(bound & ~now, 0.0, weight)
-        variance = float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
+        variance = (
+            float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
+        )
         joined = now
         mark = np.packbits(now).tobytes()
-        if rounds > 1 and mark in seen and not converged:  # a cycle between two sets: both are within a rounding of the optimum
+        if (
+            rounds > 1 and mark in seen and not converged
+        ):  # a cycle between two sets: both are within a rounding of the optimum
             break
         seen.append(mark)
     difference = target - mean_a @ answer
     counted = np.where(bound & (difference < 0), 0.0, weight)
     return _Channel(
-        answer, error, share, condition, int(joined.sum()), rounds, converged,
-        float((counted * difference**2).sum()), float((np.where(bound, counted, weight) * target**2).sum()),
+        answer,
+        error,
+        share,
+        condition,
+        int(joined.sum()),
+        rounds,
+        converged,
+        float((counted * difference**2).sum()),
+        float((np.where(bound, counted, weight) * target**2).sum()),
     )
 
 
@@ -308,9 +329,9 @@ def object_gains(
     """Albedo gain of each object and channel that goes with the light: (n_objects, 3).
 
     The base texture is off by a factor per object, and light solved with wrong albedos comes out wrong where an object
-    faces one emitter more than another. y = g_o (A E + h) is solved by turns for E (non-negative least squares) and for g
-    (a ratio per object, pulled to 1). Where no emitter is seen unsaturated only the product g E is known: the mean of log g
-    over the rows stays 0 then, as the prior has it.
+    faces one emitter more than another. y = g_o (A E + h) is solved by turns for E (non-negative least squares)
+    and for g (a ratio per object, pulled to 1). Where no emitter is seen unsaturated only the product g E is
+    known: the mean of log g over the rows stays 0 then, as the prior has it.
 
     Args:
         rows, observed, initial, cross: as in `scale_rows` and `solve_emission`.
@@ -374,7 +395,7 @@ def prune_groups(
     """Solve, then drop groups that do not shine and solve again (METHOD 8).
 
     A group goes when it carries less than `share` of the total power area x sum E and the residual grows by less than
-    `residual_change` without it, or when less than `emitted_share` of what was seen of it is its own (it reflects).
+    `residual_change` without it (its own pixels apart), or when less than `emitted_share` of what was seen of it is its own (it reflects).
 
     Args:
         rows, initial, cross: as in `solve_emission`.
@@ -395,7 +416,10 @@ def prune_groups(
             reason[g] = "no emission is left for it" if dark[g] else "reflects: little of its brightness is its own"
         if not drop.any() and weak.any():
             trial = _solve_subset(rows, initial, kept & ~weak, cross)
-            if trial.residual <= solution.residual * (1 + residual_change) + 1e-12:
+            # A surface that is brighter than its albedo says explains its own pixels; what counts is what it lights.
+            elsewhere = rows.first[:, weak].max(axis=(1, 2), initial=0.0) < 1.0
+            before, after = (_misfit(rows, s.radiance, elsewhere) for s in (solution, trial))
+            if after <= before * (1 + residual_change) + 1e-12:
                 drop = weak
                 for g in np.flatnonzero(weak):
                     reason[g] = f"below {share:.1%} of the power and not missed"
@@ -404,6 +428,14 @@ def prune_groups(
         kept &= ~drop
         solution = _solve_subset(rows, initial, kept, cross)
     return PrunedEmission(solution, kept, reason)
+
+
+def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float:
+    """Weighted root sum of squares of some rows; bounds that are met do not count."""
+    mean = 0.5 * (rows.first[mask] + rows.second[mask])
+    difference = rows.mean_target[mask] - np.einsum("ngc,gc->nc", mean, radiance)
+    counted = np.where(rows.lower_bound[mask] & (difference < 0), 0.0, rows.weight[mask])
+    return float(np.sqrt((counted * difference**2).sum()))
 
 
 def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, cross: bool) -> EmissionSolution:

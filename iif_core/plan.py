@@ -25,23 +25,32 @@ SECOND_PASS_GAIN = 0.10
 def _decision(component: str, included: bool, measure: str, value: float, threshold: float, reason: str) -> Decision:
     finite = float(value) if np.isfinite(value) else 0.0
     return {
-        "component": component, "included": bool(included), "measure": measure, "value": round(finite, 6),
-        "threshold": float(threshold), "reason": reason,
+        "component": component,
+        "included": bool(included),
+        "measure": measure,
+        "value": round(finite, 6),
+        "threshold": float(threshold),
+        "reason": reason,
     }
 
 
-def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
+def environment(
+    setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None
+) -> Decision:
     """Constant light from outside: needed when rays leave the mesh and what they meet is not black.
 
     Args:
         setting: `on`, `off` or `auto`.
         primary_escape: share of camera rays without a hit.
         secondary_escape: share of cosine-distributed rays from the surface that leave.
-        relative_brightness: mean radiance of escaping camera rays / mean radiance of the photographs; None = none escaped.
+        relative_brightness: mean radiance of escaping camera rays / mean radiance of the photographs; None = none
+            escaped.
     """
     measure = "share of cosine-distributed rays from the surface that leave the mesh"
     if setting != "auto":
-        return _decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
+        return _decision(
+            "environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}"
+        )
     leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
     dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
     if not leaves:
@@ -73,7 +82,9 @@ def camera_response(dynamic_range: str, family: str, start_residual: float, fitt
         return _decision("camera_response", False, measure, 0.0, RESPONSE_EXPLAINED, "photographs are linear radiance")
     useful = explained > RESPONSE_EXPLAINED
     verdict = "was needed" if useful else "changes little; the starting curve would have done"
-    return _decision("camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}")
+    return _decision(
+        "camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}"
+    )
 
 
 def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
@@ -96,7 +107,8 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
     count = int(np.count_nonzero(free))
     predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
     value = float(np.max(prior_median)) if len(prior_median) else 0.0
-    reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {count - predicted} because it pays)"
+    paying = count - predicted
+    reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {paying} because it pays)"
     return _decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
 
 
@@ -105,7 +117,9 @@ def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
     value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
     needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
     reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
-    return _decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
+    return _decision(
+        "specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason
+    )
 
 
 def affine_size(models: list[str]) -> Decision:
@@ -129,5 +143,9 @@ def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
     value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
-    reason = "would change the light noticeably; one pass is made" if value > SECOND_PASS_GAIN else "light would hardly change"
+    reason = (
+        "would change the light noticeably; one pass is made"
+        if value > SECOND_PASS_GAIN
+        else "light would hardly change"
+    )
     return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)

@@ -1,8 +1,8 @@
 """Camera response: the sensor value f(x) of exposed radiance x = e L, its derivatives and its inverse.
 
-A `Response` is a family and its parameters. Every family is monotone with f(0) = 0 and f(1) = 1; beyond [0, 1] it goes on
-as a straight line with its end slope, so that a prediction that is too bright keeps a gradient (METHOD H32). `identity`
-(HDR) is a straight line everywhere.
+A `Response` is a family and its parameters. Every family is monotone with f(0) = 0 and f(1) = 1; beyond [0, 1] it
+goes on as a straight line with its end slope, so that a prediction that is too bright keeps a gradient (METHOD
+H32). `identity` (HDR) is a straight line everywhere.
 
 | family | parameters | f(x), 0 <= x <= 1 |
 |---|---|---|
@@ -231,7 +231,9 @@ def response(family: str, params: np.ndarray | None = None) -> Response:
     """
     if family not in FAMILIES or family == "sampled":
         allowed = ", ".join(f for f in FAMILIES if f != "sampled")
-        raise InputError(f"camera response {family!r}: unknown; allowed: {allowed} (sampled curves: `sampled_response`)")
+        raise InputError(
+            f"camera response {family!r}: unknown; allowed: {allowed} (sampled curves: `sampled_response`)"
+        )
     start = {"gamma": [2.2], "ggcm": [-0.8, 0.0, 0.0]}.get(family, [])
     theta = np.asarray(start if params is None else params, np.float64)
     if theta.ndim not in (1, 2) or theta.shape[-1] != len(PARAMETERS[family]) or not np.isfinite(theta).all():

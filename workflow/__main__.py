@@ -45,12 +45,17 @@ def main() -> int:
     if arguments.command == "verify":
         return _verify(arguments.scenes)
     from iif_core import native
+
+    try:  # before NumPy is imported: a BLAS that has started keeps its threads
+        native.prepare()
+        native.limit_threads(arguments.threads)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     from workflow.job import configure_logging, run_stage
 
     configure_logging(arguments.log)
     try:
-        native.prepare()
-        native.limit_threads(arguments.threads)
         run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint)
     except InputError as error:
         logging.getLogger("error").error("%s", error)

@@ -28,7 +28,8 @@ class BaseScene:
     Attributes:
         vertices (n, 3), faces (m, 3), object_id (m,) of the faces, normals (m, 3), areas (m,).
         n_objects: objects are 0 ... n_objects - 1.
-        cell_edge, cell_origin, cell_ijk (c, 3), cell_object (c,), cell_values (c, 5): surface cells of the base texture.
+        cell_edge, cell_origin, cell_ijk (c, 3), cell_object (c,), cell_values (c, 5): surface cells of the base
+            texture.
         object_values: (n_objects, 5) means, for surface that nobody saw.
     """
 
@@ -74,9 +75,18 @@ def read_base_scene(job: Job) -> BaseScene:
     object_values[means["object_id"][seen]] = _rows(means)[seen]
     normals, areas = face_geometry(vertices, faces)
     return BaseScene(
-        vertices, faces, object_id, normals, areas, n_objects, float(facts["cell_edge_m"]),
-        np.asarray(facts["origin"], np.float32), np.stack([cells[c] for c in "ijk"], 1).astype(np.int32),
-        cells["object_id"].astype(np.int32), _rows(cells), object_values,
+        vertices,
+        faces,
+        object_id,
+        normals,
+        areas,
+        n_objects,
+        float(facts["cell_edge_m"]),
+        np.asarray(facts["origin"], np.float32),
+        np.stack([cells[c] for c in "ijk"], 1).astype(np.int32),
+        cells["object_id"].astype(np.int32),
+        _rows(cells),
+        object_values,
     )
 
 
@@ -128,8 +138,16 @@ def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) 
     normals = np.where(flat[:, None], wo, np.where(front[:, None], normals, -normals)).astype(np.float32)
     value = photo.reshape(-1, 3)[hit]
     return ViewPixels(
-        hit, points, normals, wo.astype(np.float32), face, ids_from_disk(maps["object.id"]).ravel()[hit], front, value,
-        valid.ravel()[hit] & np.isfinite(value).all(1), maps["interior"].ravel()[hit] > 0.5,
+        hit,
+        points,
+        normals,
+        wo.astype(np.float32),
+        face,
+        ids_from_disk(maps["object.id"]).ravel()[hit],
+        front,
+        value,
+        valid.ravel()[hit] & np.isfinite(value).all(1),
+        maps["interior"].ravel()[hit] > 0.5,
     )
 
 

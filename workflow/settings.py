@@ -89,7 +89,7 @@ class Capture(Section):
     exposure: Literal["given", "estimate"] = "given"
     """`estimate`: gains of the views from surface that they share."""
     denoise: bool = False
-    """Denoise rendered photographs (needs the optional package pyoidn)."""
+    """Denoise rendered photographs: fewer samples do, at the price of a bias of a few per cent."""
     test_every: int = Field(0, ge=0)
     """Every n-th view is kept for testing and never used (0 = none)."""
 

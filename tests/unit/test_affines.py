@@ -17,7 +17,13 @@ from iif_core.response import response
 
 LEVELS = np.linspace(0.02, 1.0, 10)
 EXACT = FitOptions(
-    iterations=60, ridge=1e-13, robust_width=1e3, roughness_weight=0, metallic_weight=0, multi_start=False, metallic_prior=2,
+    iterations=60,
+    ridge=1e-13,
+    robust_width=1e3,
+    roughness_weight=0,
+    metallic_weight=0,
+    multi_start=False,
+    metallic_prior=2,
     response_ridge=1e-14,
 )
 
@@ -80,9 +86,7 @@ def test_planted_affines_are_recovered_from_clean_hdr():
 
 @pytest.mark.parametrize("halves", [1, 2])
 def test_planted_affines_and_gamma_from_clean_ldr(halves):
-    problem, truth = _problem(
-        np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x), halves=halves
-    )
+    problem, truth = _problem(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x), halves=halves)
     out = fit_affines(problem, response("gamma"), EXACT)
     np.testing.assert_allclose(out.response.params, 1.9, atol=1e-6)
     np.testing.assert_allclose(out.affine, truth, atol=1e-5)
@@ -101,7 +105,9 @@ def test_planted_ggcm_per_channel():
 def test_gradient_and_normal_matrix_against_differences(family):
     """Every term at once: robust weights, two halves, saturation, out-of-range values, regularisers, ridge."""
     rng = np.random.default_rng(3)
-    problem, _ = _problem(rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5)
+    problem, _ = _problem(
+        rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5
+    )
     saturated = problem.value > 0.8
     problem = FitProblem(**{**problem.__dict__, "saturated": saturated})
     problem.base[:, 4] = rng.uniform(0.1, 0.9, 80)
@@ -135,9 +141,7 @@ def test_noise_in_the_cache_raises_gamma_and_two_halves_cure_it():
         rng, n_objects=8, per_object=3000, value_of=lambda x: response("gamma", [1.9])(x), noise=0.5, halves=2
     )
     opt = FitOptions(iterations=25, ridge=1e-6, robust_width=1.0, multi_start=False, metallic_prior=2)
-    mean = {
-        name: (0.5 * (getattr(problem, name)[0] + getattr(problem, name)[1]),) for name in ("diffuse", "s0", "s1")
-    }
+    mean = {name: (0.5 * (getattr(problem, name)[0] + getattr(problem, name)[1]),) for name in ("diffuse", "s0", "s1")}
     plain = fit_affines(FitProblem(**{**problem.__dict__, **mean}), response("gamma"), opt)
     two = fit_affines(problem, response("gamma"), opt)
     assert plain.response.params[0] > 2.05
@@ -185,7 +189,9 @@ def test_all_saturated_object_does_not_darken():
     np.testing.assert_allclose(out.affine[1], IDENTITY, atol=1e-3)  # every bound is met: nothing pulls
     assert np.isfinite(out.covariance).all() and out.residual[1] == 0
     raised = response("gamma")(1.3 * response("gamma").inverse(problem.value))
-    high = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)})
+    high = FitProblem(
+        **{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)}
+    )
     out = fit_affines(high, response("gamma"), FitOptions(iterations=10))
     assert out.affine[1, [0, 5, 10]].min() > 1.15  # bounds that are not met pull upwards
 
@@ -271,7 +277,9 @@ def test_covariance_is_of_the_right_size():
     """Spread of the fitted gain over repeated noise against the reported standard deviation."""
     rng = np.random.default_rng(15)
     problem, _ = _problem(rng, 1, 400, truth=IDENTITY[None])
-    opt = FitOptions(iterations=8, ridge=1e-9, robust_width=1e3, multi_start=False, roughness_weight=0, metallic_prior=2)
+    opt = FitOptions(
+        iterations=8, ridge=1e-9, robust_width=1e3, multi_start=False, roughness_weight=0, metallic_prior=2
+    )
     gains, reported = [], []
     for _ in range(60):
         noisy = problem.value * np.exp(rng.normal(0, 0.05, problem.value.shape))
@@ -318,7 +326,12 @@ def test_same_bytes_twice():
 
 def test_refused():
     problem, _ = _problem(np.random.default_rng(19), 1, 30)
-    for change in ({"value": problem.value[:5]}, {"diffuse": ()}, {"levels": LEVELS[::-1]}, {"s0": (problem.s0[0][:, :3],)}):
+    for change in (
+        {"value": problem.value[:5]},
+        {"diffuse": ()},
+        {"levels": LEVELS[::-1]},
+        {"s0": (problem.s0[0][:, :3],)},
+    ):
         with pytest.raises(InputError):
             FitProblem(**{**problem.__dict__, **change})
     with pytest.raises(InputError, match="scale"):

@@ -81,7 +81,9 @@ def test_finely_tessellated_lamp_is_found_by_pooling():
     count = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 0)  # the upper half was seen, one pixel a face
     stats = _statistics(count, count * 1.0)
     assert (emitter_candidates(stats, adjacency, areas, 0.99)).all()  # far side included
-    sparse = np.where(np.random.default_rng(0).random(len(faces)) < 0.25, 1, 0) * (vertices[faces].mean(1)[:, 2] > -0.05)
+    sparse = np.where(np.random.default_rng(0).random(len(faces)) < 0.25, 1, 0) * (
+        vertices[faces].mean(1)[:, 2] > -0.05
+    )
     found = emitter_candidates(_statistics(sparse, sparse * 1.0), adjacency, areas, 0.99)
     assert areas[found].sum() > 0.9 * areas.sum()  # gaps between the seen faces are filled
     few = np.zeros(len(faces))
@@ -126,7 +128,9 @@ def test_groups_by_plane_colour_and_side():
     flat_normals, flat_areas = face_geometry(flat, faces)
     assert group_emitters(everything, stats, adjacency, flat_normals, flat_areas).size == 2
 
-    back = FaceStatistics(stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4"))
+    back = FaceStatistics(
+        stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4")
+    )
     out = group_emitters(everything, back, adjacency, flat_normals, flat_areas)
     assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
 
@@ -135,9 +139,7 @@ def test_gradient_is_cut_into_steps():
     vertices, faces = _strip(20)
     normals, areas = face_geometry(vertices, faces)
     brightness = np.repeat(1.15 ** np.arange(20), 2)  # neighbours differ by 15 %, the ends by a factor 14
-    out = group_emitters(
-        np.ones(40, bool), _statistics([30] * 40, brightness), face_adjacency(faces), normals, areas
-    )
+    out = group_emitters(np.ones(40, bool), _statistics([30] * 40, brightness), face_adjacency(faces), normals, areas)
     assert 4 <= out.size <= 14
     for g in range(out.size):
         inside = brightness[out.of_face == g]

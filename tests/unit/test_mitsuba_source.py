@@ -527,11 +527,12 @@ def test_rendering_is_the_same_to_the_last_bit_and_balancing_lights_keeps_the_me
 def test_denoising_needs_its_package(monkeypatch):
     import sys
 
-    from workflow.sources.mitsuba_scene import render
+    from workflow.sources.denoise import require_denoiser
 
+    require_denoiser()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match="pip install pyoidn"):
-        render.require_denoiser()
+    with pytest.raises(InputError, match="capture.denoise: false"):
+        require_denoiser()
 
 
 # ------------------------------------------------------------------------------------------------ the whole stage

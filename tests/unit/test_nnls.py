@@ -34,7 +34,8 @@ def test_noise_in_a_attenuates_and_two_estimates_cure_it():
     a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))
     single = solve_emission(_rows(a1, a1, y), np.ones((3, 3)), cross=False, ridge=1e-9)
     both = solve_emission(_rows(a1, a2, y), np.ones((3, 3)), cross=True, ridge=1e-9)
-    # E[A'A] = J/4 + I/12 for uniform A; the noise adds I/12 on the diagonal: x = (J/4 + I/6)^-1 (J/4 + I/12) (5, 10, 20).
+    # E[A'A] = J/4 + I/12 for uniform A; the noise adds I/12 on the diagonal: x = (J/4 + I/6)^-1 (J/4 + I/12) (5,
+    # 10, 20).
     np.testing.assert_allclose(single.radiance[:, 0], [7.27, 9.77, 14.77], atol=0.15)
     np.testing.assert_allclose(both.radiance[:, 0], [5, 10, 20], atol=0.15)
     assert (np.abs(both.radiance - TRUE) < 5 * both.error + 1e-9).all()
@@ -183,7 +184,13 @@ def test_pruning_keeps_what_shines():
         _rows(a, a, y), np.ones((5, 3)), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), observed, np.arange(5) == 4, cross=False
     )
     assert out.kept.tolist() == [True, False, False, False, True]
-    assert (out.solution.radiance[~out.kept] == 0).all() and [bool(r) for r in out.reason] == [False, True, True, True, False]
+    assert (out.solution.radiance[~out.kept] == 0).all() and [bool(r) for r in out.reason] == [
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
     assert "reflects" in out.reason[2] and "power" in out.reason[3]
 
 

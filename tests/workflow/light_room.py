@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -80,11 +81,17 @@ class Room:
         self.vertices, self.faces = _join(list(parts.values()))
         self.object_id = np.repeat(np.arange(len(parts)), [len(f) for _, f in parts.values()]).astype(np.int32)
         looks = {
-            "floor": ((0.45, 0.3, 0.2), 0.5, 0), "ceiling": ((0.75, 0.75, 0.72), 0.9, 0),
-            "wall_a": ((0.6, 0.62, 0.55), 0.8, 0), "wall_b": ((0.6, 0.3, 0.3), 0.8, 0),
-            "wall_c": ((0.3, 0.45, 0.6), 0.8, 0), "wall_d": ((0.65, 0.6, 0.5), 0.8, 0),
-            "table": ((0.5, 0.35, 0.2), 0.4, 0), "metal": ((0.85, 0.7, 0.4), 0.3, 1),
-            "glossy": ((0.1, 0.2, 0.4), 0.2, 0), "lamp": ((0, 0, 0), 1, 0), "bulb": ((0, 0, 0), 1, 0),
+            "floor": ((0.45, 0.3, 0.2), 0.5, 0),
+            "ceiling": ((0.75, 0.75, 0.72), 0.9, 0),
+            "wall_a": ((0.6, 0.62, 0.55), 0.8, 0),
+            "wall_b": ((0.6, 0.3, 0.3), 0.8, 0),
+            "wall_c": ((0.3, 0.45, 0.6), 0.8, 0),
+            "wall_d": ((0.65, 0.6, 0.5), 0.8, 0),
+            "table": ((0.5, 0.35, 0.2), 0.4, 0),
+            "metal": ((0.85, 0.7, 0.4), 0.3, 1),
+            "glossy": ((0.1, 0.2, 0.4), 0.2, 0),
+            "lamp": ((0, 0, 0), 1, 0),
+            "bulb": ((0, 0, 0), 1, 0),
         }
         colour = np.array([looks[name][0] for name in self.names])[self.object_id]
         texture = rng.uniform(0.6, 1.25, (len(self.faces), 1)) * rng.uniform(0.95, 1.05, (len(self.faces), 3))
@@ -126,13 +133,23 @@ class StubJob:
 
 
 def build(
-    folder: Path, views: int = 8, size: int = 48, samples: int = 128, dynamic_range: str = "hdr", spoil: float = 0.2,
-    seed: int = 0, curve: str | None = None, exposures: np.ndarray | None = None,
+    folder: Path,
+    views: int = 8,
+    size: int = 48,
+    samples: int = 128,
+    dynamic_range: str = "hdr",
+    spoil: float = 0.2,
+    seed: int = 0,
+    curve: str | None = None,
+    exposures: np.ndarray | None = None,
+    brightness: float = 1.0,
+    told: bool = True,
 ) -> Room:
     """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture."""
     from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
 
     room = Room(seed)
+    room.emission *= brightness
     rng = np.random.default_rng(seed + 1)
     exposures = np.ones(views) if exposures is None else exposures
     cameras = room.views(views, size, exposures)
@@ -143,11 +160,13 @@ def build(
     capture = StubJob("capture", folder, {}).writer
     segmentation = StubJob("segmentation", folder, {}).writer
     form = CaptureWriter(capture)
-    form.cameras(cameras)
+    form.cameras(cameras if told else [replace(view, exposure=1.0) for view in cameras])
     form.mesh(room.vertices, room.faces, room.object_id, room.names, room.emission)
     spoiled, pixels = _spoil(room, spoil, rng), []
     for view in cameras:
-        directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(-1, 3)
+        directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(
+            -1, 3
+        )
         origin = view.world_from_camera[:3, 3]
         face, depth = trace(geometry, origin, directions)
         radiance = render(geometry, material, emitters, origin, directions, samples, 10, 1000 + view.view_id)
@@ -166,7 +185,14 @@ def build(
             f"maps/{view.name}.exr",
             {"object.id": ids_to_disk(objects), "segment.id": ids_to_disk(objects), "interior": inner},
         )
-        pixels.append((view, origin + depth[:, None] * directions, objects.ravel(), np.where((face >= 0)[:, None], spoiled[face], 0)))
+        pixels.append(
+            (
+                view,
+                origin + depth[:, None] * directions,
+                objects.ravel(),
+                np.where((face >= 0)[:, None], spoiled[face], 0),
+            )
+        )
     form.finish("test", dynamic_range, True, [])
     capture_facts = {"object_id": np.arange(len(room.names), dtype=np.int32), "name": np.array(room.names)}
     segmentation.table("objects.parquet", capture_facts)
@@ -223,9 +249,13 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
         base.exr(
             f"maps/{view.name}.exr",
             {
-                "cell.id": ids_to_disk(ids.reshape(size, size)), **split_rgb(maps[..., :3], "albedo"),
-                "roughness": maps[..., 3], "metallic": maps[..., 4],
-                "scale.albedo": flat, "scale.roughness": flat, "scale.metallic": flat,
+                "cell.id": ids_to_disk(ids.reshape(size, size)),
+                **split_rgb(maps[..., :3], "albedo"),
+                "roughness": maps[..., 3],
+                "metallic": maps[..., 4],
+                "scale.albedo": flat,
+                "scale.roughness": flat,
+                "scale.metallic": flat,
             },
         )
     base.json("base.json", {"cell_edge_m": CELL, "origin": [float(v) for v in origin]})
@@ -233,8 +263,14 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
 
 
 EMISSION = {
-    "saturation": 0.99, "min_observations": 8, "cache_edge": 0.06, "max_bounces": 6, "rows": 12000, "samples": 16,
-    "prune": 0.01, "environment": "auto",
+    "saturation": 0.99,
+    "min_observations": 8,
+    "cache_edge": 0.06,
+    "max_bounces": 6,
+    "rows": 12000,
+    "samples": 16,
+    "prune": 0.01,
+    "environment": "auto",
 }
 SHADING = {"samples": 32, "levels": 10, "max_bounces": 6, "indirect": "cache"}
 AFFINES = {"response": "auto", "iterations": 12, "pixels": 200000, "ridge": 2e-3, "robust_width": 0.1, "scale": "prior"}

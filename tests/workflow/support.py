@@ -19,3 +19,13 @@ def manifests(folder: Path) -> dict[str, str]:
         for path in sorted(folder.glob("results/*/*/manifest.json"))
         if path.parent.name not in ("publish", "report")
     }
+
+
+def treatment(case: str) -> str:
+    """The text that docs/bad-input.md promises for a case."""
+    page = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
+    for line in page.read_text().splitlines():
+        match = re.fullmatch(r"\| (.+?) \| `(.+)` \|", line)
+        if match and match[1] == case:
+            return match[2]
+    raise AssertionError(f"docs/bad-input.md has no row for {case!r}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.sources.denoise import NOTE, denoise, require_denoiser
 
 if TYPE_CHECKING:
     from workflow.job import Job
@@ -44,8 +45,6 @@ def capture(job: Job) -> None:
         mi.set_variant("llvm_ad_rgb")
     native.limit_threads(job.threads)
     if job.settings.capture.denoise:
-        from workflow.sources.mitsuba_scene.render import require_denoiser
-
         require_denoiser()
     from workflow.sources import rooms
 
@@ -126,8 +125,6 @@ class _Capture:
         scene = (self.geometry, self.material, self.emitters)
         image = render(*scene, origin, rays, self.settings.samples, MAX_BOUNCES, seed, jitter=steps)
         if self.settings.denoise:
-            from workflow.sources.mitsuba_scene.render import denoise
-
             normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.geometry.normals[on], 0)
             image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
         radiance[:] = image.reshape(*shape, 3)
@@ -187,7 +184,7 @@ class _Capture:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
             notes.append(
-                "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
+                NOTE
             )
         facts = {
             "room": self.room.name,

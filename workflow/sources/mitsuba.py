@@ -16,6 +16,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.sources.denoise import NOTE, denoise, require_denoiser
 from workflow.sources.mitsuba_scene.document import referenced_files
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def capture(job: Job) -> None:
     scene.choose_variant()
     native.limit_threads(job.threads)
     if job.settings.capture.denoise:
-        render.require_denoiser()
+        require_denoiser()
     _Capture(job).run()
 
 
@@ -216,7 +217,7 @@ class _Capture:
                 self.loaded.scene, integrator, view, self.settings.samples, self.job.seed
             )
             if self.settings.denoise:
-                image = render.denoise(image, truth.albedo, self._normals(view, face))
+                image = denoise(image, truth.albedo, self._normals(view, face))
             self.dropped += dropped
             self.writer.gbuffer(view.name, depth, face)
             self.writer.truth(view.name, replace(truth, radiance=image))
@@ -329,7 +330,7 @@ class _Capture:
             )
         if self.settings.denoise:
             self.notes.append(
-                "photographs denoised (Intel Open Image Denoise): biased, and so is the radiance truth"
+                NOTE
             )
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)

@@ -40,7 +40,9 @@ def run(job: Job) -> None:
     problem = _problem(job, capture, scene, emits, exposures)
     start = _starting_response(job)
     options = FitOptions(
-        iterations=settings.iterations, ridge=settings.ridge, robust_width=settings.robust_width,
+        iterations=settings.iterations,
+        ridge=settings.ridge,
+        robust_width=settings.robust_width,
         scale="none" if capture.is_hdr else settings.scale,
     )
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
@@ -61,9 +63,12 @@ def run(job: Job) -> None:
             "history": [float(x) for x in fit.history],
             "converged": bool(fit.converged),
             "pixels": int(fit.pixels.sum()),
-            "residual": float(np.sqrt(np.average(fit.residual**2, weights=np.maximum(fit.pixels, 1e-9)))) if len(fit.pixels) else 0.0,
+            "residual": float(np.sqrt(np.average(fit.residual**2, weights=np.maximum(fit.pixels, 1e-9))))
+            if len(fit.pixels)
+            else 0.0,
             "response": {
-                "family": fit.response.family, "names": list(fit.response.names),
+                "family": fit.response.family,
+                "names": list(fit.response.names),
                 "parameters": np.ravel(fit.response.params).tolist(),
             },
             "plan": decisions,
@@ -71,11 +76,12 @@ def run(job: Job) -> None:
     )
 
 
-# ------------------------------------------------------------------------------------------------------------------ input
+# -------------------------------------------------------------------------------------------------------------- input
 
 
 def _starting_response(job: Job) -> Response:
-    """Where stage emission left the response; one row of parameters a channel, because cameras differ between channels."""
+    """Where stage emission left the response; one row of parameters a channel, because cameras differ between
+    channels."""
     facts = job.read("emission").json("emission.json")["response"]
     params = np.asarray(facts["parameters"], np.float64)
     if not params.size:
@@ -103,7 +109,8 @@ def _eligible(
 
 
 def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
-    """Share of each object's pixels to keep, (O,): the same number for every object until the budget is used, all of the
+    """Share of each object's pixels to keep, (O,): the same number for every object until the budget is used, all
+    of the
     pixels of those that have fewer."""
     counts = np.asarray(counts, np.float64)
     if counts.sum() <= budget:
@@ -150,7 +157,15 @@ def _problem(
     # A value at the top of the range is a bound there, whatever is stored above it.
     value = np.minimum(value, SATURATION) if not capture.is_hdr else value
     return FitProblem(
-        joined["object"].astype(np.int32), scene.n_objects, joined["base"], d, s0, s1, levels, value, joined["exposure"],
+        joined["object"].astype(np.int32),
+        scene.n_objects,
+        joined["base"],
+        d,
+        s0,
+        s1,
+        levels,
+        value,
+        joined["exposure"],
         saturated,
     )
 
@@ -175,20 +190,23 @@ def _names(job: Job, n_objects: int) -> list[str]:
     return names
 
 
-# ----------------------------------------------------------------------------------------------------------------- output
+# ------------------------------------------------------------------------------------------------------------- output
 
 
 def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
     spread = np.sqrt(np.clip(np.diagonal(fit.covariance, axis1=1, axis2=2), 0.0, None))
     columns: dict[str, Any] = {
-        "object_id": np.arange(len(names), dtype=np.int32), "name": np.array(names, dtype=str), "pixels": fit.pixels,
+        "object_id": np.arange(len(names), dtype=np.int32),
+        "name": np.array(names, dtype=str),
+        "pixels": fit.pixels,
     }
     for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
         columns[f"T_{name}"] = fit.affine[:, part]
     for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
         columns[f"std_{name}"] = spread[:, part]
     columns |= {
-        "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2), "residual": fit.residual,
+        "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2),
+        "residual": fit.residual,
         "model": np.array(fit.model, dtype=str),
     }
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
@@ -215,7 +233,10 @@ def _write_cells(job: Job, fit: FitResult) -> None:
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
     spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, scale)
-    columns = {"cell_id": cells["cell_id"], **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)}}
+    columns = {
+        "cell_id": cells["cell_id"],
+        **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)},
+    }
     job.writer.table("cells.parquet", {**columns, "uncertainty": spread.astype(np.float32)})
 
 
@@ -233,7 +254,8 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
         shape = (view.height, view.width)
         channels = {
             **split_rgb(fitted[:, :3].reshape(*shape, 3), "albedo"),
-            "roughness": fitted[:, 3].reshape(shape), "metallic": fitted[:, 4].reshape(shape),
+            "roughness": fitted[:, 3].reshape(shape),
+            "metallic": fitted[:, 4].reshape(shape),
             "uncertainty": spread.astype(np.float32).reshape(shape),
         }
         job.writer.exr(file, channels)
@@ -247,7 +269,7 @@ def _base_scale(base: StageReader, file: str) -> np.ndarray:
     return rgb(channels, "scale.albedo").mean(-1).ravel()
 
 
-# ------------------------------------------------------------------------------------------------------------------- plan
+# --------------------------------------------------------------------------------------------------------------- plan
 
 
 def _plan(
@@ -292,4 +314,3 @@ def _response_probe(problem: FitProblem, start: Response, options: FitOptions) -
         weight = fit.pixels.astype(np.float64)
         out.append(float(np.sqrt((weight * fit.residual**2).sum() / max(weight.sum(), 1.0))))
     return out[0], out[1]
-

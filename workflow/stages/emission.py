@@ -43,8 +43,8 @@ STATISTICS_PIXELS = 20_000_000
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels a group enter the solve."""
 ANCHOR_WEIGHT = 100.0
-"""Weight of what is directly seen of a group relative to everything that its light does elsewhere: a face that is looked at
-says what it emits; light it sends elsewhere also depends on albedos that the prior only guessed."""
+"""Weight of what is directly seen of a group relative to everything that its light does elsewhere: a face that is
+looked at says what it emits; light it sends elsewhere also depends on albedos that the prior only guessed."""
 METAL = 0.9
 """Predicted metalness from which a surface counts as metal in the solve."""
 _SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
@@ -80,15 +80,22 @@ def run(job: Job) -> None:
     cache, misses = _radiance_cache(job, capture, scene, views, light, exposures, groups)
     secondary = _secondary_escape(job, capture, scene, views)
     environment = plan.environment(
-        job.settings.emission.environment, misses.share, secondary, misses.relative_brightness if misses.pixels else None
+        job.settings.emission.environment,
+        misses.share,
+        secondary,
+        misses.relative_brightness if misses.pixels else None,
     )
-    solution, table = _solve(job, capture, scene, views, light, exposures, groups, cache, misses, environment["included"])
+    solution, table = _solve(
+        job, capture, scene, views, light, exposures, groups, cache, misses, environment["included"]
+    )
     _write(job, groups, table, cache)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     for faces, area, reason in groups.dropped[:20]:
         notes.append(f"candidate of {faces} faces, {area:.2g} m^2, left out before the solve: {reason}")
     if not kept and not environment["included"]:
-        notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
+        notes.append(
+            "no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark"
+        )
     decisions = [environment, exposure_plan, plan.emitters(kept, groups.size - kept + len(groups.dropped), candidates)]
     job.writer.json(
         "emission.json",
@@ -97,7 +104,11 @@ def run(job: Job) -> None:
             "cache_origin": [float(x) for x in cache.origin],
             "condition": solution.condition,
             "residual": solution.residual,
-            "active_set": {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated},
+            "active_set": {
+                "rounds": solution.iterations,
+                "converged": solution.converged,
+                "violated": solution.violated,
+            },
             "escape_share": {"primary": misses.share, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
             "response": {"family": family, "parameters": light.curve.params.tolist()},
@@ -107,7 +118,7 @@ def run(job: Job) -> None:
     )
 
 
-# --------------------------------------------------------------------------------------------------------------- exposure
+# ----------------------------------------------------------------------------------------------------------- exposure
 
 
 def _exposures(
@@ -127,7 +138,9 @@ def _exposures(
     decision = plan.exposure("estimate", logs, int(gains.estimated.sum()))
     for view, estimated in zip(views, gains.estimated, strict=True):
         if not estimated:
-            notes.append(f"view {view.name} shares too little surface with others: exposure left at {given[view.view_id]:g}")
+            notes.append(
+                f"view {view.name} shares too little surface with others: exposure left at {given[view.view_id]:g}"
+            )
     if decision["included"]:
         for view, gain in zip(views, gains.gain, strict=True):
             given[view.view_id] *= float(gain)
@@ -155,7 +168,12 @@ def _estimate(
 
 
 def _calibrated(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    views: list[View],
+    light: _Light,
+    exposures: dict[int, float],
     notes: list[str],
 ) -> _Light:
     """The starting response, or the one that known exposures of shared surface imply."""
@@ -166,7 +184,9 @@ def _calibrated(
     exposure = np.array([exposures[view.view_id] for view in views])
     found = calibrate_response(cell, owner, value, exposure, light.curve, light.saturation)
     if not found.pairs:
-        notes.append("exposures differ by less than a stop where views overlap: the response starts at the family's default")
+        notes.append(
+            "exposures differ by less than a stop where views overlap: the response starts at the family's default"
+        )
         return light
     notes.append(
         f"response from {found.pairs} pairs of differently exposed views of the same surface ({found.stops:.1f} stops):"
@@ -191,7 +211,7 @@ def _shared_surface(
     return np.concatenate(cells), np.concatenate(owners), np.concatenate(values)
 
 
-# ----------------------------------------------------------------------------------------------------------------- groups
+# ------------------------------------------------------------------------------------------------------------- groups
 
 
 def _statistics(
@@ -199,8 +219,9 @@ def _statistics(
 ) -> tuple[FaceStatistics, float]:
     """Statistics of the faces, and the threshold in units of the photograph.
 
-    Pixels at the border of an object mix with what is beside it, so interior ones count. An object too thin to have any (a
-    filament) is judged by all of its pixels, if nearly all of them are bright: the frame of a window is not.
+    Pixels at the border of an object mix with what is beside it, so interior ones count. An object too thin to
+    have any (a filament) is judged by all of its pixels, if nearly all of them are bright: the frame of a window
+    is not.
     """
     total = sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
@@ -224,7 +245,9 @@ def _statistics(
     thin = np.bincount(owner, inside, size) < job.settings.emission.min_observations
     allow = (thin & (bright >= 0.9))[scene.object_id + 1] & (scene.object_id >= 0)
     merged = {
-        name: np.where(allow.reshape(-1, *[1] * (getattr(every, name).ndim - 1)), getattr(every, name), getattr(inner, name))
+        name: np.where(
+            allow.reshape(-1, *[1] * (getattr(every, name).ndim - 1)), getattr(every, name), getattr(inner, name)
+        )
         for name in ("count", "low", "mean", "front")
     }
     return FaceStatistics(**merged), float(threshold)
@@ -240,7 +263,7 @@ def _groups(job: Job, scene: BaseScene, statistics: FaceStatistics, threshold: f
     return groups, groups.size + len(groups.dropped)
 
 
-# ------------------------------------------------------------------------------------------------------------------ cache
+# -------------------------------------------------------------------------------------------------------------- cache
 
 
 @dataclass(frozen=True)
@@ -255,10 +278,16 @@ class _Misses:
 
 
 def _radiance_cache(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    views: list[View],
+    light: _Light,
+    exposures: dict[int, float],
     groups: EmitterGroups,
 ) -> tuple[RadianceVoxels, _Misses]:
-    """Mean radiance per voxel of interior pixels that are not on an emitter; and what the rays see that miss the mesh."""
+    """Mean radiance per voxel of interior pixels that are not on an emitter; and what the rays see that miss the
+    mesh."""
     edge = job.settings.emission.cache_edge
     sums = RadianceSums(edge, cache_origin(scene, edge))
     missed, bounded, total, mean_hit, hits, sky = 0, 0, 0, 0.0, 0, np.zeros(3)
@@ -311,7 +340,7 @@ def _secondary_escape(job: Job, capture: CaptureReader, scene: BaseScene, views:
     return float((face < 0).mean())
 
 
-# ------------------------------------------------------------------------------------------------------------------ solve
+# -------------------------------------------------------------------------------------------------------------- solve
 
 
 @dataclass(frozen=True)
@@ -328,7 +357,12 @@ class _Rows:
 
 
 def _choose_rows(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    views: list[View],
+    light: _Light,
+    exposures: dict[int, float],
     groups: EmitterGroups,
 ) -> _Rows:
     """A fixed number of pixels, evenly over views, plus enough on every emitter."""
@@ -355,7 +389,15 @@ def _choose_rows(
         row, column = part.index // view.width, part.index % view.width
         tile = (row // TILE) * (-(-view.width // TILE)) + column // TILE
         parts.append(
-            _Rows(part, base_maps(job, view)[part.index], radiance, bound, np.full(len(choice), view.view_id), tile, group[choice])
+            _Rows(
+                part,
+                base_maps(job, view)[part.index],
+                radiance,
+                bound,
+                np.full(len(choice), view.view_id),
+                tile,
+                group[choice],
+            )
         )
     joined = {
         name: np.concatenate([getattr(p, name) for p in parts])
@@ -367,8 +409,16 @@ def _choose_rows(
 
 
 def _solve(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, exposures: dict[int, float],
-    groups: EmitterGroups, voxels: RadianceVoxels, misses: _Misses, with_environment: bool,
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    views: list[View],
+    light: _Light,
+    exposures: dict[int, float],
+    groups: EmitterGroups,
+    voxels: RadianceVoxels,
+    misses: _Misses,
+    with_environment: bool,
 ) -> tuple[EmissionSolution, dict[str, Any]]:
     """Transport rows of a subset of pixels, twice; pruned non-negative least squares; the table of emitters."""
     rows = _choose_rows(job, capture, scene, views, light, exposures, groups)
@@ -379,9 +429,7 @@ def _solve(
     area = np.r_[groups.area, np.zeros(n_groups - groups.size)]
     protected = np.arange(n_groups) >= groups.size
     system = _system(rows, halves, n_groups, environment, misses, reflecting=True).with_gains(initial)
-    pruned = prune_groups(
-        system.rows, initial, area, _observed(rows, n_groups), protected, job.settings.emission.prune
-    )
+    pruned = prune_groups(system.rows, initial, area, _observed(rows, n_groups), protected, job.settings.emission.prune)
     # What remains is treated as black from here on: its pixels show its emission alone.
     kept = pruned.kept
     final = _system(rows, halves, n_groups, environment, misses, reflecting=False)
@@ -390,16 +438,20 @@ def _solve(
     radiance, error = np.zeros((n_groups, 3)), np.zeros((n_groups, 3))
     radiance[kept], error[kept] = part.radiance, part.error
     job.log.info(
-        "%d of %d groups kept; residual %.3f, condition %.3g", int(kept[: groups.size].sum()), groups.size, part.residual,
+        "%d of %d groups kept; residual %.3f, condition %.3g",
+        int(kept[: groups.size].sum()),
+        groups.size,
+        part.residual,
         part.condition,
     )
-    return replace(part, radiance=radiance, error=error), _table(groups, rows, pruned, radiance, error, misses, n_groups)
+    return replace(part, radiance=radiance, error=error), _table(
+        groups, rows, pruned, radiance, error, misses, n_groups
+    )
 
 
-def _initial(
-    light: _Light, groups: EmitterGroups, rows: _Rows, misses: _Misses, with_environment: bool
-) -> np.ndarray:
-    """Mean radiance seen on each group (a lower bound where saturated); the mean of the escaping rays for the environment."""
+def _initial(light: _Light, groups: EmitterGroups, rows: _Rows, misses: _Misses, with_environment: bool) -> np.ndarray:
+    """Mean radiance seen on each group (a lower bound where saturated); the mean of the escaping rays for the
+    environment."""
     out = np.zeros((groups.size, 3))
     for g in range(groups.size):
         own = rows.group == g
@@ -412,7 +464,12 @@ def _initial(
 
 
 def _trace(
-    job: Job, scene: BaseScene, rows: _Rows, groups: EmitterGroups, voxels: RadianceVoxels, n_groups: int,
+    job: Job,
+    scene: BaseScene,
+    rows: _Rows,
+    groups: EmitterGroups,
+    voxels: RadianceVoxels,
+    n_groups: int,
     environment_group: int | None,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Two independent estimates of (A, h)."""
@@ -421,7 +478,8 @@ def _trace(
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
-    # Predicted metalness is rarely right and would darken the diffuse light of half the room; only the certain is believed.
+    # Predicted metalness is rarely right and would darken the diffuse light of half the room; only the certain is
+    # believed.
     pixels, base = rows.pixels, rows.base
     metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
     halves = []
@@ -429,9 +487,22 @@ def _trace(
         job.progress(half, 2, "halves of the transport matrix traced")
         halves.append(
             transport_matrix(
-                geometry, material, pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic,
-                groups.of_face, n_groups, side, max(1, job.settings.emission.samples // 2),
-                job.settings.emission.max_bounces, ((job.seed << 32) | _SEEDS) * 2 + half, cache, environment_group,
+                geometry,
+                material,
+                pixels.points,
+                pixels.normals,
+                pixels.wo,
+                base[:, :3],
+                base[:, 3],
+                metallic,
+                groups.of_face,
+                n_groups,
+                side,
+                max(1, job.settings.emission.samples // 2),
+                job.settings.emission.max_bounces,
+                ((job.seed << 32) | _SEEDS) * 2 + half,
+                cache,
+                environment_group,
             )
         )
     job.progress(2, 2, "halves of the transport matrix traced")
@@ -450,7 +521,9 @@ class _System:
     def with_gains(self, initial: np.ndarray) -> _System:
         """Rows scaled by the albedo gains of the objects that go with the light."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
-        pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
+        pinned = bool(np.any(self.rows.target < self.observed)) or bool(
+            (self.anchor & ~self.rows.lower_bound.any(1)).any()
+        )
         gain = object_gains(self.rows, self.observed, self.owner, initial, pinned)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0
@@ -459,7 +532,11 @@ class _System:
 
 
 def _system(
-    rows: _Rows, halves: list[tuple[np.ndarray, np.ndarray]], n_groups: int, environment_group: int | None, misses: _Misses,
+    rows: _Rows,
+    halves: list[tuple[np.ndarray, np.ndarray]],
+    n_groups: int,
+    environment_group: int | None,
+    misses: _Misses,
     reflecting: bool,
 ) -> _System:
     """Averages over (view, tile, object) with their weights; directly seen emitters and sky as rows of their own.
@@ -499,8 +576,11 @@ def _with_sky(system: _System, n_groups: int, group: int, misses: _Misses) -> _S
     weight = np.full((1, 3), misses.pixels / max(float(sky.mean()), 1e-6) ** 2)
     old = system.rows
     added = EmissionRows(
-        np.concatenate([old.first, row]), np.concatenate([old.second, row]), np.concatenate([old.target, sky]),
-        np.concatenate([old.target_second, sky]), np.concatenate([old.weight, weight]),
+        np.concatenate([old.first, row]),
+        np.concatenate([old.second, row]),
+        np.concatenate([old.target, sky]),
+        np.concatenate([old.target_second, sky]),
+        np.concatenate([old.weight, weight]),
         np.concatenate([old.lower_bound, np.full((1, 3), misses.bounded)]),
     )
     return _System(added, np.concatenate([system.observed, sky]), np.r_[system.owner, -1], np.r_[system.anchor, True])
@@ -531,11 +611,16 @@ def _observed(rows: _Rows, n_groups: int) -> np.ndarray:
     return out
 
 
-# ---------------------------------------------------------------------------------------------------------------- writing
+# ------------------------------------------------------------------------------------------------------------ writing
 
 
 def _table(
-    groups: EmitterGroups, rows: _Rows, pruned: PrunedEmission, radiance: np.ndarray, error: np.ndarray, misses: _Misses,
+    groups: EmitterGroups,
+    rows: _Rows,
+    pruned: PrunedEmission,
+    radiance: np.ndarray,
+    error: np.ndarray,
+    misses: _Misses,
     n_groups: int,
 ) -> dict[str, Any]:
     extra = n_groups - groups.size
@@ -565,7 +650,8 @@ def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: Radian
     face = np.flatnonzero(groups.of_face >= 0)
     face = face[table["kept"][groups.of_face[face]]] if len(face) else face
     columns = {
-        "face_id": face.astype(np.int32), "emitter_id": groups.of_face[face].astype(np.int32),
+        "face_id": face.astype(np.int32),
+        "emitter_id": groups.of_face[face].astype(np.int32),
         "side": groups.side[face].astype(np.int32),
     }
     job.writer.table("emitter_faces.parquet", columns)

@@ -1,4 +1,5 @@
-"""shading: the light that arrives at every pixel, as a diffuse lobe and split specular lobes (METHOD 2.7, COMPUTE 5)."""
+"""shading: the light that arrives at every pixel, as a diffuse lobe and split specular lobes (METHOD 2.7, COMPUTE
+5)."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of 
 def roughness_levels(count: int) -> np.ndarray:
     """(count,) float64 from 0.02 to 1: closer together at the glossy end, where lobes change fastest.
 
-    r_j = 0.02 + 0.98 (j / (count - 1))^1.5. On metals linear spacing costs 7.4 % at 6 levels and 1.8 % at 10 (COMPUTE 5).
+    r_j = 0.02 + 0.98 (j / (count - 1))^1.5. On metals linear spacing costs 7.4 % at 6 levels and 1.8 % at 10
+    (COMPUTE 5).
     """
     return 0.02 + 0.98 * (np.arange(count) / (count - 1)) ** 1.5
 
@@ -40,8 +42,17 @@ def run(job: Job) -> None:
         for half in range(2):
             seed = (((job.seed << 32) | _SEEDS) << 32 | view.view_id) * 2 + half
             parts = shading_caches(
-                geometry, material, emitters, pixels.points, pixels.normals, pixels.wo, levels, per_half,
-                settings.max_bounces, seed, cache,
+                geometry,
+                material,
+                emitters,
+                pixels.points,
+                pixels.normals,
+                pixels.wo,
+                levels,
+                per_half,
+                settings.max_bounces,
+                seed,
+                cache,
             )
             if not all(np.isfinite(part).all() for part in parts):
                 raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")

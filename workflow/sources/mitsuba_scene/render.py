@@ -14,7 +14,6 @@ import mitsuba as mi
 import numpy as np
 
 from iif_core.camera import direction_derivatives, pixel_directions
-from iif_core.errors import InputError
 from workflow.normal_form import View
 
 from .flatten import texture_at
@@ -113,22 +112,3 @@ def original_distance(scene: Any, origin: Array, directions: Array) -> Array:
     ray = mi.Ray3f(mi.Point3f(*np.asarray(origin, np.float32).tolist()), mi.Vector3f(*d))
     found = scene.ray_intersect_preliminary(ray)
     return np.array(dr.select(found.is_valid(), found.t, dr.inf))
-
-
-def require_denoiser() -> None:
-    """Raises InputError where the optional denoiser is not installed."""
-    try:
-        import pyoidn  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "capture.denoise: the package pyoidn (Intel Open Image Denoise) is not installed;"
-            " run `pip install pyoidn==2.5.1.0` in the environment, or set capture.denoise: false"
-        ) from None
-
-
-def denoise(radiance: Array, albedo: Array, normal: Array) -> Array:
-    """Intel Open Image Denoise of an HDR picture (H, W, 3) with noise-free albedo and world normals beside it."""
-    import pyoidn
-
-    images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]
-    return np.maximum(pyoidn.denoise(*images, hdr=True, clean_aux=True), 0)

@@ -1,0 +1,144 @@
+"""emission, shading and affines on a room whose light and materials are known."""
+
+import logging
+
+import numpy as np
+import pytest
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
+
+from workflow.normal_form import CaptureReader
+from workflow.stages import affines, emission, shading
+
+TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB]])
+
+
+def _run(folder, dynamic_range, upto="affines", **changes):
+    capture = {"dynamic_range": dynamic_range, "exposure": changes.pop("exposure", "given")}
+    common = {"capture": capture, "affines": AFFINES}
+    for name, module, own in (
+        ("emission", emission, EMISSION),
+        ("shading", shading, SHADING),
+        ("affines", affines, {}),
+    ):
+        job = StubJob(name, folder, {**common, name: {**(own or AFFINES), **changes.get(name, {})}})
+        module.run(job)
+        job.writer.finish()
+        if name == upto:
+            return
+
+
+def _reader(folder, stage):
+    return StubJob("reader", folder, {}).read(stage)
+
+
+def _emitters(folder):
+    table = _reader(folder, "emission").table("emitters.parquet")
+    return table, np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
+
+
+def _psnr(folder, room, stage, scaled=False):
+    errors = []
+    for view in CaptureReader(_reader(folder, "capture")):
+        _, face = CaptureReader(_reader(folder, "capture")).gbuffer(view)
+        lit = (face >= 0) & ~room.emission.any(1)[face]
+        maps = _reader(folder, stage).exr(f"maps/{view.name}.exr")
+        albedo, truth = np.stack([maps[f"albedo.{c}"] for c in "RGB"], -1)[lit], room.material[face[lit], :3]
+        if scaled:
+            albedo = albedo * (albedo * truth).sum(0) / (albedo**2).sum(0)
+        errors.append(np.mean((albedo - truth) ** 2))
+    return -10 * np.log10(np.mean(errors))
+
+
+@pytest.fixture(scope="module")
+def hdr(tmp_path_factory, llvm):
+    folder = tmp_path_factory.mktemp("hdr")
+    room = build(folder, views=6, size=48, samples=128, spoil=0.25)
+    _run(folder, "hdr")
+    return folder, room
+
+
+def test_hdr_emission_is_recovered(hdr):
+    folder, room = hdr
+    table, radiance = _emitters(folder)
+    kept = np.flatnonzero(table["kept"])
+    assert len(kept) == 2
+    np.testing.assert_allclose(radiance[kept], TRUE, rtol=0.03)
+    faces = _reader(folder, "emission").table("emitter_faces.parquet")
+    assert set(faces["face_id"]) == set(np.flatnonzero(room.emission.any(1))) and (faces["side"] == 1).all()
+
+
+def test_hdr_albedo_comes_closer_to_the_truth(hdr):
+    folder, room = hdr
+    assert _psnr(folder, room, "affines") > _psnr(folder, room, "base") + 3
+
+
+def test_tables_and_maps_are_complete(hdr):
+    folder, room = hdr
+    fitted, base = (_reader(folder, stage).table("cells.parquet") for stage in ("affines", "base"))
+    np.testing.assert_array_equal(fitted["cell_id"], base["cell_id"])
+    objects = _reader(folder, "affines").table("objects.parquet")
+    assert objects["T_albedo"].shape == (len(room.names), 12) and (objects["std_albedo"] >= 0).all()
+    channels = _reader(folder, "shading").exr("maps/v000.exr")
+    assert {"half0.diffuse.R", "half1.s0.09.B", "half1.s1.00.G"} <= set(channels)
+    levels = _reader(folder, "shading").table("levels.parquet")["roughness"]
+    assert levels[0] == pytest.approx(0.02) and levels[-1] == 1 and (np.diff(levels) > 0).all()
+    facts = _reader(folder, "affines").json("affines.json")
+    assert facts["light_scale"] == 1 and (np.diff(facts["history"]) <= 1e-9).all()
+    assert not _reader(folder, "affines").has("camera_response.parquet")
+
+
+def test_halves_are_independent(hdr):
+    """Same mean, uncorrelated noise."""
+    channels = _reader(hdr[0], "shading").exr("maps/v000.exr")
+    first, second = (channels[f"half{h}.diffuse.G"].ravel() for h in range(2))
+    lit = (first > 0) & (second > 0)
+    assert abs(np.log(first[lit].mean() / second[lit].mean())) < 0.05
+    assert not np.array_equal(first, second)
+
+
+def test_same_bytes_twice(hdr):
+    folder, _ = hdr
+    before = {s: _reader(folder, s).manifest["files"] for s in ("emission", "shading", "affines")}
+    _run(folder, "hdr")
+    assert before == {s: _reader(folder, s).manifest["files"] for s in before}
+
+
+def test_ldr_with_unknown_response(tmp_path, llvm):
+    exposures = np.array([1, 0.5, 2, 0.25, 1, 0.5, 2, 1.0])
+    room = build(
+        tmp_path, views=8, size=48, samples=128, spoil=0.25, dynamic_range="ldr", curve="srgb", exposures=exposures
+    )
+    _run(tmp_path, "ldr")
+    table, radiance = _emitters(tmp_path)
+    assert table["kept"].sum() == 2
+    ratio = radiance[table["kept"]] / TRUE
+    assert 0.5 < ratio.min() and ratio.max() < 2.5
+    assert _psnr(tmp_path, room, "affines") > _psnr(tmp_path, room, "base") + 2.5
+    response = _reader(tmp_path, "affines").table("camera_response.parquet")
+    samples = response["kind"] == "sample"
+    assert samples.sum() == 303 and (np.diff(response["value"][samples][:101]) > 0).all()
+
+
+def test_exposures_are_estimated(tmp_path, llvm):
+    """Views taken at exposures that the capture does not know (it says 1 for all)."""
+    exposures = np.array([1, 0.6, 1.5, 0.8, 1.2, 1.0])
+    build(tmp_path, views=6, size=48, samples=64, dynamic_range="ldr", curve="srgb", exposures=exposures, told=False)
+    _run(tmp_path, "ldr", upto="emission", exposure="estimate")
+    table = _reader(tmp_path, "emission").table("exposures.parquet")
+    found = table["exposure"] / np.exp(np.log(table["exposure"]).mean())
+    np.testing.assert_allclose(found, exposures / np.exp(np.log(exposures).mean()), rtol=0.1)
+
+
+@pytest.mark.parametrize("brightness", [0.0, 1000.0])
+@pytest.mark.parametrize("dynamic_range", ["hdr", "ldr"])
+def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, brightness, dynamic_range):
+    caplog.set_level(logging.INFO)
+    curve = "srgb" if dynamic_range == "ldr" else None
+    build(tmp_path, views=3, size=24, samples=16, dynamic_range=dynamic_range, curve=curve, brightness=brightness)
+    _run(tmp_path, dynamic_range, emission={"rows": 2000, "samples": 4}, shading={"samples": 4})
+    table, radiance = _emitters(tmp_path)
+    assert np.isfinite(radiance).all() and (radiance >= 0).all()
+    if brightness == 0:
+        assert not table["kept"].any() and "no emitter" in " ".join(
+            _reader(tmp_path, "emission").json("emission.json")["notes"]
+        )
