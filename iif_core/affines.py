@@ -75,9 +75,7 @@ class FitProblem:
             raise InputError(f"fit: {len(self.diffuse)} halves of the cache, needed 1 or 2")
         for d, s0, s1 in zip(self.diffuse, self.s0, self.s1, strict=True):
             if d.shape != (n, 3) or s0.shape != (n, j, 3) or s1.shape != (n, j, 3):
-                raise InputError(
-                    f"fit: shading of shapes {d.shape}, {s0.shape}, {s1.shape}, needed {(n, 3)}, {(n, j, 3)}"
-                )
+                raise InputError(f"fit: shading of shapes {d.shape}, {s0.shape}, {s1.shape}, needed {(n, 3)}, {(n, j, 3)}")
         if j < 2 or np.any(np.diff(self.levels) <= 0):
             raise InputError("fit: needs at least two increasing roughness levels")
 
@@ -664,9 +662,7 @@ def _prepare(problem: FitProblem, response: Response) -> tuple[_Pixels, _Tone]:
         gain = 1.0 / float(np.log1p(np.quantile(positive, 0.99) / knee)) if len(positive) else 1.0
     tone = _Tone(response, knee, gain)
     obj = ids[index].astype(np.int64)
-    halves = [
-        (d[index], s0[index], s1[index]) for d, s0, s1 in zip(problem.diffuse, problem.s0, problem.s1, strict=True)
-    ]
+    halves = [(d[index], s0[index], s1[index]) for d, s0, s1 in zip(problem.diffuse, problem.s0, problem.s1, strict=True)]
     px = _Pixels(
         obj,
         np.searchsorted(obj, np.arange(problem.n_objects + 1)),
@@ -741,9 +737,7 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
                 damping=np.full(n_objects, 1e-3),
                 history=history,
             )
-            state, converged = _descend(
-                px, state, tone, opt, max(1, opt.iterations - early), opt.free_response, start_params
-            )
+            state, converged = _descend(px, state, tone, opt, max(1, opt.iterations - early), opt.free_response, start_params)
             history = state.history
     return _result(px, state, tone, opt, rank, enough, history, converged)
 
@@ -776,9 +770,7 @@ def _result(
         mean_error = np.where(px.saturated, 0.0, 0.5 * (errors[0] + errors[-1]))
         square = np.bincount(px.obj, (mean_error**2).sum(1), n_objects)
         residual = np.sqrt(square / np.maximum(np.bincount(px.obj, (~px.saturated).sum(1), n_objects), 1))
-        robust_square = np.bincount(
-            px.obj, (px.trust * np.minimum(mean_error**2, 9 * opt.robust_width**2)).sum(1), n_objects
-        )
+        robust_square = np.bincount(px.obj, (px.trust * np.minimum(mean_error**2, 9 * opt.robust_width**2)).sum(1), n_objects)
         inverse = _inverse(_masked(terms.h, state.free), np.zeros(n_objects)) * (robust_square / freedom)[:, None, None]
         covariance = np.where(state.free[:, :, None] & state.free[:, None, :], inverse, 0.0)
     light_scale = 1.0

@@ -90,8 +90,7 @@ class BaseProblem:
         maps = maps.reshape(maps.shape[0], -1, 5)
         if maps.shape[1] != np.size(self.cell_of_pixel[view]):
             raise InputError(
-                f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has "
-                f"{np.size(self.cell_of_pixel[view])}"
+                f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has {np.size(self.cell_of_pixel[view])}"
             )
         return maps
 
@@ -129,8 +128,7 @@ class BaseOptions:
             raise InputError(f"base variant {self.variant!r}; allowed: {', '.join(VARIANTS)}")
         if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1:
             raise InputError(
-                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), "
-                f"anneal {self.anneal} (between 0 and 1)"
+                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1)"
             )
 
 
@@ -462,9 +460,7 @@ class _Counts:
     weight: NDArray
 
 
-def _first_pass(
-    problem: BaseProblem, options: BaseOptions
-) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
+def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
     """Gram matrices, the first texture (cell mean of the predictions' median), usable predictions, counts."""
     n_views = len(problem.cell_of_pixel)
     counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
@@ -477,8 +473,7 @@ def _first_pass(
             sums = _Sums(problem.n_segments, len(usable))
         if len(usable) != sums.usable.shape[1]:
             raise InputError(
-                f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; "
-                "give every view the same number"
+                f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; give every view the same number"
             )
         usable_of_view.append(usable)
         if not usable.all():

@@ -14,15 +14,11 @@ Array = np.ndarray
 def _pose(world_from_camera: ArrayLike) -> Array:
     pose = np.asarray(world_from_camera, np.float64)
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise InputError(
-            f"world_from_camera has shape {pose.shape} or non-finite entries; give a finite 4x4 matrix"
-        )
+        raise InputError(f"world_from_camera has shape {pose.shape} or non-finite entries; give a finite 4x4 matrix")
     return pose
 
 
-def pixel_directions(
-    fx: float, fy: float, cx: float, cy: float, width: int, height: int, world_from_camera: ArrayLike
-) -> Array:
+def pixel_directions(fx: float, fy: float, cx: float, cy: float, width: int, height: int, world_from_camera: ArrayLike) -> Array:
     """World direction of every pixel centre, NOT normalised: its camera z is 1, so point = origin + depth *
     direction.
 

@@ -52,9 +52,7 @@ def voxel_indices(points: ArrayLike, edge: float, origin: ArrayLike) -> Array:
         raise InputError("voxel_indices: points contain NaN or infinity; drop rays that miss the mesh first")
     scaled = np.floor((points - np.asarray(origin, np.float32)) * inverse_edge(edge))
     if scaled.size and np.abs(scaled).max() > 2**31 - 256:
-        raise InputError(
-            f"voxel edge {edge} m is too small for points {np.abs(points).max()} m from the origin"
-        )
+        raise InputError(f"voxel edge {edge} m is too small for points {np.abs(points).max()} m from the origin")
     return scaled.astype(np.int32)
 
 
@@ -76,10 +74,7 @@ def pack_keys(ijk: ArrayLike, object_id: ArrayLike = -1) -> Array:
             "use a larger cell edge or `grid_origin`"
         )
     if objects.size and (objects.min() < 0 or objects.max() >= INDEX_LIMIT):
-        raise InputError(
-            f"object ids span {objects.min() - 1} ... {objects.max() - 1}, "
-            f"allowed are -1 ... {INDEX_LIMIT - 2}"
-        )
+        raise InputError(f"object ids span {objects.min() - 1} ... {objects.max() - 1}, allowed are -1 ... {INDEX_LIMIT - 2}")
     i, j, k, o = (part.astype(np.uint64) for part in (*ijk.T, objects))
     return i | (j << np.uint64(16)) | (k << np.uint64(32)) | (o << np.uint64(48))
 

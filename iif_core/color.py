@@ -54,9 +54,7 @@ def luminance(rgb: ArrayLike) -> Array:
     return rgb @ np.asarray(REC709_LUMINANCE, rgb.dtype)
 
 
-def display_exposure(
-    radiance: ArrayLike, valid: Array | None = None, quantile: float = 0.9, target: float = 0.7
-) -> float:
+def display_exposure(radiance: ArrayLike, valid: Array | None = None, quantile: float = 0.9, target: float = 0.7) -> float:
     """Factor that brings the `quantile` of luminance to `target`; 1 where there is nothing to go by.
 
     Args:

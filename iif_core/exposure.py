@@ -64,9 +64,7 @@ def estimate_gains(
     if len(view) and (view.min() < 0 or view.max() >= n_views):
         raise InputError(f"exposure: view {int(view.min())}..{int(view.max())} out of range 0..{n_views - 1}")
     cell, view, log_y, weight = _pairs(cell, view, value, n_views)
-    nothing = ExposureGains(
-        np.ones(n_views), np.zeros(n_views), np.zeros(n_views, bool), np.full(n_views, -1, np.int32), 0.0, 0
-    )
+    nothing = ExposureGains(np.ones(n_views), np.zeros(n_views), np.zeros(n_views, bool), np.full(n_views, -1, np.int32), 0.0, 0)
     # Cells that one view alone sees say nothing; dropping thin views can leave new ones, hence the loop.
     while len(cell):
         count = np.bincount(cell)
@@ -216,10 +214,7 @@ def calibrate_response(
         return CalibratedResponse(start, 0.0, 0, 0.0, 0.0)
     # One curve for all channels first; each channel then has to earn its difference.
     offsets = np.cumsum([0] + [int(channels[c][0].max()) + 1 for c in enough])
-    joined = [
-        np.concatenate([channels[c][k] + (offsets[i] if k == 0 else 0) for i, c in enumerate(enough)])
-        for k in (0, 1, 2)
-    ]
+    joined = [np.concatenate([channels[c][k] + (offsets[i] if k == 0 else 0) for i, c in enumerate(enough)]) for k in (0, 1, 2)]
     clipped = np.concatenate([channels[c][3] for c in enough])
     common = start.channel(0).with_params(start.params.mean(0))
     shared, before, after = _fit_channel(*joined, clipped, common, saturation, ridge)

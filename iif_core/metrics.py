@@ -119,9 +119,7 @@ def ssim(prediction: Array, truth: Array, mask: Array) -> float:
     from skimage.metrics import structural_similarity
 
     if min(mask.shape) < SSIM_WINDOW:
-        raise InputError(
-            f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way"
-        )
+        raise InputError(f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way")
     inside = mask if mask.ndim == truth.ndim else mask[..., None]
     truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
     filled = np.where(inside, prediction, truth).astype(np.float32)
@@ -158,9 +156,7 @@ def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) ->
 
     truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
     filled = np.where(mask[..., None], np.clip(prediction, 0, 1), truth).astype(np.float32)
-    error, _, _ = evaluate(
-        np.clip(truth, 0, 1), filled, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False
-    )
+    error, _, _ = evaluate(np.clip(truth, 0, 1), filled, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False)
     return float(np.asarray(error)[..., 0][mask].mean(dtype=np.float64))
 
 

@@ -77,9 +77,7 @@ class LlvmReport:
     problem: str | None
 
 
-def find_llvm(
-    environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None
-) -> LlvmReport:
+def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None) -> LlvmReport:
     """Find an LLVM >= 16: `DRJIT_LIBLLVM_PATH` if set, else this environment's lib folder, else the system's.
 
     A variable that names an unusable library is a problem even where another library would do: it was set
@@ -164,9 +162,7 @@ def process_environment() -> None:
     """
     repository = Path(__file__).resolve().parents[1]
     for variable, first in (("PATH", Path(sys.executable).parent), ("PYTHONPATH", repository)):
-        rest = [
-            part for part in os.environ.get(variable, "").split(os.pathsep) if part and part != str(first)
-        ]
+        rest = [part for part in os.environ.get(variable, "").split(os.pathsep) if part and part != str(first)]
         os.environ[variable] = os.pathsep.join([str(first), *rest])
     home = os.path.expanduser("~")
     if "HOME" not in os.environ and os.path.isabs(home):

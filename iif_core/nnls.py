@@ -192,9 +192,7 @@ class _Channel:
     square_target: float
 
 
-def _normal(
-    rows: EmissionRows, c: int, active: np.ndarray, cross: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _normal(rows: EmissionRows, c: int, active: np.ndarray, cross: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """H, the noise part K, b and the plain diagonal, summed in float64 over chunks."""
     groups = rows.groups
     h, k = np.zeros((groups, groups)), np.zeros((groups, groups))
@@ -275,14 +273,10 @@ def _solve_channel(
         # The first round has no residual to weigh the prior with.
         converged = rounds > 1 and bool((now == joined).all())
         used = np.where(bound & ~now, 0.0, weight)
-        variance = (
-            float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
-        )
+        variance = float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
         joined = now
         mark = np.packbits(now).tobytes()
-        if (
-            rounds > 1 and mark in seen and not converged
-        ):  # a cycle between two sets: both are within a rounding of the optimum
+        if rounds > 1 and mark in seen and not converged:  # a cycle between two sets: both are within a rounding of the optimum
             break
         seen.append(mark)
     difference = target - mean_a @ answer

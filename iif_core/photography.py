@@ -120,9 +120,7 @@ def exposures(
     if stops.ndim != 1 or not len(stops) or not (stops > 0).all() or (np.diff(stops) < 0).any():
         raise InputError(f"exposures: stops {stops.tolist()}; they must be positive and ascending")
     if not (grey > 0 and 0 <= saturated < 1):
-        raise InputError(
-            f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1"
-        )
+        raise InputError(f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1")
     pixels = [_valid_pixels(v, r, None if valid is None else valid[v]) for v, r in enumerate(views)]
 
     luminance = [p @ _LUMINANCE for p in pixels]
@@ -130,31 +128,23 @@ def exposures(
     median = np.array([np.median(y) if len(y) else 0.0 for y in luminance])
     order = np.argsort(-mean, kind="stable")
     stop = np.empty(len(views))
-    stop[order] = (
-        stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
-    )
+    stop[order] = stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
     lit = median > 0
     gain = grey / np.exp(np.mean(np.log(stop[lit] * median[lit]))) if lit.any() else 1.0
-    return (
-        gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
-    )
+    return gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
 
 
 def _valid_pixels(view: int, radiance: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
     if radiance.ndim < 1 or radiance.shape[-1] != 3:
         raise InputError(f"exposures: view {view} has shape {radiance.shape}; the last axis must be R, G, B")
     if not np.isfinite(radiance).all() or (radiance < 0).any():
-        raise InputError(
-            f"exposures: view {view} has negative or non-finite radiance; render it again or mask it to 0"
-        )
+        raise InputError(f"exposures: view {view} has negative or non-finite radiance; render it again or mask it to 0")
     flat = radiance.reshape(-1, 3)
     if mask is None:
         return flat
     mask = np.asarray(mask, bool)
     if mask.shape != radiance.shape[:-1]:
-        raise InputError(
-            f"exposures: view {view}: mask of shape {mask.shape} for radiance of shape {radiance.shape}"
-        )
+        raise InputError(f"exposures: view {view}: mask of shape {mask.shape} for radiance of shape {radiance.shape}")
     return flat[mask.ravel()]
 
 
@@ -167,9 +157,7 @@ def _closing(exposure: float, pixels: np.ndarray, saturated: float) -> float:
     return _THIRD ** max(0, np.ceil(3 * np.log2(limit) - 1e-9)) if limit > 1 else 1.0
 
 
-def expose(
-    radiance: np.ndarray, exposure: float, curve: Callable[[np.ndarray], np.ndarray] | None = None
-) -> np.ndarray:
+def expose(radiance: np.ndarray, exposure: float, curve: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
     """The photograph: round(255 f(clip(e L, 0, 1))) / 255, (..., 3) float32 in [0, 1], one of 256 values.
 
     Rounded to nearest: the truncation of METHOD 4.1 would darken by half a step. No sensor noise.
@@ -186,8 +174,6 @@ def expose(
         raise InputError(f"exposure is {exposure}; it must be positive and finite")
     radiance = np.asarray(radiance, np.float64)
     if not np.isfinite(radiance).all():
-        raise InputError(
-            f"{np.count_nonzero(~np.isfinite(radiance))} non-finite radiance values; nothing to photograph"
-        )
+        raise InputError(f"{np.count_nonzero(~np.isfinite(radiance))} non-finite radiance values; nothing to photograph")
     curve = response_curve() if curve is None else curve
     return (np.rint(255 * curve(np.clip(exposure * radiance, 0, 1))) / 255).astype(np.float32)

@@ -34,9 +34,7 @@ def _decision(component: str, included: bool, measure: str, value: float, thresh
     }
 
 
-def environment(
-    setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None
-) -> Decision:
+def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
     """Constant light from outside: needed when rays leave the mesh and what they meet is not black.
 
     Args:
@@ -48,9 +46,7 @@ def environment(
     """
     measure = "share of cosine-distributed rays from the surface that leave the mesh"
     if setting != "auto":
-        return _decision(
-            "environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}"
-        )
+        return _decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
     leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
     dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
     if not leaves:
@@ -82,9 +78,7 @@ def camera_response(dynamic_range: str, family: str, start_residual: float, fitt
         return _decision("camera_response", False, measure, 0.0, RESPONSE_EXPLAINED, "photographs are linear radiance")
     useful = explained > RESPONSE_EXPLAINED
     verdict = "was needed" if useful else "changes little; the starting curve would have done"
-    return _decision(
-        "camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}"
-    )
+    return _decision("camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}")
 
 
 def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
@@ -117,9 +111,7 @@ def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
     value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
     needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
     reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
-    return _decision(
-        "specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason
-    )
+    return _decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
 
 
 def affine_size(models: list[str]) -> Decision:
@@ -143,9 +135,5 @@ def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
     value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
-    reason = (
-        "would change the light noticeably; one pass is made"
-        if value > SECOND_PASS_GAIN
-        else "light would hardly change"
-    )
+    reason = "would change the light noticeably; one pass is made" if value > SECOND_PASS_GAIN else "light would hardly change"
     return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)

@@ -163,9 +163,7 @@ class Response:
             dp_dx = p * polynomial_slope
             powers = np.stack([np.ones_like(z), z, z * z], -1)
             dp = p[..., None] * powers
-            ddp_dx = dp * polynomial_slope[..., None] + p[..., None] * np.stack(
-                [np.zeros_like(z), np.ones_like(z), 2.0 * z], -1
-            )
+            ddp_dx = dp * polynomial_slope[..., None] + p[..., None] * np.stack([np.zeros_like(z), np.ones_like(z), 2.0 * z], -1)
         y = np.exp(p * log_z)
         rate = dp_dx * log_z + p / z  # d log f / dx
         slope = y * rate
@@ -231,9 +229,7 @@ def response(family: str, params: np.ndarray | None = None) -> Response:
     """
     if family not in FAMILIES or family == "sampled":
         allowed = ", ".join(f for f in FAMILIES if f != "sampled")
-        raise InputError(
-            f"camera response {family!r}: unknown; allowed: {allowed} (sampled curves: `sampled_response`)"
-        )
+        raise InputError(f"camera response {family!r}: unknown; allowed: {allowed} (sampled curves: `sampled_response`)")
     start = {"gamma": [2.2], "ggcm": [-0.8, 0.0, 0.0]}.get(family, [])
     theta = np.asarray(start if params is None else params, np.float64)
     if theta.ndim not in (1, 2) or theta.shape[-1] != len(PARAMETERS[family]) or not np.isfinite(theta).all():

@@ -179,9 +179,7 @@ def vote_faces(
     column = np.searchsorted(object_id, label)
     pixels = np.bincount(column, votes, len(object_id))
     agreeing = (
-        np.bincount(
-            np.searchsorted(object_id, label[pair_face]), count * (label[pair_face] == pair_instance), len(object_id)
-        )
+        np.bincount(np.searchsorted(object_id, label[pair_face]), count * (label[pair_face] == pair_instance), len(object_id))
         if pair.size
         else np.zeros(len(object_id))
     )

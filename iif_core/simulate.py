@@ -144,15 +144,11 @@ def simulate_predictions(
             f"simulated prior: albedo, roughness, metallic (and shading) {found} and object ids {shape} do not "
             "share height and width"
         )
-    truth = np.concatenate(
-        [albedo, np.asarray(roughness)[..., None], np.asarray(metallic)[..., None]], -1, dtype=np.float32
-    )
+    truth = np.concatenate([albedo, np.asarray(roughness)[..., None], np.asarray(metallic)[..., None]], -1, dtype=np.float32)
     if samples < 1 or not 0 <= strength <= 4:
         raise InputError(f"simulated prior: samples {samples} (at least 1), strength {strength} (between 0 and 4)")
     if not np.isfinite(truth).all():
-        raise InputError(
-            f"simulated prior: {np.sum(~np.isfinite(truth))} values of the truth are not finite; fix the capture"
-        )
+        raise InputError(f"simulated prior: {np.sum(~np.isfinite(truth))} values of the truth are not finite; fix the capture")
     if strength == 0 or truth.size == 0:
         return np.repeat(np.clip(truth, 0, 1)[None], samples, 0)
 
@@ -180,16 +176,12 @@ def simulate_predictions(
             + e.tint_sample * draw.normal("tint", "sample", 3)
         )
     )  # (3, n, K)
-    offset = s * (
-        e.offset_object * draw.normal("offset", "object", 3) + e.offset_sample * draw.normal("offset", "sample", 3)
-    )
+    offset = s * (e.offset_object * draw.normal("offset", "object", 3) + e.offset_sample * draw.normal("offset", "sample", 3))
     grey = np.clip(s * e.desaturation * draw.uniform("desaturation", "object"), 0, 1)[0, :, 0]  # (n,)
     pull = np.clip(s * np.array([e.roughness_pull, e.metallic_pull]), 0, 1)
     low, high = np.array([e.roughness_target, e.metallic_target]).T
     wrong = low[:, None, None] + (high - low)[:, None, None] * draw.uniform("target", "object", 2)
-    shift = s * (
-        e.material_view * draw.normal("material", "view", 2) + e.material_sample * draw.normal("material", "sample", 2)
-    )
+    shift = s * (e.material_view * draw.normal("material", "view", 2) + e.material_sample * draw.normal("material", "sample", 2))
     rippled = residue * e.material_pattern
 
     out = np.empty((samples, *shape, 5), np.float32)
@@ -198,9 +190,7 @@ def simulate_predictions(
         colour = truth[..., :3] * (1 - b) + blurred * b
         colour = colour + grey[unit][..., None] * (colour.mean(-1, keepdims=True) - colour)
         log_error = amplitude[unit, k][..., None] * patterns[k] + (leak[unit, k] * log_shading)[..., None]
-        colour = colour * np.moveaxis(gain[:, unit, k], 0, -1) * np.exp(log_error) + np.moveaxis(
-            offset[:, unit, k], 0, -1
-        )
+        colour = colour * np.moveaxis(gain[:, unit, k], 0, -1) * np.exp(log_error) + np.moveaxis(offset[:, unit, k], 0, -1)
         out[k, ..., :3] = colour
         for p in range(2):
             value = truth[..., 3 + p] * (1 - pull[p]) + pull[p] * wrong[p, unit, 0]

@@ -34,17 +34,13 @@ class Namespace:
 
 
 def _numpy() -> Namespace:
-    return Namespace(
-        "numpy", np.sqrt, np.exp, np.log, np.abs, np.sin, np.cos, np.floor, np.maximum, np.minimum, np.where
-    )
+    return Namespace("numpy", np.sqrt, np.exp, np.log, np.abs, np.sin, np.cos, np.floor, np.maximum, np.minimum, np.where)
 
 
 def _drjit() -> Namespace:
     import drjit as dr
 
-    return Namespace(
-        "drjit", dr.sqrt, dr.exp, dr.log, dr.abs, dr.sin, dr.cos, dr.floor, dr.maximum, dr.minimum, dr.select
-    )
+    return Namespace("drjit", dr.sqrt, dr.exp, dr.log, dr.abs, dr.sin, dr.cos, dr.floor, dr.maximum, dr.minimum, dr.select)
 
 
 def _torch() -> Namespace:

@@ -209,14 +209,3 @@ def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:
     ijk = np.stack([table[c] for c in "ijk"], 1)[use].astype(np.int32)
     radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)[use].astype(np.float32)
     return RadianceCache(facts["cache_edge_m"], np.asarray(facts["cache_origin"], np.float32), ijk, radiance)
-
-
-def read_exposures(job: Job, capture: CaptureReader) -> np.ndarray:
-    """(views,) exposure of every view in the order of `capture.views`, with estimated gains where there are any."""
-    given = np.array([view.exposure for view in capture.views], np.float64)
-    reader = job.read("emission")
-    if not reader.has("exposures.parquet"):
-        return given
-    table = reader.table("exposures.parquet")
-    by_view = dict(zip(table["view_id"].tolist(), table["exposure"].tolist(), strict=True))
-    return np.array([by_view.get(view.view_id, e) for view, e in zip(capture.views, given, strict=True)])

@@ -72,9 +72,7 @@ class Finding:
 def check_python() -> Iterator[Finding]:
     found = f"{'.'.join(map(str, sys.version_info[:3]))} at {sys.executable}"
     if sys.version_info < OLDEST_PYTHON:
-        yield Finding(
-            "FAIL", "python", found, "3.11 or newer is needed: run `PYTHON=python3.11 bash envs/setup.sh`"
-        )
+        yield Finding("FAIL", "python", found, "3.11 or newer is needed: run `PYTHON=python3.11 bash envs/setup.sh`")
     elif sys.version_info[:2] > NEWEST_PYTHON:
         yield Finding("warn", "python", found, "tried with 3.11 to 3.14 only")
     else:
@@ -100,9 +98,7 @@ def check_packages(pins: Path = PINS) -> Iterator[Finding]:
     if missing:
         yield Finding("FAIL", "packages", "missing " + ", ".join(missing), INSTALL)
     if differing:
-        yield Finding(
-            "warn", "packages", ", ".join(differing), f"results may differ from those of the lock: {INSTALL}"
-        )
+        yield Finding("warn", "packages", ", ".join(differing), f"results may differ from those of the lock: {INSTALL}")
     if not missing and not differing:
         yield Finding("ok", "packages", f"all {count} of {pins.name} are installed as pinned")
 
@@ -114,9 +110,7 @@ def check_llvm() -> Iterator[Finding]:
         yield Finding("FAIL", "llvm", report.problem)
         return
     yield Finding("ok", "llvm", f"{report.version} at {report.path}")
-    yield _tried(
-        "drjit", DRJIT_PROBE, DRJIT_ANSWER, "kernel, gradient and render agree with closed forms", report.path
-    )
+    yield _tried("drjit", DRJIT_PROBE, DRJIT_ANSWER, "kernel, gradient and render agree with closed forms", report.path)
 
 
 def check_open3d() -> Iterator[Finding]:
@@ -148,13 +142,9 @@ def check_disk(repository: Path = REPOSITORY) -> Iterator[Finding]:
         free = shutil.disk_usage(folder).free / GIB
         found = f"{free:.1f} GiB free in {folder}"
         if error := _write_error(folder):
-            yield Finding(
-                "FAIL", what, f"{folder} cannot be written ({error})", advice.replace("free some, or ", "")
-            )
+            yield Finding("FAIL", what, f"{folder} cannot be written ({error})", advice.replace("free some, or ", ""))
         elif free < plenty_gib:
-            yield Finding(
-                "FAIL" if free < 0.2 else "warn", what, found, f"{plenty_gib:.0f} GiB are advisable: {advice}"
-            )
+            yield Finding("FAIL" if free < 0.2 else "warn", what, found, f"{plenty_gib:.0f} GiB are advisable: {advice}")
         else:
             yield Finding("ok", what, found)
 
@@ -222,15 +212,11 @@ def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> F
         return Finding("ok", what, success)
     if child.returncode == 0:
         return Finding("FAIL", what, f"computed {child.stdout.strip()!r} instead of {answer!r}", INSTALL)
-    errors = [
-        line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)
-    ]
+    errors = [line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)]
     reason = (errors or child.stderr.strip().splitlines() or [""])[-1].strip()[:300]
     if child.returncode < 0:
         first = (errors or [reason])[0].strip()[:120]
-        reason = f"the process was ended by {signal.Signals(-child.returncode).name}" + (
-            f" ({first})" if first else ""
-        )
+        reason = f"the process was ended by {signal.Signals(-child.returncode).name}" + (f" ({first})" if first else "")
     advice = INSTALL
     if library := re.search(r"(lib[\w+.-]+\.so[.\d]*): cannot open shared object", reason):
         packages = "libgl1 libegl1 libx11-6 libusb-1.0-0"
@@ -241,9 +227,7 @@ def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> F
 def _run(command: list[str], variables: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, **(variables or {})}
     try:
-        return subprocess.run(
-            command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S
-        )
+        return subprocess.run(command, cwd=REPOSITORY, env=environment, capture_output=True, text=True, timeout=CHILD_TIMEOUT_S)
     except (OSError, subprocess.TimeoutExpired) as error:
         return subprocess.CompletedProcess(command, 1, "", str(error))
 
@@ -276,9 +260,7 @@ def main() -> int:
         try:
             findings = list(check())
         except Exception as error:  # a check that breaks must not hide the others
-            findings = [
-                Finding("FAIL", check.__name__.removeprefix("check_"), repr(error), "please report this bug")
-            ]
+            findings = [Finding("FAIL", check.__name__.removeprefix("check_"), repr(error), "please report this bug")]
         for finding in findings:
             print(finding, flush=True)
             failed |= finding.level == "FAIL"

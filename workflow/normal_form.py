@@ -1,4 +1,4 @@
-"""The waist of the workflow: every source ends in this form, and every later stage begins with it (docs/artefacts.md, capture)."""
+"""The waist of the workflow: every source ends in this form, every later stage begins with it (docs/artefacts.md, capture)."""
 
 from __future__ import annotations
 
@@ -70,7 +70,9 @@ class CaptureWriter:
         """Vertices (n, 3) in metres, faces (m, 3), ids (m,) with -1 = none, emission (m, 3) of the front side if known."""
         v, f = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
         n = np.arange(len(v), dtype=np.int32)
-        self.writer.table("vertices.parquet", {"vertex_id": n, "x": v[:, 0], "y": v[:, 1], "z": v[:, 2]}, dict.fromkeys("xyz", "m"))
+        self.writer.table(
+            "vertices.parquet", {"vertex_id": n, "x": v[:, 0], "y": v[:, 1], "z": v[:, 2]}, dict.fromkeys("xyz", "m")
+        )
         ids = np.full(len(f), -1, np.int32) if instance_id is None else np.asarray(instance_id, np.int32)
         columns: dict[str, Any] = {"face_id": np.arange(len(f), dtype=np.int32)}
         columns |= {"v0": f[:, 0], "v1": f[:, 1], "v2": f[:, 2], "instance_id": ids}
@@ -155,6 +157,10 @@ class CaptureReader:
 
     def __iter__(self) -> Iterator[View]:
         return iter(self.views)
+
+    def exposures(self) -> np.ndarray:
+        """(views,) exposure of every view, in order."""
+        return np.array([view.exposure for view in self.views], np.float64)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (n, 3) float32 in metres and faces (m, 3) int32."""

@@ -66,9 +66,7 @@ def read_recovered(job: Job) -> Recovered:
     cell_values = np.stack([fitted[name] for name in MATERIAL], 1).astype(np.float32)
     scale = float(affines.json("affines.json").get("light_scale", 1.0)) if affines.has("affines.json") else 1.0
     light = read_light(job, len(base.faces))
-    light = replace(
-        light, radiance=light.radiance * np.float32(scale), environment=light.environment * np.float32(scale)
-    )
+    light = replace(light, radiance=light.radiance * np.float32(scale), environment=light.environment * np.float32(scale))
     emitters, faces = emission.table("emitters.parquet"), emission.table("emitter_faces.parquet")
     shines = light.emits[faces["face_id"]]
     emitter_id = np.full(len(base.faces), -1, np.int32)

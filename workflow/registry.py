@@ -45,7 +45,19 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "publish",
-            ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export", "report"),
+            (
+                "capture",
+                "prior",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+                "affines",
+                "render",
+                "metrics",
+                "export",
+                "report",
+            ),
             (),
         ),
     )

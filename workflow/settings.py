@@ -327,6 +327,7 @@ _UNIONS: dict[str, dict[str, type[Section]]] = {
     "prior": {"simulated": SimulatedPrior, "files": FilesPrior, "retinex": RetinexPrior},
 }
 
+
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
     model: Any = SceneSettings
     parts = [str(p) for p in where]

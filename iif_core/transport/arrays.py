@@ -85,9 +85,7 @@ class Batch:
         of a point."""
         rows = rows[self.part]
         columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
-        parts = [
-            dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns
-        ]
+        parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
         return kind(*parts)
 
     def samples(self, count: int) -> tuple[Any, Any]:
@@ -105,12 +103,8 @@ class Batch:
         """One PCG32 stream a lane, a function of (seed, lane number) alone. The seed is any integer >= 0."""
         words = np.random.SeedSequence(seed).generate_state(4)
         lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
-        a, b = mi.sample_tea_32(
-            lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8
-        )
-        c, d = mi.sample_tea_32(
-            lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8
-        )
+        a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
+        c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
         return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))
 
 
@@ -118,9 +112,7 @@ def batches(points: int, samples: int, floats_per_lane: int, lanes: int | None =
     """Cuts `points` x `samples` into batches of at most `lanes` lanes (at least one point)."""
     split = -(-samples // SAMPLES_PER_LANE)
     if points * split >= 1 << 32:
-        raise InputError(
-            f"{points} points with {samples} samples are too many for one call; call with fewer points"
-        )
+        raise InputError(f"{points} points with {samples} samples are too many for one call; call with fewer points")
     if lanes is None:
         lanes = min(LANES, DEVICE_FLOATS // max(floats_per_lane, 1))
     for part in chunks(points, max(1, lanes // split)):

@@ -30,10 +30,7 @@ class VoxelRows:
 
     def find(self, point: Any, object_id: Any, active: Any) -> tuple[Any, Any]:
         """(found, row) of the cell around `point`; row is 0 where nothing is found."""
-        i, j, k = (
-            mi.Int32(dr.floor((x - low) * self._inverse_edge))
-            for x, low in zip(point, self._origin, strict=True)
-        )
+        i, j, k = (mi.Int32(dr.floor((x - low) * self._inverse_edge)) for x, low in zip(point, self._origin, strict=True))
         # One unsigned test covers both ends: negative indices wrap to huge values.
         inside = (mi.UInt32(i | j | k) < 65536) & (object_id >= -1) & (object_id < 65535)
         low = mi.UInt32(i) | (mi.UInt32(j) << 16)
@@ -66,9 +63,7 @@ class RadianceCache:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
         self.count = len(ijk)
         self._rows = VoxelRows(edge, origin, ijk, -1)
-        self._radiance = (
-            table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
-        )
+        self._radiance = table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
 
     def radiance(self, point: Any, active: Any) -> tuple[Any, Any]:
         """(found, radiance) at a surface point (device types)."""

@@ -39,18 +39,12 @@ class Geometry:
         solid = twice / 2 >= MIN_AREA
         self.areas = np.where(solid, twice / 2, 0.0)
         up = np.array([0.0, 0.0, 1.0])
-        self.normals = np.where(solid[:, None], normals / np.where(solid, twice, 1.0)[:, None], up).astype(
-            np.float32
-        )
+        self.normals = np.where(solid[:, None], normals / np.where(solid, twice, 1.0)[:, None], up).astype(np.float32)
         if not solid.any():
-            raise InputError(
-                f"the mesh has no face of area >= {MIN_AREA} m^2 among {len(faces)}; give a mesh with surface"
-            )
+            raise InputError(f"the mesh has no face of area >= {MIN_AREA} m^2 among {len(faces)}; give a mesh with surface")
 
         primitives = np.flatnonzero(solid)
-        mesh = mi.Mesh(
-            "scene", len(vertices), len(primitives), has_vertex_normals=False, has_vertex_texcoords=False
-        )
+        mesh = mi.Mesh("scene", len(vertices), len(primitives), has_vertex_normals=False, has_vertex_texcoords=False)
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = vertices.ravel()
         parameters["faces"] = faces[primitives].astype(np.uint32).ravel()
@@ -77,9 +71,7 @@ class Geometry:
 
     def intersect(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
         """(hit, face, t) of the nearest face along origin + t direction; face is 0 where nothing is hit."""
-        found = self.scene.ray_intersect_preliminary(
-            mi.Ray3f(origin, direction), coherent=False, active=active
-        )
+        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
         hit = active & found.is_valid()
         face = dr.select(hit, found.prim_index, 0)
         if self._face_of_primitive is not None:
@@ -88,9 +80,7 @@ class Geometry:
 
     def occluded(self, origin: Any, direction: Any, distance: Any, active: Any) -> Any:
         """Whether something lies on origin + t direction for 0 < t < distance (direction of unit length)."""
-        return self.scene.ray_test(
-            mi.Ray3f(origin, direction, distance, 0.0, mi.Color0f()), coherent=False, active=active
-        )
+        return self.scene.ray_test(mi.Ray3f(origin, direction, distance, 0.0, mi.Color0f()), coherent=False, active=active)
 
 
 def _padded(rows: Array) -> Array:
@@ -106,24 +96,12 @@ def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) 
     vertices = np.ascontiguousarray(vertices, np.float32)
     faces = np.ascontiguousarray(faces, np.int32)
     object_id = np.ascontiguousarray(object_id, np.int32)
-    if (
-        vertices.ndim != 2
-        or vertices.shape[1] != 3
-        or faces.ndim != 2
-        or faces.shape[1] != 3
-        or len(faces) == 0
-    ):
-        raise InputError(
-            f"mesh of vertices {vertices.shape} and faces {faces.shape}; both must be (count, 3), not empty"
-        )
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        raise InputError(f"mesh of vertices {vertices.shape} and faces {faces.shape}; both must be (count, 3), not empty")
     if object_id.shape != (len(faces),):
-        raise InputError(
-            f"object_id has shape {object_id.shape}, expected ({len(faces)},): one id for each face"
-        )
+        raise InputError(f"object_id has shape {object_id.shape}, expected ({len(faces)},): one id for each face")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"faces name vertices {faces.min()} ... {faces.max()}, the mesh has 0 ... {len(vertices) - 1}"
-        )
+        raise InputError(f"faces name vertices {faces.min()} ... {faces.max()}, the mesh has 0 ... {len(vertices) - 1}")
     if not np.isfinite(vertices[faces.ravel()]).all():
         raise InputError("the mesh has faces with NaN or infinite vertices; remove them first")
     if object_id.min() < -1:
@@ -158,9 +136,7 @@ def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any) ->
     return Hit(valid, face, object_id, mi.Point3f(dr.fma(direction, t, origin)), normal, t)
 
 
-def trace(
-    geometry: Geometry, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20
-) -> tuple[Array, Array]:
+def trace(geometry: Geometry, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20) -> tuple[Array, Array]:
     """(face_id int32 with -1 = miss, t float32 with inf = miss) of the nearest face along origin + t
     direction.
 

@@ -144,9 +144,7 @@ def direct_light(
     return world.collector.emitter(light.face, light.radiance, weight * f * share, light.valid)
 
 
-def scatter(
-    rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
-) -> tuple[Any, Any, Any, Any]:
+def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
     wi = sample_lobe(choice < 0.5, u1, u2, wo, normal, roughness)
@@ -200,9 +198,7 @@ def incoming(
     active = mi.Bool(active)
     while active:
         hit = nearest_hit(world.geometry, origin, direction, active)
-        gain += world.collector.environment(
-            world.emitters.environment_radiance(), throughput, active & ~hit.valid
-        )
+        gain += world.collector.environment(world.emitters.environment_radiance(), throughput, active & ~hit.valid)
         cos_front = -dr.dot(hit.normal, direction)
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))

@@ -30,9 +30,7 @@ class _Rows:
         values = rows_of(values, len(values), 5, name)
         clamped = np.clip(values, [0, 0, 0, R_MIN, 0], 1)
         self.count = len(values)
-        self._table = (
-            table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
-        )
+        self._table = table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
 
     def read(self, row: Any, active: Any) -> tuple[Any, Any, Any]:
         first = dr.gather(mi.Vector4f, self._table, row * 2, active)
@@ -73,15 +71,11 @@ class CellMaterials:
         object_values = np.asarray(object_values, np.float32)
         object_values = rows_of(object_values, len(object_values), 5, "object values")
         if not len(object_values):
-            raise InputError(
-                "CellMaterials needs at least one row of object_values: the material of surface nobody saw"
-            )
+            raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
         self._cells = VoxelRows(edge, origin, ijk, object_id)
         self._objects = len(object_values)
         # One table: cells, then objects, then the overall mean; a miss only changes which row is read.
-        self._rows = _Rows(
-            np.concatenate([values, object_values, object_values.mean(axis=0, keepdims=True)]), "values"
-        )
+        self._rows = _Rows(np.concatenate([values, object_values, object_values.mean(axis=0, keepdims=True)]), "values")
         self._first_object = len(ijk)
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:

@@ -139,9 +139,7 @@ def transport_matrix(
     width = 3 * n_groups
     for batch in batches(count, samples, width, chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
-        collector = _ColumnCollector(
-            rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group
-        )
+        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group)
         gain = _deposit_paths(
             World(geometry, material, emitters, cache, collector),
             batch.streams(seed),

@@ -76,13 +76,10 @@ def render(
     directions = rows_of(directions, len(directions), 3, "directions")
     if not (np.abs(directions).max(axis=1, initial=0) > 0).all():
         raise InputError("directions contain a zero vector")
-    origins = rows_of(
-        np.broadcast_to(np.asarray(origins, np.float32), directions.shape), len(directions), 3, "origins"
-    )
+    origins = rows_of(np.broadcast_to(np.asarray(origins, np.float32), directions.shape), len(directions), 3, "origins")
     steps = (np.zeros(3), np.zeros(3)) if jitter is None else jitter
     d_du, d_dv = (
-        rows_of(np.broadcast_to(np.asarray(step, np.float32), directions.shape), len(directions), 3, "jitter")
-        for step in steps
+        rows_of(np.broadcast_to(np.asarray(step, np.float32), directions.shape), len(directions), 3, "jitter") for step in steps
     )
     world = World(geometry, material, emitters, cache, RadianceCollector())
     result = np.zeros(directions.shape, np.float32)

@@ -150,9 +150,7 @@ def shading_caches(
     """
     check_counts(samples, max_bounces)
     levels = np.asarray(levels, np.float64).reshape(-1)
-    if levels.size and not (
-        levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()
-    ):
+    if levels.size and not (levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()):
         raise InputError(f"roughness levels {levels.tolist()}: must increase within [{R_MIN}, 1]")
     points, normals, wo = surface_points(points, normals, wo)
     count = len(levels)

@@ -17,9 +17,7 @@ pytestmark = pytest.mark.front_door
 
 
 def run(command, folder, environment, **variables):
-    return subprocess.run(
-        command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True, timeout=120
-    )
+    return subprocess.run(command, cwd=folder, env={**environment, **variables}, capture_output=True, text=True, timeout=120)
 
 
 @pytest.fixture
@@ -154,9 +152,7 @@ def test_doctor_names_a_bad_llvm(repository, clean_environment):
 
 
 def test_doctor_survives_and_names_an_abort():
-    finding = doctor._tried(
-        "drjit", "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select\\n'); os.abort()", "1", ""
-    )
+    finding = doctor._tried("drjit", "import os, sys; sys.stderr.write('LLVM ERROR: Cannot select\\n'); os.abort()", "1", "")
     assert finding.level == "FAIL" and "SIGABRT (LLVM ERROR: Cannot select)" in finding.found
 
 
@@ -170,9 +166,7 @@ def test_doctor_compares_packages_with_the_pins(tmp_path):
     pins = tmp_path / "requirements.in"
     pins.write_text("# comment\nnumpy==0.1\nno-such-package-here==1\ntorch\n")
     missing, differing = doctor.check_packages(pins)
-    assert (
-        missing.level == "FAIL" and "no-such-package-here" in missing.found and "numpy" not in missing.found
-    )
+    assert missing.level == "FAIL" and "no-such-package-here" in missing.found and "numpy" not in missing.found
     assert differing.level == "warn" and "instead of 0.1" in differing.found
 
 
@@ -207,10 +201,7 @@ class TestMake:
         shutil.copy(repository / "Makefile", tmp_path)
         (tmp_path / "scenes" / "kitchen").mkdir(parents=True)
         for target in ("scenes/kitchen", "scenes"):
-            assert any(
-                f"snakemake --cores all {target}" in line
-                for line in self.commands(tmp_path, clean_environment, target)
-            )
+            assert any(f"snakemake --cores all {target}" in line for line in self.commands(tmp_path, clean_environment, target))
 
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")

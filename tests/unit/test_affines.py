@@ -105,9 +105,7 @@ def test_planted_ggcm_per_channel():
 def test_gradient_and_normal_matrix_against_differences(family):
     """Every term at once: robust weights, two halves, saturation, out-of-range values, regularisers, ridge."""
     rng = np.random.default_rng(3)
-    problem, _ = _problem(
-        rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5
-    )
+    problem, _ = _problem(rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5)
     saturated = problem.value > 0.8
     problem = FitProblem(**{**problem.__dict__, "saturated": saturated})
     problem.base[:, 4] = rng.uniform(0.1, 0.9, 80)
@@ -189,9 +187,7 @@ def test_all_saturated_object_does_not_darken():
     np.testing.assert_allclose(out.affine[1], IDENTITY, atol=1e-3)  # every bound is met: nothing pulls
     assert np.isfinite(out.covariance).all() and out.residual[1] == 0
     raised = response("gamma")(1.3 * response("gamma").inverse(problem.value))
-    high = FitProblem(
-        **{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)}
-    )
+    high = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)})
     out = fit_affines(high, response("gamma"), FitOptions(iterations=10))
     assert out.affine[1, [0, 5, 10]].min() > 1.15  # bounds that are not met pull upwards
 
@@ -277,9 +273,7 @@ def test_covariance_is_of_the_right_size():
     """Spread of the fitted gain over repeated noise against the reported standard deviation."""
     rng = np.random.default_rng(15)
     problem, _ = _problem(rng, 1, 400, truth=IDENTITY[None])
-    opt = FitOptions(
-        iterations=8, ridge=1e-9, robust_width=1e3, multi_start=False, roughness_weight=0, metallic_prior=2
-    )
+    opt = FitOptions(iterations=8, ridge=1e-9, robust_width=1e3, multi_start=False, roughness_weight=0, metallic_prior=2)
     gains, reported = [], []
     for _ in range(60):
         noisy = problem.value * np.exp(rng.normal(0, 0.05, problem.value.shape))

@@ -25,10 +25,7 @@ def surface(seed=0):
     n = 60
     y, x = np.mgrid[:n, :n] / n
     obj = (y > 0.5).astype(int) * 2 + (x > 0.5)
-    wave = [
-        np.sin(2 * np.pi * (rng.uniform(2, 9, OBJECTS)[obj] * x + rng.uniform(2, 9, OBJECTS)[obj] * y))
-        for _ in range(3)
-    ]
+    wave = [np.sin(2 * np.pi * (rng.uniform(2, 9, OBJECTS)[obj] * x + rng.uniform(2, 9, OBJECTS)[obj] * y)) for _ in range(3)]
     checker = np.sign(np.sin(40 * x) * np.sin(40 * y))
     colour = rng.uniform(0.25, 0.6, (OBJECTS, 3))[obj] * (1 + 0.3 * np.stack(wave, -1) + 0.2 * checker[..., None])
     rough = np.clip(rng.uniform(0.3, 0.8, OBJECTS)[obj] + 0.1 * wave[0], 0.02, 1)
@@ -67,9 +64,7 @@ def simulated(views=8, samples=6, seed=0, strength=1.0):
     predictions = []
     for v, cell in enumerate(cell_maps):
         t = truth[cell]
-        predictions.append(
-            simulate.simulate_predictions(t[..., :3], t[..., 3], t[..., 4], obj[cell], samples, v, seed, strength)
-        )
+        predictions.append(simulate.simulate_predictions(t[..., :3], t[..., 3], t[..., 4], obj[cell], samples, v, seed, strength))
     return problem_of(cell_maps, predictions, obj), truth
 
 
@@ -127,9 +122,7 @@ def test_truth_goes_through_untouched():
 def test_affine_predictions_are_made_consistent():
     """With exact affine errors the texture is an affine map of the truth, far closer than the plain mean."""
     problem, truth = planted()
-    full, mean = (
-        solve_base(problem, BaseOptions(v, sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean")
-    )
+    full, mean = (solve_base(problem, BaseOptions(v, sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean"))
     assert oracle_psnr(problem, full, truth) > 45
     assert oracle_psnr(problem, full, truth) > oracle_psnr(problem, mean, truth) + 10
 
@@ -258,9 +251,7 @@ def test_corrections_equal_ridge_regression_in_float64():
                 found = (
                     result.affine_albedo[segment, k].T
                     if channels.start == 0
-                    else (result.affine_roughness if channels.start == 3 else result.affine_metallic)[segment, k][
-                        :, None
-                    ]
+                    else (result.affine_roughness if channels.start == 3 else result.affine_metallic)[segment, k][:, None]
                 )
                 expected = solution.copy()
                 expected[-1] += level[o, channels]

@@ -94,9 +94,7 @@ def test_float32_keeps_its_digits_at_the_peak(r):
     NoH = np.sqrt(1 - sin2.astype(np.float64)).astype(np.float32)
     NoL, NoV, VoH = (np.full(200, x, np.float32) for x in (0.7, 0.45, 0.8))
     _, spec, fc = brdf.lobes(NUMPY, NoL, NoV, NoH, VoH, sin2, np.float32(r))
-    oracle, schlick = textbook(
-        *(x.astype(np.float64) for x in (NoL, NoV, sin2, VoH)), np.float64(np.float32(r))
-    )
+    oracle, schlick = textbook(*(x.astype(np.float64) for x in (NoL, NoV, sin2, VoH)), np.float64(np.float32(r)))
     assert spec.dtype == np.float32
     np.testing.assert_allclose(spec, oracle, rtol=3e-6)
     np.testing.assert_allclose(fc, schlick, rtol=1e-5)
@@ -184,10 +182,7 @@ def test_directions_follow_mixture_pdf(r, NoV):
 def test_extremes_are_finite_and_one_sided():
     zero, one = np.float32(0), np.float32(1)
     edge = [zero, np.float32(1e-7), np.float32(1e-3), one]
-    grid = [
-        g.ravel()
-        for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")
-    ]
+    grid = [g.ravel() for g in np.meshgrid(edge, edge, edge, edge, edge, [zero, np.float32(0.02), one], indexing="ij")]
     for value in (*brdf.lobes(NUMPY, *grid), brdf.specular_pdf(NUMPY, *grid[2:])):
         assert np.isfinite(value).all() and (value >= 0).all()
     diffuse, spec, _ = brdf.lobes(NUMPY, *grid)

@@ -162,9 +162,7 @@ def test_everything_but_the_shell_is_closed_and_outward(room):
     assert {room.names[i] for i in owner[is_open]} == OPEN[room.name]
     middle = np.zeros((count, 3))
     for axis in range(3):
-        middle[:, axis] = np.bincount(part, room.vertices[room.faces[:, 0], axis], count) / np.bincount(
-            part, minlength=count
-        )
+        middle[:, axis] = np.bincount(part, room.vertices[room.faces[:, 0], axis], count) / np.bincount(part, minlength=count)
     a, b, c = (room.vertices[room.faces[:, k]].astype(float) - middle[part] for k in range(3))
     volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)) / 6, count)
     wrong = {room.names[i] for i in owner[~is_open & (volume <= 0)]}
@@ -189,9 +187,7 @@ def test_no_ray_escapes_and_nobody_sees_a_back_side(room, traced):
     cosine = (traced.normals[face] * direction).sum(1)
     assert (cosine >= 0).mean() <= 1e-4
     point = origin + t[:, None] * direction
-    assert (point > -0.01).all() and (
-        point < room.size + [0.2, 0.01, 0.01]
-    ).all()  # the window lies 0.15 m outside
+    assert (point > -0.01).all() and (point < room.size + [0.2, 0.01, 0.01]).all()  # the window lies 0.15 m outside
 
 
 def test_no_two_surfaces_lie_in_one_plane(room, traced):
@@ -309,12 +305,7 @@ def test_truth_and_renderer_see_the_same_material(llvm, room):
     difference = np.abs(found - expected).max(1)
     assert np.median(difference) < 1e-6
     assert (difference > 1e-4).mean() < 1e-3
-    assert (
-        expected.dtype == np.float32
-        and expected.min() >= 0
-        and expected.max() <= 1
-        and expected[:, 3].min() >= 0.02
-    )
+    assert expected.dtype == np.float32 and expected.min() >= 0 and expected.max() <= 1 and expected[:, 3].min() >= 0.02
     assert not expected[room.is_emitter[object_id], :3].any()
 
 
@@ -350,9 +341,7 @@ def test_textures_survive_a_draft_pixel(llvm, kitchen):
         albedo, *_ = kitchen.materials.numpy(pose[:3, 3] + t[:, None] * rays, kitchen.object_id[face])
 
         def blocks(a):
-            return (
-                a.reshape(width, fine, width, fine, -1).swapaxes(1, 2).reshape(width * width, fine * fine, -1)
-            )
+            return a.reshape(width, fine, width, fine, -1).swapaxes(1, 2).reshape(width * width, fine * fine, -1)
 
         ids, values = blocks(kitchen.object_id[face])[..., 0], blocks(albedo)
         whole = (ids == ids[:, :1]).all(1)
@@ -400,9 +389,7 @@ def captured(llvm, tmp_path_factory):
 def _digests(capture):
     folder = capture.reader.directory
     return {
-        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in sorted(folder.rglob("*"))
-        if p.is_file()
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()
     }
 
 
@@ -461,9 +448,7 @@ def test_geometry_and_truth_of_a_view(captured, llvm):
         assert np.median(gap) < 1e-6 and (gap > 1e-3).mean() < 5e-3
         np.testing.assert_array_equal(truth.metallic.ravel(), metallic)
         lamp = room.emission[face].any(-1)
-        np.testing.assert_array_equal(
-            truth.emission, room.emission[face]
-        )  # every lamp is seen from its front
+        np.testing.assert_array_equal(truth.emission, room.emission[face])  # every lamp is seen from its front
         inner = lamp & np.roll(lamp, 1, 0) & np.roll(lamp, -1, 0) & np.roll(lamp, 1, 1) & np.roll(lamp, -1, 1)
         if inner.any():  # emission plus the reflection of a black dielectric
             extra = truth.radiance[inner] - truth.emission[inner]
@@ -495,7 +480,5 @@ def test_source_is_light_to_ask(repository):
         "import sys, json; from workflow.sources import builtin; assert builtin.raw_inputs({}) == [];"
         "print(json.dumps([m for m in ('mitsuba', 'drjit', 'scipy', 'torch', 'open3d') if m in sys.modules]))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=repository, capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=repository, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == []

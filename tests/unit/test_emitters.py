@@ -81,9 +81,7 @@ def test_finely_tessellated_lamp_is_found_by_pooling():
     count = np.where(vertices[faces].mean(1)[:, 2] > 0, 1, 0)  # the upper half was seen, one pixel a face
     stats = _statistics(count, count * 1.0)
     assert (emitter_candidates(stats, adjacency, areas, 0.99)).all()  # far side included
-    sparse = np.where(np.random.default_rng(0).random(len(faces)) < 0.25, 1, 0) * (
-        vertices[faces].mean(1)[:, 2] > -0.05
-    )
+    sparse = np.where(np.random.default_rng(0).random(len(faces)) < 0.25, 1, 0) * (vertices[faces].mean(1)[:, 2] > -0.05)
     found = emitter_candidates(_statistics(sparse, sparse * 1.0), adjacency, areas, 0.99)
     assert areas[found].sum() > 0.9 * areas.sum()  # gaps between the seen faces are filled
     few = np.zeros(len(faces))
@@ -128,9 +126,7 @@ def test_groups_by_plane_colour_and_side():
     flat_normals, flat_areas = face_geometry(flat, faces)
     assert group_emitters(everything, stats, adjacency, flat_normals, flat_areas).size == 2
 
-    back = FaceStatistics(
-        stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4")
-    )
+    back = FaceStatistics(stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4"))
     out = group_emitters(everything, back, adjacency, flat_normals, flat_areas)
     assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
 

@@ -149,9 +149,7 @@ def test_islands():
 def test_extremes_and_determinism():
     assert len(segment_mesh(np.zeros((0, 3)), np.zeros((0, 3), int))) == 0
     np.testing.assert_array_equal(segment_mesh(np.eye(3), np.array([[0, 1, 2]])), [0])
-    flat = segment_mesh(
-        np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0]]), np.array([[0, 1, 2], [0, 3, 1]]), 0.05, 1
-    )
+    flat = segment_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0]]), np.array([[0, 1, 2], [0, 3, 1]]), 0.05, 1)
     assert flat.max() <= 1  # a zero-area face has no normal, and no NaN comes of it
     vertices, faces, _ = corner(12, 0.01)
     first = segment_mesh(vertices, faces)

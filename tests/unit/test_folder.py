@@ -148,9 +148,7 @@ def test_eight_bits_grey_palette_and_alpha(tmp_path):
     assert grey.shape == (6, 9, 3) and np.abs(grey[..., 0] - rgba[..., 0] / 255).max() < 0.02
     flat = Image.fromarray(np.full((4, 4, 3), (10, 200, 30), np.uint8)).convert("P", palette=Image.Palette.ADAPTIVE)
     flat.save(tmp_path / "p.png")
-    np.testing.assert_allclose(
-        images.load_photo(tmp_path / "p.png").pixels[0, 0], np.array([10, 200, 30]) / 255, atol=1e-6
-    )
+    np.testing.assert_allclose(images.load_photo(tmp_path / "p.png").pixels[0, 0], np.array([10, 200, 30]) / 255, atol=1e-6)
 
 
 def test_exr_pictures_and_bad_pixels(tmp_path):
@@ -391,9 +389,7 @@ def test_hdr_exposure_nan_instances_and_truth(tmp_path):
     for i, view in enumerate(capture):
         photo, valid = capture.photo(view)
         assert view.exposure == 1.0
-        np.testing.assert_allclose(
-            photo[valid], own.pattern(capture.points(view, capture.gbuffer(view)[0]))[valid], atol=2e-5
-        )
+        np.testing.assert_allclose(photo[valid], own.pattern(capture.points(view, capture.gbuffer(view)[0]))[valid], atol=2e-5)
         truth = capture.truth(view)
         assert (truth.albedo == 0.25).all() and (truth.roughness == 0.5).all() and (truth.metallic == 0).all()
         np.testing.assert_array_equal(truth.radiance, photo)

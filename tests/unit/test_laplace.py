@@ -26,9 +26,7 @@ def test_kl_equals_quadrature(d, b_r, b_p):
 
     breaks = sorted({0.0, d})
     edges = [-60 * b_r, *breaks, d + 60 * b_r]
-    by_quadrature = sum(
-        quad(integrand, a, b, epsabs=1e-12, limit=200)[0] for a, b in zip(edges, edges[1:], strict=False)
-    )
+    by_quadrature = sum(quad(integrand, a, b, epsabs=1e-12, limit=200)[0] for a, b in zip(edges, edges[1:], strict=False))
     assert laplace.kl(d, b_r, b_p) == pytest.approx(by_quadrature, rel=1e-8, abs=1e-9)
 
 

@@ -64,9 +64,7 @@ def test_small_image_is_a_named_result():
     small = np.full((8, 40), 0.5)
     scores = values(m.score_map("roughness", small, small, np.ones((8, 40), bool)))
     assert scores["raw", "ssim"] is None and scores["raw", "psnr"] == 100.0
-    reason = next(
-        s.reason for s in m.score_map("roughness", small, small, np.ones((8, 40), bool)) if s.metric == "ssim"
-    )
+    reason = next(s.reason for s in m.score_map("roughness", small, small, np.ones((8, 40), bool)) if s.metric == "ssim")
     assert "at least 11" in reason
 
 
@@ -133,9 +131,7 @@ def test_oracle_affine_agrees_with_least_squares():
     rng = np.random.default_rng(8)
     x, y = rng.uniform(0.4, 0.6, (24, 32)), rng.uniform(0.4, 0.6, (24, 32))
     slope, offset = np.polyfit(x.ravel(), y.ravel(), 1)
-    np.testing.assert_allclose(
-        m.oracle_affine(x, y, ALL, np.zeros((24, 32), int), ridge=1e-12), slope * x + offset, atol=1e-8
-    )
+    np.testing.assert_allclose(m.oracle_affine(x, y, ALL, np.zeros((24, 32), int), ridge=1e-12), slope * x + offset, atol=1e-8)
 
 
 def test_oracle_affine_of_a_constant_is_the_mean():

@@ -622,8 +622,11 @@ def test_capture_hdr_with_glass_kept(llvm, tmp_path, monkeypatch):
 
 
 def test_lights_that_are_not_surface_are_noted(llvm, tmp_path, monkeypatch):
-    body = ROOM + """<emitter type="constant"><rgb name="radiance" value="0.5,1,2"/></emitter>
+    body = (
+        ROOM
+        + """<emitter type="constant"><rgb name="radiance" value="0.5,1,2"/></emitter>
       <emitter type="point"><point name="position" x="1" y="1" z="2"/></emitter>"""
+    )
     reader = capture(tmp_path, monkeypatch, body)
     assert reader.facts["environment"]["mean_radiance"] == pytest.approx([0.5, 1, 2], rel=1e-5)
     assert any("PointLight" in note for note in reader.facts["notes"])

@@ -133,9 +133,7 @@ def test_prepare_sets_the_variable_and_is_idempotent(monkeypatch):
 
 def test_prepare_raises_one_line(monkeypatch, tmp_path):
     monkeypatch.setenv(native.LLVM_VARIABLE, str(tmp_path / "libLLVM.so.19"))
-    with pytest.raises(
-        InputError, match=f"^{native.LLVM_VARIABLE} names .*libLLVM.so.19, which does not exist"
-    ):
+    with pytest.raises(InputError, match=f"^{native.LLVM_VARIABLE} names .*libLLVM.so.19, which does not exist"):
         native.prepare()
     assert os.environ[native.LLVM_VARIABLE] == str(tmp_path / "libLLVM.so.19")
 
@@ -207,14 +205,10 @@ def test_this_environment_has_its_own_llvm():
 
 
 def test_old_llvm_of_the_system_is_refused():
-    old = [
-        path for path, version in native.find_llvm({}, native.SYSTEM_FOLDERS).candidates if 0 < version < 16
-    ]
+    old = [path for path, version in native.find_llvm({}, native.SYSTEM_FOLDERS).candidates if 0 < version < 16]
     if not old:
         pytest.skip("the system has no LLVM older than 16")
     for path in old:
         report = native.find_llvm({native.LLVM_VARIABLE: path})
         assert report.path is None and path in report.problem
-        assert native._version(path)[1] is not None, (
-            "the library itself says that it is older, whatever its name"
-        )
+        assert native._version(path)[1] is not None, "the library itself says that it is older, whatever its name"

@@ -59,12 +59,8 @@ def test_unknown_curve_is_refused():
 def test_expose_rounds_to_nearest_and_clips():
     levels = np.arange(256) / 255
     radiance = np.stack([levels] * 3, -1)
-    np.testing.assert_array_equal(
-        expose(radiance, 1.0, response_curve("linear")), radiance.astype(np.float32)
-    )
-    nudged = expose(
-        radiance + 0.49 / 255, 1.0, response_curve("linear")
-    )  # truncation and rounding differ here
+    np.testing.assert_array_equal(expose(radiance, 1.0, response_curve("linear")), radiance.astype(np.float32))
+    nudged = expose(radiance + 0.49 / 255, 1.0, response_curve("linear"))  # truncation and rounding differ here
     np.testing.assert_array_equal(nudged, radiance.astype(np.float32))
     assert expose(np.full((1, 3), 1e30), 4.0).max() == 1.0
     assert expose(np.full((1, 3), -1.0), 4.0).max() == 0.0

@@ -21,9 +21,7 @@ def view(name="desk_01", width=WIDTH, height=HEIGHT):
 
 
 def settings(folder, samples=2, albedo_space="linear", roughness_is="perceptual", path=None):
-    prior = SimpleNamespace(
-        kind="files", samples=samples, path=path, albedo_space=albedo_space, roughness_is=roughness_is
-    )
+    prior = SimpleNamespace(kind="files", samples=samples, path=path, albedo_space=albedo_space, roughness_is=roughness_is)
     return SimpleNamespace(prior=prior, source=SimpleNamespace(path=str(folder)))
 
 

@@ -51,9 +51,7 @@ class FakeJob:
         self.document = {"seed": 3}
         self.log = logging.getLogger("test")
         self.readers = {}
-        self.writer = StageWriter(
-            root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"}
-        )
+        self.writer = StageWriter(root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"})
 
     def read(self, stage):
         assert stage in self.stage.upstream
@@ -100,9 +98,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     seen = []
     for view in views:
         eye = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(
-            -1, 3
-        )
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, WIDTH, HEIGHT, view.world_from_camera).reshape(-1, 3)
         face, depth = trace(geometry, eye, rays)
         material = FaceMaterials(TRUE[object_id])
         jitter = direction_derivatives(view.fx, view.fy, view.world_from_camera)
@@ -161,9 +157,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     columns |= {c: centres[:, i] for i, c in enumerate("xyz")}
     job.writer.table("cells.parquet", {**columns, **material_columns(base)})
     counts = np.bincount(cells[:, 3], minlength=3)
-    job.writer.table(
-        "objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])}
-    )
+    job.writer.table("objects.parquet", {"object_id": ids, "cells": counts, **material_columns(TRUE * [0.8, 0.8, 0.8, 1, 1])})
     rows = {"segment_id": np.repeat(np.arange(6), K), "k": np.tile(np.arange(K), 6)}
     job.writer.table("selection.parquet", {**rows, "weight_albedo": rng.uniform(0, 1, 6 * K)})
     start = 0
@@ -250,9 +244,7 @@ def toy(llvm, tmp_path_factory):
 def test_recovered_scene(toy):
     scene = read_recovered(FakeJob("publish", toy))
     assert scene.object_names == ["walls", "box", "lamp"]
-    np.testing.assert_allclose(
-        scene.emitter_radiance, [LAMP, [0, 0, 0]]
-    )  # light scale applied, dropped emitter is dark
+    np.testing.assert_allclose(scene.emitter_radiance, [LAMP, [0, 0, 0]])  # light scale applied, dropped emitter is dark
     np.testing.assert_array_equal(np.flatnonzero(scene.emitter_id >= 0), [24, 25])
     np.testing.assert_allclose(scene.surface.object_values[:2], TRUE[:2], atol=1e-6)  # base mean through T_o
     np.testing.assert_allclose(scene.light.environment, 0)
@@ -300,9 +292,7 @@ def test_variants_and_gain(toy):
     assert summary["not_scored"] == []
     scores = [
         v
-        for variant, q, m, p, v in zip(
-            *(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True
-        )
+        for variant, q, m, p, v in zip(*(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True)
         if (variant, q, m, p) == ("result", "emission", "iou", "raw")
     ]
     assert min(scores) > 0.99
@@ -320,9 +310,7 @@ def test_object_mean_is_the_mean_of_the_predictions(toy):
         for k in range(K):
             total += rgb(channels, f"prior.{k:03d}.albedo")[box].astype(np.float64).sum(0)
         count += K * box.sum()
-    np.testing.assert_allclose(
-        means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5
-    )
+    np.testing.assert_allclose(means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5)
 
 
 def test_maps_hold_everything(toy):
@@ -401,9 +389,7 @@ def test_timings(toy):
 def test_plan_is_collected(toy):
     plan = yaml.safe_load((toy / "scenes/toy/plan.yaml").read_text())
     assert plan["scene"] == "toy"
-    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [
-        ("metallic", False, "base")
-    ]
+    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [("metallic", False, "base")]
 
 
 # ---------------------------------------------------------------------------------------------------------------- page

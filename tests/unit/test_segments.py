@@ -22,9 +22,7 @@ def test_segments_are_numbered_by_view_then_object():
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    arrays(np.int32, st.tuples(st.integers(0, 4), st.integers(1, 5), st.integers(1, 5)), elements=st.integers(-1, 6))
-)
+@given(arrays(np.int32, st.tuples(st.integers(0, 4), st.integers(1, 5), st.integers(1, 5)), elements=st.integers(-1, 6)))
 def test_segment_maps_give_the_object_back(maps):
     segment_maps, table = segments.segment_table(maps)
     assert table.segment_id.tolist() == list(range(len(table)))
@@ -71,9 +69,7 @@ def grid_mesh(n):
 def test_adjacency_of_a_grid():
     faces, vertices = grid_mesh(3)
     pairs = segments.face_adjacency(faces)
-    slow = {
-        (i, j) for i in range(len(faces)) for j in range(i + 1, len(faces)) if len(set(faces[i]) & set(faces[j])) == 2
-    }
+    slow = {(i, j) for i in range(len(faces)) for j in range(i + 1, len(faces)) if len(set(faces[i]) & set(faces[j])) == 2}
     assert {tuple(p) for p in pairs.tolist()} == slow
     # the same with every corner its own vertex, joined by position
     split = vertices[faces].reshape(-1, 3)
@@ -125,9 +121,7 @@ def test_spread_equals_breadth_first_search():
         near[j].append(i)
     while len(label) < len(faces):
         label |= {
-            i: min(label[j] for j in near[i] if j in label)
-            for i in near
-            if i not in label and any(j in label for j in near[i])
+            i: min(label[j] for j in near[i] if j in label) for i in near if i not in label and any(j in label for j in near[i])
         }
     assert votes.object_of_face.tolist() == [label[i] for i in range(len(faces))]
 

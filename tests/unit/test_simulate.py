@@ -17,9 +17,7 @@ def room(height=64, width=96, seed=0):
     for i in range(12):
         cy, cx = rng.random(2)
         ids[(abs(y - cy) < 0.04) & (abs(x - cx) < 0.04)] = 5 + i
-    albedo = np.concatenate(
-        [[[0.8] * 3, [1.0] * 3, [0.55] * 3, [0.25, 0.11, 0.06], [0.7] * 3], 0.1 + 0.7 * rng.random((12, 3))]
-    )
+    albedo = np.concatenate([[[0.8] * 3, [1.0] * 3, [0.55] * 3, [0.25, 0.11, 0.06], [0.7] * 3], 0.1 + 0.7 * rng.random((12, 3))])
     colour = albedo[ids] * (1 + 0.3 * np.where(ids == 3, np.sin(60 * x + 9 * y), 0))[..., None]
     roughness = np.concatenate([[1, 1, 0.32, 0.32, 0.3], rng.choice([0.3, 1.0], 12)])[ids]
     metallic = np.where(ids == 4, 1.0, 0.0)
@@ -67,8 +65,7 @@ def test_errors_of_an_object_do_not_depend_on_what_else_is_in_view():
     albedo, roughness, metallic, ids, _ = room()
     fewer = np.where(ids == 3, 3, 99)
     a, b = (
-        simulate.simulate_predictions(albedo, roughness, metallic, i, 3, 0, 0, errors=errors)[:, ids == 3]
-        for i in (ids, fewer)
+        simulate.simulate_predictions(albedo, roughness, metallic, i, 3, 0, 0, errors=errors)[:, ids == 3] for i in (ids, fewer)
     )
     np.testing.assert_array_equal(a, b)
 
@@ -141,9 +138,7 @@ def test_shading_proxy_finds_the_light():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (0, 4)])
 def test_tiny_pictures(shape):
-    p = simulate.simulate_predictions(
-        np.full((*shape, 3), 0.5), np.ones(shape), np.zeros(shape), np.full(shape, -1), 2, 0, 0
-    )
+    p = simulate.simulate_predictions(np.full((*shape, 3), 0.5), np.ones(shape), np.zeros(shape), np.full(shape, -1), 2, 0, 0)
     assert p.shape == (2, *shape, 5) and np.isfinite(p).all()
 
 

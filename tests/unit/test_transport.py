@@ -45,11 +45,7 @@ def box(low, high, inward):
         e2[(axis + 2) % 3] = (high - low)[(axis + 2) % 3]
         lift = np.zeros(3)
         lift[axis] = (high - low)[axis]
-        parts += (
-            [quad(low, e1, e2), quad(low + lift, e2, e1)]
-            if inward
-            else [quad(low, e2, e1), quad(low + lift, e1, e2)]
-        )
+        parts += [quad(low, e1, e2), quad(low + lift, e2, e1)] if inward else [quad(low, e2, e1), quad(low + lift, e1, e2)]
     return merge(parts)[:2]
 
 
@@ -161,9 +157,7 @@ def test_direct_light_of_a_rectangle_is_the_form_factor(T, half, nee):
     vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), light])
     geometry = T.build_geometry(vertices, faces, ids)
     radiance = np.where(ids[:, None] == 1, np.float32([3, 1, 0.5]), 0)
-    emitters = T.Emitters(
-        geometry, radiance, np.where(ids == 1, 1, 0), sampling_weight=None if nee else np.zeros(4)
-    )
+    emitters = T.Emitters(geometry, radiance, np.where(ids == 1, 1, 0), sampling_weight=None if nee else np.zeros(4))
     assert emitters.can_be_sampled == nee
     n = 2000
     black = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (4, 1)))
@@ -193,13 +187,9 @@ def test_emitters_radiate_from_their_side_only(T):
     nothing = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (2, 1)))
     for side, below, above in ((1, 0, 1), (-1, 1, 0), (0, 1, 1)):
         emitters = T.Emitters(geometry, np.ones((2, 3)), np.full(2, side))
-        seen = T.render(
-            geometry, nothing, emitters, [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], 2, 0, seed=0
-        )
+        seen = T.render(geometry, nothing, emitters, [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], 2, 0, seed=0)
         assert seen[:, 0].tolist() == [below, above]
-        diffuse, _, _ = T.shading_caches(
-            geometry, nothing, emitters, [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], 64, 1, 0
-        )
+        diffuse, _, _ = T.shading_caches(geometry, nothing, emitters, [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], 64, 1, 0)
         assert (diffuse[0, 0] > 0.1) == bool(below)
 
 
@@ -209,9 +199,7 @@ def lambertian(rho):
     import mitsuba as mi
 
     metallic = -0.04 / (rho - 0.04)
-    return lambda point, face, object_id, active: (mi.Color3f(rho), mi.Float(1), mi.Float(metallic)), (
-        1 - metallic
-    ) * rho
+    return lambda point, face, object_id, active: (mi.Color3f(rho), mi.Float(1), mi.Float(metallic)), (1 - metallic) * rho
 
 
 def test_closed_grey_box_sums_the_geometric_series(T):
@@ -265,13 +253,9 @@ def test_closed_sphere_solves_its_integral_equation(T):
         start /= np.linalg.norm(start)
         side = np.cross(start, (0, 1, 0))
         side /= np.linalg.norm(side)
-        toward = (
-            cosine * start + np.sqrt(1 - cosine**2) * side
-        )  # arrives at the far wall under the same angle
+        toward = cosine * start + np.sqrt(1 - cosine**2) * side  # arrives at the far wall under the same angle
         n = 4000
-        seen = T.render(
-            geometry, material, emitters, repeated(start * 0.9 - 0 * side, n), repeated(toward, n), 32, 64, 5
-        )
+        seen = T.render(geometry, material, emitters, repeated(start * 0.9 - 0 * side, n), repeated(toward, n), 32, 64, 5)
         arrived = np.array([0.9 * start @ toward])
         distance = -arrived + np.sqrt(arrived**2 + 1 - 0.81)
         hit = 0.9 * start + distance * toward
@@ -300,9 +284,7 @@ def test_white_furnace(T, r, m):
     emitters = T.Emitters(geometry, np.zeros((2, 3)), environment=(1, 1, 1))
     assert not emitters.can_be_sampled
     material = T.FaceMaterials(np.tile([*a, r, m], (2, 1)))
-    seen = T.render(
-        geometry, material, emitters, repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), 32, 8, 1
-    )
+    seen = T.render(geometry, material, emitters, repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), 32, 8, 1)
     caches = T.shading_caches(
         geometry,
         material,
@@ -410,9 +392,7 @@ def test_transport_matrix_reproduces_reflected_radiance(T, room):
         )
         assert matrix.shape == (len(room.points), 2, 3) and not cached.any() and (matrix >= 0).all()
         products.append(np.einsum("ngc,gc->nc", matrix, ROOM_RADIANCE))
-        rendered.append(
-            room.render(T, 128, seed=50 + seed)
-        )  # no visible emission: those pixels were left out
+        rendered.append(room.render(T, 128, seed=50 + seed))  # no visible emission: those pixels were left out
     for number, bias, error in bias_over(products, rendered, room.object, seeds):
         assert abs(bias) < 4 * error + 1e-3 and error < 8e-3, number
 
@@ -467,9 +447,7 @@ def test_constant_cache_in_a_closed_room_is_a_furnace(T, room):
     kd, ks = brdf.kd_ks(room.base_color[pick], room.metallic[pick, None])
     expected = brdf.compose(kd, ks, diffuse, s0[:, 1], s1[:, 1])
     assert_mean((h - expected)[walls, 0], 0)
-    seen = T.render(
-        room.geometry, room.material, dark, room.origin, room.directions[pick], 64, 1, 0, cache=cache
-    )
+    seen = T.render(room.geometry, room.material, dark, room.origin, room.directions[pick], 64, 1, 0, cache=cache)
     assert_mean(seen[:, 0] - h[:, 0], 0)  # the primary hit is shaded with its material, never cached
     assert_mean(seen[:, 1] - h[:, 1], 0)
     assert seen[:, 0].mean() < 1.7 and not seen[:, 2].any()
@@ -558,9 +536,7 @@ def test_reruns_chunks_and_threads_do_not_change_a_bit(T, room):
             chunk=chunk,
             cache=constant_cache(T, (1, 2, 3), low=(-6, -6, -3), count=12),
         )
-        caches = T.shading_caches(
-            room.geometry, room.material, room.emitters, *parts, levels, 8, 4, 9, chunk=chunk
-        )
+        caches = T.shading_caches(room.geometry, room.material, room.emitters, *parts, levels, 8, 4, 9, chunk=chunk)
         matrix = T.transport_matrix(
             room.geometry,
             room.material,
@@ -593,9 +569,7 @@ def test_lanes_and_seeds_are_independent(T, room):
     same = (repeated(room.origin, n), repeated(room.directions[len(room.directions) // 2], n))
 
     def run(seed):
-        return T.render(room.geometry, room.material, room.emitters, *same, 1, 5, seed)[:, 0].astype(
-            np.float64
-        )
+        return T.render(room.geometry, room.material, room.emitters, *same, 1, 5, seed)[:, 0].astype(np.float64)
 
     a, b, c = run(0), run(1), run(2**63 + 1)
     assert len(np.unique(a)) > 0.5 * n
@@ -643,9 +617,7 @@ def test_trace_agrees_with_open3d(T, room):
     directions = (rng.normal(size=(20000, 3)) * rng.uniform(0.1, 5, (20000, 1))).astype(np.float32)
     face, t = T.trace(room.geometry, origins, directions, chunk=7001)
     scene = open3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        open3d.core.Tensor(room.vertices.astype(np.float32)), open3d.core.Tensor(room.faces.astype(np.uint32))
-    )
+    scene.add_triangles(open3d.core.Tensor(room.vertices.astype(np.float32)), open3d.core.Tensor(room.faces.astype(np.uint32)))
     other = scene.cast_rays(open3d.core.Tensor(np.concatenate([origins, directions], 1)))
     assert np.mean(face == other["primitive_ids"].numpy().astype(np.int64)) > 0.9995
     np.testing.assert_allclose(t, other["t_hit"].numpy(), rtol=1e-4)
@@ -667,9 +639,7 @@ def test_degenerate_faces_keep_their_ids(T):
     emitters = T.Emitters(geometry, np.ones((4, 3)))
     assert set(emitters.slots) == {1, 3} and emitters.pdf_area[[0, 2]].tolist() == [0, 0]
     colours = T.FaceMaterials(np.tile([0.5, 0.5, 0.5, 0.5, 0], (4, 1)))
-    assert np.isfinite(
-        T.render(geometry, colours, emitters, [0, 0, 1], repeated((0.1, 0, -1), 5), 8, 3, 0)
-    ).all()
+    assert np.isfinite(T.render(geometry, colours, emitters, [0, 0, 1], repeated((0.1, 0, -1), 5), 8, 3, 0)).all()
 
 
 def test_light_slots_have_the_density_they_report(T):
@@ -690,9 +660,7 @@ def test_sampling_weights_do_not_change_the_mean(T, room):
     means = []
     for weight in (None, room.geometry.areas, np.where(room.group == 0, 1.0, 0.0), np.zeros(len(room.faces))):
         emitters = T.Emitters(room.geometry, room.radiance, room.side, sampling_weight=weight)
-        seen = T.render(
-            room.geometry, room.material, emitters, repeated(room.origin, n), repeated(direction, n), 32, 3, 4
-        )
+        seen = T.render(room.geometry, room.material, emitters, repeated(room.origin, n), repeated(direction, n), 32, 3, 4)
         means.append((seen[:, 0].mean(), seen[:, 0].std() / np.sqrt(n)))
     for mean, error in means[1:]:
         assert abs(mean - means[0][0]) < 3.5 * np.hypot(error, means[0][1])
@@ -714,9 +682,7 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     far = np.array([[1e9, 0, 0], [-1e9, 0, 0], [2, 1, 1e4]], np.float32)
     points = np.concatenate([room.points, far]).astype(np.float32)
     objects = np.concatenate([objects, [0, 1, 2]]).astype(np.int32)
-    color, roughness, metallic = material(
-        mi.Point3f(points.T), mi.UInt32(0), mi.Int32(objects), mi.Bool(True)
-    )
+    color, roughness, metallic = material(mi.Point3f(points.T), mi.UInt32(0), mi.Int32(objects), mi.Bool(True))
     got = np.column_stack([color.numpy().T, roughness.numpy(), metallic.numpy()])
 
     table = cells.CellTable.build(keys)
@@ -732,9 +698,7 @@ def test_cell_materials_read_what_numpy_reads(T, room):
 
 
 def test_extremes_are_finite(T, room):
-    mirror = T.FaceMaterials(
-        np.tile([0, 0, 0, 0, 1.0], (len(room.faces), 1))
-    )  # black metal, r clamped to 0.02
+    mirror = T.FaceMaterials(np.tile([0, 0, 0, 0, 1.0], (len(room.faces), 1)))  # black metal, r clamped to 0.02
     bright = T.Emitters(room.geometry, room.radiance * 1e6, room.side)
     grazing = room.normals * 1e-6 + np.cross(room.normals, (0.3, 0.5, 0.8))
     behind = np.cross(room.normals, (0.3, 0.5, 0.8))
@@ -771,9 +735,7 @@ def test_extremes_are_finite(T, room):
             )
             for value in (*caches, *matrix):
                 assert np.isfinite(value).all() and (value >= 0).all()
-        assert np.isfinite(
-            T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)
-        ).all()
+        assert np.isfinite(T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)).all()
     dark = T.Emitters(room.geometry, np.zeros((len(room.faces), 3)))
     assert not T.render(room.geometry, room.material, dark, room.origin, room.directions, 2, 4, 0).any()
 
@@ -848,6 +810,4 @@ def test_bad_input_is_named(T, room):
         )
     none = np.zeros((0, 3), np.float32)
     assert T.render(room.geometry, room.material, room.emitters, none, none, 1, 1, 0).shape == (0, 3)
-    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[
-        1
-    ].shape == (0, 1, 3)
+    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[1].shape == (0, 1, 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -143,7 +142,6 @@ def build(
     curve: str | None = None,
     exposures: np.ndarray | None = None,
     brightness: float = 1.0,
-    told: bool = True,
 ) -> Room:
     """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture."""
     from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
@@ -160,13 +158,11 @@ def build(
     capture = StubJob("capture", folder, {}).writer
     segmentation = StubJob("segmentation", folder, {}).writer
     form = CaptureWriter(capture)
-    form.cameras(cameras if told else [replace(view, exposure=1.0) for view in cameras])
+    form.cameras(cameras)
     form.mesh(room.vertices, room.faces, room.object_id, room.names, room.emission)
     spoiled, pixels = _spoil(room, spoil, rng), []
     for view in cameras:
-        directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(
-            -1, 3
-        )
+        directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(-1, 3)
         origin = view.world_from_camera[:3, 3]
         face, depth = trace(geometry, origin, directions)
         radiance = render(geometry, material, emitters, origin, directions, samples, 10, 1000 + view.view_id)

@@ -65,7 +65,7 @@ def test_timings_name_every_job(scene):
 
 
 def test_snapshot(finished):
-    """Exact: counts, ids, columns. Tolerance: means of maps within the Monte Carlo spread of another machine. Structure: channels."""
+    """Exact: counts, ids. Tolerance: means, within the Monte Carlo spread of another machine. Structure: files, channels."""
     want, got = json.loads(PATH.read_text()), take(finished.folder)
     assert got["exact"] == want["exact"]
     assert got["structure"] == want["structure"]

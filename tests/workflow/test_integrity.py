@@ -7,6 +7,7 @@ import subprocess
 import time
 
 from support import manifests, planned
+
 from workflow.registry import STAGES
 
 NOTHING = "Nothing to be done"

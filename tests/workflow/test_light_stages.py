@@ -13,7 +13,7 @@ TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB
 
 
 def _run(folder, dynamic_range, upto="affines", **changes):
-    capture = {"dynamic_range": dynamic_range, "exposure": changes.pop("exposure", "given")}
+    capture = {"dynamic_range": dynamic_range}
     common = {"capture": capture, "affines": AFFINES}
     for name, module, own in (
         ("emission", emission, EMISSION),
@@ -105,9 +105,7 @@ def test_same_bytes_twice(hdr):
 
 def test_ldr_with_unknown_response(tmp_path, llvm):
     exposures = np.array([1, 0.5, 2, 0.25, 1, 0.5, 2, 1.0])
-    room = build(
-        tmp_path, views=8, size=48, samples=128, spoil=0.25, dynamic_range="ldr", curve="srgb", exposures=exposures
-    )
+    room = build(tmp_path, views=8, size=48, samples=128, spoil=0.25, dynamic_range="ldr", curve="srgb", exposures=exposures)
     _run(tmp_path, "ldr")
     table, radiance = _emitters(tmp_path)
     assert table["kept"].sum() == 2
@@ -117,16 +115,6 @@ def test_ldr_with_unknown_response(tmp_path, llvm):
     response = _reader(tmp_path, "affines").table("camera_response.parquet")
     samples = response["kind"] == "sample"
     assert samples.sum() == 303 and (np.diff(response["value"][samples][:101]) > 0).all()
-
-
-def test_exposures_are_estimated(tmp_path, llvm):
-    """Views taken at exposures that the capture does not know (it says 1 for all)."""
-    exposures = np.array([1, 0.6, 1.5, 0.8, 1.2, 1.0])
-    build(tmp_path, views=6, size=48, samples=64, dynamic_range="ldr", curve="srgb", exposures=exposures, told=False)
-    _run(tmp_path, "ldr", upto="emission", exposure="estimate")
-    table = _reader(tmp_path, "emission").table("exposures.parquet")
-    found = table["exposure"] / np.exp(np.log(table["exposure"]).mean())
-    np.testing.assert_allclose(found, exposures / np.exp(np.log(exposures).mean()), rtol=0.1)
 
 
 @pytest.mark.parametrize("brightness", [0.0, 1000.0])
@@ -139,6 +127,4 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, brightne
     table, radiance = _emitters(tmp_path)
     assert np.isfinite(radiance).all() and (radiance >= 0).all()
     if brightness == 0:
-        assert not table["kept"].any() and "no emitter" in " ".join(
-            _reader(tmp_path, "emission").json("emission.json")["notes"]
-        )
+        assert not table["kept"].any() and "no emitter" in " ".join(_reader(tmp_path, "emission").json("emission.json")["notes"])

@@ -22,8 +22,7 @@ class DamagedArtefact(InputError):
     def __init__(self, path: Path, stage: str, scene: str, problem: str):
         self.path, self.stage, self.scene = path, stage, scene
         super().__init__(
-            f"{path}: {problem}. It was made by rule {stage};"
-            f" rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
+            f"{path}: {problem}. It was made by rule {stage}; rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
         )
 
 

@@ -30,9 +30,7 @@ _NOTE = """
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
-def mitsuba_files(
-    parts: Sequence[Part], views: Sequence[View], environment: np.ndarray, max_depth: int = 9
-) -> dict[str, bytes]:
+def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.ndarray, max_depth: int = 9) -> dict[str, bytes]:
     """Files of the scene by relative name: `scene.xml` and `meshes/<part>.ply`.
 
     Args:

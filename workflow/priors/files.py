@@ -37,9 +37,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     found = {name: _listing(folder / name) for name in PROPERTIES}
     views = sorted({view for listing in found.values() for view, _ in listing})
     if not views:
-        raise InputError(
-            f"{folder}: no predictions; expected albedo/<view>_000.png (or .exr), roughness/..., metallic/..."
-        )
+        raise InputError(f"{folder}: no predictions; expected albedo/<view>_000.png (or .exr), roughness/..., metallic/...")
     wanted = [(name, view, k) for name in PROPERTIES for view in views for k in range(samples)]
     missing = [_file(name, view, k) for name, view, k in wanted if (view, k) not in found[name]]
     if missing:
@@ -57,10 +55,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
     folder = _folder(prior.path, getattr(settings.source, "path", None))
     found = {name: _listing(folder / name, view.name) for name in PROPERTIES}
     missing = [
-        _file(name, view.name, k)
-        for name in PROPERTIES
-        for k in range(prior.samples)
-        if (view.name, k) not in found[name]
+        _file(name, view.name, k) for name in PROPERTIES for k in range(prior.samples) if (view.name, k) not in found[name]
     ]
     if missing:
         raise InputError(_missing(folder, missing, prior.samples))

@@ -30,9 +30,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
     instance = capture.given_instances(view)
     if instance is None:
         instance = np.where(hit, instance_of_face[face_id], -1)
-    return retinex_predictions(
-        photo, settings.prior.samples, settings.prior.mean_albedo, instance, normals * -towards, valid
-    )
+    return retinex_predictions(photo, settings.prior.samples, settings.prior.mean_albedo, instance, normals * -towards, valid)
 
 
 @lru_cache(1)

@@ -108,9 +108,7 @@ def number(value: Any, digits: int = 3) -> str:
     return str(value)
 
 
-def score_table(
-    title: str, means: dict[str, Any], columns: Sequence[tuple[str, str, str]], note: str = ""
-) -> Table | None:
+def score_table(title: str, means: dict[str, Any], columns: Sequence[tuple[str, str, str]], note: str = "") -> Table | None:
     """Variants x (quantity, protocol, metric) from summary.json's `means`; None when no variant has any of them.
 
     The best number of each column is marked where two variants have one.
@@ -146,6 +144,4 @@ def _mean(means: dict[str, Any], variant: str, quantity: str, protocol: str, met
 def _text(value: float | None, metric: str) -> str:
     if value is None:
         return "–"
-    return (
-        f"{value:.{_DECIMALS[metric]}f}" if metric in _DECIMALS else f"{value:.4f}" if value < 1000 else f"{value:.3g}"
-    )
+    return f"{value:.{_DECIMALS[metric]}f}" if metric in _DECIMALS else f"{value:.4f}" if value < 1000 else f"{value:.3g}"

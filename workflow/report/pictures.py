@@ -27,9 +27,7 @@ def linear(image: Array, exposure: float = 1.0) -> Array:
     return color.to_uint8(color.tone_map(image, exposure))
 
 
-def scalar(
-    values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "value", mask: Array | None = None
-) -> Array:
+def scalar(values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "value", mask: Array | None = None) -> Array:
     """(H, W) in false colours; grey where `mask` is False."""
     picture = color.false_colour(values, low, high, scheme)
     return color.to_uint8(picture if mask is None else np.where(mask[..., None], picture, 0.35))
@@ -120,8 +118,7 @@ def curves_svg(curves: Sequence[tuple[Array, Array, str, bool]], width: int = 30
         out.append(f'<text x="{left - 4}" y="{y + 3:.1f}" text-anchor="end">{tick:g}</text>')
     for x, y, colour, dashed in curves:
         points = " ".join(
-            f"{left + np.clip(a, 0, 1) * w:.1f},{top + (1 - np.clip(b, 0, 1)) * h:.1f}"
-            for a, b in zip(x, y, strict=True)
+            f"{left + np.clip(a, 0, 1) * w:.1f},{top + (1 - np.clip(b, 0, 1)) * h:.1f}" for a, b in zip(x, y, strict=True)
         )
         dash = ' stroke-dasharray="5 4"' if dashed else ""
         out.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"{dash}/>')

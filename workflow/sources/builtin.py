@@ -106,17 +106,13 @@ class _Capture:
 
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(
-            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
-        )
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         rays = rays.reshape(-1, 3)
         face, depth = trace(self.geometry, origin, rays)
         hit = face >= 0
         depth = np.where(hit, depth, 0).astype(np.float32)
         on = np.maximum(face, 0)
-        albedo, roughness, metallic = self.room.materials.numpy(
-            origin + depth[:, None] * rays, self.room.object_id[on]
-        )
+        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.room.object_id[on])
         cosine = (self.geometry.normals[on] * rays).sum(1)
         emission = np.where((hit & (cosine < 0))[:, None], self.room.emission[on], 0)
 
@@ -144,9 +140,7 @@ class _Capture:
         step = max(1, len(image) // _METER)
         return image[::step], ~emission.any(1)[::step]
 
-    def _photographs(
-        self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]
-    ) -> list[View]:
+    def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
         """Write the photographs; the views with their exposures."""
         from iif_core.photography import expose, exposures, response_curve
 
@@ -169,23 +163,17 @@ class _Capture:
         opening = self.room.field_of_view
 
         def count(cameras: list[Array], aspect: float) -> Array:
-            return np.sum(
-                [seen_from(self.geometry, points, opening, aspect, pose) for pose in cameras], axis=0
-            )
+            return np.sum([seen_from(self.geometry, points, opening, aspect, pose) for pose in cameras], axis=0)
 
         views_of_point = count([v.world_from_camera for v in views], views[0].height / views[0].width)
         reachable = (views_of_point > 0) | (count(self.room.cameras(len(self.room.shots)), 1.0) > 0)
         once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
-        self.job.log.info(
-            "of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice
-        )
+        self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
         notes = [f"{len(self.room.names)} objects, {len(self.room.faces)} faces; up to {MAX_BOUNCES} bounces"]
         if self.response is not None:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
-            notes.append(
-                NOTE
-            )
+            notes.append(NOTE)
         facts = {
             "room": self.room.name,
             "coverage": {

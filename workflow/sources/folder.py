@@ -176,7 +176,11 @@ class _Capture:
         self.writer.cameras(views)
         self.writer.mesh(self.mesh.vertices, self.mesh.faces, self.mesh.instance, self.mesh.names)
         self._note_pixels(frames, views)
-        facts = {"alignment": self.alignment.report(), "dropped_views": dropped}
+        facts = {
+            "alignment": self.alignment.report(),
+            "dropped_views": dropped,
+            "exposure_estimated": self.settings.exposure == "estimate",
+        }
         has_truth = bool(self.inputs.truth)
         self.writer.finish("folder", self.settings.dynamic_range, has_truth, self.notes, facts=facts)
         for note in self.notes:
@@ -229,9 +233,7 @@ class _Capture:
             )
         return pixels
 
-    def _resized(
-        self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _resized(self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Undistorted and reduced by area."""
         if not frame.lens.is_identity:
             pixels, valid = undistort_image(pixels, frame.lens, frame.camera, self._target(frame), valid)
@@ -345,9 +347,7 @@ class _Capture:
             self.notes.append(f"exposure: the views fall into {groups} groups without shared surface; each has mean 1")
         if gains.pairs:
             low, high = gains.gain.min(), gains.gain.max()
-            self.notes.append(
-                f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})"
-            )
+            self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})")
         if self.encoded:
             return [replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)]
         counts = dict(self.counts)

@@ -44,7 +44,7 @@ def capture(job: Job) -> None:
     from iif_core import native
 
     native.prepare()
-    from workflow.sources.mitsuba_scene import render, scene
+    from workflow.sources.mitsuba_scene import scene
 
     scene.choose_variant()
     native.limit_threads(job.threads)
@@ -78,19 +78,13 @@ class _Capture:
             self.mesh = flatten.compact(everything, keep)
         if not len(self.mesh.faces):
             raise InputError(f"{xml}: every face is transparent; a capture needs opaque surface")
-        self.job.log.info(
-            "mesh: %d faces of %d shapes", len(self.mesh.faces), len(np.unique(self.mesh.shape))
-        )
+        self.job.log.info("mesh: %d faces of %d shapes", len(self.mesh.faces), len(np.unique(self.mesh.shape)))
 
-        views = self._plan(
-            flatten.compact(everything, keep), bool(transparent.any()) and self.source.drop_transparent
-        )
+        views = self._plan(flatten.compact(everything, keep), bool(transparent.any()) and self.source.drop_transparent)
         del everything
         shapes, instance = np.unique(self.mesh.shape, return_inverse=True)
         names = [self.mesh.shapes[i].name for i in shapes]
-        self.writer.mesh(
-            self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission
-        )
+        self.writer.mesh(self.mesh.vertices, self.mesh.faces, instance.astype(np.int32), names, self.mesh.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
@@ -115,18 +109,14 @@ class _Capture:
                 }
             elif emitter.class_name() not in ("AreaLight", "DirectionalArea"):
                 loose[emitter.class_name()] = loose.get(emitter.class_name(), 0) + 1
-        self.notes += [
-            f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()
-        ]
+        self.notes += [f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()]
 
     def _note_faces(self, transparent: Array, thin: Array) -> None:
         if transparent.any():
             what = "left out of the mesh" if self.source.drop_transparent else "kept in the mesh"
             self.notes.append(f"{transparent.sum()} transparent faces {what}; no truth where a ray meets one")
         if thin.any():
-            self.notes.append(
-                f"{thin.sum()} faces of low opacity left out of the mesh; no truth where a ray meets one"
-            )
+            self.notes.append(f"{thin.sum()} faces of low opacity left out of the mesh; no truth where a ray meets one")
 
     def _plan(self, solid_mesh: Any, glass: bool) -> list[View]:
         """Geometry for tracing, and the views."""
@@ -134,11 +124,7 @@ class _Capture:
         from workflow.sources.mitsuba_scene import path
 
         self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, self.mesh.shape)
-        solid = (
-            build_geometry(solid_mesh.vertices, solid_mesh.faces, solid_mesh.shape)
-            if glass
-            else self.geometry
-        )
+        solid = build_geometry(solid_mesh.vertices, solid_mesh.faces, solid_mesh.shape) if glass else self.geometry
         width, height = self.settings.width, self.settings.height
         sensors = self._sensors()
         up = path.upright(-sensors[0][0][:3, 1])
@@ -162,9 +148,7 @@ class _Capture:
             focal = width / 2 / sensors[i][1] if found.given[i] else 1 / (2 * wide)
             test = self.settings.test_every and i % self.settings.test_every == self.settings.test_every - 1
             split = "test" if test else "train"
-            views.append(
-                View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split)
-            )
+            views.append(View(i, f"{i:03d}", width, height, focal, focal, width / 2, height / 2, pose, 1.0, split))
         share = found.facts
         self.job.log.info(
             "%d views; of the reachable surface %.1f %% are seen, %.1f %% three times or more",
@@ -210,12 +194,8 @@ class _Capture:
         for i, view in enumerate(views):
             depth, face, truth = self._gbuffer(view)
             if i == 0 and not (face >= 0).any():
-                raise InputError(
-                    f"{self.source.path}: the scene's sensor sees no surface; point it into the room"
-                )
-            image, valid, dropped = render.render_view(
-                self.loaded.scene, integrator, view, self.settings.samples, self.job.seed
-            )
+                raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
+            image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
             if self.settings.denoise:
                 image = denoise(image, truth.albedo, self._normals(view, face))
             self.dropped += dropped
@@ -235,9 +215,7 @@ class _Capture:
         from workflow.sources.mitsuba_scene import materials, render
 
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(
-            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
-        )
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         rays = rays.reshape(-1, 3)
         face, t = trace(self.geometry, origin, rays)
         hit = np.flatnonzero(face >= 0)
@@ -274,9 +252,7 @@ class _Capture:
         """World normals towards the camera (H, W, 3), 0 where nothing is hit."""
         from iif_core.camera import pixel_directions
 
-        rays = pixel_directions(
-            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
-        )
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
         return np.where((normal * rays).sum(-1, keepdims=True) > 0, -normal, normal)
 
@@ -305,9 +281,7 @@ class _Capture:
         from iif_core.camera import pixel_directions
         from iif_core.transport.geometry import trace
 
-        rays = pixel_directions(
-            view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
-        )
+        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
         hit = (face >= 0).reshape(valid.shape)
         points = view.world_from_camera[:3, 3] + np.where(hit, t.reshape(valid.shape), 0)[..., None] * rays
@@ -317,21 +291,16 @@ class _Capture:
     def _estimated(self, shared: Any, views: list[View]) -> list[View]:
         """The views with exposures estimated from their photographs; the true ones are kept among the facts."""
         gains = shared.gains()
+        self.facts["exposure_estimated"] = True
         self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
-        self.notes.append(
-            f"exposures estimated from surface that views share (residual {gains.residual:.3f})"
-        )
+        self.notes.append(f"exposures estimated from surface that views share (residual {gains.residual:.3f})")
         return [replace(view, exposure=float(g)) for view, g in zip(views, gains.gain, strict=True)]
 
     def _finish(self) -> None:
         if self.dropped:
-            self.notes.append(
-                f"{self.dropped} path samples were not finite and are left out of the photographs"
-            )
+            self.notes.append(f"{self.dropped} path samples were not finite and are left out of the photographs")
         if self.settings.denoise:
-            self.notes.append(
-                NOTE
-            )
+            self.notes.append(NOTE)
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("mitsuba", self.settings.dynamic_range, True, self.notes, samples, self.facts)
         for note in self.notes:

@@ -16,7 +16,6 @@ from workflow.base_scene import (
     BaseScene,
     base_maps,
     read_base_scene,
-    read_exposures,
     read_light,
     view_pixels,
 )
@@ -36,7 +35,7 @@ def run(job: Job) -> None:
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     settings = job.settings.affines
     emits = read_light(job, len(scene.faces)).emits
-    exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job, capture), strict=True))
+    exposures = dict(zip((v.view_id for v in capture.views), capture.exposures(), strict=True))
     problem = _problem(job, capture, scene, emits, exposures)
     start = _starting_response(job)
     options = FitOptions(
@@ -122,9 +121,7 @@ def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
     return np.minimum(1.0, limit / np.maximum(counts, 1.0))
 
 
-def _problem(
-    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]
-) -> FitProblem:
+def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]) -> FitProblem:
     """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
@@ -272,9 +269,7 @@ def _base_scale(base: StageReader, file: str) -> np.ndarray:
 # --------------------------------------------------------------------------------------------------------------- plan
 
 
-def _plan(
-    problem: FitProblem, fit: FitResult, start: Response, options: FitOptions, dynamic_range: str
-) -> list[plan.Decision]:
+def _plan(problem: FitProblem, fit: FitResult, start: Response, options: FitOptions, dynamic_range: str) -> list[plan.Decision]:
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
     medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)

@@ -53,9 +53,7 @@ def run(job: Job) -> None:
         weights,
     )
     options = BaseOptions(settings.variant, settings.sweeps, anneal=settings.anneal, ridge=settings.ridge)
-    result = solve_base(
-        problem, options, lambda done, total: job.progress(done, total, "passes over the views"), job.threads
-    )
+    result = solve_base(problem, options, lambda done, total: job.progress(done, total, "passes over the views"), job.threads)
     for dropped in result.dropped:
         if dropped.k < 0:
             job.log.warning("view %s: %s", views[dropped.view].name, dropped.reason)
@@ -121,9 +119,7 @@ def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View
             if hit.any():
                 footprints.append(float(np.median(depth[hit])) / view.fx)
         if not footprints:
-            raise InputError(
-                "base: no pixel of any view with predictions sees the mesh; check the alignment of the capture"
-            )
+            raise InputError("base: no pixel of any view with predictions sees the mesh; check the alignment of the capture")
         edge = job.settings.base.cell_footprints * float(np.median(footprints))
     extent = float(np.ptp(corners, axis=0).max())
     smallest = extent / (INDEX_LIMIT - 8)
@@ -153,9 +149,7 @@ def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View
     return Cells(edge, origin, keys, (summed / total[:, None]).astype(np.float32)), maps
 
 
-def _pixels(
-    capture: CaptureReader, segmentation: StageReader, views: list[View]
-) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _pixels(capture: CaptureReader, segmentation: StageReader, views: list[View]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weight and segment of every pixel of each view, flattened; pixels that the photograph does not show weigh 0."""
     weights, segments = [], []
     for view in views:
@@ -212,26 +206,18 @@ def _write_tables(
     counted = np.zeros(n_objects, np.int32)
     means[:known], counted[:known] = result.object_value[:known], result.object_cells[:known]
     columns = {name: means[:, c] for c, name in enumerate(CHANNELS)}
-    job.writer.table(
-        "objects.parquet", {"object_id": np.arange(n_objects, dtype=np.int32), "cells": counted, **columns}
-    )
+    job.writer.table("objects.parquet", {"object_id": np.arange(n_objects, dtype=np.int32), "cells": counted, **columns})
     n, k = result.weight.shape[:2]
     job.writer.table(
         "selection.parquet",
         {
             "segment_id": np.repeat(segment_id.astype(np.int32), k),
             "k": np.tile(np.arange(k, dtype=np.int32), n),
-            **{
-                f"weight_{name}": result.weight[..., p].ravel()
-                for p, name in enumerate(("albedo", "roughness", "metallic"))
-            },
+            **{f"weight_{name}": result.weight[..., p].ravel() for p, name in enumerate(("albedo", "roughness", "metallic"))},
             "affine_albedo": result.affine_albedo.reshape(n * k, 12),
             "affine_roughness": result.affine_roughness.reshape(n * k, 2),
             "affine_metallic": result.affine_metallic.reshape(n * k, 2),
-            **{
-                f"error_{name}": result.error[..., p].ravel()
-                for p, name in enumerate(("albedo", "roughness", "metallic"))
-            },
+            **{f"error_{name}": result.error[..., p].ravel() for p, name in enumerate(("albedo", "roughness", "metallic"))},
         },
     )
 

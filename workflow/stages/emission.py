@@ -19,7 +19,7 @@ from iif_core.emitters import (
     group_emitters,
     hdr_threshold,
 )
-from iif_core.exposure import ExposureGains, calibrate_response, estimate_gains
+from iif_core.exposure import calibrate_response
 from iif_core.nnls import (
     EmissionRows,
     EmissionSolution,
@@ -67,13 +67,13 @@ class _Light:
 
 
 def run(job: Job) -> None:
-    """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet, emission.json (and exposures.parquet)."""
+    """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
     family = family_for(job.settings.affines.response, capture.facts["dynamic_range"])
     light = _Light(response(family), capture.is_hdr, job.settings.emission.saturation)
     notes: list[str] = []
-    exposures, exposure_plan = _exposures(job, capture, scene, views, light, notes)
+    exposures, exposure_plan = _exposures(capture, views, notes)
     light = _calibrated(job, capture, scene, views, light, exposures, notes)
     statistics, threshold = _statistics(job, capture, scene, views, light)
     groups, candidates = _groups(job, scene, statistics, threshold)
@@ -85,17 +85,13 @@ def run(job: Job) -> None:
         secondary,
         misses.relative_brightness if misses.pixels else None,
     )
-    solution, table = _solve(
-        job, capture, scene, views, light, exposures, groups, cache, misses, environment["included"]
-    )
+    solution, table = _solve(job, capture, scene, views, light, exposures, groups, cache, misses, environment["included"])
     _write(job, groups, table, cache)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     for faces, area, reason in groups.dropped[:20]:
         notes.append(f"candidate of {faces} faces, {area:.2g} m^2, left out before the solve: {reason}")
     if not kept and not environment["included"]:
-        notes.append(
-            "no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark"
-        )
+        notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
     decisions = [environment, exposure_plan, plan.emitters(kept, groups.size - kept + len(groups.dropped), candidates)]
     job.writer.json(
         "emission.json",
@@ -121,50 +117,17 @@ def run(job: Job) -> None:
 # ----------------------------------------------------------------------------------------------------------- exposure
 
 
-def _exposures(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, notes: list[str]
-) -> tuple[dict[int, float], plan.Decision]:
-    """Exposure per view id; estimated ones are written to exposures.parquet and read by the later stages."""
-    given = {view.view_id: float(view.exposure) for view in capture.views}
+def _exposures(capture: CaptureReader, views: list[View], notes: list[str]) -> tuple[dict[int, float], plan.Decision]:
+    """Exposure per view id, and whether the source estimated it."""
+    exposures = {view.view_id: float(view.exposure) for view in capture.views}
     bad = [view.name for view in capture.views if not view.exposure > 1e-6]
     if bad:  # METHOD H31
         notes.append(f"exposure not positive, taken as 1: {', '.join(bad)}")
-        given.update({view.view_id: 1.0 for view in capture.views if view.name in bad})
-    setting = getattr(job.settings.capture, "exposure", "given")
-    if setting != "estimate" or light.is_hdr or len(views) < 2:
-        return given, plan.exposure("given", np.zeros(0), 0)
-    gains = _estimate(job, capture, scene, views, light, given)
-    logs = np.log(gains.gain[gains.estimated])
-    decision = plan.exposure("estimate", logs, int(gains.estimated.sum()))
-    for view, estimated in zip(views, gains.estimated, strict=True):
-        if not estimated:
-            notes.append(
-                f"view {view.name} shares too little surface with others: exposure left at {given[view.view_id]:g}"
-            )
-    if decision["included"]:
-        for view, gain in zip(views, gains.gain, strict=True):
-            given[view.view_id] *= float(gain)
-        columns = {
-            "view_id": np.array([view.view_id for view in views], np.int32),
-            "exposure": np.array([given[view.view_id] for view in views], np.float64),
-            "gain": gains.gain,
-            "error": gains.error,
-            "estimated": gains.estimated,
-            "overlap_group": gains.group,
-        }
-        job.writer.table("exposures.parquet", columns)
-    return given, decision
-
-
-def _estimate(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], light: _Light, given: dict[int, float]
-) -> ExposureGains:
-    """Gains of the photographs after the starting response and the given exposures."""
-    cell, owner, value = _shared_surface(job, capture, scene, views)
-    exposure = np.array([given[view.view_id] for view in views])
-    radiance, bound = light.radiance(value, 1.0)
-    radiance = (radiance / exposure[owner, None]).astype(np.float32)
-    return estimate_gains(np.where(bound.any(1), -1, cell), owner, radiance, len(views))
+        exposures.update({view.view_id: 1.0 for view in capture.views if view.name in bad})
+    if not capture.facts.get("exposure_estimated"):
+        return exposures, plan.exposure("given", np.zeros(0), 0)
+    logs = np.log([exposures[view.view_id] for view in views])
+    return exposures, plan.exposure("estimate", logs, len(views))
 
 
 def _calibrated(
@@ -176,17 +139,15 @@ def _calibrated(
     exposures: dict[int, float],
     notes: list[str],
 ) -> _Light:
-    """The starting response, or the one that known exposures of shared surface imply."""
-    given = all(exposures[view.view_id] == view.exposure for view in views)
-    if light.is_hdr or not light.curve.names or not given or len(views) < 2:
+    """The starting response, or the one that known exposures of shared surface imply (estimated ones assumed a response)."""
+    estimated = capture.facts.get("exposure_estimated", False)
+    if light.is_hdr or not light.curve.names or estimated or len(views) < 2:
         return light
     cell, owner, value = _shared_surface(job, capture, scene, views)
     exposure = np.array([exposures[view.view_id] for view in views])
     found = calibrate_response(cell, owner, value, exposure, light.curve, light.saturation)
     if not found.pairs:
-        notes.append(
-            "exposures differ by less than a stop where views overlap: the response starts at the family's default"
-        )
+        notes.append("exposures differ by less than a stop where views overlap: the response starts at the family's default")
         return light
     notes.append(
         f"response from {found.pairs} pairs of differently exposed views of the same surface ({found.stops:.1f} stops):"
@@ -245,9 +206,7 @@ def _statistics(
     thin = np.bincount(owner, inside, size) < job.settings.emission.min_observations
     allow = (thin & (bright >= 0.9))[scene.object_id + 1] & (scene.object_id >= 0)
     merged = {
-        name: np.where(
-            allow.reshape(-1, *[1] * (getattr(every, name).ndim - 1)), getattr(every, name), getattr(inner, name)
-        )
+        name: np.where(allow.reshape(-1, *[1] * (getattr(every, name).ndim - 1)), getattr(every, name), getattr(inner, name))
         for name in ("count", "low", "mean", "front")
     }
     return FaceStatistics(**merged), float(threshold)
@@ -400,8 +359,7 @@ def _choose_rows(
             )
         )
     joined = {
-        name: np.concatenate([getattr(p, name) for p in parts])
-        for name in ("base", "radiance", "bound", "view", "tile", "group")
+        name: np.concatenate([getattr(p, name) for p in parts]) for name in ("base", "radiance", "bound", "view", "tile", "group")
     }
     fields = parts[0].pixels.__dict__
     pixels = ViewPixels(**{name: np.concatenate([getattr(p.pixels, name) for p in parts]) for name in fields})
@@ -444,9 +402,7 @@ def _solve(
         part.residual,
         part.condition,
     )
-    return replace(part, radiance=radiance, error=error), _table(
-        groups, rows, pruned, radiance, error, misses, n_groups
-    )
+    return replace(part, radiance=radiance, error=error), _table(groups, rows, pruned, radiance, error, misses, n_groups)
 
 
 def _initial(light: _Light, groups: EmitterGroups, rows: _Rows, misses: _Misses, with_environment: bool) -> np.ndarray:
@@ -521,9 +477,7 @@ class _System:
     def with_gains(self, initial: np.ndarray) -> _System:
         """Rows scaled by the albedo gains of the objects that go with the light."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
-        pinned = bool(np.any(self.rows.target < self.observed)) or bool(
-            (self.anchor & ~self.rows.lower_bound.any(1)).any()
-        )
+        pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
         gain = object_gains(self.rows, self.observed, self.owner, initial, pinned)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0

@@ -12,7 +12,6 @@ import numpy as np
 
 from iif_core import metrics
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
-from workflow.base_scene import read_exposures
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
@@ -59,7 +58,7 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     rows = _Rows()
     means = _PredictionMeans(job, capture) if capture.has_truth else None
-    exposures = read_exposures(job, capture)
+    exposures = capture.exposures()
 
     def scores_of(index: int) -> list[tuple[str, str, str, list[metrics.Score]]]:
         return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means))
@@ -237,9 +236,7 @@ def _summary(rows: _Rows, capture: CaptureReader) -> dict[str, Any]:
         "variants": {name: BASELINES[name] for name in means if name in BASELINES},
         "means": means,
         "gain_over_raw_predictions": {
-            q: {p: g for p, g in by_protocol.items() if g}
-            for q, by_protocol in gains.items()
-            if any(by_protocol.values())
+            q: {p: g for p, g in by_protocol.items() if g} for q, by_protocol in gains.items() if any(by_protocol.values())
         },
         "not_scored": rows.missing,
     }

@@ -9,7 +9,6 @@ import yaml
 
 from iif_core import color
 from workflow.artifacts.store import ids_from_disk, rgb
-from workflow.base_scene import read_exposures
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.recovered import Recovered, read_recovered, response_samples
@@ -66,9 +65,7 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
             document = reader.json(name)
             found = document.get("plan", []) if isinstance(document, dict) else []
             for item in found if isinstance(found, list) else []:
-                items.append(
-                    {**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage}
-                )
+                items.append({**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage})
     return items
 
 
@@ -89,9 +86,7 @@ def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
 def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     means = summary["means"].get("result", {})
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
-    text = (
-        f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
-    )
+    text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
     gains = summary.get("gain_over_raw_predictions", {})
     parts = [f"{q} {g['raw']['psnr_db']:+.1f} dB" for q, g in gains.items() if "raw" in g]
     if parts:
@@ -104,16 +99,12 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
 def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple[str, str]]:
     first = capture.views[0]
     sizes = sorted({(v.width, v.height) for v in capture.views})
-    exposures = read_exposures(job, capture)
+    exposures = capture.exposures()
     stops = np.log2(exposures.max() / exposures.min()) if exposures.min() > 0 else 0.0
     held_out = sum(v.split == "test" for v in capture.views)
     extent = np.ptp(recovered.surface.vertices, axis=0)
     prior = job.read("prior").manifest.get("settings", {}).get("prior", {})
-    size = (
-        f"{first.width} x {first.height}"
-        if len(sizes) == 1
-        else f"{len(sizes)} sizes, first {first.width} x {first.height}"
-    )
+    size = f"{first.width} x {first.height}" if len(sizes) == 1 else f"{len(sizes)} sizes, first {first.width} x {first.height}"
     facts = [
         ("quality", job.quality),
         ("source", str(capture.facts.get("source", ""))),
@@ -136,9 +127,7 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
     materials += [(q, "raw", m) for q in ("roughness", "metallic") for m in ("l2", "psnr", "ssim")]
     oracle = [(q, "oracle_affine", m) for q in ("albedo", "roughness", "metallic") for m in ("l2", "psnr", "ssim")]
     light = [("rgb", "raw", m) for m in ("l2", "psnr", "ssim", "flip", "log_l2")] + [("rgb", "scaled", "log_l2")]
-    light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [
-        ("emission", "scaled", m) for m in ("l2", "log_l2")
-    ]
+    light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [("emission", "scaled", m) for m in ("l2", "log_l2")]
     tables = [
         score_table(
             "Materials against ground truth, mean over the views",
@@ -165,7 +154,7 @@ def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewR
     count = min(job.settings.report.views, len(capture.views))
     chosen = np.unique(np.linspace(0, len(capture.views) - 1, count).round().astype(int))
     emission_exposure = _emission_exposure(recovered)
-    exposures, rows = read_exposures(job, capture), []
+    exposures, rows = capture.exposures(), []
     for done, i in enumerate(chosen):
         rows.append(_view(job, capture, capture.views[i], float(exposures[i]), emission_exposure))
         job.progress(done + 1, len(chosen), "views drawn")

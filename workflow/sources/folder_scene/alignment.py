@@ -55,9 +55,7 @@ class Conventions:
         return opencv_pose(matrix, "opencv", self.metres)
 
 
-def depth_ratio(
-    frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray
-) -> np.ndarray:
+def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Mesh depth / measured depth (n,) float64 in the photograph's (pinhole) camera `view`, one entry a measured pixel.
 
     The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in `mesh_depth`, so a
@@ -272,9 +270,7 @@ class Alignment:
         r, out = self.report(), []
         doubtful = self.doubtful(tolerance) if "depth_median_disagreement" in r else []
         if doubtful:
-            out.append(
-                f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?"
-            )
+            out.append(f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?")
         if "depth_median_disagreement" in r:
             out.append(
                 f"alignment: mesh depth differs from the depth images by {r['depth_median_disagreement']:.2%} (median"

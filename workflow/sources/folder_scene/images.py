@@ -63,9 +63,7 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     try:
         with Image.open(path) as image:
             if image.mode not in MODES:
-                raise InputError(
-                    f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it"
-                )
+                raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
             orientation = int(image.getexif().get(274, 1) or 1)
             return Header(image.size, orientation if 1 <= orientation <= 8 else 1)
     except InputError:
@@ -111,9 +109,7 @@ def _exr(path: Path) -> dict[str, np.ndarray]:
     try:
         return read_exr(path)
     except Exception as error:
-        raise InputError(
-            f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts"
-        ) from None
+        raise InputError(f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts") from None
 
 
 def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
@@ -222,9 +218,7 @@ def load_depth(path: Path, unit: float | None) -> np.ndarray:
         if stored.ndim != 2:
             stored = stored[..., 0]
         if stored.dtype == np.uint8:
-            raise InputError(
-                f"{path}: 8 bits are too few for depth; give 16-bit png or EXR, or remove `depth_file_path`"
-            )
+            raise InputError(f"{path}: 8 bits are too few for depth; give 16-bit png or EXR, or remove `depth_file_path`")
         depth = stored.astype(np.float32)
         scale = 0.001 if unit is None else unit
         known = (depth > 0) & (depth < 65535)

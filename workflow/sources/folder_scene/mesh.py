@@ -76,9 +76,7 @@ def load(path: Path, metres: float) -> Mesh:
     if len(faces) == 0:
         raise InputError(f"{path}: no faces (a point cloud?); a triangle mesh is needed")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(
-            f"{path}: faces name vertices {faces.min()} ... {faces.max()}, it has 0 ... {len(vertices) - 1}"
-        )
+        raise InputError(f"{path}: faces name vertices {faces.min()} ... {faces.max()}, it has 0 ... {len(vertices) - 1}")
     mesh = _cleaned(path, vertices * metres, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True

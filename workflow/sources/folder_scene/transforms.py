@@ -65,9 +65,7 @@ def metres_per_unit(unit: str | float) -> float:
     except ValueError:
         factor = math.nan
     if not (math.isfinite(factor) and factor > 0):
-        raise InputError(
-            f"`source.unit`: found {unit!r}; allowed: {', '.join(METRES)} or metres per unit (a number > 0)"
-        )
+        raise InputError(f"`source.unit`: found {unit!r}; allowed: {', '.join(METRES)} or metres per unit (a number > 0)")
     return factor
 
 
@@ -152,9 +150,7 @@ def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) ->
     kept = [e for e in entries if fnmatch.fnmatchcase(e["file_path"], pattern)]
     if not kept:
         example = entries[0]["file_path"]
-        raise InputError(
-            f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})"
-        )
+        raise InputError(f"{path}: `source.frames: {pattern}` matches none of {len(entries)} frames (such as {example!r})")
     return kept
 
 
@@ -203,9 +199,7 @@ def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
     hdr = [f for f in files if f.suffix.lower() == ".exr"]
     if hdr and len(hdr) < len(files):
         other = next(f for f in files if f.suffix.lower() != ".exr")
-        raise InputError(
-            f"{path}: mixes HDR ({hdr[0].name}) and LDR ({other.name}) images; choose with `source.frames`"
-        )
+        raise InputError(f"{path}: mixes HDR ({hdr[0].name}) and LDR ({other.name}) images; choose with `source.frames`")
     if hdr and dynamic_range == "ldr":
         raise InputError(
             f"{path}: the images are EXR, which hold linear radiance, but `capture.dynamic_range` is ldr;"
@@ -391,9 +385,7 @@ def _matrix(path: Path, where: str, entry: dict[str, Any], key: str) -> np.ndarr
     rotation, last = matrix[:3, :3], matrix[3]
     determinant = float(np.linalg.det(rotation))
     if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(
-            f"{path}: {where}: last row of `{key}` is {last.tolist()}; expected 0 0 0 1 (row-major matrix)"
-        )
+        raise InputError(f"{path}: {where}: last row of `{key}` is {last.tolist()}; expected 0 0 0 1 (row-major matrix)")
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE or determinant < 0:
         kind = "a reflection" if determinant < 0 else "a scale or shear"
         raise InputError(

@@ -90,9 +90,7 @@ def _collect(
             missing[name] = None
         elif element.tag == "include":
             if depth >= _DEEPEST:
-                raise InputError(
-                    f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?"
-                )
+                raise InputError(f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?")
             _collect(path, folders, defaults, found, missing, tags, depth + 1)
         else:
             found[path] = None

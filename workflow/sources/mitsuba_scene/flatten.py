@@ -84,14 +84,10 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
             else:
                 skipped_lights[light.class_name()] = skipped_lights.get(light.class_name(), 0) + 1
         ids = np.full(len(faces), index, np.int32)
-        parts.append(
-            (vertices.astype(np.float32), faces.astype(np.int64) + offset, uv, ids, primitive, emission)
-        )
+        parts.append((vertices.astype(np.float32), faces.astype(np.int64) + offset, uv, ids, primitive, emission))
         offset += len(vertices)
     if not offset or not any(len(part[1]) for part in parts):
-        raise InputError(
-            f"the scene has no surface that can become triangles; supported: {', '.join(SUPPORTED)}"
-        )
+        raise InputError(f"the scene has no surface that can become triangles; supported: {', '.join(SUPPORTED)}")
 
     columns = [np.concatenate([part[i] for part in parts]) for i in range(6)]
     parts.clear()
@@ -100,10 +96,7 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
     notes = [f"{n} {plugin} {left_out}" for plugin, n in unsupported.items()]
     if tessellated:
         notes.append(f"{tessellated} disks, spheres and cylinders became triangles, {SEGMENTS} around")
-    notes += [
-        f"{n} shapes with the light {kind}: no emission truth on the mesh"
-        for kind, n in skipped_lights.items()
-    ]
+    notes += [f"{n} shapes with the light {kind}: no emission truth on the mesh" for kind, n in skipped_lights.items()]
 
     vertices, faces = _weld(vertices, faces)
     keep, degenerate, repeated = _proper(vertices, faces, emission.any(1))
@@ -113,9 +106,7 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
         notes.append(f"{repeated} faces over the same three vertices as another face left out")
     if not keep.any():
         raise InputError(f"all {len(keep)} faces of the scene are without area")
-    mesh = FlatMesh(
-        vertices, faces[keep], uv[keep], ids[keep], primitive[keep], emission[keep], loaded.shapes, notes
-    )
+    mesh = FlatMesh(vertices, faces[keep], uv[keep], ids[keep], primitive[keep], emission[keep], loaded.shapes, notes)
     return compact(mesh)
 
 
@@ -286,9 +277,7 @@ def _emission(shape: Shape, light: Any, uv: Array, primitive: Array) -> Array:
         return np.zeros((0, 3), np.float32)
     texture = children(light)["radiance"]
     if not texture.is_spatially_varying():
-        return np.broadcast_to(texture_at(texture, np.zeros((1, 2), np.float32)), (len(uv), 3)).astype(
-            np.float32
-        )
+        return np.broadcast_to(texture_at(texture, np.zeros((1, 2), np.float32)), (len(uv), 3)).astype(np.float32)
     total = np.zeros((len(uv), 3))
     for b1, b2 in _BARYCENTRIC:
         total += texture_at(texture, (1 - b1 - b2) * uv[:, 0] + b1 * uv[:, 1] + b2 * uv[:, 2])

@@ -70,9 +70,7 @@ class Points:
         si.wi = mi.Vector3f(0, 0, 1)
         if len(shape):
             used, which = np.unique(shape, return_inverse=True)
-            ids = [
-                int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[i].object)))[0]) for i in used
-            ]
+            ids = [int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shapes[i].object)))[0]) for i in used]
             si.shape = dr.reinterpret_array(mi.ShapePtr, mi.UInt32(np.array(ids, np.uint32)[which]))
         self.si = si
 
@@ -112,12 +110,8 @@ class Material:
         self.notes: set[str] = set().union(*(inner.notes for inner in self.inner.values()))
         nested = [inner for name, inner in self.inner.items() if name != "brdf_1"]
         self.masked = self.kind == "MaskBSDF" or any(inner.masked for inner in nested)
-        self.transparent = self.kind in _TRANSPARENT or (
-            bool(nested) and all(inner.transparent for inner in nested)
-        )
-        self.two_sided = (
-            self.kind in ("TwoSidedBRDF", "Null") or self.transparent or any(i.two_sided for i in nested)
-        )
+        self.transparent = self.kind in _TRANSPARENT or (bool(nested) and all(inner.transparent for inner in nested))
+        self.two_sided = self.kind in ("TwoSidedBRDF", "Null") or self.transparent or any(i.two_sided for i in nested)
         self.known = True
         self._read_kind()
 
@@ -126,19 +120,13 @@ class Material:
         if self.kind in _TRANSPARENT:
             note("dielectric, thindielectric, roughdielectric: transparent, no material truth")
         elif self.kind == "SmoothDiffuse":
-            note(
-                "diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack"
-            )
+            note("diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack")
         elif self.kind in _PLASTIC:
             note("plastic, roughplastic: base colour = diffuse_reflectance, without the loss under the coat")
             eta = parameter(self.bsdf, "eta")
             if eta is None and "eta" in self.textures:
                 eta = self._points_zero().scalar(self.textures["eta"], 1.5)
-            f0 = (
-                float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2)
-                if eta is not None
-                else 0.04
-            )
+            f0 = float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2) if eta is not None else 0.04
             if abs(f0 - 0.04) > 0.004:
                 note("plastic, roughplastic of another index than 1.5: F0 = 0.04 stands in its place")
             if "specular_reflectance" in self.textures:
@@ -146,15 +134,11 @@ class Material:
             if self.kind == "SmoothPlastic":
                 note(f"plastic: mirror-smooth coat, r = {MIN_ROUGHNESS}")
         elif self.kind in _CONDUCTOR:
-            note(
-                "conductor, roughconductor: base colour = F0(eta, k) x specular_reflectance; Fresnel is Schlick's"
-            )
+            note("conductor, roughconductor: base colour = F0(eta, k) x specular_reflectance; Fresnel is Schlick's")
         elif self.kind == "Principled":
             zero = self._points_zero()
             if any(zero.scalar(self.textures.get(name), 0).max() > 0 for name in _PRINCIPLED_EXTRAS):
-                note(
-                    "principled with anisotropy, tint, sheen, clearcoat or flatness: those lobes are left out"
-                )
+                note("principled with anisotropy, tint, sheen, clearcoat or flatness: those lobes are left out")
             self.transparent = bool(zero.scalar(self.textures.get("spec_trans"), 0)[0] > 0.5)
             self.two_sided |= self.transparent
             note("principled: base_color, roughness, metallic as they are; its diffuse lobe is Disney's")
@@ -164,9 +148,7 @@ class Material:
             self.two_sided = True
             note("principledthin: base_color and roughness; light that goes through is left out")
         elif self.kind == "MaskBSDF":
-            note(
-                f"mask: faces of opacity below {OPAQUE} left out, the others opaque (in the photographs only in part)"
-            )
+            note(f"mask: faces of opacity below {OPAQUE} left out, the others opaque (in the photographs only in part)")
         elif self.kind == "Null":
             note("null: no surface, left out")
         elif self.kind in ("BumpMap", "NormalMap"):
@@ -182,9 +164,7 @@ class Material:
 
     def _points_zero(self) -> Points:
         """One point in the middle of the texture, for what is asked once per BSDF."""
-        return Points(
-            np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), []
-        )
+        return Points(np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), [])
 
     def opacity(self, points: Points) -> Array:
         """(n,) in [0, 1]: product of the masks above the surface; 0 for `null`."""
@@ -198,9 +178,7 @@ class Material:
         """Albedo, roughness and metallic at points; roughness in [0.02, 1], the others clipped to [0, 1]."""
         surface = self._evaluate(points)
         surface.albedo = np.clip(np.nan_to_num(surface.albedo), 0, 1).astype(np.float32)
-        surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(
-            np.float32
-        )
+        surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(np.float32)
         surface.metallic = np.clip(np.nan_to_num(surface.metallic), 0, 1).astype(np.float32)
         return surface
 
@@ -217,9 +195,7 @@ class Material:
         if self.kind in _CONDUCTOR:
             eta, k = colour("eta", 0), colour("k", 1)
             f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
-            return Surface(
-                f0 * colour("specular_reflectance", 1), np.sqrt(self._alpha(points)), zero + 1, sure
-            )
+            return Surface(f0 * colour("specular_reflectance", 1), np.sqrt(self._alpha(points)), zero + 1, sure)
         if self.kind in ("Principled", "PrincipledThin"):
             metallic = points.scalar(self.textures.get("metallic"), 0)
             roughness = points.scalar(self.textures.get("roughness"), 0.5)
@@ -229,9 +205,7 @@ class Material:
             a, b = self.inner["bsdf_0"].evaluate(points), self.inner["bsdf_1"].evaluate(points)
             mix = lambda x, y: x + (w if x.ndim == 1 else w[:, None]) * (y - x)  # noqa: E731
             truth = (a.truth | (w >= 1)) & (b.truth | (w <= 0))
-            return Surface(
-                mix(a.albedo, b.albedo), mix(a.roughness, b.roughness), mix(a.metallic, b.metallic), truth
-            )
+            return Surface(mix(a.albedo, b.albedo), mix(a.roughness, b.roughness), mix(a.metallic, b.metallic), truth)
         surface = Surface.neutral(n)
         if self.kind in _TRANSPARENT:
             surface.albedo[:] = 1
@@ -245,9 +219,7 @@ class Material:
         pair = []
         for name in ("alpha_u", "alpha_v") if self._has("alpha_u") else ("alpha", "alpha"):
             value = self.textures.get(name)
-            pair.append(
-                np.maximum(points.scalar(parameter(self.bsdf, name) if value is None else value, 0.1), 0)
-            )
+            pair.append(np.maximum(points.scalar(parameter(self.bsdf, name) if value is None else value, 0.1), 0))
         return np.sqrt(pair[0] * pair[1])
 
     def _has(self, name: str) -> bool:

@@ -97,16 +97,12 @@ def plan(
     unit = 1.0
     if not PLAUSIBLE[0] <= reach <= PLAUSIBLE[1]:
         unit = reach / 2.5
-        notes.append(
-            f"the median distance seen from the sensor is {reach:.3g} m: is the scene's unit the metre?"
-        )
+        notes.append(f"the median distance seen from the sensor is {reach:.3g} m: is the scene's unit the metre?")
     room = _Room(start, up, directions, around, reach, escape, unit)
     positions, distances, facts = _free_positions(solid, room, sphere, count, rng)
     if len(positions) and facts["clearance_m"] < CLEARANCE * unit:
         wanted = CLEARANCE * unit
-        notes.append(
-            f"cameras keep {facts['clearance_m']:.3g} m from surfaces: too few places have {wanted:.3g} m"
-        )
+        notes.append(f"cameras keep {facts['clearance_m']:.3g} m from surfaces: too few places have {wanted:.3g} m")
 
     points, normals = _surface_points(vertices, faces, *room.box(), rng)
     sees = _visibility(visible, positions, points, normals)
@@ -117,9 +113,7 @@ def plan(
     counts = np.zeros(len(points), np.int64)
     for (pose, own_lens), row in zip(given, own, strict=True):
         counts += row & _in_frustum(pose, own_lens, points)
-    views, poses = _views(
-        positions, distances, sphere, sees, points, lens, up, min(NEAR * unit, 0.5 * reach), escape
-    )
+    views, poses = _views(positions, distances, sphere, sees, points, lens, up, min(NEAR * unit, 0.5 * reach), escape)
     chosen = _greedy(views, counts, count - len(given))
     if len(given) + len(chosen) < count:
         notes.append(f"only {len(given) + len(chosen)} of {count} views: the free space allows no more")
@@ -186,9 +180,7 @@ class _Room:
         return low - 0.05 * self.reach, high + 0.05 * self.reach
 
 
-def _free_positions(
-    solid: Trace, room: _Room, sphere: Array, count: int, rng: Any
-) -> tuple[Array, Array, dict[str, Any]]:
+def _free_positions(solid: Trace, room: _Room, sphere: Array, count: int, rng: Any) -> tuple[Array, Array, dict[str, Any]]:
     """Positions (n, 3) where a camera can stand, distances (n, SPHERE) of what surrounds each, and facts."""
     start, up = room.start, room.up
     e1, e2 = _basis(up)

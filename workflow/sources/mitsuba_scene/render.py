@@ -41,10 +41,7 @@ def balance_lights(scene: Any, shapes: list[Any]) -> None:
         return
     weight = 0.1 + 0.9 * len(lights) * power / power.sum()
     parameters = mi.traverse(scene)
-    keys = {
-        f"{shape.id()}.emitter.sampling_weight": float(w)
-        for (shape, _), w in zip(lights, weight, strict=True)
-    }
+    keys = {f"{shape.id()}.emitter.sampling_weight": float(w) for (shape, _), w in zip(lights, weight, strict=True)}
     for key, value in keys.items():
         if key in parameters:
             parameters[key] = value
@@ -66,9 +63,7 @@ def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int
 
     A function of scene, view, samples and seed alone. Where no sample was finite: radiance 0, not valid.
     """
-    directions = pixel_directions(
-        view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera
-    )
+    directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
     directions = directions.reshape(-1, 3)
     d_du, d_dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
     origin = mi.Point3f(*view.world_from_camera[:3, 3].astype(np.float32).tolist())
@@ -86,9 +81,7 @@ def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int
             sampler.seed(int(key), count * repeat)
             toward = mi.Vector3f(*(dr.repeat(axis, repeat) for axis in device))
             du, dv = sampler.next_1d() - 0.5, sampler.next_1d() - 0.5
-            toward = dr.normalize(
-                toward + du * mi.Vector3f(*d_du.tolist()) + dv * mi.Vector3f(*d_dv.tolist())
-            )
+            toward = dr.normalize(toward + du * mi.Vector3f(*d_du.tolist()) + dv * mi.Vector3f(*d_dv.tolist()))
             value, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(mi.Ray3f(origin, toward)))
             good = dr.all(dr.isfinite(value))
             value = dr.select(good, value, 0)

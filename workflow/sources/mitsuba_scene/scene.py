@@ -116,9 +116,7 @@ def _bsdf_name(state: Any, index: int) -> str:
 class _Entry:
     plugin: str
     name: str
-    members: tuple[
-        tuple[str, str, dict[str, Any]], ...
-    ]  # of an instance: plugin, name, dictionary of each shape
+    members: tuple[tuple[str, str, dict[str, Any]], ...]  # of an instance: plugin, name, dictionary of each shape
 
 
 def _name_shapes(state: Any) -> dict[str, _Entry]:
@@ -127,9 +125,7 @@ def _name_shapes(state: Any) -> dict[str, _Entry]:
     names = {}
     for index in shapes:
         props = state.nodes[index].props
-        own = props.id() or (
-            Path(str(props["filename"])).stem if "filename" in props else props.plugin_name()
-        )
+        own = props.id() or (Path(str(props["filename"])).stem if "filename" in props else props.plugin_name())
         bsdf = [i for i in _references(state.nodes[index]) if state.nodes[i].type == mi.ObjectType.BSDF]
         names[index] = f"{_bsdf_name(state, bsdf[0])}/{own}" if bsdf else own
     out = {}
@@ -139,9 +135,7 @@ def _name_shapes(state: Any) -> dict[str, _Entry]:
         if node.props.plugin_name() == "instance":
             for group in _references(node):
                 inside = [i for i in _references(state.nodes[group]) if i in names]
-                members += [
-                    (state.nodes[i].props.plugin_name(), names[i], _as_dict(state, i)) for i in inside
-                ]
+                members += [(state.nodes[i].props.plugin_name(), names[i], _as_dict(state, i)) for i in inside]
         out[f"@{index}"] = _Entry(node.props.plugin_name(), names[index], tuple(members))
     for index in shapes:
         state.nodes[index].props.set_id(f"@{index}")
@@ -176,9 +170,7 @@ def _as_dict(state: Any, index: int) -> dict[str, Any]:
     out: dict[str, Any] = {"type": props.plugin_name()}
     for key in props.keys():
         value = props[key]
-        out[key] = (
-            _as_dict(state, value.index()) if isinstance(value, mi.Properties.ResolvedReference) else value
-        )
+        out[key] = _as_dict(state, value.index()) if isinstance(value, mi.Properties.ResolvedReference) else value
     return out
 
 
@@ -195,7 +187,5 @@ def _notes(state: Any) -> list[str]:
     if beckmann:
         out.append(f"{beckmann} rough BSDFs have the Beckmann distribution: their alpha is taken for GGX's")
     if plugins:
-        out.append(
-            f"{plugins['medium']} participating media: not rendered, the photographs show surfaces alone"
-        )
+        out.append(f"{plugins['medium']} participating media: not rendered, the photographs show surfaces alone")
     return out

@@ -26,9 +26,7 @@ def surface_points(room: Room, count: int, seed: int = 0) -> np.ndarray:
     return chosen[:, 0] * (1 - root) + chosen[:, 1] * (root * (1 - v)) + chosen[:, 2] * (root * v)
 
 
-def seen_from(
-    geometry: Geometry, points: np.ndarray, field_of_view: float, aspect: float, pose: np.ndarray
-) -> np.ndarray:
+def seen_from(geometry: Geometry, points: np.ndarray, field_of_view: float, aspect: float, pose: np.ndarray) -> np.ndarray:
     """(n,) bool: the points a camera sees. `field_of_view` horizontal, degrees; `aspect` height / width."""
     from iif_core.transport import trace
 

@@ -85,9 +85,7 @@ def _shell(room: RoomBuilder) -> None:
     x, y, z = SIZE
     o, step = _OVER, 0.25
     wall = plain("#e6dccb", 0.85, "#ddd1bd", grain=1.6, vary=0.08)
-    room.add(
-        "floor", sheet((-o, -o, 0), (x + 2 * o, 0, 0), (0, y + 2 * o, 0), step), material=FLOOR, is_part=False
-    )
+    room.add("floor", sheet((-o, -o, 0), (x + 2 * o, 0, 0), (0, y + 2 * o, 0), step), material=FLOOR, is_part=False)
     room.add(
         "ceiling",
         sheet((-o, y + o, z), (x + 2 * o, 0, 0), (0, -y - 2 * o, 0), step),
@@ -145,10 +143,7 @@ def _shell(room: RoomBuilder) -> None:
 
 
 def _refined(edges: list[float], step: float) -> np.ndarray:
-    pieces = [
-        np.linspace(a, b, max(2, round((b - a) / step) + 1))[:-1]
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    pieces = [np.linspace(a, b, max(2, round((b - a) / step) + 1))[:-1] for a, b in zip(edges[:-1], edges[1:], strict=True)]
     return np.concatenate([*pieces, edges[-1:]])
 
 
@@ -207,9 +202,7 @@ def _door(room: RoomBuilder) -> None:
         for a, c in ((0.10, 0.39), (0.46, 0.75))
         for b, d in ((0.22, 0.92), (1.08, 1.92))
     ]
-    room.add(
-        "door", box((x0 + 0.004, 0.006, 0.006), (x1 - 0.004, 0.026, top - 0.004)), *panels, material=blue
-    )
+    room.add("door", box((x0 + 0.004, 0.006, 0.006), (x1 - 0.004, 0.026, top - 0.004)), *panels, material=blue)
     room.add(
         "door handle",
         box((x0 + 0.045, 0.027, 0.93), (x0 + 0.085, 0.033, 1.10), 0.002),
@@ -235,9 +228,7 @@ def _front(low: tuple[float, float], high: tuple[float, float], wall: str) -> Sh
     return box((4.416, low[0] + 0.003, low[1] + 0.003), (4.437, high[0] - 0.003, high[1] - 0.003), 0.004)
 
 
-def _bow(
-    a: tuple[float, float, float], b: tuple[float, float, float], out: tuple[float, float, float]
-) -> Shape:
+def _bow(a: tuple[float, float, float], b: tuple[float, float, float], out: tuple[float, float, float]) -> Shape:
     """A bar handle from a to b that stands off by `out`."""
     a, b, out = np.array(a), np.array(b), np.array(out)
     return tube([a, a + out, b + out, b], 0.006, 10)
@@ -252,9 +243,7 @@ def _fitted(room: RoomBuilder) -> None:
         box((3.215, 3.44, 0.10), (4.37, 3.975, 0.858)),
         material=green,
     )
-    fronts = [
-        _front((0.78, z0), (1.38, z1), "north") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))
-    ]
+    fronts = [_front((0.78, z0), (1.38, z1), "north") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))]
     fronts += [_front((x0, 0.11), (x1, 0.85), "north") for x0, x1 in ((1.38, 1.98), (1.98, 2.585))]
     fronts += [_front((3.215, z0), (3.82, z1), "north") for z0, z1 in ((0.11, 0.48), (0.48, 0.85))]
     fronts += [_front((3.82, 0.11), (4.37, 0.85), "north")]
@@ -277,14 +266,11 @@ def _fitted(room: RoomBuilder) -> None:
         _front((1.93, 0.11), (2.25, 0.61), "east"),
         _front((2.25, 0.11), (2.57, 0.61), "east"),
     ]
-    fronts += [
-        _front((2.575, z0), (3.385, z1), "east") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))
-    ]
+    fronts += [_front((2.575, z0), (3.385, z1), "east") for z0, z1 in ((0.11, 0.38), (0.38, 0.63), (0.63, 0.85))]
     room.add("east fronts", *fronts, material=green)
     out = (-0.035, 0, 0)
     bows = [
-        _bow((4.418, y, z0), (4.418, y, z1), out)
-        for y, z0, z1 in ((1.87, 0.62, 0.78), (2.20, 0.42, 0.56), (2.30, 0.42, 0.56))
+        _bow((4.418, y, z0), (4.418, y, z1), out) for y, z0, z1 in ((1.87, 0.62, 0.78), (2.20, 0.42, 0.56), (2.30, 0.42, 0.56))
     ]
     bows += [_bow((4.418, 2.88, z), (4.418, 3.08, z), out) for z in (0.32, 0.57, 0.79)]
     room.add("east handles", *bows, material=BRASS)
@@ -334,11 +320,7 @@ def _fitted(room: RoomBuilder) -> None:
     )
     room.add(
         "shelf brackets",
-        *(
-            tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.010)], 0.007, 8)
-            for x in (3.45, 4.08, 4.72)
-            for z in (1.46, 1.86)
-        ),
+        *(tube([(x, 3.985, z - 0.10), (x, 3.78, z - 0.010)], 0.007, 8) for x in (3.45, 4.08, 4.72) for z in (1.46, 1.86)),
         material=IRON,
     )
 
@@ -369,9 +351,7 @@ def _fitted(room: RoomBuilder) -> None:
         *(box((x + 0.003, 0.432, 0.155), (x + 0.562, 0.450, 0.790), 0.004) for x in (1.253, 1.817, 2.382)),
         material=wood(OAK, OAK_DARK, UP, EAST, 0.38, origin=(0.3, 0.1, 0)),
     )
-    room.add(
-        "sideboard knobs", *(sphere((x, 0.462, 0.50), 0.016, 12) for x in (1.77, 1.87, 2.43)), material=BRASS
-    )
+    room.add("sideboard knobs", *(sphere((x, 0.462, 0.50), 0.016, 12) for x in (1.77, 1.87, 2.43)), material=BRASS)
     room.add(
         "book shelves",
         *(box((1.45, 0.006, z), (2.85, 0.235, z + 0.028), 0.004) for z in (1.36, 1.76)),
@@ -555,13 +535,9 @@ def _lamps(room: RoomBuilder) -> None:
     room.add_emitter("bulb", sphere((lx, ly, 1.662), 0.085, 16), radiance=(10.5, 8.2, 5.6))
     room.add("bulb socket", cylinder((lx, ly, 1.744), 0.018, 0.092, segments=12), material=BRASS)
     for number, (x, y) in enumerate(((3.35, 2.55), (3.35, 0.95)), 1):
-        frame = [
-            box((x - 0.33, y + s * 0.30 - 0.015, 2.655), (x + 0.33, y + s * 0.30 + 0.015, 2.698), 0.003)
-            for s in (-1, 1)
-        ]
+        frame = [box((x - 0.33, y + s * 0.30 - 0.015, 2.655), (x + 0.33, y + s * 0.30 + 0.015, 2.698), 0.003) for s in (-1, 1)]
         frame += [
-            box((x + s * 0.315 - 0.015, y - 0.283, 2.656), (x + s * 0.315 + 0.015, y + 0.283, 2.697), 0.003)
-            for s in (-1, 1)
+            box((x + s * 0.315 - 0.015, y - 0.283, 2.656), (x + s * 0.315 + 0.015, y + 0.283, 2.697), 0.003) for s in (-1, 1)
         ]
         room.add(f"ceiling panel frame {number}", *frame, material=WHITE_PAINT)
         room.add_emitter(
@@ -569,9 +545,7 @@ def _lamps(room: RoomBuilder) -> None:
             sheet((x - 0.322, y + 0.307, 2.652), (0.644, 0, 0), (0, -0.614, 0), 0.33),
             radiance=(9.6, 8.7, 7.3),
         )
-    room.add(
-        "cabinet light body", box((0.94, 3.722, 1.4385), (2.39, 3.808, 1.449), 0.003), material=WHITE_PAINT
-    )
+    room.add("cabinet light body", box((0.94, 3.722, 1.4385), (2.39, 3.808, 1.449), 0.003), material=WHITE_PAINT)
     room.add_emitter(
         "cabinet light",
         sheet((0.95, 3.80, 1.438), (1.43, 0, 0), (0, -0.07, 0), 0.25),

@@ -45,19 +45,12 @@ def furnish(room: RoomBuilder) -> None:
     _on_the_walls_and_floor(room)
 
 
-def bowl(
-    centre: Sequence[float], radius: float, height: float, wall: float = 0.006, foot: float = 0.45
-) -> Shape:
+def bowl(centre: Sequence[float], radius: float, height: float, wall: float = 0.006, foot: float = 0.45) -> Shape:
     """A round bowl that stands on `centre`."""
     s = np.linspace(0, 1, 7)[1:]
-    outer = [
-        (foot * radius + (1 - foot) * radius * np.sin(np.pi / 2 * t), height * (1 - np.cos(np.pi / 2 * t)))
-        for t in s
-    ]
+    outer = [(foot * radius + (1 - foot) * radius * np.sin(np.pi / 2 * t), height * (1 - np.cos(np.pi / 2 * t))) for t in s]
     inner = [(r - wall, max(z, 1.6 * wall)) for r, z in reversed(outer)]
-    return lathe(
-        [(0, 0), (foot * radius, 0), *outer, *inner, (0.4 * radius, 1.5 * wall), (0, 1.5 * wall)], centre, 32
-    )
+    return lathe([(0, 0), (foot * radius, 0), *outer, *inner, (0.4 * radius, 1.5 * wall), (0, 1.5 * wall)], centre, 32)
 
 
 def plate(centre: Sequence[float], radius: float) -> Shape:
@@ -80,9 +73,7 @@ def bottle(centre: Sequence[float], radius: float, height: float, neck: float = 
     r, h = radius, height
     foot = [(0, 0), (r - 0.004, 0), (r, 0.005), (r, h * (0.92 - neck) - 0.02)]
     shoulder = [(0.92 * r, h * (0.96 - neck)), (0.45 * r, h * (1.06 - neck)), (0.34 * r, h * (1.12 - neck))]
-    return lathe(
-        [*foot, *shoulder, (0.34 * r, h - 0.012), (0.42 * r, h - 0.01), (0.42 * r, h), (0, h)], centre, 24
-    )
+    return lathe([*foot, *shoulder, (0.34 * r, h - 0.012), (0.42 * r, h - 0.01), (0.42 * r, h), (0, h)], centre, 24)
 
 
 def jar(centre: Sequence[float], radius: float, height: float) -> tuple[Shape, Shape]:
@@ -135,16 +126,12 @@ def _on_the_table(room: RoomBuilder) -> None:
     room.add(
         "plate west",
         plate((1.24, 1.62, z), 0.12),
-        material=patterned(
-            "rings", "#efeae0", "#3d6d86", roughness=0.14, size=(0.098, 0.112), origin=(1.24, 1.62, z)
-        ),
+        material=patterned("rings", "#efeae0", "#3d6d86", roughness=0.14, size=(0.098, 0.112), origin=(1.24, 1.62, z)),
     )
     room.add(
         "plate east",
         plate((2.24, 1.90, z), 0.12),
-        material=patterned(
-            "rings", "#efeae0", "#3d6d86", roughness=0.14, size=(0.098, 0.112), origin=(2.24, 1.90, z)
-        ),
+        material=patterned("rings", "#efeae0", "#3d6d86", roughness=0.14, size=(0.098, 0.112), origin=(2.24, 1.90, z)),
     )
     room.add(
         "bread roll",
@@ -304,9 +291,7 @@ def _on_the_worktops(room: RoomBuilder) -> None:
         (0.01, -0.03, 0.03, 0.29),
         (-0.01, 0.03, -0.02, 0.34),
     ):
-        spoons.append(
-            tube([(4.02 + u, 3.82 + v, z + 0.012), (4.02 + u + w, 3.82 + 1.6 * v, z + h - 0.05)], 0.006, 8)
-        )
+        spoons.append(tube([(4.02 + u, 3.82 + v, z + 0.012), (4.02 + u + w, 3.82 + 1.6 * v, z + h - 0.05)], 0.006, 8))
         spoons.append(
             move(
                 stretch(sphere((0, 0, 0), 1.0, 12), (0.026, 0.009, 0.038)),
@@ -410,8 +395,7 @@ def _on_the_worktops(room: RoomBuilder) -> None:
             material=plain(code, 0.7, grain=14.0),
         )
         leaves = [
-            _leaf(0.085, 0.034, 28 + 17 * (k % 3), 137.5 * k, (4.935, y, SILL + 0.086 + 0.012 * (k % 5)))
-            for k in range(13)
+            _leaf(0.085, 0.034, 28 + 17 * (k % 3), 137.5 * k, (4.935, y, SILL + 0.086 + 0.012 * (k % 5))) for k in range(13)
         ]
         room.add(f"herb {number}", *leaves, material=plain("#5c8a3a", 0.55, "#3f6b2e", grain=40))
 
@@ -428,9 +412,7 @@ def _on_the_shelves(room: RoomBuilder) -> None:
         *(bowl((3.78, 3.86, low + 0.022 * k), 0.085, 0.06, 0.005) for k in range(3)),
         material=plain("#dfd3bb", 0.2, "#d2c3a6"),
     )
-    for number, (x, code) in enumerate(
-        ((3.99, "#b5523f"), (4.12, "#e3d8c3"), (4.25, "#5f8a82"), (4.38, "#d0a040")), 1
-    ):
+    for number, (x, code) in enumerate(((3.99, "#b5523f"), (4.12, "#e3d8c3"), (4.25, "#5f8a82"), (4.38, "#d0a040")), 1):
         room.add(f"shelf mug {number}", *mug((x, 3.85, low), 0.040, 0.09, -60), material=plain(code, 0.2))
     body, lid = jar((4.60, 3.86, low), 0.07, 0.19)
     room.add(
@@ -468,9 +450,7 @@ def _on_the_shelves(room: RoomBuilder) -> None:
         ),
         material=plain("#355e7a", 0.12, "#dcd6c8", grain=15, vary=0.02),
     )
-    for number, (x, radius, code) in enumerate(
-        ((4.16, 0.05, "#a04a3a"), (4.30, 0.05, "#d4b35a"), (4.44, 0.05, "#6d7f4a")), 1
-    ):
+    for number, (x, radius, code) in enumerate(((4.16, 0.05, "#a04a3a"), (4.30, 0.05, "#d4b35a"), (4.44, 0.05, "#6d7f4a")), 1):
         room.add(
             f"spice tin {number}",
             cylinder((x, 3.86, high), radius, 0.12, 0.004),
@@ -478,9 +458,7 @@ def _on_the_shelves(room: RoomBuilder) -> None:
         )
     room.add(
         "pepper mill",
-        lathe(
-            mm("0,0 32,0 34,10 22,60 20,100 30,140 32,155 20,165 26,190 18,212 0,216"), (4.72, 3.86, high), 24
-        ),
+        lathe(mm("0,0 32,0 34,10 22,60 20,100 30,140 32,155 20,165 26,190 18,212 0,216"), (4.72, 3.86, high), 24),
         material=wood(WALNUT, WALNUT_DARK, UP, EAST, 0.3),
     )
 
@@ -543,9 +521,7 @@ def _on_the_shelves(room: RoomBuilder) -> None:
     ):
         body, lid = jar((x, 0.125, BOOKS_LOW), radius, height)
         room.add(f"storage jar {number}", body, lid, material=plain(code, 0.18, grain=11, vary=0.05))
-    room.add(
-        "trailing plant pot", bowl((1.78, 0.125, BOOKS_HIGH), 0.085, 0.11, 0.008, 0.7), material=TERRAZZO
-    )
+    room.add("trailing plant pot", bowl((1.78, 0.125, BOOKS_HIGH), 0.085, 0.11, 0.008, 0.7), material=TERRAZZO)
     leaves = [
         _leaf(
             0.13 + 0.02 * (k % 3),
@@ -611,17 +587,12 @@ def _on_the_sideboard(room: RoomBuilder) -> None:
     )
     room.add(
         "candles",
-        *(
-            cylinder((x, 0.24, z + h + 0.001), 0.0105, 0.13, 0.002, 14)
-            for x, h in ((1.98, 0.24), (2.09, 0.19))
-        ),
+        *(cylinder((x, 0.24, z + h + 0.001), 0.0105, 0.13, 0.002, 14) for x, h in ((1.98, 0.24), (2.09, 0.19))),
         material=plain("#efe6cf", 0.5),
     )
     room.add(
         "cake stand",
-        lathe(
-            mm("0,0 70,0 68,8 20,30 18,90 50,105 150,112 155,125 148,125 142,118 0,117"), (2.42, 0.24, z), 36
-        ),
+        lathe(mm("0,0 70,0 68,8 20,30 18,90 50,105 150,112 155,125 148,125 142,118 0,117"), (2.42, 0.24, z), 36),
         material=recoloured(WHITE_GLAZE, "#dfc9c2", "#d6bdb6"),
     )
     cake = z + 0.118

@@ -28,9 +28,7 @@ def plain(
     """One paint, clouded towards `second` at `grain` cycles a metre; `vary` is added to roughness there."""
     first = paint(code)
     clouded = paint(second) if second else first
-    return Material(
-        first, clouded, roughness=(roughness, vary, 0.0), metallic=metallic, grain=(grain, grain, grain)
-    )
+    return Material(first, clouded, roughness=(roughness, vary, 0.0), metallic=metallic, grain=(grain, grain, grain))
 
 
 def patterned(
@@ -81,16 +79,10 @@ OAK, OAK_DARK = "#d2a878", "#a5784a"
 WALNUT, WALNUT_DARK = "#8f6142", "#5b3a26"
 BIRCH, BIRCH_DARK = "#e6cfa6", "#c9a877"
 
-STEEL = Material(
-    (0.60, 0.59, 0.57), (0.53, 0.52, 0.51), roughness=(0.30, 0.10, 0.0), metallic=1.0, grain=(1.0, 1.0, 14.0)
-)
+STEEL = Material((0.60, 0.59, 0.57), (0.53, 0.52, 0.51), roughness=(0.30, 0.10, 0.0), metallic=1.0, grain=(1.0, 1.0, 14.0))
 CHROME = plain("#d6d8da", 0.15, metallic=1.0)
-COPPER = Material(
-    (0.93, 0.58, 0.43), (0.74, 0.40, 0.28), roughness=(0.20, 0.16, 0.0), metallic=1.0, grain=(9.0, 9.0, 9.0)
-)
-BRASS = Material(
-    (0.88, 0.68, 0.36), (0.78, 0.57, 0.27), roughness=(0.28, 0.12, 0.0), metallic=1.0, grain=(12.0,) * 3
-)
+COPPER = Material((0.93, 0.58, 0.43), (0.74, 0.40, 0.28), roughness=(0.20, 0.16, 0.0), metallic=1.0, grain=(9.0, 9.0, 9.0))
+BRASS = Material((0.88, 0.68, 0.36), (0.78, 0.57, 0.27), roughness=(0.28, 0.12, 0.0), metallic=1.0, grain=(12.0,) * 3)
 IRON = plain("#35353a", 0.55, metallic=1.0)
 BLACK_GLASS = plain("#16171a", 0.07)
 WHITE_GLAZE = plain("#ece8df", 0.16)
@@ -128,9 +120,7 @@ TERRAZZO = Material(
 )
 
 
-def tiles(
-    axis: str, light: str, dark: str, origin: Sequence[float], size: tuple[float, float] = (0.15, 0.10)
-) -> Material:
+def tiles(axis: str, light: str, dark: str, origin: Sequence[float], size: tuple[float, float] = (0.15, 0.10)) -> Material:
     """Glazed tiles with grout, on a wall across `axis`."""
     return Material(
         paint(light),

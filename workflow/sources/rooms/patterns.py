@@ -153,14 +153,10 @@ class MaterialTable:
         return material
 
 
-def evaluate(
-    xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]
-) -> tuple[tuple[Any, Any, Any], Any, Any]:
+def evaluate(xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]) -> tuple[tuple[Any, Any, Any], Any, Any]:
     """(albedo, roughness, metallic) at world points (x, y, z); `column(name)`: their table entries."""
     x, y, z = point
-    u, v, w = (
-        column(f"{a}_x") * x + column(f"{a}_y") * y + column(f"{a}_z") * z + column(f"{a}_1") for a in "uvw"
-    )
+    u, v, w = (column(f"{a}_x") * x + column(f"{a}_y") * y + column(f"{a}_z") * z + column(f"{a}_1") for a in "uvw")
     frequency = [column(f"grain_{a}") for a in "uvw"]
     coarse = noise(xp, *(q * f for q, f in zip((u, v, w), frequency, strict=True)))
     fine = column("fine")
@@ -168,16 +164,13 @@ def evaluate(
     t, s = _blends(xp, (u, v, w), coarse, detail, column)
     t, s = (xp.minimum(xp.maximum(b, 0.0), 1.0) for b in (t, s))
     albedo = tuple(
-        (column(f"first_{c}") * (1 - t) + column(f"second_{c}") * t) * (1 - s) + column(f"third_{c}") * s
-        for c in "rgb"
+        (column(f"first_{c}") * (1 - t) + column(f"second_{c}") * t) * (1 - s) + column(f"third_{c}") * s for c in "rgb"
     )
     roughness = column("r_0") + column("r_t") * t + column("r_s") * s
     return albedo, xp.minimum(xp.maximum(roughness, 0.02), 1.0), column("metallic")
 
 
-def _blends(
-    xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, column: Callable[[str], Any]
-) -> tuple[Any, Any]:
+def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, column: Callable[[str], Any]) -> tuple[Any, Any]:
     u, v, _ = local
     kind, su, sv, amount = (column(name) for name in ("kind", "size_u", "size_v", "amount"))
     zero = 0 * u
@@ -215,13 +208,9 @@ def _blends(
     # rug: nested frames and a lattice of diamonds; size = half extents
     across = xp.maximum(xp.abs(u) / su, xp.abs(v) / sv)
     frame = xp.floor(across * 12)
-    lattice = xp.abs(2 * (u / 0.24 - xp.floor(u / 0.24)) - 1) + xp.abs(
-        2 * (v / 0.24 - xp.floor(v / 0.24)) - 1
-    )
+    lattice = xp.abs(2 * (u / 0.24 - xp.floor(u / 0.24)) - 1) + xp.abs(2 * (v / 0.24 - xp.floor(v / 0.24)) - 1)
     border = frame >= 9
-    rug_t = xp.where(
-        border, xp.where(frame == 10, 1.0 + zero, zero), xp.where(lattice < 0.75, 1.0 + zero, 0.12 * detail)
-    )
+    rug_t = xp.where(border, xp.where(frame == 10, 1.0 + zero, zero), xp.where(lattice < 0.75, 1.0 + zero, 0.12 * detail))
     rug_s = xp.where(border, zero, xp.where(xp.abs(lattice - 1.1) < 0.12, 1.0 + zero, zero))
 
     # painting: sky, a sun and two ridges; size = half extents
@@ -229,12 +218,8 @@ def _blends(
     far = 0.05 + 0.16 * xp.sin(4.1 * pu + 0.6) + 0.06 * xp.sin(9.7 * pu)
     near = -0.42 + 0.13 * xp.sin(3.1 * pu + 2.2) + 0.03 * detail
     sun = (pu - 0.38) * (pu - 0.38) * (su * su) / (sv * sv) + (pv - 0.5) * (pv - 0.5)
-    paint_t = xp.where(
-        pv < near, 1.0 + zero, xp.where(pv < far, 0.62 + 0.2 * detail, 0.25 - 0.25 * pv + 0.1 * coarse)
-    )
-    paint_s = xp.where(
-        pv < near, 0.18 * detail, xp.where(pv < far, zero, xp.where(sun < 0.05, 1.0 + zero, zero))
-    )
+    paint_t = xp.where(pv < near, 1.0 + zero, xp.where(pv < far, 0.62 + 0.2 * detail, 0.25 - 0.25 * pv + 0.1 * coarse))
+    paint_s = xp.where(pv < near, 0.18 * detail, xp.where(pv < far, zero, xp.where(sun < 0.05, 1.0 + zero, zero)))
 
     # rings about w: disc of radius su plain, then a band to sv in the second colour, twelve ticks outside it
     radius = xp.sqrt(u * u + v * v)

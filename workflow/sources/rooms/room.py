@@ -60,9 +60,7 @@ class Room:
         """Whether a camera may stand here: inside the room and `margin` metres away from everything."""
         p = np.asarray(position, float)
         inside = (p > margin).all() and (p < self.size - margin).all()
-        return bool(
-            inside and not ((p > self.parts[:, 0] - margin) & (p < self.parts[:, 1] + margin)).all(1).any()
-        )
+        return bool(inside and not ((p > self.parts[:, 0] - margin) & (p < self.parts[:, 1] + margin)).all(1).any())
 
     def cameras(self, count: int) -> list[np.ndarray]:
         """`world_from_camera` (4x4) of `count` different cameras: the hand-chosen, then these moved a bit.
@@ -74,9 +72,7 @@ class Room:
         attempt = 0
         while len(poses) < count:
             if attempt > 20 * count:
-                raise InputError(
-                    f"capture.views: {count} cameras do not fit into the room {self.name}; ask for fewer"
-                )
+                raise InputError(f"capture.views: {count} cameras do not fit into the room {self.name}; ask for fewer")
             base = self.shots[attempt % len(self.shots)]
             spread = (0.5 + _STEP * (attempt + 1)) % 1 - 0.5
             position = np.asarray(base[0]) + spread * (0.7, 0.7, 0.4)
@@ -102,9 +98,7 @@ class RoomBuilder:
         if is_part:
             self._parts += [np.stack([s[0].min(0), s[0].max(0)]) for s in shapes]
 
-    def add_emitter(
-        self, name: str, *shapes: Shape, radiance: Sequence[Sequence[float]] | Sequence[float]
-    ) -> None:
+    def add_emitter(self, name: str, *shapes: Shape, radiance: Sequence[Sequence[float]] | Sequence[float]) -> None:
         """An emitter; `radiance` (3,) for all shapes or one row a shape."""
         shape = merge(*shapes)
         per_shape = np.broadcast_to(np.asarray(radiance, float), (len(shapes), 3))
@@ -112,9 +106,7 @@ class RoomBuilder:
         self._objects.append((name, shape, BLACK, emission))
         self._parts += [np.stack([s[0].min(0), s[0].max(0)]) for s in shapes]
 
-    def finish(
-        self, shots: Sequence[tuple[Sequence[float], Sequence[float]]], field_of_view: float = 72.0
-    ) -> Room:
+    def finish(self, shots: Sequence[tuple[Sequence[float], Sequence[float]]], field_of_view: float = 72.0) -> Room:
         """The room with its cameras."""
         names = tuple(name for name, *_ in self._objects)
         if len(set(names)) != len(names):

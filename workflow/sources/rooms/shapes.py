@@ -233,18 +233,14 @@ def tube(path: Sequence[Point], radius: float | Sequence[float], segments: int =
     return vertices, np.concatenate(faces)
 
 
-def arc(
-    centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8
-) -> list:
+def arc(centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8) -> list:
     """Points on a circle from `start` to `stop` degrees, in the plane of two unit axes."""
     angle = np.radians(np.linspace(start, stop, count))
     centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
     return list(centre + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v))
 
 
-def ring(
-    centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28
-) -> Shape:
+def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28) -> Shape:
     """A torus about `centre` in the plane of two unit axes."""
     centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
     around, across = 2 * np.pi * np.arange(segments) / segments, 2 * np.pi * np.arange(10) / 10

@@ -42,9 +42,7 @@ def build() -> Room:
         is_part=False,
     )
     room.add("chest", box((1.9, 1.7, 0.001), (2.7, 2.4, 0.8), 0.02), material=wood(OAK, OAK_DARK, EAST, UP))
-    room.add(
-        "crate", box((0.4, 1.6, 0.001), (0.95, 2.2, 0.5), 0.02), material=plain("#b5473a", 0.25, "#8f2f28")
-    )
+    room.add("crate", box((0.4, 1.6, 0.001), (0.95, 2.2, 0.5), 0.02), material=plain("#b5473a", 0.25, "#8f2f28"))
     room.add("ball", sphere((2.2, 2.0, 0.962), 0.16), material=BRASS)
     room.add(
         "rug",
