@@ -44,7 +44,6 @@ doctor:
 lint: setup
 	$(PYTHON_BIN) -m ruff check .
 	$(PYTHON_BIN) -m snakefmt --check Snakefile workflow/rules
-	$(SNAKEMAKE) --lint
 
 format: setup
 	$(PYTHON_BIN) -m ruff check --fix .

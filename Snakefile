@@ -33,7 +33,11 @@ rule scenes:
 
 
 rule verify:
+    log:
+        "results/verify.log",
     params:
         python=sys.executable,
+    message:
+        "re-hashing every artefact"
     shell:
-        "{params.python:q} -m workflow verify"
+        "{params.python:q} -m workflow verify 2>&1 | tee {log:q}"

@@ -389,7 +389,8 @@ def prune_groups(
     """Solve, then drop groups that do not shine and solve again (METHOD 8).
 
     A group goes when it carries less than `share` of the total power area x sum E and the residual grows by less than
-    `residual_change` without it (its own pixels apart), or when less than `emitted_share` of what was seen of it is its own (it reflects).
+    `residual_change` without it (its own pixels apart), or when less than `emitted_share` of what was seen of it is its own
+    (it reflects).
 
     Args:
         rows, initial, cross: as in `solve_emission`.

@@ -11,7 +11,6 @@ from workflow.settings import QUALITIES, scene_names
 native.process_environment()
 
 
-
 def stop(message):
     """End with one message for the user instead of a traceback through Snakemake."""
     print(f"\nerror: {message}\n", file=sys.stderr)
