@@ -21,7 +21,7 @@ from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PACKAGES = ("iif_core", "workflow")
+PACKAGES = ("iif_core", "workflow")  # their __init__ hold a docstring and nothing else
 # Runners, not results: their effect on artefacts is versioned by the schema number in the manifest.
 INFRASTRUCTURE = (
     "workflow.job",
@@ -50,7 +50,7 @@ def module_file(module: str) -> Path | None:
 
 
 def is_infrastructure(module: str) -> bool:
-    return any(module == name or module.startswith(name + ".") for name in INFRASTRUCTURE)
+    return module in PACKAGES or any(module == name or module.startswith(name + ".") for name in INFRASTRUCTURE)
 
 
 @lru_cache(None)
