@@ -1,7 +1,7 @@
 """What a Mitsuba BSDF is in terms of base colour, perceptual roughness and metallic; every approximation is said.
 
     diffuse                    a = reflectance, r = 1, m = 0
-    plastic, roughplastic      a = diffuse_reflectance, r = sqrt(alpha) (smooth: alpha = 0), m = 0
+    plastic, roughplastic      a = what leaves the coat diffusely (`under_coat`), r = sqrt(alpha) (smooth: alpha = 0), m = 0
     conductor, roughconductor  a = F0 specular_reflectance, F0 = ((eta - 1)^2 + k^2) / ((eta + 1)^2 + k^2), m = 1
     principled                 a = base_color, r = roughness (Mitsuba's alpha = roughness^2), m = metallic
     blendbsdf                  linear in its weight; twosided, bumpmap, normalmap, mask: the BSDF inside
@@ -40,6 +40,21 @@ _WRAPPER = {
 }
 _PRINCIPLED_EXTRAS = ("anisotropic", "spec_tint", "sheen", "clearcoat", "flatness", "diff_trans")
 _CHUNK = 1 << 22
+
+
+def under_coat(reflectance: Array, eta: float, nonlinear: bool) -> Array:
+    """Albedo of a diffuse base under a dielectric coat: (1 - F_ext)^2 / eta^2 * rho / (1 - s F_int), float32.
+
+    F_ext, F_int are the diffuse Fresnel reflectances from outside and inside, s = rho for `nonlinear` plastics, else 1. Light
+    enters and leaves through the coat and is partly thrown back inside: 0.34 reflects 0.16. Averaged over directions; the
+    target model has no such loss, so this, not the reflectance below, is its base colour.
+    """
+    outside = float(np.ravel(mi.fresnel_diffuse_reflectance(1.0 / eta))[0])
+    inside = float(np.ravel(mi.fresnel_diffuse_reflectance(eta))[0])
+    if eta > 1:  # the larger one is total reflection inside
+        outside, inside = min(outside, inside), max(outside, inside)
+    thrown_back = inside * (reflectance if nonlinear else 1.0)
+    return ((1 - outside) ** 2 / eta**2 * reflectance / (1 - thrown_back)).astype(np.float32)
 
 
 @dataclass
@@ -122,12 +137,9 @@ class Material:
         elif self.kind == "SmoothDiffuse":
             note("diffuse: r = 1; the target model adds a specular reflection of F0 = 0.04 that the photographs lack")
         elif self.kind in _PLASTIC:
-            note("plastic, roughplastic: base colour = diffuse_reflectance, without the loss under the coat")
-            eta = parameter(self.bsdf, "eta")
-            if eta is None and "eta" in self.textures:
-                eta = self._points_zero().scalar(self.textures["eta"], 1.5)
-            f0 = float(((np.asarray(eta) - 1) / (np.asarray(eta) + 1)).ravel()[0] ** 2) if eta is not None else 0.04
-            if abs(f0 - 0.04) > 0.004:
+            note("plastic, roughplastic: base colour = diffuse albedo of base and coat together, not diffuse_reflectance")
+            eta = self._eta()
+            if abs(((eta - 1) / (eta + 1)) ** 2 - 0.04) > 0.004:
                 note("plastic, roughplastic of another index than 1.5: F0 = 0.04 stands in its place")
             if "specular_reflectance" in self.textures:
                 note("plastic, roughplastic with specular_reflectance: left out")
@@ -162,6 +174,13 @@ class Material:
             self.known = False
             note(f"{self.bsdf.class_name()}: unknown BSDF, grey in its place and no material truth")
 
+    def _eta(self) -> float:
+        """Index of refraction of a plastic's coat; one number stands for a textured one."""
+        eta = parameter(self.bsdf, "eta")
+        if eta is None and "eta" in self.textures:
+            eta = self._points_zero().scalar(self.textures["eta"], 1.5)
+        return float(np.asarray(eta).ravel()[0]) if eta is not None else 1.5
+
     def _points_zero(self) -> Points:
         """One point in the middle of the texture, for what is asked once per BSDF."""
         return Points(np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), [])
@@ -191,7 +210,10 @@ class Material:
         if self.kind == "SmoothDiffuse":
             return Surface(colour("reflectance", 0.5), np.ones(n, np.float32), zero, sure)
         if self.kind in _PLASTIC:
-            return Surface(colour("diffuse_reflectance", 0.5), np.sqrt(self._alpha(points)), zero, sure)
+            # Mitsuba tells the flag nowhere but in the description.
+            nonlinear = "nonlinear = 1" in str(self.bsdf)
+            albedo = under_coat(colour("diffuse_reflectance", 0.5), self._eta(), nonlinear)
+            return Surface(albedo, np.sqrt(self._alpha(points)), zero, sure)
         if self.kind in _CONDUCTOR:
             eta, k = colour("eta", 0), colour("k", 1)
             f0 = ((eta - 1) ** 2 + k**2) / ((eta + 1) ** 2 + k**2)
