@@ -227,6 +227,8 @@ class Render(Section):
     """Paths a pixel."""
     max_bounces: int = Field(8, ge=1, le=64)
     """Path length."""
+    denoise: bool = True
+    """Denoise the re-renderings (they are looked at and compared, nothing is fitted to them)."""
 
 
 class Metrics(Section):

@@ -552,11 +552,11 @@ def test_rendering_is_the_same_to_the_last_bit_and_balancing_lights_keeps_the_me
 def test_denoising_needs_its_package(monkeypatch):
     import sys
 
-    from workflow.sources.denoise import require_denoiser
+    from workflow.denoise import require_denoiser
 
     require_denoiser()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match="capture.denoise: false"):
+    with pytest.raises(InputError, match="render.denoise: false"):
         require_denoiser()
 
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from workflow.denoise import NOTE, denoise, require_denoiser
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.denoise import NOTE, denoise, require_denoiser
 
 if TYPE_CHECKING:
     from workflow.job import Job

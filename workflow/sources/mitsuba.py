@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.denoise import NOTE, denoise, require_denoiser
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.denoise import NOTE, denoise, require_denoiser
 from workflow.sources.mitsuba_scene.document import referenced_files
 
 if TYPE_CHECKING:

@@ -6,10 +6,11 @@ import numpy as np
 
 from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
-from workflow.artifacts.store import split_rgb
+from workflow.artifacts.store import rgb, split_rgb
+from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
-from workflow.recovered import read_recovered, read_response
+from workflow.recovered import Recovered, read_recovered, read_response
 
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
 
@@ -24,6 +25,8 @@ def run(job: Job) -> None:
     geometry, material = scene.surface.traceable(scene.light.emits)
     from iif_core.transport import render
 
+    if job.settings.render.denoise:
+        require_denoiser()
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
@@ -43,10 +46,13 @@ def run(job: Job) -> None:
         ).reshape(view.height, view.width, 3)
         if not np.isfinite(radiance).all():
             raise InputError(f"view {view.name}: re-rendered radiance is not finite; please report it with the scene")
-        sensor = curve(np.clip(exposure * radiance, 0, 1))
         _, face_id = capture.gbuffer(view)
+        fitted = _fitted(job, view)
+        if job.settings.render.denoise:
+            radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
+        sensor = curve(np.clip(exposure * radiance, 0, 1))
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
-        channels |= split_rgb(scene.emission_map(face_id, eye), "emission") | _fitted(job, view)
+        channels |= split_rgb(scene.emission_map(face_id, eye), "emission") | fitted
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
 
@@ -62,6 +68,17 @@ def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:
     if job.read("segmentation").has(file):
         channels["instance.id"] = job.read("segmentation").exr(file)["object.id"]
     return channels
+
+
+def _guides(
+    scene: Recovered, fitted: dict[str, np.ndarray], face_id: np.ndarray, eye: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fitted albedo and the normals that face the camera, (H, W, 3) each, 0 where nothing is seen."""
+    albedo = rgb(fitted, "albedo") if "albedo.R" in fitted else np.zeros((*face_id.shape, 3), np.float32)
+    surface = scene.surface
+    facing = np.sign(np.einsum("ij,ij->i", surface.normals, eye - surface.vertices[surface.faces[:, 0]]))
+    normals = np.where((face_id >= 0)[..., None], (surface.normals * facing[:, None])[face_id], 0)
+    return albedo, normals.astype(np.float32)
 
 
 def _directions(view: View) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Denoising of rendered photographs, for every source that renders."""
+"""Denoising of rendered pictures: photographs of sources that render, and re-renderings. Never of what a fit reads."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def require_denoiser() -> None:
         import pyoidn  # noqa: F401
     except (ImportError, OSError) as error:
         raise InputError(
-            f"capture.denoise: the package pyoidn (Intel Open Image Denoise) does not load ({error});"
-            " run `bash envs/setup.sh`, or set capture.denoise: false"
+            f"denoise: the package pyoidn (Intel Open Image Denoise) does not load ({error});"
+            " run `bash envs/setup.sh`, or set capture.denoise: false and render.denoise: false"
         ) from None
 
 
