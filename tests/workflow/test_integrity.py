@@ -80,11 +80,11 @@ def test_edited_deliverable_is_found(workflow):
     assert verify.returncode != 0 and "scenes/tiny/plan.yaml" in verify.stdout + verify.stderr
 
 
-def test_killed_job_resumes_to_the_same_result(finished, workflow):
+def test_killed_job_resumes_to_the_same_result(finished, tmp_path):
     """kill -9 on a running job; the same command then completes, and every manifest equals the undisturbed run's."""
-    process = subprocess.Popen(
-        workflow.command("scenes/tiny", "--forceall"), stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    workflow = type(finished)(finished.repository, tmp_path / "run")
+    workflow.write("tiny", (finished.folder / "config/scenes/tiny.yaml").read_text())
+    process = subprocess.Popen(workflow.command("scenes/tiny"), stderr=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     victim = None
     while victim is None and time.monotonic() < deadline:
