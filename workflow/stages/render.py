@@ -7,6 +7,7 @@ import numpy as np
 from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from workflow.artifacts.store import rgb, split_rgb
+from workflow.base_scene import BLACK
 from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
@@ -52,7 +53,8 @@ def run(job: Job) -> None:
             radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
         sensor = curve(np.clip(exposure * radiance, 0, 1))
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
-        channels |= split_rgb(scene.emission_map(face_id, eye), "emission") | fitted
+        emission = scene.emission_map(face_id, eye)
+        channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
 
@@ -68,6 +70,15 @@ def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:
     if job.read("segmentation").has(file):
         channels["instance.id"] = job.read("segmentation").exr(file)["object.id"]
     return channels
+
+
+def _without_emitters(fitted: dict[str, np.ndarray], emits: np.ndarray) -> dict[str, np.ndarray]:
+    """The fitted maps with emitters as the model has them: black, rough, no metal (METHOD 2.9)."""
+    values = {**dict(zip(("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic"), BLACK, strict=True)), "uncertainty": 0}
+    return {
+        name: np.where(emits, np.float16(values[name]), channel) if name in values else channel
+        for name, channel in fitted.items()
+    }
 
 
 def _guides(
