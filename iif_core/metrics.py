@@ -179,12 +179,14 @@ def iou(prediction: Array, truth: Array, mask: Array) -> float:
 def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1.0) -> Array:
     """Prediction times one gain per channel, sum truth / sum prediction over the mask; clamped to [0, limit].
 
-    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36). `limit=None`: not clamped above.
+    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36), and so does one whose truth is black: a gain of
+    0 would erase what was wrongly found there. `limit=None`: not clamped above.
     """
     prediction = np.asarray(prediction, np.float64)
     mean_prediction = prediction[mask].mean(0)
     mean_truth = np.asarray(truth, np.float64)[mask].mean(0)
-    gain = np.where(mean_prediction < _MIN_MEAN, 1.0, mean_truth / np.maximum(mean_prediction, _MIN_MEAN))
+    known = (mean_prediction >= _MIN_MEAN) & (mean_truth > 0)
+    gain = np.where(known, mean_truth / np.maximum(mean_prediction, _MIN_MEAN), 1.0)
     return np.clip(prediction * gain, 0, limit)
 
 
@@ -258,7 +260,7 @@ def score_map(
     protocols = [p for p in PROTOCOLS_OF[quantity] if p != "oracle_affine" or object_id is not None]
     problem = _problem(prediction, truth, mask)
     if problem:
-        return [Score(metric, protocol, None, problem) for protocol in protocols for metric in wanted]
+        return [Score(m, protocol, None, problem) for protocol in protocols for m in wanted if m != "iou" or protocol == "raw"]
     out = []
     for protocol in protocols:
         image = np.asarray(prediction, np.float64)
@@ -267,7 +269,9 @@ def score_map(
         elif protocol == "oracle_affine":
             assert object_id is not None
             image = oracle_affine(prediction, truth, mask, object_id)
-        out.extend(_score(metric, protocol, image, truth, mask, encoded) for metric in wanted)
+        # A mask has no scale, so intersection over union is scored raw alone.
+        scored = [metric for metric in wanted if metric != "iou" or protocol == "raw"]
+        out.extend(_score(metric, protocol, image, truth, mask, encoded) for metric in scored)
     return out
 
 

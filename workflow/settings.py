@@ -225,7 +225,7 @@ class Render(Section):
 
     samples: int = Field(32, ge=1)
     """Paths a pixel."""
-    max_bounces: int = Field(8, ge=1, le=64)
+    max_bounces: int = Field(16, ge=1, le=64)
     """Path length."""
     denoise: bool = True
     """Denoise the re-renderings (they are looked at and compared, nothing is fitted to them)."""

@@ -184,3 +184,29 @@ def test_flip_of_equal_images_is_zero():
     truth = image(11)
     assert m.flip(truth, truth, ALL) == 0.0
     assert m.flip(1 - truth, truth, ALL) > 0.2
+
+
+def test_scaled_gain_is_ratio_of_sums_not_least_squares():
+    """Prediction (0.2, 0.4) against truth (0.3, 0.4): sums give 7/6, least squares would give 1.1."""
+    prediction, truth = np.zeros((1, 2, 3)), np.zeros((1, 2, 3))
+    prediction[0, :, :] = [[0.2] * 3, [0.4] * 3]
+    truth[0, :, :] = [[0.3] * 3, [0.4] * 3]
+    out = m.scaled(prediction, truth, np.ones((1, 2), bool))
+    np.testing.assert_allclose(out[0, :, 0], [0.2 * 7 / 6, 0.4 * 7 / 6])
+
+
+def test_scaling_does_not_erase_false_emitters():
+    """Nothing shines, something was found: the error stays in every protocol, and a mask has no scaled score."""
+    prediction, truth = np.zeros((8, 8, 3)), np.zeros((8, 8, 3))
+    prediction[2:4, 2:4] = 5.0
+    scores = m.score_map("emission", prediction, truth, np.ones((8, 8), bool))
+    by_key = {(s.metric, s.protocol): s.value for s in scores}
+    assert by_key["l2", "scaled"] == by_key["l2", "raw"] > 0
+    assert by_key["iou", "raw"] == 0 and ("iou", "scaled") not in by_key
+
+
+@pytest.mark.parametrize(("roughness", "counts"), [(0.049, False), (0.051, True), (0.3, True)])
+def test_mirror_threshold(roughness, counts):
+    ones = np.ones((1, 1))
+    masks = m.material_masks(ones > 0, ones > 0, np.zeros((1, 1, 3)), ones * roughness)
+    assert bool(masks["albedo"][0, 0]) is counts

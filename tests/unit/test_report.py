@@ -43,7 +43,7 @@ class FakeJob:
         self.scene, self.root = scene, root
         self.stage = SimpleNamespace(name=stage, upstream=STAGES[stage].upstream)
         self.settings = SimpleNamespace(
-            render=SimpleNamespace(samples=256, max_bounces=4),
+            render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
             export=SimpleNamespace(max_faces_glb=100_000),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
             metrics=SimpleNamespace(views="all"),
@@ -196,7 +196,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.table("objects.parquet", {"object_id": ids, "name": ["walls", "box", "lamp"], **tables})
     fitted = {"cell_id": np.arange(len(cells)), **material_columns(TRUE[cells[:, 3]])}
     job.writer.table("cells.parquet", {**fitted, "uncertainty": np.full(len(cells), 0.02)})
-    job.writer.json("affines.json", {"light_scale": 2.0})
+    job.writer.json("affines.json", {"light_scale": 2.0, "history": [3.0, 2.0], "converged": False})
     if dynamic_range == "ldr":
         n = np.repeat(["R", "G", "B"], 101)
         response = {"channel": n, "kind": ["sample"] * 303, "name": [""] * 303, "x": np.tile(np.linspace(0, 1, 101), 3)}

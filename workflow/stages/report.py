@@ -91,9 +91,21 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     parts = [f"{q} {g['raw']['psnr_db']:+.1f} dB" for q, g in gains.items() if "raw" in g]
     if parts:
         text += f" Against ground truth, compared with the raw predictions: {', '.join(parts)}."
+        plain = summary["means"].get("object_mean", {}).get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
+        own = means.get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
+        if plain is not None and own is not None:
+            text += f" Scaled albedo: {own:.1f} dB; the mean prediction of each object, painted flat, has {plain:.1f} dB."
     elif not capture.has_truth:
         text += " There is no ground truth for this scene: materials are judged by re-rendering alone."
     return text.strip()
+
+
+def _fit_fact(facts: dict[str, Any]) -> str:
+    history = facts["history"]
+    if facts["converged"]:
+        return f"converged in {len(history) - 1} steps"
+    last = (history[-2] - history[-1]) / max(abs(history[-1]), 1e-12) if len(history) > 1 else 0.0
+    return f"stopped after {len(history) - 1} steps, the last of which lowered the objective by {100 * last:.2g} %"
 
 
 def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple[str, str]]:
@@ -112,6 +124,7 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
         ("mesh", f"{len(recovered.surface.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
         ("objects", str(len(recovered.object_names))),
+        ("material fit", _fit_fact(job.read("affines").json("affines.json"))),
         ("surface cells", f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm"),
         ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
     ]
