@@ -16,6 +16,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
@@ -167,11 +168,15 @@ def resolved(scene: str, quality: str) -> str:
 def fingerprint(stage: str, scene: str, quality: str) -> str:
     """Sixteen hexadecimal characters that change when, and only when, the stage's result may."""
     document = json.loads(resolved(scene, quality))
+    try:
+        raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
+    except InputError as error:
+        raise InputError(f"config/scenes/{scene}.yaml: {error}") from None
     facts = {
         "stage": stage,
         "settings": settings_module.select(document, STAGES[stage].settings),
         "code": code_digest(stage, document),
-        "raw": raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else "",
+        "raw": raw,
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]

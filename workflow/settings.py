@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from iif_core.errors import InputError
 
@@ -92,6 +92,13 @@ class Capture(Section):
     """Denoise rendered photographs: fewer samples do, at the price of a bias of a few per cent."""
     test_every: int = Field(0, ge=0)
     """Every n-th view is kept for testing and never used (0 = none)."""
+
+    @field_validator("test_every")
+    @classmethod
+    def _leave_views(cls, value: int) -> int:
+        if value == 1:
+            raise ValueError("1 would keep every view for testing and leave none to use; allowed: 0, or 2 and more")
+        return value
 
 
 # ------------------------------------------------------------------------------------------------------------------ prior
@@ -278,9 +285,22 @@ class SceneSettings(Section):
 # ---------------------------------------------------------------------------------------------------------------- loading
 
 
+class _StrictLoader(yaml.SafeLoader):
+    """YAML in which a key that stands twice in one mapping is an error, not a silent choice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
+        for key, (key_node, _) in zip(keys, node.value, strict=True):
+            if keys.count(key) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"key `{key}` stands twice", key_node.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(path.read_text())
+        document = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""
@@ -358,6 +378,8 @@ def _explain(error: ValidationError, path: Path) -> str:
             near = difflib.get_close_matches(str(where[-1]), allowed, 1)
             hint = f" Did you mean `{near[0]}`?" if near else ""
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
+        elif kind in ("model_type", "model_attributes_type", "dict_type"):
+            lines.append(f"{path}: `{dotted}`: found {found!r}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`.")
         elif kind == "missing":
             lines.append(f"{path}: `{dotted}`: missing. Add it; config/scenes/kitchen.yaml is a complete example.")
         elif kind in ("union_tag_invalid", "union_tag_not_found"):

@@ -13,6 +13,7 @@ from workflow.artifacts.store import MANIFEST, StageReader
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
     """One line for each damaged, missing or unlisted file; nothing when all is well."""
+    upstream: set[str] = set()  # scenes whose results are damaged: those must be repaired before publishing
     for manifest in sorted(root.glob(f"results/*/*/{MANIFEST}")):
         stage, scene = manifest.parent.name, manifest.parent.parent.name
         if scenes and scene not in scenes:
@@ -20,12 +21,14 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
         try:
             reader = StageReader(manifest.parent, stage, scene)
         except InputError as error:
+            upstream.add(scene)
             yield str(error)
             continue
         for name in reader.names():
             try:
                 reader.path(name)
             except InputError as error:
+                upstream.add(scene)
                 yield str(error)
         listed = set(reader.names()) | {MANIFEST}
         for path in sorted(manifest.parent.rglob("*")):
@@ -35,14 +38,15 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
         scene = manifest.parent.name
         if scenes and scene not in scenes:
             continue
-        yield from _deliverable(manifest, scene)
+        yield from _deliverable(manifest, scene, scene in upstream)
     for folder in sorted(root.glob("scenes/*")):
         if folder.is_dir() and (not scenes or folder.name in scenes) and not (folder / MANIFEST).is_file():
             yield f"{folder / MANIFEST}: missing; rebuild with: snakemake --cores 2 scenes/{folder.name} --forcerun publish"
 
 
-def _deliverable(manifest: Path, scene: str) -> Iterator[str]:
-    again = f"rebuild with: snakemake --cores 2 scenes/{scene} --forcerun publish"
+def _deliverable(manifest: Path, scene: str, damaged_results: bool) -> Iterator[str]:
+    first = "repair results/ first (the lines above), then " if damaged_results else ""
+    again = first + f"rebuild with: snakemake --cores 2 scenes/{scene} --forcerun publish"
     try:
         listed = json.loads(manifest.read_text())["files"]
     except (ValueError, KeyError) as error:

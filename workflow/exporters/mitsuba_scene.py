@@ -1,4 +1,4 @@
-"""mitsuba/scene.xml: the recovered scene for Mitsuba 3, relightable with `mitsuba scene.xml` alone.
+"""mitsuba/scene.xml: the recovered scene for Mitsuba 3, relightable with `mitsuba -m scalar_rgb scene.xml` alone.
 
 Meshes are PLY with the material as vertex attributes, in world coordinates and metres; values linear, paths relative.
 """
@@ -23,8 +23,8 @@ _NOTE = """
   has a retro-reflective term and its microfacets shadow less: surfaces are about 10 % brighter than in the workflow.
 
   Relight: change or remove the emitters below, or add your own.
-  Sizes: mitsuba scene.xml -Dspp=256 -Dresx=640 -Dresy=480
-  Other views: mitsuba -s 1 scene.xml  (one sensor a photograph, in order)
+  Sizes: mitsuba -m scalar_rgb scene.xml -Dspp=256 -Dresx=640 -Dresy=480
+  Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)
 """
 
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both

@@ -3,13 +3,28 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.simulate import shading_proxy, simulate_predictions
 from workflow.normal_form import CaptureReader, View
+
+_NO_TRUTH = (
+    "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"
+    " use `prior: {kind: files}` or `{kind: retinex}`, or a source with truth (builtin, mitsuba)"
+)
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """No files of its own; refuses a folder without `truth/` before any work starts."""
+    source = document["source"]
+    if source["kind"] == "folder" and not (Path(source["path"]) / "truth").is_dir():
+        raise InputError(_NO_TRUTH)
+    return []
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
@@ -19,10 +34,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
         InputError: the capture has no ground truth.
     """
     if not capture.has_truth:
-        raise InputError(
-            "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"
-            " use `prior: {kind: files}` or `{kind: retinex}`, or a source with truth (builtin, mitsuba)"
-        )
+        raise InputError(_NO_TRUTH)
     truth = capture.truth(view)
     _, face_id = capture.gbuffer(view)
     instance = capture.given_instances(view)

@@ -1,4 +1,4 @@
-"""publish: the deliverable scenes/<scene>/, made of links to what the stages wrote; tiny, because it comes last."""
+"""publish: the deliverable scenes/<scene>/, copies of what the stages wrote; quick, because it comes last."""
 
 from __future__ import annotations
 
@@ -71,12 +71,9 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
 
 
 def place(source: Path, destination: Path) -> None:
-    """Hard link, or a copy where the file system has none."""
+    """A copy: editing the deliverable must not reach back into results/."""
     destination.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, destination)
-    except OSError:
-        shutil.copyfile(source, destination)
+    shutil.copyfile(source, destination)
 
 
 def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:

@@ -88,9 +88,9 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
     text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
     gains = summary.get("gain_over_raw_predictions", {})
-    parts = [f"{q} {g['raw']['psnr_db']:+.1f} dB" for q, g in gains.items() if "raw" in g]
-    if parts:
-        text += f" Against ground truth, compared with the raw predictions: {', '.join(parts)}."
+    gain = gains.get("albedo", {}).get("scaled", {}).get("psnr_db")
+    if gain is not None:
+        text += f" Against ground truth, albedo up to scale gains {gain:+.1f} dB over the raw predictions of the prior."
         plain = summary["means"].get("object_mean", {}).get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         own = means.get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         if plain is not None and own is not None:
