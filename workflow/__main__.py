@@ -55,6 +55,9 @@ def main() -> int:
     from workflow.job import configure_logging, run_stage
 
     configure_logging(arguments.log)
+    note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
+    note.parent.mkdir(parents=True, exist_ok=True)
+    note.write_text(f"{arguments.threads}\n")
     try:
         run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint)
     except InputError as error:

@@ -32,10 +32,18 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
                 "seconds": seconds,
                 "cpu_seconds": _number(facts.get("cpu_time")),
                 "max_rss_mb": _number(facts.get("max_rss")),
-                "threads": int(_number(facts.get("threads"))),
+                "threads": int(_number(facts.get("threads", _threads(path)))),
             }
         )
     return rows
+
+
+def _threads(benchmark: Path) -> str:
+    """What `python -m workflow` noted beside the benchmark: Snakemake's short format leaves it out."""
+    try:
+        return benchmark.with_suffix(".threads").read_text()
+    except OSError:
+        return ""
 
 
 def _number(value: Any) -> float:

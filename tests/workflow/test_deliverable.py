@@ -61,7 +61,7 @@ def test_report_is_self_contained(scene):
 def test_timings_name_every_job(scene):
     table = pq.read_table(scene / "timings.parquet").to_pandas()
     assert {"capture", "prior", "base", "emission", "shading", "affines", "render"} <= set(table["rule"])
-    assert (table["seconds"] > 0).all()
+    assert (table["seconds"] > 0).all() and (table["threads"] > 0).all()
 
 
 def test_snapshot(finished):
