@@ -42,6 +42,9 @@ def test_scene_over_preset_over_default(scene):
         ("prior: {kind: simulated}\n", ["`source`: missing"]),
         ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
         ("- a\n- b\n", ["found list", "key: value"]),
+        (GOOD + "capture: {views: 3, views: 5}\n", ["x.yaml, line 3", "`views` stands twice"]),
+        ("source: builtin\nprior: {kind: simulated}\n", ["`source`", "'builtin'", "{kind: ...}"]),
+        (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", "found 1", "2 and more"]),
     ],
 )
 def test_errors_tell_what_to_do(scene, text, words):
@@ -50,6 +53,13 @@ def test_errors_tell_what_to_do(scene, text, words):
         settings.load("x", "draft", root)
     for word in words:
         assert word in str(caught.value)
+
+
+def test_scene_file_that_is_not_utf8(scene):
+    root = scene(GOOD)
+    (root / "config/scenes/x.yaml").write_bytes(GOOD.encode("utf-16"))
+    with pytest.raises(InputError, match="x.yaml: not UTF-8 text"):
+        settings.load("x", "draft", root)
 
 
 def test_unknown_scene_suggests(scene):

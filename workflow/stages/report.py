@@ -204,7 +204,7 @@ def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emissio
 
     strips = []
     gaps: list[Picture | None] = [None, None, None]
-    result = material_maps(job.read("affines").exr(file)) if job.read("affines").has(file) else None
+    result = material_maps(rendered) if "albedo.R" in rendered else None
     strips.append(
         Strip(
             "result",
