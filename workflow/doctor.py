@@ -188,8 +188,8 @@ def check_optional() -> Iterator[Finding]:
     advice = "optional, checks scene.glb: `npm install gltf-validator`"
     yield Finding("ok", "gltf-validator", validator or "not found", "" if validator else advice)
     oidn = find_spec("pyoidn") is not None
-    advice = "optional, denoises pictures: `.venv/bin/pip install pyoidn`"
-    yield Finding("ok", "oidn", "pyoidn" if oidn else "not found", "" if oidn else advice)
+    advice = "rendered scenes and re-renderings are denoised with it: `bash envs/setup.sh`, or set denoise: false"
+    yield Finding("ok" if oidn else "warn", "oidn", "pyoidn" if oidn else "not found", "" if oidn else advice)
 
 
 CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
