@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iif_core import base, laplace, metrics, simulate
-from iif_core.base import BaseOptions, BaseProblem, solve_base
+from iif_core import laplace, metrics, simulate
+from iif_core.base.direct import VARIANTS, BaseOptions, solve_base
+from iif_core.base.gauge import covisible_parts
+from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem, object_means, prediction_faults
+from iif_core.base.selection import selection_weights
 from iif_core.errors import InputError
 from iif_core.segments import interior, segment_table
 
@@ -103,7 +106,7 @@ def seen(problem):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_selection_beats_corrections_beat_means(seed):
     problem, truth = simulated(seed=seed)
-    psnr = {v: oracle_psnr(problem, solve_base(problem, BaseOptions(v)).value, truth) for v in base.VARIANTS}
+    psnr = {v: oracle_psnr(problem, solve_base(problem, BaseOptions(v)).value, truth) for v in VARIANTS}
     assert psnr["full"] > psnr["uniform"] + 0.8
     assert psnr["uniform"] > psnr["texel_mean"] + 0.3
     assert psnr["texel_mean"] > psnr["object_mean"] + 3
@@ -266,7 +269,7 @@ def first_texture(problem):
     total, summed = np.zeros(problem.n_cells), np.zeros((problem.n_cells, 5))
     for cell, p, w in zip(problem.cell_of_pixel, problem.predictions, problem.weight, strict=True):
         np.add.at(total, cell.ravel(), w.ravel())
-        middle = np.clip(np.median(p.astype(np.float64), 0), base.LOWEST, 1)
+        middle = np.clip(np.median(p.astype(np.float64), 0), LOWEST, 1)
         np.add.at(summed, cell.ravel(), (w[..., None] * middle).reshape(-1, 5))
     return summed / np.maximum(total, 1e-30)[:, None]
 
@@ -297,7 +300,7 @@ def base_level_shift(problem, result):
                     )
                     out[:, c] = result.weight[s, k, p] * (design @ solution)
                 mixture = mixture + out
-            found[o] += (w[:, None] * np.clip(mixture, base.LOWEST, 1)).sum(0)
+            found[o] += (w[:, None] * np.clip(mixture, LOWEST, 1)).sum(0)
             wanted[o] += (w[:, None] * x.mean(0)).sum(0)
             total[o] += w.sum()
     return (wanted - found) / np.maximum(total, 1e-30)
@@ -322,7 +325,7 @@ def test_scale_equals_the_closed_form():
 def test_selection_at_zero_temperature_is_the_argmin(seed):
     rng = np.random.default_rng(seed)
     error = rng.random((50, 7))
-    cold, nearly = base.selection_weights(error, 0.0), base.selection_weights(error, 1e-6)
+    cold, nearly = selection_weights(error, 0.0), selection_weights(error, 1e-6)
     np.testing.assert_array_equal(cold, np.eye(7)[error.argmin(1)])
     np.testing.assert_allclose(nearly, cold, atol=1e-12)
 
@@ -330,16 +333,16 @@ def test_selection_at_zero_temperature_is_the_argmin(seed):
 def test_selection_equals_softmax_in_float64():
     error = np.array([0.1, 0.4, 0.2])
     expected = np.exp(-error / (0.7 * (0.2 + 1e-6)))
-    np.testing.assert_allclose(base.selection_weights(error, 0.7), expected / expected.sum(), rtol=1e-12)
+    np.testing.assert_allclose(selection_weights(error, 0.7), expected / expected.sum(), rtol=1e-12)
 
 
 def test_selection_at_the_limits():
-    np.testing.assert_array_equal(base.selection_weights(np.array([0.3, 0.1, 0.1]), 0.0), [0, 0.5, 0.5])
-    np.testing.assert_array_equal(base.selection_weights(np.zeros(2), 0.0), [0.5, 0.5])
-    np.testing.assert_array_equal(base.selection_weights(np.zeros(2), 1.0, np.array([False, True])), [0, 1])
-    np.testing.assert_array_equal(base.selection_weights(np.ones(3), 1.0, np.zeros(3, bool)), 0)
-    assert np.isfinite(base.selection_weights(np.array([1e-30, 1e30]), 1e-3)).all()
-    assert base.selection_weights(np.ones((4, 1)), 0.0).tolist() == [[1.0]] * 4
+    np.testing.assert_array_equal(selection_weights(np.array([0.3, 0.1, 0.1]), 0.0), [0, 0.5, 0.5])
+    np.testing.assert_array_equal(selection_weights(np.zeros(2), 0.0), [0.5, 0.5])
+    np.testing.assert_array_equal(selection_weights(np.zeros(2), 1.0, np.array([False, True])), [0, 1])
+    np.testing.assert_array_equal(selection_weights(np.ones(3), 1.0, np.zeros(3, bool)), 0)
+    assert np.isfinite(selection_weights(np.array([1e-30, 1e30]), 1e-3)).all()
+    assert selection_weights(np.ones((4, 1)), 0.0).tolist() == [[1.0]] * 4
 
 
 # ------------------------------------------------------------------------------------------------------ bad predictions
@@ -402,7 +405,7 @@ def test_constant_colour_is_rank_one(level):
     cells = [look(v) for v in range(3)]
     result = solve_base(problem_of(cells, [np.full((2, SIZE, SIZE, 5), level)] * 3, obj))
     assert finite(result)
-    np.testing.assert_allclose(result.value, np.maximum(np.broadcast_to(level, (len(obj), 5)), base.LOWEST), atol=1e-5)
+    np.testing.assert_allclose(result.value, np.maximum(np.broadcast_to(level, (len(obj), 5)), LOWEST), atol=1e-5)
 
 
 def test_constant_objects_of_different_views_meet():
@@ -451,7 +454,7 @@ def test_a_view_without_any_usable_prediction_does_not_count():
 def test_nothing_usable_at_all_gives_neutral():
     obj, _ = surface()
     result = solve_base(problem_of([look(0)], [np.full((2, SIZE, SIZE, 5), np.nan)], obj))
-    np.testing.assert_array_equal(result.value, np.broadcast_to(base.NEUTRAL, (len(obj), 5)))
+    np.testing.assert_array_equal(result.value, np.broadcast_to(NEUTRAL, (len(obj), 5)))
     assert finite(result) and len(result.dropped) == 2 and (result.object_cells == 0).all()
 
 
@@ -476,7 +479,7 @@ def test_objects_of_one_pixel_and_unseen_cells():
     result = solve_base(problem_of([cell], predictions, obj, 0))
     assert finite(result)
     np.testing.assert_allclose(result.value[[0, 1, 2]], 0.3, atol=1e-6)  # cell 1 nobody saw: its object's mean
-    np.testing.assert_array_equal(result.value[3:], [base.NEUTRAL] * 2)
+    np.testing.assert_array_equal(result.value[3:], [NEUTRAL] * 2)
     assert result.observations.tolist() == [1, 0, 1, 0, 0] and result.views.tolist() == [1, 0, 1, 0, 0]
     assert result.object_cells.tolist() == [1, 1, 0]
 
@@ -506,9 +509,9 @@ def test_prediction_faults():
     maps = np.random.default_rng(0).random((4, 10, 10, 5)).astype(np.float32)
     maps[1, :2, 0] = np.nan
     maps[2, ..., :3] = 0.5
-    faults = base.prediction_faults(maps)
+    faults = prediction_faults(maps)
     assert faults[0] == faults[3] == "" and "2 %" in faults[1] and "constant" in faults[2]
-    assert base.prediction_faults(np.full((2, 3, 3, 5), 0.5)) == ["", ""]  # a plain wall is a plain wall
+    assert prediction_faults(np.full((2, 3, 3, 5), 0.5)) == ["", ""]  # a plain wall is a plain wall
 
 
 # ----------------------------------------------------------------------------------------------------------- the rest
@@ -516,9 +519,9 @@ def test_prediction_faults():
 
 def test_object_means():
     value = np.array([[0.2] * 5, [0.4] * 5, [0.9] * 5])
-    mean, cells = base.object_means(value, np.array([0, 0, 2]), np.array([3.0, 1.0, 0.0]), 5)
+    mean, cells = object_means(value, np.array([0, 0, 2]), np.array([3.0, 1.0, 0.0]), 5)
     np.testing.assert_allclose(mean[0], 0.25)
-    np.testing.assert_allclose(mean[1:], [base.NEUTRAL] * 4)
+    np.testing.assert_allclose(mean[1:], [NEUTRAL] * 4)
     assert cells.tolist() == [2, 0, 0, 0, 0]
 
 
@@ -526,13 +529,13 @@ def test_parts_of_an_object_that_share_no_cell():
     cells = [np.array([[0, 1]]), np.array([[1, 2]]), np.array([[3, 3]]), np.array([[-1, -1]])]
     segments = [np.array([[0, 0]]), np.array([[1, 1]]), np.array([[2, 2]]), np.array([[-1, -1]])]
     problem = BaseProblem([], cells, segments, 4, np.zeros(4, int), np.zeros(3, int))
-    parts = base.covisible_parts(problem)
+    parts = covisible_parts(problem)
     assert parts[0] == parts[1] != parts[2]
 
 
 def test_no_views():
     result = solve_base(BaseProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)))
-    np.testing.assert_array_equal(result.value, [base.NEUTRAL] * 3)
+    np.testing.assert_array_equal(result.value, [NEUTRAL] * 3)
 
 
 @pytest.mark.parametrize(
@@ -567,7 +570,8 @@ def test_same_bytes_whatever_the_threads_of_blas():
     """Odd sizes, large enough for OpenBLAS to share out; its thread count is fixed when NumPy is imported."""
     program = """
 import hashlib, numpy as np
-from iif_core.base import BaseProblem, solve_base
+from iif_core.base.direct import solve_base
+from iif_core.base.problem import BaseProblem
 rng = np.random.default_rng(0)
 maps = rng.random((2, 8, 40001, 5)).astype(np.float32)
 cell = [rng.permutation(40001) // 3 for _ in range(2)]

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.base import CHANNELS, BaseOptions, BaseProblem, BaseResult, covisible_parts, solve_base
+from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.gauge import covisible_parts
+from iif_core.base.problem import CHANNELS, BaseProblem, BaseResult
 from iif_core.cells import INDEX_LIMIT, grid_origin, pack_keys, unpack_keys, voxel_indices
 from iif_core.errors import InputError
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb

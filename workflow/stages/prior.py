@@ -6,7 +6,7 @@ import importlib
 
 import numpy as np
 
-from iif_core.base import prediction_faults
+from iif_core.base.problem import prediction_faults
 from iif_core.errors import InputError
 from workflow.artifacts.store import split_rgb
 from workflow.job import Job

@@ -24,25 +24,30 @@ Results do not depend on the order of the predictions, nor on threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import laplace
-from .errors import InputError
+from .. import laplace
+from ..errors import InputError
+from .problem import (
+    LOWEST,
+    NEUTRAL,
+    PROPERTIES,
+    BaseProblem,
+    BaseResult,
+    Dropped,
+    object_means,
+    prediction_faults,
+)
+from .selection import selection_weights
 
-CHANNELS = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
-PROPERTIES = ("albedo", "roughness", "metallic")
 VARIANTS = ("full", "uniform", "texel_mean", "object_mean")
-LOWEST = np.float32([0, 0, 0, 0.02, 0])
-"""Smallest value of each channel; the largest is 1."""
-NEUTRAL = np.float32([0.5, 0.5, 0.5, 0.9, 0.0])
-"""Material of surface that no prediction shows (METHOD H40)."""
 
 _PROPERTY_OF_CHANNEL = np.array([0, 0, 0, 1, 2])
 _ALBEDO = [0, 1, 2, 5]  # columns of phi = [albedo, roughness, metallic, 1] that each correction reads
@@ -51,48 +56,6 @@ _METALLIC = [4, 5]
 
 _NOTHING = np.zeros((0, 0, 6))
 _T = TypeVar("_T")
-
-Predictions = Callable[[int], NDArray] | Sequence[NDArray]
-
-
-@dataclass(frozen=True)
-class BaseProblem:
-    """Predictions on surface cells; what every base solver reads.
-
-    Attributes:
-        predictions: view -> (K, N, 5) or (K, H, W, 5) half or float: albedo R G B linear, perceptual roughness,
-            metallic, in [0, 1]; a sequence or a callable (then read once a sweep). Not-finite values are dropped.
-        cell_of_pixel: per view (N,) or (H, W) int32, -1 = no surface.
-        segment_of_pixel: per view, same shape, int32, -1 = none; a segment lies in one view.
-        n_cells: number of cells.
-        object_of_cell: (n_cells,) int32.
-        object_of_segment: (S,) int32.
-        weight: per view, same shape, >= 0: how much a pixel counts (low near object borders, 0 = ignore); default 1.
-    """
-
-    predictions: Predictions
-    cell_of_pixel: Sequence[NDArray]
-    segment_of_pixel: Sequence[NDArray]
-    n_cells: int
-    object_of_cell: NDArray
-    object_of_segment: NDArray
-    weight: Sequence[NDArray] | None = None
-
-    @property
-    def n_segments(self) -> int:
-        return len(self.object_of_segment)
-
-    def view(self, view: int) -> NDArray:
-        """Predictions of a view, (K, N, 5)."""
-        maps = self.predictions(view) if callable(self.predictions) else self.predictions[view]
-        if maps.ndim not in (3, 4) or maps.shape[-1] != 5 or maps.shape[0] == 0:
-            raise InputError(f"predictions of view {view} have shape {maps.shape}; (K, H, W, 5) with K >= 1 is needed")
-        maps = maps.reshape(maps.shape[0], -1, 5)
-        if maps.shape[1] != np.size(self.cell_of_pixel[view]):
-            raise InputError(
-                f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has {np.size(self.cell_of_pixel[view])}"
-            )
-        return maps
 
 
 @dataclass(frozen=True)
@@ -132,99 +95,7 @@ class BaseOptions:
             )
 
 
-@dataclass(frozen=True)
-class Dropped:
-    """A prediction that was not used, and why; `k` = -1: the whole view."""
-
-    view: int
-    k: int
-    reason: str
-
-
-@dataclass(frozen=True)
-class BaseResult:
-    """The base texture and how it came about.
-
-    Attributes:
-        value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells nobody saw have their object's mean,
-            objects nobody saw `NEUTRAL`.
-        scale: (n_cells, 5) float32 Laplace scales, same units.
-        observations: (n_cells,) int32 pixels; views: (n_cells,) int32 views that saw the cell.
-        object_value: (O, 5) float32 mean of each object id up to the largest; object_cells: (O,) int32 cells behind it.
-        weight: (S, K, 3) float32 selection weights of albedo, roughness, metallic; sum over k is 1 (0 where the
-            segment has no usable pixel).
-        affine_albedo: (S, K, 3, 4); affine_roughness, affine_metallic: (S, K, 2) = (gain, bias); float32.
-        error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture before the last
-            update.
-        dropped: predictions that were not used.
-        history: one entry a sweep: temperature, error of each property, entropy, gain, change.
-    """
-
-    value: NDArray
-    scale: NDArray
-    observations: NDArray
-    views: NDArray
-    object_value: NDArray
-    object_cells: NDArray
-    weight: NDArray
-    affine_albedo: NDArray
-    affine_roughness: NDArray
-    affine_metallic: NDArray
-    error: NDArray
-    dropped: list[Dropped]
-    history: list[dict[str, float]] = field(default_factory=list)
-
-
 # ------------------------------------------------------------------------------------------------------ predictions
-
-
-def prediction_faults(maps: NDArray, not_finite_share: float = 0.01) -> list[str]:
-    """Why each of the K predictions of a view cannot be used; "" for those that can.
-
-    `maps` (K, ..., 5). Faults (METHOD H51, half-precision overflow of a diffusion model): more than `not_finite_share`
-    of the pixels not finite; albedo constant over the picture while that of another prediction is not.
-    """
-    maps = maps.reshape(len(maps), -1, 5)
-    finite = np.isfinite(maps).all(-1)  # (K, N)
-    bad_share = 1 - finite.mean(1) if maps.shape[1] else np.zeros(len(maps))
-    spread = np.zeros(len(maps))
-    for k, prediction in enumerate(maps):
-        good = prediction[finite[k], :3]
-        spread[k] = good.astype(np.float32).std(0).max() if len(good) else 0.0
-    faults = []
-    for share, std in zip(bad_share, spread, strict=True):
-        if share > not_finite_share:
-            faults.append(f"{100 * share:.3g} % of its pixels are not finite")
-        elif std < 1e-4 and spread.max() > 1e-2:
-            faults.append("albedo is constant over the picture")
-        else:
-            faults.append("")
-    return faults
-
-
-def selection_weights(error: NDArray, temperature: float, usable: NDArray | None = None) -> NDArray:
-    """Weights of K predictions by their error: alpha_k ~ exp(-(E_k - min E) / (temperature * median E)).
-
-    `error` (..., K), K last, >= 0; `usable` (..., K) bool. Temperature 0 is the limit: the smallest error takes all,
-    equal ones (to an rms of 1e-6) share, so that the result does not depend on the order. Sum 1, or 0 where nothing is
-    usable.
-    """
-    error = np.asarray(error, np.float64)
-    usable = np.ones(error.shape, bool) if usable is None else np.broadcast_to(usable, error.shape)
-    counted = np.where(usable, error, np.inf)
-    lowest = counted.min(-1, keepdims=True)
-    any_usable = np.isfinite(lowest)
-    excess = np.where(usable, error, 0.0) - np.where(any_usable, lowest, 0.0)
-    ranked = np.sort(counted, -1)
-    middle = np.maximum(usable.sum(-1, keepdims=True) - 1, 0) // 2
-    median = np.where(any_usable, np.take_along_axis(ranked, middle, -1), 0.0)
-    if temperature > 0:
-        weight = np.exp(-excess / (temperature * (median + 1e-6)))
-    else:
-        weight = (excess <= 1e-9 * median + 1e-12).astype(np.float64)
-    weight = np.where(usable, weight, 0.0)
-    total = weight.sum(-1, keepdims=True)
-    return weight / np.where(total > 0, total, 1.0)
 
 
 # ------------------------------------------------------------------------------------------------------------- views
@@ -635,44 +506,6 @@ def _filled(problem: BaseProblem, texture: NDArray, counts: _Counts) -> tuple[ND
     )
     value = np.where((counts.weight > 0)[:, None], texture, object_value[problem.object_of_cell])
     return value.astype(np.float32), object_value, object_cells
-
-
-def object_means(
-    value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None, n_objects: int = 0
-) -> tuple[NDArray, NDArray]:
-    """Mean value of every object and the cells behind it: (O, 5) float32, (O,) int32.
-
-    O is the largest object id + 1, or `n_objects` if that is more. `weight` (n_cells,): pixels (0 = not seen, does not
-    count). Objects without a cell that counts get `NEUTRAL`: albedo 0.5, roughness 0.9, metallic 0.
-    """
-    weight = np.ones(len(value)) if weight is None else weight
-    n_objects = max(n_objects, int(np.max(object_of_cell, initial=-1)) + 1)
-    total = np.bincount(object_of_cell, weight, n_objects)
-    mean = np.stack([np.bincount(object_of_cell, weight * value[:, c], n_objects) for c in range(5)], 1)
-    mean = mean / np.where(total > 0, total, 1.0)[:, None]
-    cells = np.bincount(object_of_cell, weight > 0, n_objects)
-    return np.where((total > 0)[:, None], mean, NEUTRAL).astype(np.float32), cells.astype(np.int32)
-
-
-def covisible_parts(problem: BaseProblem) -> NDArray:
-    """Part of every segment, (S,) int32: segments are in one part when they share cells, directly or through others.
-
-    An object in n > 1 parts has n independent gauges that only the pull to identity ties together (METHOD 7c, G2):
-    its parts may differ in tone.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = [np.zeros(0, np.int64)]
-    for cell, segment in zip(problem.cell_of_pixel, problem.segment_of_pixel, strict=True):
-        cell, segment = np.ravel(cell), np.ravel(segment)
-        known = (cell >= 0) & (segment >= 0)
-        pairs.append(np.unique(segment[known].astype(np.int64) * problem.n_cells + cell[known]))
-    segment, cell = np.divmod(np.concatenate(pairs), max(problem.n_cells, 1))
-    size = problem.n_segments + problem.n_cells
-    graph = coo_matrix((np.ones(len(cell), np.int8), (segment, problem.n_segments + cell)), (size, size))
-    _, label = connected_components(graph, directed=False)
-    return np.unique(label[: problem.n_segments], return_inverse=True)[1].astype(np.int32)
 
 
 def _notify(progress: Callable[[int, int], None] | None, done: int, total: int) -> None:
