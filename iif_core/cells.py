@@ -22,6 +22,10 @@ Array = np.ndarray
 INDEX_LIMIT = 1 << 16
 """Voxel indices and object_id + 1 lie in [0, INDEX_LIMIT)."""
 
+COARSE_SHIFT = 2
+COARSE = 1 << COARSE_SHIFT
+"""Edge of a coarse cell in fine ones."""
+
 MAX_PROBES = 8
 EMPTY = np.uint32(0xFFFFFFFF)
 _PROBE_STRIDE = 0x9E3779B9
@@ -84,6 +88,33 @@ def unpack_keys(keys: ArrayLike) -> tuple[Array, Array]:
     keys = np.asarray(keys, np.uint64).reshape(-1)
     parts = [((keys >> np.uint64(shift)) & np.uint64(0xFFFF)).astype(np.int32) for shift in (0, 16, 32, 48)]
     return np.stack(parts[:3], axis=-1), parts[3] - 1
+
+
+def coarse_cells(ijk: ArrayLike, object_id: ArrayLike, values: ArrayLike) -> tuple[Array, Array, Array]:
+    """Cells of `COARSE` times the edge and the mean of the fine cells in them: ((m, 3), (m,), (m, C) float32).
+
+    They answer for surface between fine cells, which a few views leave empty. The coarse index of a point is its fine
+    one shifted by two bits, so both grids share one origin.
+    """
+    ijk, values = np.asarray(ijk).reshape(-1, 3), np.asarray(values, np.float64)
+    keys, row = np.unique(pack_keys(ijk >> COARSE_SHIFT, object_id), return_inverse=True)
+    count = np.bincount(row, minlength=len(keys))[:, None]
+    sums = np.stack([np.bincount(row, values[:, c], len(keys)) for c in range(values.shape[1])], 1)
+    return *unpack_keys(keys), (sums / np.maximum(count, 1)).astype(np.float32)
+
+
+def neighbour_pairs(keys: ArrayLike) -> Array:
+    """(m, 2) int32 rows of cells of one object whose voxels touch by face, edge or corner; `keys` sorted, distinct."""
+    keys = np.asarray(keys, np.uint64).reshape(-1)
+    found = [np.zeros((0, 2), np.int32)]
+    half = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (k, j, i) > (0, 0, 0)]
+    for i, j, k in half:  # the other half are the same pairs again
+        step = np.int64(i) + (np.int64(j) << np.int64(16)) + (np.int64(k) << np.int64(32))
+        wanted = keys + step.astype(np.uint64)  # indices lie in 1 ... 65534, so no word overflows into the next
+        row = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
+        hit = np.flatnonzero(keys[row] == wanted) if len(keys) else np.zeros(0, np.intp)
+        found.append(np.stack([hit, row[hit]], 1).astype(np.int32))
+    return np.concatenate(found)
 
 
 def hash_words(low, high):

@@ -1,4 +1,4 @@
-"""Scores of one image: L2, PSNR, SSIM, FLIP for maps; log-L2 and IoU for emission; three protocols (METHOD 2.11).
+"""Scores of one image: L2, PSNR, SSIM, FLIP, LPIPS for maps; log-L2 and IoU for emission; three protocols (METHOD 2.11).
 
 Protocols say what the prediction may be forgiven before it is compared:
 
@@ -17,12 +17,13 @@ with `value=None` and the reason, never a NaN. Not quantised to 8 bits (the refe
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from .errors import InputError
+from .lpips import Weights, lpips
 
 Array = np.ndarray
 
@@ -44,12 +45,14 @@ PROTOCOLS_OF = {
 """Roughness and metallic have no gain that the photographs leave open; emission x albedo has one (LDR)."""
 
 METRICS_OF = {
-    "albedo": ("l2", "psnr", "ssim", "flip"),
-    "roughness": ("l2", "psnr", "ssim"),
-    "metallic": ("l2", "psnr", "ssim"),
+    "albedo": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
+    "roughness": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
+    "metallic": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
     "emission": ("l2", "log_l2", "iou"),
-    "rgb": ("l2", "psnr", "ssim", "flip"),
+    "rgb": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
 }
+LPIPS_NETWORKS = {"lpips": "alex", "lpips_vgg": "vgg"}
+"""The paper reports LPIPS with VGG16; AlexNet is what its authors recommend, and a twentieth of the work."""
 
 _MIN_MEAN = 1e-4  # H36: a darker prediction is not scaled
 _SCORED_MIN = 1e-6  # emission below this is no emission
@@ -234,6 +237,7 @@ def score_map(
     object_id: Array | None = None,
     metrics: Iterable[str] | None = None,
     encoded: bool = False,
+    networks: Mapping[str, Weights] | None = None,
 ) -> list[Score]:
     """Every score of one map under every protocol that applies to its quantity.
 
@@ -242,8 +246,9 @@ def score_map(
         prediction, truth: (H, W, 3), or (H, W) for roughness and metallic.
         mask: (H, W) bool, pixels that count.
         object_id: (H, W) int, for `oracle_affine`; without it that protocol is left out.
-        metrics: default: all of the quantity; FLIP only where its package is installed.
-        encoded: images are sensor values, not linear (matters to FLIP only).
+        metrics: default: all of the quantity; FLIP only where its package is installed, LPIPS where its network is given.
+        encoded: images are sensor values, not linear (matters to FLIP only; LPIPS takes every image as it is).
+        networks: `alex` and `vgg` -> weights of LPIPS (`iif_core.lpips`).
 
     Raises:
         InputError: unknown quantity, or shapes that do not match.
@@ -257,22 +262,39 @@ def score_map(
         )
     wanted = tuple(METRICS_OF[quantity] if metrics is None else metrics)
     wanted = tuple(m for m in wanted if m != "flip" or has_flip())
+    networks = networks or {}
+    wanted = tuple(m for m in wanted if m not in LPIPS_NETWORKS or LPIPS_NETWORKS[m] in networks)
     protocols = [p for p in PROTOCOLS_OF[quantity] if p != "oracle_affine" or object_id is not None]
     problem = _problem(prediction, truth, mask)
     if problem:
         return [Score(m, protocol, None, problem) for protocol in protocols for m in wanted if m != "iou" or protocol == "raw"]
-    out = []
+    images = {}
     for protocol in protocols:
-        image = np.asarray(prediction, np.float64)
+        images[protocol] = np.asarray(prediction, np.float64)
         if protocol == "scaled":
-            image = scaled(prediction, truth, mask, None if quantity == "emission" else 1.0)
+            images[protocol] = scaled(prediction, truth, mask, None if quantity == "emission" else 1.0)
         elif protocol == "oracle_affine":
             assert object_id is not None
-            image = oracle_affine(prediction, truth, mask, object_id)
-        # A mask has no scale, so intersection over union is scored raw alone.
-        scored = [metric for metric in wanted if metric != "iou" or protocol == "raw"]
-        out.extend(_score(metric, protocol, image, truth, mask, encoded) for metric in scored)
+            images[protocol] = oracle_affine(prediction, truth, mask, object_id)
+    learned = {m: _lpips(m, images, truth, mask, networks) for m in wanted if m in LPIPS_NETWORKS}
+    out = []
+    for protocol, image in images.items():
+        for metric in wanted:
+            if metric in learned:
+                out.append(learned[metric][protocol])
+            elif metric != "iou" or protocol == "raw":  # a mask has no scale
+                out.append(_score(metric, protocol, image, truth, mask, encoded))
     return out
+
+
+def _lpips(metric: str, images: dict[str, Array], truth: Array, mask: Array, networks: Mapping[str, Weights]) -> dict[str, Score]:
+    """One score a protocol; the truth goes through the network once."""
+    network = LPIPS_NETWORKS[metric]
+    try:
+        values = lpips(np.stack(list(images.values())), truth, networks[network], mask, network)
+    except InputError as error:
+        return {protocol: Score(metric, protocol, None, str(error)) for protocol in images}
+    return {protocol: Score(metric, protocol, float(value)) for protocol, value in zip(images, values, strict=True)}
 
 
 def _problem(prediction: Array, truth: Array, mask: Array) -> str:

@@ -1,6 +1,7 @@
 """`python -m workflow <stage> <scene>`: what the rules call, and what a person calls in a debugger.
 
-Also `python -m workflow verify [scene ...]`.
+Also `python -m workflow verify [scene ...]`, `python -m workflow study <study>` (collects what its jobs left) and
+`python -m workflow lpips_vgg` (fetches weights).
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from iif_core.errors import InputError
@@ -24,6 +26,13 @@ def _arguments() -> argparse.Namespace:
         sub.add_argument("--threads", type=int, default=2)
         sub.add_argument("--fingerprint", help="refuse to run when it differs")
         sub.add_argument("--log", type=Path)
+    study = commands.add_parser("study")
+    study.add_argument("study")
+    study.add_argument("--quality", default="draft")
+    study.add_argument("--fingerprint", help="of the plan; recorded by Snakemake, not checked")
+    study.add_argument("--log", type=Path)
+    lpips = commands.add_parser("lpips_vgg")
+    lpips.add_argument("--log", type=Path)
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
     return parser.parse_args()
@@ -39,6 +48,18 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
+def _guarded(what: str, run: Callable[[], None]) -> int:
+    try:
+        run()
+    except InputError as error:
+        logging.getLogger("error").error("%s", error)
+        return 1
+    except Exception:
+        logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
+        return 1
+    return 0
+
+
 def main() -> int:
     """Exit code 0, or 1 with one line on stderr."""
     arguments = _arguments()
@@ -48,29 +69,28 @@ def main() -> int:
 
     try:  # before NumPy is imported: a BLAS that has started keeps its threads
         native.prepare()
-        native.limit_threads(arguments.threads)
+        native.limit_threads(getattr(arguments, "threads", 1))
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     from workflow.job import configure_logging, run_stage
 
     configure_logging(arguments.log)
+    if arguments.command == "study":
+        from workflow.study_table import write_study
+
+        return _guarded(f"study {arguments.study}", lambda: write_study(arguments.study, arguments.quality))
+    if arguments.command == "lpips_vgg":
+        from workflow.weights import fetch_vgg
+
+        return _guarded("fetching VGG16", fetch_vgg)
     note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
     note.parent.mkdir(parents=True, exist_ok=True)
     note.write_text(f"{arguments.threads}\n")
-    try:
-        run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint)
-    except InputError as error:
-        logging.getLogger("error").error("%s", error)
-        return 1
-    except Exception:
-        logging.getLogger("error").exception(
-            "%s of %s stopped on an unexpected error (a bug: please report it with this log)",
-            arguments.command,
-            arguments.scene,
-        )
-        return 1
-    return 0
+    return _guarded(
+        f"{arguments.command} of {arguments.scene}",
+        lambda: run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint),
+    )
 
 
 if __name__ == "__main__":

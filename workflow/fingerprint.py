@@ -18,6 +18,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
+from workflow import studies
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
 
@@ -28,6 +29,7 @@ INFRASTRUCTURE = (
     "workflow.job",
     "workflow.registry",
     "workflow.settings",
+    "workflow.studies",
     "workflow.fingerprint",
     "workflow.artifacts",
     "iif_core.native",
@@ -38,6 +40,8 @@ PLUGINS = {
     "capture": (("source", "kind", "workflow.sources.{}"),),
     "prior": (("prior", "kind", "workflow.priors.{}"),),
 }
+# Files that a stage reads if they are there.
+OPTIONAL_FILES = {"base_scores": (Path("results/weights/lpips_vgg.npz"),)}
 
 
 def module_file(module: str) -> Path | None:
@@ -121,7 +125,12 @@ def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
 
 def code_digest(stage: str, settings: dict[str, Any]) -> str:
     """Digest of the code behind a stage, blind to comments, docstrings and layout."""
-    parts = [f"{module}:{_module_digest(module)}" for module in stage_modules(stage, settings)]
+    return modules_digest(stage_modules(stage, settings))
+
+
+def modules_digest(modules: list[str]) -> str:
+    """Digest of the code of some modules."""
+    parts = [f"{module}:{_module_digest(module)}" for module in modules]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -150,7 +159,7 @@ def raw_digest(paths: list[Path]) -> str:
 
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     """Input files from outside that a stage reads; the source (or prior) module knows them and checks them first."""
-    out: list[Path] = []
+    out = [path for path in OPTIONAL_FILES.get(stage, ()) if path.is_file()]
     for section, key, pattern in PLUGINS.get(stage, ()):
         module = importlib.import_module(pattern.format(document[section][key]))
         if hasattr(module, "raw_inputs"):
@@ -171,7 +180,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
     except InputError as error:
-        raise InputError(f"config/scenes/{scene}.yaml: {error}") from None
+        raise InputError(f"{settings_module.scene_file(scene)}: {error}") from None
     facts = {
         "stage": stage,
         "settings": settings_module.select(document, STAGES[stage].settings),
@@ -180,3 +189,12 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@lru_cache(None)
+def home(stage: str, scene: str, quality: str) -> str:
+    """Scene in whose folder the result of a stage lies: a study's variant shares what others would make alike."""
+    for shared in studies.bases(scene):
+        if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
+            return shared
+    return scene

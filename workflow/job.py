@@ -7,8 +7,11 @@ import importlib.metadata
 import json
 import logging
 import platform
+import resource
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +21,7 @@ from iif_core.errors import InputError
 from workflow import fingerprint as fp
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
-from workflow.artifacts.files import sha256_of
+from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
@@ -51,6 +54,8 @@ class Job:
         self.log = logging.getLogger(f"{stage}")
         self.document = json.loads(fp.resolved(scene, quality))
         self._last_progress = self._started = time.monotonic()
+        self._cpu_started = time.process_time()
+        self._parts: dict[str, dict[str, float]] = {}
         self._readers: dict[str, StageReader] = {}
 
     @cached_property
@@ -80,7 +85,8 @@ class Job:
         if stage not in self.stage.upstream:
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as upstream")
         if stage not in self._readers:
-            reader = StageReader(stage_directory(self.scene, stage), stage, self.scene)
+            scene = fp.home(stage, self.scene, self.quality)
+            reader = StageReader(stage_directory(scene, stage), stage, scene)
             expected = fp.fingerprint(stage, self.scene, self.quality)
             if reader.fingerprint != expected:
                 raise InputError(
@@ -99,10 +105,10 @@ class Job:
     def _provenance(self) -> dict[str, Any]:
         inputs = {}
         for stage in self.stage.upstream:
-            directory = stage_directory(self.scene, stage)
+            reader = self.read(stage)
             inputs[stage] = {
-                "fingerprint": self.read(stage).fingerprint,
-                "manifest_sha256": sha256_of(directory / "manifest.json"),
+                "fingerprint": reader.fingerprint,
+                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
             }
         return {
             "scene": self.scene,
@@ -115,6 +121,33 @@ class Job:
             "inputs": inputs,
             "versions": library_versions(),
         }
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Record the wall and CPU seconds of a part of the job (all threads of this process); parts of one name add up.
+
+        They go to `results/<scene>/benchmarks/<stage>.parts.json`, not into the manifest: no two runs take the same time.
+        """
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            part = self._parts.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
+            part["seconds"] += time.perf_counter() - wall
+            part["cpu_seconds"] += time.process_time() - cpu
+
+    def write_timings(self) -> None:
+        """Write what `timed` recorded, and seconds, CPU seconds peak memory (MB) and threads of the job so far as `job`."""
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
+        whole = {
+            "seconds": time.monotonic() - self._started,
+            "cpu_seconds": time.process_time() - self._cpu_started,
+            "max_rss_mb": memory,
+            "threads": self.threads,
+        }
+        parts = {name: {key: round(value, 3) for key, value in part.items()} for name, part in self._parts.items()}
+        document = {**parts, "job": {key: round(value, 3) for key, value in whole.items()}}
+        write_json(Path("results") / self.scene / "benchmarks" / f"{self.stage.name}.parts.json", document)
 
     def progress(self, done: int, total: int, what: str) -> None:
         """Say how far the job is, at most every five seconds and at the end."""
@@ -157,6 +190,7 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()
+    job.write_timings()
 
 
 def configure_logging(path: Path | None) -> None:

@@ -9,12 +9,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Stage:
-    """One rule: name, upstream stages, settings that it reads, whether raw input files enter here."""
+    """One rule: name, upstream stages, settings that it reads, whether raw input files enter here.
+
+    `on_demand`: no scene needs it; a study asks for it.
+    """
 
     name: str
     upstream: tuple[str, ...]
     settings: tuple[str, ...]
     reads_raw: bool = False
+    on_demand: bool = False
 
     @property
     def module(self) -> str:
@@ -28,6 +32,7 @@ STAGES: dict[str, Stage] = {
         Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
         Stage("segmentation", ("capture",), ("segmentation",)),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
+        Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics",), reads_raw=True, on_demand=True),
         Stage("emission", ("capture", "segmentation", "base"), ("emission", "capture.dynamic_range", "affines.response", "seed")),
         Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(

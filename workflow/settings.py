@@ -1,6 +1,7 @@
 """The settings of a scene: one typed model that validates, documents and generates (schema, defaults, reference page).
 
-Order of precedence: defaults here < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`.
+Order of precedence: defaults here < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a study
+(workflow/studies.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`.
 Nothing else is consulted: no environment variables, no hidden files.
 """
 
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from iif_core.errors import InputError
 
@@ -107,6 +108,8 @@ class Capture(Section):
 class PriorBase(Section):
     samples: int = Field(8, ge=1, le=256)
     """Predictions a photograph, K."""
+    seed: int | None = Field(None, ge=0, lt=2**31)
+    """Seed of the predictions alone; default: the scene's."""
 
 
 class SimulatedPrior(PriorBase):
@@ -160,20 +163,59 @@ class Segmentation(Section):
 class Base(Section):
     """Fusing the K predictions of all views into one 3D base texture."""
 
-    solver: Literal["direct"] = "direct"
-    """`direct`: alternating closed forms on surface cells."""
-    variant: Literal["full", "uniform", "texel_mean", "object_mean"] = "full"
-    """`full`: affines and selection; `uniform`: affines, no selection; the means: baselines."""
+    solver: Literal["direct", "sgd"] = "direct"
+    """`direct`: alternating closed forms on surface cells; `sgd`: the paper's optimiser, to compare with."""
+    variant: Literal["full", "uniform", "image_affine", "texel_mean", "object_mean", "raw"] = "full"
+    """`full`: affines and selection; `uniform`: affines, no selection; `image_affine`: one affine an image instead of one an
+    object and image; the means, and `raw` = the first prediction of each view as it is: baselines."""
+    predictions: int | None = Field(None, ge=1)
+    """Use only the first so many predictions of each view; default: all."""
     cell_edge: float | None = Field(None, gt=0)
     """Edge of a surface cell in metres; default: `cell_footprints` pixel footprints."""
-    cell_footprints: float = Field(0.6, gt=0)
+    cell_footprints: float = Field(0.4, gt=0)
     """Cell edge in median pixel footprints."""
+    border_weight: float = Field(0.1, gt=0, le=1)
+    """Weight of pixels next to another object: real predictions bleed across borders."""
+    footprint_power: float = Field(0.0, ge=0, le=4)
+    """Weight pixels by (median footprint / own footprint) to this power: prefers near and frontal views of a surface."""
+    objective: Literal["least_squares", "distribution"] = "least_squares"
+    """`direct`: `distribution` then minimises the paper's own loss for the selection found."""
+    robust: bool = False
+    """`direct`: cells take an M-estimate instead of the mean (outliers in few views, at the price of sharpness)."""
     sweeps: int = Field(12, ge=1, le=200)
-    """Alternations."""
+    """`direct`: alternations."""
+    polish: int = Field(25, ge=1, le=1000)
+    """`direct`, `objective: distribution`: sweeps on the paper's loss."""
     ridge: float = Field(0.01, gt=0)
-    """Pull of the affines towards identity, per pixel."""
+    """`direct`: pull of the affines towards identity, per pixel."""
+    temperature: float = Field(1.0, ge=0)
+    """`direct`: selection temperature of the first sweep, in units of a segment's median error."""
     anneal: float = Field(0.6, gt=0, lt=1)
-    """Factor on the selection temperature per sweep."""
+    """`direct`: factor on the selection temperature per sweep."""
+    final_temperature: float = Field(0.1, ge=0)
+    """`direct`: where annealing stops; 0 = the single best prediction, more = near-ties are averaged."""
+    seams: bool = True
+    """`direct`: close seams between parts of an object that no photograph shows together."""
+    texture: Literal["cells", "hashgrid"] = "cells"
+    """`sgd`: texture model."""
+    iterations: int = Field(2000, ge=1)
+    """`sgd`: optimiser steps of 65,536 pixels."""
+    preset: Literal["safe", "paper"] = "safe"
+    """`sgd`: `paper` = the published behaviour; `safe` = with the treatments of docs/base.md."""
+    hash_levels: int = Field(16, ge=1, le=32)
+    """`sgd`, `texture: hashgrid`: levels of the grid (the paper: 32)."""
+    hash_entries: int = Field(17, ge=8, le=24)
+    """`sgd`, `texture: hashgrid`: log2 of the entries a level (the paper: 19)."""
+
+    @model_validator(mode="after")
+    def _known_pairs(self) -> Base:
+        if self.solver == "sgd" and self.variant != "full":
+            raise ValueError(
+                f"`solver: sgd` fits `variant: full` alone, not `{self.variant}`; use `solver: direct` for the others"
+            )
+        if self.objective == "distribution" and self.variant not in ("full", "image_affine"):
+            raise ValueError(f"`objective: distribution` needs a selection; `variant: {self.variant}` makes none")
+        return self
 
 
 class Emission(Section):
@@ -296,7 +338,8 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A file of `key: value` lines; an `InputError` names file and line."""
     try:
         document = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
     except UnicodeDecodeError as error:
@@ -331,7 +374,11 @@ def scene_names(root: Path = Path(".")) -> list[str]:
 
 
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
-    """Path of a scene's file; an unknown scene is an error that suggests the nearest name."""
+    """Path of a scene's file, of a study's derived scene its parent's; an unknown scene is an error with the nearest name."""
+    from workflow import studies  # it needs this module first
+
+    parts = studies.derived(scene, root)
+    scene = parts.scene if parts else scene
     path = root / "config/scenes" / f"{scene}.yaml"
     if not path.is_file():
         names = scene_names(root)
@@ -364,7 +411,7 @@ def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
     return model if isinstance(model, type) else None
 
 
-def _explain(error: ValidationError, path: Path) -> str:
+def _explain(error: ValidationError, path: str) -> str:
     lines = []
     for problem in error.errors():
         where = problem["loc"]
@@ -396,14 +443,31 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
     """Settings of `scene` at `quality`; an `InputError` names file, key, what was found and what is allowed."""
     if quality not in QUALITIES:
         raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
+    from workflow import studies
+
     path = scene_file(scene, root)
-    own = _read_yaml(path)
     preset_file = root / "config/quality" / f"{quality}.yaml"
-    preset = _read_yaml(preset_file) if preset_file.is_file() else {}
+    preset = read_yaml(preset_file) if preset_file.is_file() else {}
+    shown = path.relative_to(root) if path.is_absolute() else path
+    layers = [("", preset), (str(shown), read_yaml(path))]
+    if parts := studies.derived(scene, root):
+        layers += studies.layers(parts, root)
     try:
-        return SceneSettings.model_validate(merge(preset, own))
-    except ValidationError as error:
-        raise InputError(_explain(error, path.relative_to(root) if path.is_absolute() else path)) from None
+        return SceneSettings.model_validate(_merged(layers))
+    except ValidationError:
+        for count in range(2, len(layers) + 1):  # blame the first layer that spoils it
+            try:
+                SceneSettings.model_validate(_merged(layers[:count]))
+            except ValidationError as error:
+                raise InputError(_explain(error, layers[count - 1][0])) from None
+        raise
+
+
+def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for _, layer in layers:
+        out = merge(out, layer)
+    return out
 
 
 def dump(settings: SceneSettings) -> dict[str, Any]:

@@ -38,6 +38,18 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
     return rows
 
 
+def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]:
+    """What a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job`, the whole, also has max_rss_mb and threads.
+
+    Empty where nothing readable was left. Snakemake samples too seldom to tell the CPU time of a short job.
+    """
+    try:
+        document = json.loads((root / "results" / scene / "benchmarks" / f"{stage}.parts.json").read_text())
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
+
+
 def _threads(benchmark: Path) -> str:
     """What `python -m workflow` noted beside the benchmark: Snakemake's short format leaves it out."""
     try:

@@ -1,61 +1,59 @@
-"""The material base: K inconsistent predictions of every view fused into one value per surface cell (METHOD 2.3, 7c).
+"""Direct solver: alternating closed forms on surface cells (METHOD 7c).
 
 Each segment i (one object in one view) and prediction k has an affine correction T_ik (albedo 3x4, roughness and
-metallic 1x2) and, per property, a selection weight alpha_ik. The solver alternates closed forms, one pass over the
-views a sweep:
+metallic 1x2) and, per property, a selection weight alpha_ik. One pass over the views a sweep:
 
 1. T: least squares of the corrected prediction against the texture of the sweep before, with a ridge to identity
    that grows with the pixel count (without it, a constant texture would be a perfect fit);
 2. alpha: softmax over k of minus the segment's mean squared error, at a temperature that falls from sweep to sweep
-   and is 0 in the last one, where the best prediction is taken;
+   to a last one at which only predictions nearly as good as the best count (0 = the best alone);
 3. texture: weighted mean (or M-estimate) in each cell of the mixture sum_k alpha_ik T_ik v_nk;
-4. gauge: an affine map of an object's texture and its inverse on all T cancel, so the level of an object would drift
-   from sweep to sweep. It is moved back to the object's mean over all predictions, so that the mean correction keeps
-   the mean colour. Contrast is held by the ridge: with predictions of variance v that correlate by rho it settles at
-   about ridge / (ridge + v (1 - rho)) of theirs, it cannot collapse; `history` has the mean gain. Stretching it back
-   every sweep was tried and only amplified the noise of plain objects, with no gain elsewhere.
+4. gauge: an affine map of a part's texture and its inverse on all T cancel, so the level of a part would drift from
+   sweep to sweep. It is moved back to the mean over all predictions (gauge.anchor_shifts). Contrast is held by the
+   ridge: with predictions of variance v that correlate by rho it settles at about ridge / (ridge + v (1 - rho)) of
+   theirs, it cannot collapse; `history` has the mean gain. Stretching it back every sweep was tried and only
+   amplified the noise of plain objects, with no gain elsewhere. At the end, seams between the parts of an object
+   are closed (gauge.seam_shifts).
+
+`objective="distribution"` then minimises the paper's own loss from there, for the selection found (matching.py).
 
 Given T, errors follow from sums over the segment (Gram matrices, made once) and are not a pass of their own. A segment
 lies in one view, so T, alpha and the mixture of a view need only the previous texture: memory is one view's predictions
-plus the sums. Sums are float64. Last, the Laplace scale of a cell in closed form (laplace.closed_form_scale).
+a thread plus the sums, plus what `memory` allows to keep. Last, the Laplace scale of a cell in closed form
+(laplace.closed_form_scale).
 
-Results do not depend on the order of the predictions, nor on threads.
+The same bytes whatever the number of threads; the order of the predictions matters to rounding alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .. import laplace
 from ..errors import InputError
-from .problem import (
-    LOWEST,
-    NEUTRAL,
-    PROPERTIES,
-    BaseProblem,
-    BaseResult,
-    Dropped,
-    object_means,
-    prediction_faults,
-)
-from .selection import selection_weights
+from . import kernels, matching
+from .blocks import Block, Blocks, in_order
+from .gauge import Parts, anchor_shifts, covisible_parts, seam_shifts
+from .problem import LOWEST, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, Dropped, object_means
+from .selection import effective_number, margin, selection_weights
+from .uncertainty import location_uncertainty
 
 VARIANTS = ("full", "uniform", "texel_mean", "object_mean")
+OBJECTIVES = ("least_squares", "distribution")
 
-_PROPERTY_OF_CHANNEL = np.array([0, 0, 0, 1, 2])
-_ALBEDO = [0, 1, 2, 5]  # columns of phi = [albedo, roughness, metallic, 1] that each correction reads
-_ROUGHNESS = [3, 5]
-_METALLIC = [4, 5]
-
-_NOTHING = np.zeros((0, 0, 6))
-_T = TypeVar("_T")
+_PROPERTY_OF_ENTRY = np.repeat([0, 1, 2], [12, 2, 2])  # of the CROSS layout
+_GRAM_4 = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 13]])  # where a 4x4 entry is in the GRAM layout
+_GRAM_R = np.array([[9, 10], [10, 13]])
+_GRAM_M = np.array([[11, 12], [12, 13]])
+_IDENTITY = np.zeros(kernels.CROSS)
+_IDENTITY[[0, 5, 10, 12, 14]] = 1.0
+_BIAS = [3, 7, 11, 13, 15]  # entries of the CROSS layout that multiply 1
+_NO_MASK = np.zeros((0, 0), bool)
 
 
 @dataclass(frozen=True)
@@ -66,13 +64,18 @@ class BaseOptions:
         variant: `full`; `uniform` = corrections, but all predictions alike (no selection); `texel_mean` = mean of all
             predictions a cell; `object_mean` = mean of all predictions an object.
         sweeps: alternations.
-        temperature, anneal: selection temperature of the first sweep, in units of the segment's median error, and its
-            factor per sweep; the last sweep is at 0.
+        temperature, anneal, final_temperature: selection temperature of the first sweep, in units of the segment's
+            median error, its factor per sweep, and where it stops. At the default 0.1 a prediction whose error exceeds
+            the best by a tenth of the median has 1/e of its weight: averaging near-ties is worth 0.5-1.3 dB over
+            the single best one (0).
         ridge: pull of T to identity, times the segment's pixel weight (at least `ridge_pixels`).
         robust: cells take the M-estimate of the Laplace divergence instead of the mean.
         clip_share, clip_pixels: predicted albedo at exactly 0 or 1 is left out of the fit of T where at most this
             share of the segment is, and at least so many pixels remain.
         scale_floor: smallest Laplace scale.
+        objective: `least_squares`, or `distribution`: afterwards `polish` sweeps on the paper's loss, hard selection.
+        seams: close seams between parts of an object (needs `BaseProblem.neighbours`).
+        memory: bytes of predictions that may stay in memory between sweeps; the others are read again.
     """
 
     variant: str = "full"
@@ -85,145 +88,111 @@ class BaseOptions:
     clip_share: float = 0.5
     clip_pixels: int = 50
     scale_floor: float = laplace.SCALE_FLOOR
+    memory: int = 1 << 30
+    final_temperature: float = 0.1
+    objective: str = "least_squares"
+    polish: int = 20
+    seams: bool = True
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
             raise InputError(f"base variant {self.variant!r}; allowed: {', '.join(VARIANTS)}")
+        if self.objective not in OBJECTIVES:
+            raise InputError(f"base objective {self.objective!r}; allowed: {', '.join(OBJECTIVES)}")
+        if self.final_temperature < 0 or self.temperature < self.final_temperature or self.polish < 1:
+            raise InputError(
+                f"base options: temperature {self.temperature} must not be below final_temperature {self.final_temperature}"
+                f" (>= 0), polish {self.polish} must be >= 1"
+            )
         if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1:
             raise InputError(
                 f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1)"
             )
 
 
-# ------------------------------------------------------------------------------------------------------ predictions
+class _State:
+    """What a sweep changes, by segment and prediction: corrections (S, K, CROSS), alpha and error (S, K, 3)."""
 
-
-# ------------------------------------------------------------------------------------------------------------- views
-
-
-@dataclass(frozen=True)
-class _Block:
-    """The usable pixels of one view in segment order, and the range of each segment."""
-
-    phi: NDArray  # (n, K, 6) float64: albedo, roughness, metallic, 1
-    cell: NDArray  # (n,) intp
-    weight: NDArray  # (n,) float64
-    segments: NDArray  # (s,)
-    start: NDArray  # (s + 1,)
-
-    def ranges(self) -> Iterator[tuple[int, slice]]:
-        for i, segment in enumerate(self.segments):
-            yield int(segment), slice(int(self.start[i]), int(self.start[i + 1]))
-
-
-def _block(problem: BaseProblem, view: int, usable: NDArray | None = None) -> tuple[_Block, NDArray, int]:
-    """A view's pixels, which predictions are usable (K,), and how many pixels had a value that is not finite."""
-    maps = problem.view(view)
-    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
-    weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
-    if usable is None:
-        usable = np.array([not fault for fault in prediction_faults(maps)])
-    finite = np.isfinite(maps[usable]).all((0, 2))
-    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
-    lost = int((keep & ~finite).sum())
-    keep = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
-    keep = keep[np.argsort(segment[keep], kind="stable")]
-    phi = np.ones((len(keep), len(maps), 6))
-    phi[..., :5] = maps[:, keep].swapaxes(0, 1)
-    phi[:, ~usable, :5] = 0  # weight 0, but NaN x 0 is NaN
-    segments, start = np.unique(segment[keep], return_index=True)
-    return _Block(phi, cell[keep], weight[keep], segments, np.r_[start, len(keep)].astype(np.intp)), usable, lost
-
-
-def _inside(phi: NDArray) -> NDArray:
-    """Pixels (...) whose albedo is inside (0, 1) in every channel."""
-    r, g, b = phi[..., 0], phi[..., 1], phi[..., 2]  # NumPy reduces a short last axis slowly
-    return (r > 0) & (r < 1) & (g > 0) & (g < 1) & (b > 0) & (b < 1)
-
-
-def _in_order(work: Callable[[int], _T], n_views: int, threads: int) -> Iterator[_T]:
-    """work(0), work(1), ... in this order, `threads` of them under way at a time."""
-    if threads <= 1:
-        yield from map(work, range(n_views))
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for first in range(0, n_views, threads):  # in rounds, so that no more results wait than there are threads
-            yield from pool.map(work, range(first, min(first + threads, n_views)))
-
-
-# ------------------------------------------------------------------------------------------------------------ sums
-
-
-def _transposed_product(a: NDArray, b: NDArray) -> NDArray:
-    """a' b of (m, i) and (m, j), summed over pieces of rows."""
-    step = _rows_per_product(a.shape[1] * b.shape[1])
-    out = np.zeros((a.shape[1], b.shape[1]))
-    for start in range(0, len(a), step):
-        out += a[start : start + step].T @ b[start : start + step]
-    return out
-
-
-def _product(a: NDArray, b: NDArray) -> NDArray:
-    """a b of (m, i) and (i, j), in pieces of rows."""
-    step = _rows_per_product(b.size)
-    out = np.empty((len(a), b.shape[1]))
-    for start in range(0, len(a), step):
-        np.matmul(a[start : start + step], b, out=out[start : start + step])
-    return out
-
-
-def _rows_per_product(work_per_row: int) -> int:
-    """Rows whose product OpenBLAS computes on one thread (below 2^18 multiplications): larger ones are shared out, and
-    then the rounding depends on the number of threads."""
-    return max(1, (1 << 17) // work_per_row)
+    def __init__(self, n_segments: int, k: int):
+        self.affine = np.tile(_IDENTITY, (n_segments, k, 1))
+        self.alpha = np.zeros((n_segments, k, 3))
+        self.error = np.zeros((n_segments, k, 3))
 
 
 class _Sums:
-    """Gram matrices of every (segment, prediction) and the regularised inverses, made in one pass."""
+    """What does not change: Gram matrices of every (segment, prediction) and the regularised inverses."""
 
     def __init__(self, n_segments: int, k: int):
         self.weight = np.zeros(n_segments)
-        self.gram = np.zeros((n_segments, k, 6, 6))  # all pixels
-        self.fit = np.zeros((n_segments, k, 4, 4))  # albedo without clipped pixels
+        self.gram = np.zeros((n_segments, k, kernels.GRAM))
         self.usable = np.zeros((n_segments, k), bool)
-        self.clipped = np.zeros((n_segments, k), bool)  # predictions that are fitted without their clipped pixels
+        self.predicted = np.zeros((n_segments, 5))  # weighted sums of the mean usable prediction
+        self.masked = np.zeros((n_segments, k), bool)  # fitted without its clipped pixels
+        self.ridge = np.zeros(n_segments)
+        self.inverse = (np.zeros((n_segments, k, 4, 4)), np.zeros((n_segments, k, 2, 2)), np.zeros((n_segments, k, 2, 2)))
 
-    def add(self, segment: int, phi: NDArray, weight: NDArray, usable: NDArray, options: BaseOptions) -> None:
-        if self.weight[segment] > 0:
+    def add(self, block: Block, options: BaseOptions) -> None:
+        rows = block.segments
+        if not len(rows):
+            return
+        if (self.weight[rows] > 0).any():
+            segment = rows[np.argmax(self.weight[rows] > 0)]
             raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
-        self.weight[segment] = weight.sum()
-        self.usable[segment] = usable
-        for k in np.flatnonzero(usable):
-            one = np.ascontiguousarray(phi[:, k])
-            self.gram[segment, k] = _transposed_product(one, weight[:, None] * one)
-        self.fit[segment] = self.gram[segment][:, _ALBEDO][:, :, _ALBEDO]
-        inside = _inside(phi).T  # (K, m)
-        remain = inside.sum(1)
-        enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * len(phi))
-        self.clipped[segment] = usable & enough & (remain < len(phi))
-        for k in np.flatnonzero(self.clipped[segment]):
-            one = phi[inside[k], k][:, _ALBEDO]
-            self.fit[segment, k] = _transposed_product(one, weight[inside[k], None] * one)
+        gram = kernels.gram(block.values, block.weight, block.start, _NO_MASK)
+        self.gram[rows], self.weight[rows], self.usable[rows] = gram, gram[:, 0, 13], block.usable
+        self.predicted[rows] = gram[:, block.usable][..., [6, 7, 8, 10, 12]].mean(1)
+        fit = gram
+        if block.inside.size:
+            count = np.diff(block.start)
+            remain = np.add.reduceat(block.inside, block.start[:-1], axis=1, dtype=np.int64).T
+            enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * count[:, None])
+            self.masked[rows] = block.usable & enough & (remain < count[:, None])
+            fit = np.where(
+                self.masked[rows][..., None], kernels.gram(block.values, block.weight, block.start, block.inside), gram
+            )
+        self.ridge[rows] = options.ridge * np.maximum(self.weight[rows], options.ridge_pixels)
+        for out, where, source in zip(self.inverse, (_GRAM_4, _GRAM_R, _GRAM_M), (fit, gram, gram), strict=True):
+            out[rows] = np.linalg.inv(source[..., where] + self.ridge[rows, None, None, None] * np.eye(len(where)))
 
-    def invert(self, options: BaseOptions) -> None:
-        self.ridge = options.ridge * np.maximum(self.weight, options.ridge_pixels)
-        ridge = self.ridge[:, None, None, None]
-        self.inverse_albedo = np.linalg.inv(self.fit + ridge * np.eye(4))
-        self.inverse_roughness, self.inverse_metallic = (
-            np.linalg.inv(self.gram[:, :, rows][:, :, :, rows] + ridge * np.eye(2)) for rows in (_ROUGHNESS, _METALLIC)
-        )
+    def corrections(self, rows: NDArray, cross: NDArray, cross_albedo: NDArray) -> NDArray:
+        """(s, K, CROSS) ridge regression of the predictions on the texture: (G + lambda I)^-1 (phi'W t + lambda T_id)."""
+        ridge = self.ridge[rows, None, None]
+        out = np.empty(cross.shape)
+        right = cross_albedo[..., :12] + ridge * _IDENTITY[:12]
+        out[..., :12] = (right.reshape(*right.shape[:2], 3, 4) @ self.inverse[0][rows]).reshape(*right.shape)
+        for part, inverse in ((slice(12, 14), self.inverse[1]), (slice(14, 16), self.inverse[2])):
+            right = cross[..., part] + ridge * _IDENTITY[part]
+            out[..., part] = (right[..., None, :] @ inverse[rows])[..., 0, :]
+        return out
+
+    def errors(self, rows: NDArray, affine: NDArray, cross: NDArray, square: NDArray) -> NDArray:
+        """(s, K, 3) mean squared error per property of phi T - t from sums: (T G T' - 2 T c + t't) / weight."""
+        gram, weight = self.gram[rows], self.weight[rows, None]
+        out = np.zeros((*affine.shape[:2], 3))
+        for p, part, where in ((0, slice(0, 12), _GRAM_4), (1, slice(12, 14), _GRAM_R), (2, slice(14, 16), _GRAM_M)):
+            channels = 3 if p == 0 else 1
+            t = affine[..., part].reshape(*affine.shape[:2], channels, len(where))
+            c = cross[..., part].reshape(t.shape)
+            total = (t @ gram[..., where] * t).sum((-1, -2)) - 2 * (t * c).sum((-1, -2))
+            total += square[:, :3].sum(1)[:, None] if p == 0 else square[:, p + 2][:, None]
+            out[..., p] = np.maximum(total / (channels * weight), 0)
+        return out
 
 
-class _State:
-    """What a sweep changes: corrections (S, K, 6, 5) with phi @ T = corrected values, alpha and error (S, K, 3)."""
+class _CellSums:
+    """Weighted sums per cell, per channel; added in pixel order, so the result is the same every time."""
 
-    def __init__(self, n_segments: int, sums: _Sums):
-        k = sums.usable.shape[1]
-        self.affine = np.zeros((n_segments, k, 6, 5))
-        self.affine[..., range(5), range(5)] = 1
-        share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
-        self.alpha = np.repeat(share[:, :, None], 3, 2)
-        self.error = np.zeros((n_segments, k, 3))
+    def __init__(self, n_cells: int):
+        self.sum = np.zeros((n_cells, 5))
+        self.total = np.zeros((n_cells, 5))
+
+    def add(self, cell: NDArray, value: NDArray, weight: NDArray) -> None:
+        """`value` (5, n); `weight` (n,), or (5, n) by channel."""
+        kernels.add_to_cells(self.total, self.sum, cell, value, np.atleast_2d(weight))
+
+    def mean(self, fallback: NDArray) -> NDArray:
+        """(n_cells, 5) float32; cells without weight keep the fallback."""
+        return kernels.cell_means(self.total, self.sum, np.broadcast_to(fallback, self.sum.shape))
 
 
 # ---------------------------------------------------------------------------------------------------------- solver
@@ -235,7 +204,7 @@ def solve_base(
     progress: Callable[[int, int], None] | None = None,
     threads: int = 1,
 ) -> BaseResult:
-    """Base texture of a problem by alternating closed forms; deterministic, independent of the order of predictions.
+    """Base texture of a problem by alternating closed forms; deterministic.
 
     `progress(done, total)` is called after every pass over the views. `threads` views are worked on at a time (and are
     in memory); the result does not depend on it.
@@ -247,81 +216,147 @@ def solve_base(
     means = options.variant in ("texel_mean", "object_mean")
     sweeps = 1 if means else options.sweeps
     n_views = len(problem.cell_of_pixel)
-    total = sweeps + 2
+    polish = options.polish if options.objective == "distribution" and not means else 0
+    total = sweeps + polish + 2
+    blocks = Blocks(problem, options.memory)
+    parts = covisible_parts(problem)
 
-    sums, texture, usable, dropped, counts = _first_pass(problem, options)
+    sums, state, texture, dropped, counts = _first_pass(problem, blocks, options, threads)
     _notify(progress, 1, total)
-    state = _State(problem.n_segments, sums)
     history: list[dict[str, float]] = []
-
     for sweep in range(sweeps):
-        temperature = 0.0 if sweep == sweeps - 1 else options.temperature * options.anneal**sweep
-        centre = texture if options.robust and sweep else None
+        temperature = max(options.temperature * options.anneal**sweep, options.final_temperature)
+        if sweep == sweeps - 1:
+            temperature = options.final_temperature
         cells = _CellSums(problem.n_cells)
-        work = partial(_sweep_view, problem, options, sums, usable, texture, temperature, state)
-        for block, mixture in _in_order(work, n_views, threads):
-            cells.add(block.cell, mixture, block.weight, centre, options)
+        work = partial(_sweep_view, blocks, options, sums, texture, temperature, state)
+        for block, mixed in in_order(work, n_views, threads):
+            cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
         updated = cells.mean(texture)
         if not means:
-            updated = _anchored(problem, sums, updated, state, counts)
-        change = float(np.sqrt(np.mean((updated - texture)[cells.seen] ** 2))) if cells.seen.any() else 0.0
+            shift = anchor_shifts(parts, sums.predicted, updated, counts.weight)
+            updated = _shifted(parts, shift, updated, state)
+        seen = counts.weight > 0
+        change = float(np.sqrt(np.mean((updated - texture)[seen] ** 2, dtype=np.float64))) if seen.any() else 0.0
         texture = updated
         history.append({"temperature": temperature, **_summary(sums, state), "change": change})
         _notify(progress, sweep + 2, total)
 
+    if polish:
+        chosen = _hard(state, sums)
+        texture = _polish(blocks, problem, options, sums, state, chosen, texture, threads, history, progress, total)
+    elif options.seams and not means and problem.neighbours is not None:
+        shift, _ = seam_shifts(parts, texture, counts.weight, problem.neighbours)
+        texture = _shifted(parts, shift, texture, state)
     texture = np.clip(texture, LOWEST, 1.0)
     if options.variant == "object_mean":
         object_value, _ = object_means(texture, problem.object_of_cell, counts.weight)
-        texture = object_value.astype(np.float64)[problem.object_of_cell]
-    scale = _scales(problem, options, texture, state, usable, threads)
+        texture = object_value[problem.object_of_cell]
+    result = _outcome(problem, blocks, options, sums, parts, counts, texture, state, threads)
     _notify(progress, total, total)
+    return replace(result, dropped=dropped, history=history)
+
+
+def describe_fit(
+    problem: BaseProblem,
+    value: NDArray,
+    scale: NDArray,
+    affine: NDArray,
+    weight: NDArray,
+    history: list[dict[str, float]] | None = None,
+    threads: int = 1,
+    memory: int = 1 << 30,
+) -> BaseResult:
+    """The result of another solver described like that of `solve_base`, so that both can be compared.
+
+    Args:
+        value, scale: (n_cells, 5) texture and its Laplace scale; affine: (S, K, CROSS) corrections; weight: (S, K, 3).
+
+    Errors, votes, counts and fills are measured on the problem; `scale` is kept as the solver found it.
+    """
+    options = BaseOptions(memory=memory)
+    blocks, parts = Blocks(problem, memory), covisible_parts(problem)
+    sums, state, _, dropped, counts = _first_pass(problem, blocks, replace(options, variant="texel_mean"), threads)
+    state.affine, state.alpha = affine.astype(np.float64), weight.astype(np.float64)
+    texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
+    for block in in_order(blocks, len(problem.cell_of_pixel), threads):
+        rows, target = block.segments, kernels.texture_at(texture, block.cell)
+        cross = kernels.cross(block.values, target, block.weight, block.start, _NO_MASK)
+        square = kernels.square(target, block.weight, block.start)
+        state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
+    result = _outcome(problem, blocks, options, sums, parts, counts, texture, state, threads)
+    own = np.where((counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
+    return replace(result, scale=own, dropped=dropped, history=history or [])
+
+
+def _outcome(
+    problem: BaseProblem,
+    blocks: Blocks,
+    options: BaseOptions,
+    sums: _Sums,
+    parts: Parts,
+    counts: _Counts,
+    texture: NDArray,
+    state: _State,
+    threads: int,
+) -> BaseResult:
+    scale, votes = _scales(blocks, problem, options, texture, state, threads)
     value, object_value, object_cells = _filled(problem, texture, counts)
-    scale[counts.weight == 0] = _unseen_scale(scale, counts.weight > 0, options)
+    seen = counts.weight > 0
+    uncertainty = location_uncertainty(scale, counts.views)
+    for array in (scale, uncertainty):
+        array[~seen] = _unseen_scale(array, seen)
+    n, k = state.alpha.shape[:2]
+    probability = votes / np.maximum(votes.sum(1, keepdims=True), 1e-30)
+    by_property = state.error.swapaxes(1, 2), np.repeat(sums.usable[:, None], 3, 1)  # (S, 3, K)
     return BaseResult(
         value=value,
         scale=scale,
+        uncertainty=uncertainty,
+        coverage=counts.weight.astype(np.float32),
+        part_of_cell=parts.of_cell,
         observations=counts.observations,
         views=counts.views,
         object_value=object_value,
         object_cells=object_cells,
         weight=state.alpha.astype(np.float32),
-        affine_albedo=state.affine[..., _ALBEDO, :3].swapaxes(-1, -2).astype(np.float32),
-        affine_roughness=state.affine[..., _ROUGHNESS, 3].astype(np.float32),
-        affine_metallic=state.affine[..., _METALLIC, 4].astype(np.float32),
+        affine_albedo=state.affine[..., :12].reshape(n, k, 3, 4).astype(np.float32),
+        affine_roughness=state.affine[..., 12:14].astype(np.float32),
+        affine_metallic=state.affine[..., 14:16].astype(np.float32),
         error=state.error.astype(np.float32),
-        dropped=dropped,
-        history=history,
+        probability=probability.astype(np.float32),
+        margin=margin(*by_property).astype(np.float32),
+        effective=effective_number(probability.swapaxes(1, 2)).astype(np.float32),
+        dropped=[],
+        history=[],
     )
 
 
 def _sweep_view(
-    problem: BaseProblem,
-    options: BaseOptions,
-    sums: _Sums,
-    usable: list[NDArray],
-    texture: NDArray,
-    temperature: float,
-    state: _State,
-    view: int,
-) -> tuple[_Block, NDArray]:
-    """T, error and alpha of a view's segments against the texture, and the mixture at its pixels.
+    blocks: Blocks, options: BaseOptions, sums: _Sums, texture: NDArray, temperature: float, state: _State, view: int
+) -> tuple[Block, NDArray]:
+    """T, error and alpha of a view's segments against the texture; the mixture at its pixels.
 
     Writes only the rows of its own segments in `state`, so views can run side by side.
     """
-    block, _, _ = _block(problem, view, usable[view])
-    mixture = np.empty((len(block.cell), 5))
-    for segment, rows in block.ranges():
-        phi, t = block.phi[rows], texture[block.cell[rows]]
-        weighted = block.weight[rows, None] * t
-        cross = _transposed_product(phi.reshape(len(phi), -1), weighted).reshape(-1, 6, 5)
-        if options.variant in ("full", "uniform"):
-            state.affine[segment] = _fit(sums, segment, phi, cross, weighted)
-        state.error[segment] = _errors(sums, segment, state.affine[segment], cross, (weighted * t).sum(0))
-        if options.variant == "full":
-            weights = selection_weights(state.error[segment].T, temperature, sums.usable[segment])
-            state.alpha[segment] = weights.T
-        mixture[rows] = _mixture(phi, state.affine[segment], state.alpha[segment])
-    return replace(block, phi=_NOTHING), mixture
+    block = blocks(view)
+    rows = block.segments
+    values, target = block.values, kernels.texture_at(texture, block.cell)
+    cross = kernels.cross(values, target, block.weight, block.start, _NO_MASK)
+    if options.variant in ("full", "uniform"):
+        albedo = cross
+        if sums.masked[rows].any():
+            inside = kernels.cross(values, target, block.weight, block.start, block.inside)
+            albedo = np.where(sums.masked[rows][..., None], inside, cross)
+        state.affine[rows] = sums.corrections(rows, cross, albedo)
+    square = kernels.square(target, block.weight, block.start)
+    state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
+    if options.variant == "full" and len(rows):
+        for p in range(3):
+            state.alpha[rows, :, p] = selection_weights(state.error[rows, :, p], temperature, sums.usable[rows])
+    alpha = state.alpha[rows]
+    blend = (state.affine[rows] * alpha[..., _PROPERTY_OF_ENTRY]).astype(np.float32)
+    return block, kernels.mixture(values, blend, block.start, LOWEST)
 
 
 @dataclass
@@ -331,126 +366,62 @@ class _Counts:
     weight: NDArray
 
 
-def _first_pass(problem: BaseProblem, options: BaseOptions) -> tuple[_Sums, NDArray, list[NDArray], list[Dropped], _Counts]:
-    """Gram matrices, the first texture (cell mean of the predictions' median), usable predictions, counts."""
-    n_views = len(problem.cell_of_pixel)
+def _first_pass(
+    problem: BaseProblem, blocks: Blocks, options: BaseOptions, threads: int
+) -> tuple[_Sums, _State, NDArray, list[Dropped], _Counts]:
+    """Gram matrices, the first texture (cell mean of the predictions' median), what was dropped, counts."""
     counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
     cells = _CellSums(problem.n_cells)
-    sums, usable_of_view, dropped = None, [], []
-    for view in range(n_views):
-        _check_ids(problem, view)
-        block, usable, lost = _block(problem, view)
+    sums, state = None, _State(problem.n_segments, 1)
+    dropped: list[Dropped] = []
+
+    def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
+        block, left_out = blocks.first(view)
+        if options.variant in ("texel_mean", "object_mean"):
+            share = np.float32(block.usable / max(block.usable.sum(), 1))
+            blend = np.broadcast_to(share[:, None] * np.float32(_IDENTITY), (len(block.segments), len(share), kernels.CROSS))
+            start = kernels.mixture(block.values, np.ascontiguousarray(blend), block.start, LOWEST)
+        else:
+            start = kernels.medians(block.values, block.usable, kernels.sorting_network(int(block.usable.sum())))
+        return block, left_out, start
+
+    for view, (block, left_out, start) in enumerate(in_order(start_of, len(problem.cell_of_pixel), threads)):
         if sums is None:
-            sums = _Sums(problem.n_segments, len(usable))
-        if len(usable) != sums.usable.shape[1]:
+            sums, state = _Sums(problem.n_segments, len(block.usable)), _State(problem.n_segments, len(block.usable))
+        if len(block.usable) != sums.usable.shape[1]:
             raise InputError(
-                f"view {view} has {len(usable)} predictions, view 0 has {sums.usable.shape[1]}; give every view the same number"
+                f"view {view} has {len(block.usable)} predictions, view 0 has {sums.usable.shape[1]};"
+                " give every view the same number"
             )
-        usable_of_view.append(usable)
-        if not usable.all():
-            faults = prediction_faults(problem.view(view))
-            dropped += [Dropped(view, i, fault) for i, fault in enumerate(faults) if fault]
-        if lost and usable.any():
-            dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
-        for segment, rows in block.ranges():
-            phi = block.phi[rows]
-            sums.add(segment, phi, block.weight[rows], usable, options)
-            if options.variant in ("texel_mean", "object_mean"):
-                start = phi[:, usable, :5].mean(1)
-            else:
-                start = np.median(phi[:, usable, :5], 1)
-            cells.add(block.cell[rows], start, block.weight[rows], None, options)
-        np.add.at(counts.observations, block.cell, 1)
+        blocks.keep(view, block)
+        dropped += left_out
+        sums.add(block, options)
+        cells.add(block.cell, start, block.weight)
+        counts.observations += np.bincount(block.cell, minlength=problem.n_cells).astype(np.int32)
         counts.views[np.unique(block.cell)] += 1
     if sums is None:
         sums = _Sums(problem.n_segments, 1)
-    sums.invert(options)
-    counts.weight = cells.total[0]
-    return sums, cells.mean(np.broadcast_to(NEUTRAL, (problem.n_cells, 5))), usable_of_view, dropped, counts
+    share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
+    state.alpha = np.repeat(share[:, :, None], 3, 2)
+    counts.weight = cells.total[:, 0]
+    return sums, state, cells.mean(NEUTRAL), dropped, counts
 
 
-def _check_ids(problem: BaseProblem, view: int) -> None:
-    for name, ids, n in (
-        ("cell", problem.cell_of_pixel[view], problem.n_cells),
-        ("segment", problem.segment_of_pixel[view], problem.n_segments),
-    ):
-        highest = int(np.max(ids, initial=-1))
-        if highest >= n:
-            raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
+def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: _State) -> NDArray:
+    """Texture with each part moved by its shift (parts, 5); corrections in `state` move along."""
+    if not parts.count:
+        return texture
+    state.affine[..., _BIAS] += shift[parts.of_segment][:, None, :]
+    of_cell = np.where((parts.of_cell >= 0)[:, None], shift[parts.of_cell], 0)
+    return texture + of_cell.astype(np.float32)
 
 
-def _fit(sums: _Sums, segment: int, phi: NDArray, cross: NDArray, weighted: NDArray) -> NDArray:
-    """Corrections (K, 6, 5) of a segment: (G + lambda I)^-1 (phi' W t + lambda T_identity); `weighted` = W t."""
-    ridge = sums.ridge[segment]
-    out = np.zeros((phi.shape[1], 6, 5))
-    albedo = cross[:, _ALBEDO, :3]
-    for k in np.flatnonzero(sums.clipped[segment]):
-        inside = _inside(phi[:, k])
-        albedo[k] = _transposed_product(phi[inside, k][:, _ALBEDO], weighted[inside, :3])
-    out[:, _ALBEDO, :3] = sums.inverse_albedo[segment] @ (albedo + ridge * np.eye(4, 3))
-    for rows, inverse, channel in ((_ROUGHNESS, sums.inverse_roughness, 3), (_METALLIC, sums.inverse_metallic, 4)):
-        right = cross[:, rows, channel] + ridge * np.array([1.0, 0.0])
-        out[:, rows, channel] = (inverse[segment] @ right[..., None])[..., 0]
-    return out
-
-
-def _errors(sums: _Sums, segment: int, affine: NDArray, cross: NDArray, square: NDArray) -> NDArray:
-    """(K, 3) mean squared error per property of phi T - t from sums: (T' G T - 2 T' c + t't) / weight."""
-    by_channel = (affine * (sums.gram[segment] @ affine - 2 * cross)).sum(1) + square
-    by_channel = np.maximum(by_channel / sums.weight[segment], 0)
-    return np.stack([by_channel[:, :3].mean(1), by_channel[:, 3], by_channel[:, 4]], 1)
-
-
-def _mixture(phi: NDArray, affine: NDArray, alpha: NDArray) -> NDArray:
-    """(m, 5) sum_k alpha_k T_k v_k."""
-    blended = affine * alpha[:, None, _PROPERTY_OF_CHANNEL]
-    active = np.flatnonzero((alpha > 0).any(1))
-    if 2 * len(active) <= len(alpha):  # after the last sweep all but one
-        phi, blended = phi[:, active], blended[active]
-    return _product(phi.reshape(len(phi), -1), blended.reshape(-1, 5))
-
-
-class _CellSums:
-    """Weighted sums per cell, per channel; added in pixel order, so the result is the same every time."""
-
-    def __init__(self, n_cells: int):
-        self.sum = np.zeros((5, n_cells))
-        self.total = np.zeros((5, n_cells))
-
-    def add(self, cell: NDArray, value: NDArray, weight: NDArray, centre: NDArray | None, options: BaseOptions) -> None:
-        """`centre` (n_cells, 5): texture about which the M-estimate weighs; None = mean."""
-        value = np.clip(value, LOWEST, 1.0)
-        for c in range(5):
-            w = weight
-            if centre is not None:
-                w = weight * laplace.kl_weight(value[:, c] - centre[cell, c], options.scale_floor, 1.0)
-            np.add.at(self.sum[c], cell, w * value[:, c])
-            np.add.at(self.total[c], cell, w)
-
-    @property
-    def seen(self) -> NDArray:
-        return self.total[0] > 0
-
-    def mean(self, fallback: NDArray) -> NDArray:
-        """(n_cells, 5) float64; cells without weight keep the fallback."""
-        mean = self.sum / np.where(self.total > 0, self.total, 1.0)
-        return np.where(self.seen[:, None], mean.T, fallback)
-
-
-def _anchored(problem: BaseProblem, sums: _Sums, texture: NDArray, state: _State, counts: _Counts) -> NDArray:
-    """Texture (and corrections in `state`), shifted so that each object's mean is that of its usable predictions."""
-    of_segment, of_cell = problem.object_of_segment, problem.object_of_cell
-    n_objects = int(max(np.max(of_segment, initial=-1), np.max(of_cell, initial=-1))) + 1
-    usable = np.maximum(sums.usable.sum(1), 1)
-    predicted = (sums.gram[:, :, :5, 5] * sums.usable[:, :, None]).sum(1) / usable[:, None]  # (S, 5) weighted sums
-    total = np.bincount(of_cell, counts.weight, n_objects)
-    shift = np.zeros((n_objects, 5))
-    for c in range(5):
-        wanted = np.bincount(of_segment, predicted[:, c], n_objects)
-        found = np.bincount(of_cell, counts.weight * texture[:, c], n_objects)
-        shift[:, c] = (wanted - found) / np.where(total > 0, total, np.inf)
-    state.affine[..., 5, :] += shift[of_segment][:, None, :]
-    return texture + shift[of_cell]
+def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: BaseOptions) -> NDArray:
+    """Weight of the pixels in their cells: as given, or (5, n) of the M-estimate about the texture."""
+    if not options.robust:
+        return block.weight
+    distance = mixed - kernels.texture_at(texture, block.cell)
+    return block.weight * laplace.kl_weight(distance, options.scale_floor, 1.0).astype(np.float32)
 
 
 def _summary(sums: _Sums, state: _State) -> dict[str, float]:
@@ -462,40 +433,128 @@ def _summary(sums: _Sums, state: _State) -> dict[str, float]:
     mixed = (sums.weight[:, None] * (state.alpha * state.error).sum(1)).sum(0) / total
     log = np.log(np.where(state.alpha > 0, state.alpha, 1.0))
     entropy = -(sums.weight * (state.alpha * log).sum(1).mean(1)).sum() / total
-    gains = (state.alpha[..., 0] * state.affine[..., range(3), range(3)].mean(-1)).sum(1)
+    gains = (state.alpha[..., 0] * state.affine[..., [0, 5, 10]].mean(-1)).sum(1)
     gain = (sums.weight * gains).sum() / total
     errors = {f"error_{name}": float(mixed[p]) for p, name in enumerate(PROPERTIES)}
     return {**errors, "entropy": float(entropy) + 0.0, "gain": float(gain)}  # + 0.0: no minus zero
 
 
 def _scales(
-    problem: BaseProblem, options: BaseOptions, texture: NDArray, state: _State, usable: list[NDArray], threads: int
+    blocks: Blocks, problem: BaseProblem, options: BaseOptions, texture: NDArray, state: _State, threads: int
+) -> tuple[NDArray, NDArray]:
+    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels; and the votes (S, K, 3)."""
+    votes = np.zeros(state.alpha.shape)
+
+    def one_view(view: int) -> tuple[Block, NDArray, NDArray]:
+        block = blocks(view)
+        rows = block.segments
+        values, target = block.values, kernels.texture_at(texture, block.cell)
+        blend = (state.affine[rows] * state.alpha[rows][..., _PROPERTY_OF_ENTRY]).astype(np.float32)
+        mixed = kernels.mixture(values, blend, block.start, LOWEST)
+        affine = state.affine[rows].astype(np.float32)
+        network = kernels.sorting_network(int(block.usable.sum()))
+        b_ref, votes_of = kernels.disagreement(
+            values, affine, mixed, target, block.weight, block.start, block.usable, network, LOWEST, options.scale_floor
+        )
+        return block, laplace.scale_contribution(mixed - target, b_ref, options.scale_floor), votes_of
+
+    cells = _CellSums(problem.n_cells)
+    for block, part, votes_of in in_order(one_view, len(problem.cell_of_pixel), threads):
+        votes[block.segments] = votes_of
+        cells.add(block.cell, part, block.weight)
+    return laplace.floored(cells.mean(np.zeros(5)), np.float32(options.scale_floor)), votes
+
+
+def _hard(state: _State, sums: _Sums) -> NDArray:
+    """Chosen prediction (S, 3) int64; alpha becomes one-hot there and unchosen corrections the identity."""
+    chosen = state.alpha.argmax(1)
+    one_hot = (np.arange(state.alpha.shape[1])[None, :, None] == chosen[:, None]) & sums.usable[:, :, None]
+    state.alpha = one_hot.astype(np.float64)
+    state.affine = np.where(one_hot[..., _PROPERTY_OF_ENTRY], state.affine, _IDENTITY)
+    return chosen
+
+
+def _polish(
+    blocks: Blocks,
+    problem: BaseProblem,
+    options: BaseOptions,
+    sums: _Sums,
+    state: _State,
+    chosen: NDArray,
+    texture: NDArray,
+    threads: int,
+    history: list[dict[str, float]],
+    progress: Callable[[int, int], None] | None,
+    total: int,
 ) -> NDArray:
-    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels, b_r the spread over k."""
+    """Texture (n_cells, 5) after `options.polish` sweeps of majorisation on the paper's loss."""
+    n_views, n_k = len(problem.cell_of_pixel), state.alpha.shape[1]
+    scale, _ = _scales(blocks, problem, options, texture, state, threads)
+    floor = options.scale_floor
 
-    def one_view(view: int) -> tuple[_Block, NDArray]:
-        block, use, _ = _block(problem, view, usable[view])
-        part = np.empty((len(block.cell), 5))
-        for segment, rows in block.ranges():
-            phi = block.phi[rows]
-            mixture = np.clip(_mixture(phi, state.affine[segment], state.alpha[segment]), LOWEST, 1)
-            corrected = np.empty((int(use.sum()), len(phi), 5), np.float32)
-            for i, k in enumerate(np.flatnonzero(use)):
-                corrected[i] = np.clip(_product(phi[:, k], state.affine[segment, k]), LOWEST, 1)
-            b_ref = laplace.reference_scale(mixture.astype(np.float32), corrected, options.scale_floor)
-            part[rows] = laplace.scale_contribution(mixture - texture[block.cell[rows]], b_ref, options.scale_floor)
-        return replace(block, phi=_NOTHING), part
+    def one_view(view: int) -> tuple[Block, NDArray, NDArray, NDArray, float]:
+        block = blocks(view)
+        rows = block.segments
+        planes = kernels.choose(block.values, chosen[rows], block.start)
+        target, b = kernels.texture_at(texture, block.cell), kernels.texture_at(scale, block.cell)
+        mixed, b_ref = _against(block, state, rows, target, options)
+        weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
+        second, first = kernels.channel_moments(planes, target, weight, block.start)
+        strength = matching.REGULARISER * sums.weight[rows] / n_k
+        state.affine[rows] = _penalised(state.affine[rows], chosen[rows], second, first, strength)
+        mixed, b_ref = _against(block, state, rows, target, options)
+        loss = (block.weight * laplace.kl(mixed - target, b_ref, b, floor)).sum(dtype=np.float64) / 5
+        weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32)
+        part = laplace.scale_contribution(mixed - target, b_ref, floor)
+        return block, mixed, weight, part, float(loss)
 
-    total = np.zeros(problem.n_cells)
-    summed = np.zeros((5, problem.n_cells))
-    for block, part in _in_order(one_view, len(problem.cell_of_pixel), threads):
-        np.add.at(total, block.cell, block.weight)
-        for c in range(5):
-            np.add.at(summed[c], block.cell, block.weight * part[:, c])
-    return laplace.floored((summed / np.where(total > 0, total, 1.0)).T, options.scale_floor).astype(np.float32)
+    for sweep in range(options.polish):
+        cells, scales, data = _CellSums(problem.n_cells), _CellSums(problem.n_cells), 0.0
+        for block, mixed, weight, part, loss in in_order(one_view, n_views, threads):
+            cells.add(block.cell, mixed, weight)
+            scales.add(block.cell, part, block.weight)
+            data += loss
+        updated = cells.mean(texture)
+        change = float(np.sqrt(np.mean((updated - texture) ** 2, dtype=np.float64)))
+        texture = updated
+        scale = laplace.floored(scales.mean(scale), np.float32(floor))
+        pixels = max(sums.weight.sum(), 1e-30)
+        penalty = matching.identity_penalty(state.affine[..., :12].reshape(*state.affine.shape[:2], 3, 4))
+        penalty = penalty + ((state.affine[..., 12:] - _IDENTITY[12:]) ** 2).sum(-1)
+        terms = {"data": data / pixels, "regulariser": matching.REGULARISER * (sums.weight @ penalty.mean(1)) / pixels}
+        history.append({"temperature": 0.0, **_summary(sums, state), "change": change, **terms})
+        _notify(progress, options.sweeps + sweep + 2, total)
+    return texture
 
 
-def _unseen_scale(scale: NDArray, seen: NDArray, options: BaseOptions) -> NDArray:
+def _against(block: Block, state: _State, rows: NDArray, target: NDArray, options: BaseOptions) -> tuple[NDArray, NDArray]:
+    """Mixture and reference scale (5, n) of a view under the present corrections."""
+    affine = state.affine[rows].astype(np.float32)
+    blend = (state.affine[rows] * state.alpha[rows][..., _PROPERTY_OF_ENTRY]).astype(np.float32)
+    mixed = kernels.mixture(block.values, blend, block.start, LOWEST)
+    network = kernels.sorting_network(int(block.usable.sum()))
+    b_ref, _ = kernels.disagreement(
+        block.values, affine, mixed, target, block.weight, block.start, block.usable, network, LOWEST, options.scale_floor
+    )
+    return mixed, b_ref
+
+
+def _penalised(affine: NDArray, chosen: NDArray, second: NDArray, first: NDArray, strength: NDArray) -> NDArray:
+    """Corrections (s, K, CROSS) with those of the chosen predictions renewed."""
+    out, each = affine.copy(), np.arange(len(affine))
+    if not len(affine):
+        return out
+    where = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 9]])
+    start = out[each, chosen[:, 0], :12].reshape(-1, 3, 4)
+    albedo = matching.penalised_affine(second[:, :3][..., where], first[:, :3], start, strength)
+    out[each, chosen[:, 0], :12] = albedo.reshape(-1, 12)
+    pair = np.array([[0, 1], [1, 2]])
+    for p, part in ((1, slice(12, 14)), (2, slice(14, 16))):
+        out[each, chosen[:, p], part] = matching.penalised_gain(second[:, p + 2][..., pair], first[:, p + 2, :2], strength)
+    return out
+
+
+def _unseen_scale(scale: NDArray, seen: NDArray) -> NDArray:
     """Scale of cells nobody saw: as unsure as the least sure tenth of those seen, or 0.5 where there are none."""
     return np.quantile(scale[seen], 0.9, axis=0).astype(np.float32) if seen.any() else np.float32(0.5)
 

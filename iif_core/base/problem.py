@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,10 @@ class BaseProblem:
         object_of_cell: (n_cells,) int32.
         object_of_segment: (S,) int32.
         weight: per view, same shape, >= 0: how much a pixel counts (low near object borders, 0 = ignore); default 1.
+        point: view -> (N, 3) float32 surface points of the pixels in world coordinates, m; textures that are functions of
+            space read them, any value where there is no surface.
+        neighbours: (m, 2) int32 pairs of neighbouring cells of one object, for closing seams between its parts.
+        tangent: view -> (N, 2, 3) float32 how the surface point moves over one pixel to the right and down, m.
     """
 
     predictions: Predictions
@@ -43,6 +47,9 @@ class BaseProblem:
     object_of_cell: NDArray
     object_of_segment: NDArray
     weight: Sequence[NDArray] | None = None
+    point: Sequence[NDArray] | Callable[[int], NDArray] | None = None
+    tangent: Sequence[NDArray] | Callable[[int], NDArray] | None = None
+    neighbours: NDArray | None = None
 
     @property
     def n_segments(self) -> int:
@@ -77,11 +84,18 @@ class BaseResult:
     Attributes:
         value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells nobody saw have their object's mean,
             objects nobody saw `NEUTRAL`.
-        scale: (n_cells, 5) float32 Laplace scales, same units.
+        scale: (n_cells, 5) float32 Laplace scale b of the cell's distribution, same units (METHOD 2.3.4).
+        uncertainty: (n_cells, 5) float32 Laplace scale of the location's error, calibrated (uncertainty.py).
         observations: (n_cells,) int32 pixels; views: (n_cells,) int32 views that saw the cell.
+        coverage: (n_cells,) float32 pixels weighted by how well they see the cell; 0 = `value` is a fill.
+        part_of_cell: (n_cells,) int32 part that the cell hangs together with through shared cells (gauge.py), or -1.
         object_value: (O, 5) float32 mean of each object id up to the largest; object_cells: (O,) int32 cells behind it.
         weight: (S, K, 3) float32 selection weights of albedo, roughness, metallic; sum over k is 1 (0 where the
             segment has no usable pixel).
+        probability: (S, K, 3) float32 share of the segment's pixels at which prediction k is the nearest to the texture:
+            the stationary point of the paper's label loss as its temperature goes to 0 (METHOD 2.3.8).
+        margin: (S, 3) float32 how clear the selection is, 0 = a tie, 1 = one prediction fits exactly.
+        effective: (S, 3) float32 exp(entropy of `probability`): how many predictions share the segment, 1 ... K.
         affine_albedo: (S, K, 3, 4); affine_roughness, affine_metallic: (S, K, 2) = (gain, bias); float32.
         error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture before the last
             update.
@@ -91,11 +105,17 @@ class BaseResult:
 
     value: NDArray
     scale: NDArray
+    uncertainty: NDArray
     observations: NDArray
     views: NDArray
+    coverage: NDArray
+    part_of_cell: NDArray
     object_value: NDArray
     object_cells: NDArray
     weight: NDArray
+    probability: NDArray
+    margin: NDArray
+    effective: NDArray
     affine_albedo: NDArray
     affine_roughness: NDArray
     affine_metallic: NDArray
@@ -104,19 +124,43 @@ class BaseResult:
     history: list[dict[str, float]] = field(default_factory=list)
 
 
-def prediction_faults(maps: NDArray, not_finite_share: float = 0.01) -> list[str]:
+def one_segment_per_view(problem: BaseProblem) -> BaseProblem:
+    """The same predictions with one correction an image instead of one an object and image (the paper's ablation)."""
+    segments = [
+        np.where(np.asarray(segment) >= 0, view, -1).astype(np.int32) for view, segment in enumerate(problem.segment_of_pixel)
+    ]
+    return replace(problem, segment_of_pixel=segments, object_of_segment=np.full(len(segments), -1, np.int32))
+
+
+def check_ids(problem: BaseProblem, view: int) -> None:
+    """Raise InputError where a cell or segment id of a view has no row in its table."""
+    for name, ids, n in (
+        ("cell", problem.cell_of_pixel[view], problem.n_cells),
+        ("segment", problem.segment_of_pixel[view], problem.n_segments),
+    ):
+        highest = int(np.max(ids, initial=-1))
+        if highest >= n:
+            raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
+
+
+def prediction_faults(maps: NDArray, finite: NDArray | None = None, not_finite_share: float = 0.01) -> list[str]:
     """Why each of the K predictions of a view cannot be used; "" for those that can.
 
-    `maps` (K, ..., 5). Faults (METHOD H51, half-precision overflow of a diffusion model): more than `not_finite_share`
-    of the pixels not finite; albedo constant over the picture while that of another prediction is not.
+    `maps` (K, ..., 5); `finite` (K, pixels) bool where it is known already. Faults (METHOD H51, half-precision overflow
+    of a diffusion model): more than `not_finite_share` of the pixels not finite; albedo constant over the picture while
+    that of another prediction is not.
     """
     maps = maps.reshape(len(maps), -1, 5)
-    finite = np.isfinite(maps).all(-1)  # (K, N)
+    finite = np.isfinite(maps).all(-1) if finite is None else finite
     bad_share = 1 - finite.mean(1) if maps.shape[1] else np.zeros(len(maps))
     spread = np.zeros(len(maps))
     for k, prediction in enumerate(maps):
-        good = prediction[finite[k], :3]
-        spread[k] = good.astype(np.float32).std(0).max() if len(good) else 0.0
+        some = slice(None, None, max(1, len(prediction) // 4096))  # enough to tell a picture from a constant
+        for part in (some, slice(None)):
+            good = prediction[part, :3][finite[k, part]].astype(np.float32)
+            spread[k] = good.std(0).max() if len(good) else 0.0
+            if spread[k] > 1e-2:
+                break
     faults = []
     for share, std in zip(bad_share, spread, strict=True):
         if share > not_finite_share:

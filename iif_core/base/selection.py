@@ -29,3 +29,26 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
     weight = np.where(usable, weight, 0.0)
     total = weight.sum(-1, keepdims=True)
     return weight / np.where(total > 0, total, 1.0)
+
+
+def margin(error: NDArray, usable: NDArray) -> NDArray:
+    """How clear the choice is: (second smallest error - smallest) / second smallest, in [0, 1], over the last axis.
+
+    `error` (..., K) >= 0; `usable` (..., K) bool. 0 = a tie (or nothing usable); 1 = one prediction fits exactly, or only
+    one is usable.
+    """
+    counted = np.where(usable, np.asarray(error, np.float64), np.inf)
+    if counted.shape[-1] == 1:
+        return usable[..., 0].astype(np.float64)
+    two = np.partition(counted, 1, axis=-1)[..., :2]
+    best, second = two[..., 0], two[..., 1]
+    known = np.isfinite(second) & (second > 0)
+    ratio = 1 - np.where(known, best, 0) / np.where(known, second, 1)
+    return np.where(known, ratio, (np.isfinite(best) & ~np.isfinite(second)).astype(np.float64))
+
+
+def effective_number(probability: NDArray) -> NDArray:
+    """exp(entropy) of probabilities over the last axis: 1 = one prediction, K = all alike; 0 where all are 0."""
+    p = np.asarray(probability, np.float64)
+    entropy = -(p * np.log(np.where(p > 0, p, 1.0))).sum(-1)
+    return np.where(p.sum(-1) > 0, np.exp(entropy), 0.0)

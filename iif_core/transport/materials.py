@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..brdf import R_MIN
+from ..cells import COARSE, coarse_cells
 from ..errors import InputError
 from .arrays import rows_of, table
 from .cache import VoxelRows
@@ -50,7 +51,8 @@ class FaceMaterials:
 
 
 class CellMaterials:
-    """One material for each surface cell (voxel x object), the object's mean where no cell was observed.
+    """One material for each surface cell (voxel x object); the mean of the coarse cell around where the cell was not
+    observed, the object's mean where that is empty too.
 
     `ijk` (n, 3) from `cells.voxel_indices(points, edge, origin)`, `object_id` (n,), values (n, 5),
     object_values (n_objects, 5). Faces without an object (-1) and without a cell get the mean over all
@@ -74,12 +76,17 @@ class CellMaterials:
             raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
         self._cells = VoxelRows(edge, origin, ijk, object_id)
         self._objects = len(object_values)
-        # One table: cells, then objects, then the overall mean; a miss only changes which row is read.
-        self._rows = _Rows(np.concatenate([values, object_values, object_values.mean(axis=0, keepdims=True)]), "values")
-        self._first_object = len(ijk)
+        coarse_ijk, coarse_object, coarse = coarse_cells(ijk, object_id, values)
+        self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
+        self._first_coarse, self._first_object = len(ijk), len(ijk) + len(coarse)
+        # One table: cells, coarse cells, objects, the overall mean; a miss only changes which row is read.
+        parts = [values, coarse, object_values, object_values.mean(axis=0, keepdims=True)]
+        self._rows = _Rows(np.concatenate(parts), "values")
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
         found, row = self._cells.find(point, object_id, active)
+        near, around = self._coarse.find(point, object_id, active & ~found)
         known = (object_id >= 0) & (object_id < self._objects)
         fallback = self._first_object + dr.select(known, mi.UInt32(object_id), self._objects)
-        return self._rows.read(dr.select(found, row, fallback), active)
+        row = dr.select(found, row, dr.select(near, self._first_coarse + around, fallback))
+        return self._rows.read(row, active)

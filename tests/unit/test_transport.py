@@ -688,6 +688,11 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     table = cells.CellTable.build(keys)
     row = np.append(table.lookup(cells.pack_keys(ijk, objects[: len(ijk)])), [-1, -1, -1])
     fallback = np.where(objects[:, None] >= 0, means[objects], means.mean(0))
+    coarse_ijk, coarse_object, coarse = cells.coarse_cells(*cells.unpack_keys(keys), values)
+    around = cells.CellTable.build(cells.pack_keys(coarse_ijk, coarse_object))
+    near = np.append(around.lookup(cells.pack_keys(ijk >> cells.COARSE_SHIFT, objects[: len(ijk)])), [-1, -1, -1])
+    assert 0 < np.mean((row < 0) & (near >= 0)) < np.mean(row < 0)  # all three roads are taken
+    fallback = np.where(near[:, None] >= 0, coarse[near], fallback)
     expected = np.where(row[:, None] >= 0, values[row], fallback)
     expected[:, 3] = np.maximum(expected[:, 3], brdf.R_MIN)
     assert 0.2 < np.mean(row >= 0) < 0.8

@@ -111,6 +111,8 @@ def test_every_stage_has_a_manifest_that_chains(finished):
     import hashlib
 
     for stage in STAGES.values():
+        if stage.on_demand:
+            continue
         path = finished.folder / f"results/tiny/{stage.name}/manifest.json"
         document = json.loads(path.read_text())
         assert set(document["inputs"]) == set(stage.upstream)

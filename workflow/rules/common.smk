@@ -33,6 +33,11 @@ wildcard_constraints:
     scene=r"[A-Za-z0-9][A-Za-z0-9_-]*",
 
 
+def manifest(stage, scene):
+    """Manifest of a stage; variants of a study share what they have in common."""
+    return f"results/{fingerprints.home(stage, scene, QUALITY)}/{stage}/manifest.json"
+
+
 def upstream(stage):
     """Manifests of the stages that `stage` reads. Checks the scene first, so that bad input stops before any job."""
 
@@ -42,7 +47,7 @@ def upstream(stage):
         except InputError as error:
             stop(error)
         return [
-            f"results/{wildcards.scene}/{name}/manifest.json"
+            manifest(name, wildcards.scene)
             for name in fingerprints.STAGES[stage].upstream
         ]
 

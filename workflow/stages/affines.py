@@ -10,7 +10,7 @@ import numpy as np
 from iif_core import plan
 from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
 from iif_core.response import Response, response
-from workflow.artifacts.store import StageReader, ids_from_disk, rgb, split_rgb
+from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.base_scene import (
     MATERIAL,
     BaseScene,
@@ -226,7 +226,7 @@ def _write_response(job: Job, curve: Response) -> None:
 def _write_cells(job: Job, fit: FitResult) -> None:
     cells = job.read("base").table("cells.parquet")
     base = np.stack([cells[name] for name in MATERIAL], 1)
-    scale = np.stack([cells[f"scale_albedo_{c}"] for c in "rgb"], 1)
+    scale = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
     spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, scale)
@@ -243,7 +243,7 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
         file = f"maps/{view.name}.exr"
         object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)
         values = base_maps(job, view)
-        scale = _base_scale(base, file)
+        scale = base.exr(file)["uncertainty.albedo"].ravel().astype(np.float32)
         fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
         spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(scale[:, None], 3, 1))
         seen = object_id >= 0
@@ -257,13 +257,6 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
         }
         job.writer.exr(file, channels)
         job.progress(done + 1, len(capture.views), "views written")
-
-
-def _base_scale(base: StageReader, file: str) -> np.ndarray:
-    channels = base.exr(file)
-    if "scale.albedo" in channels:
-        return channels["scale.albedo"].ravel().astype(np.float32)
-    return rgb(channels, "scale.albedo").mean(-1).ravel()
 
 
 # --------------------------------------------------------------------------------------------------------------- plan

@@ -7,17 +7,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.base.direct import BaseOptions, solve_base
-from iif_core.base.gauge import covisible_parts
-from iif_core.base.problem import CHANNELS, BaseProblem, BaseResult
-from iif_core.cells import INDEX_LIMIT, grid_origin, pack_keys, unpack_keys, voxel_indices
+from iif_core.base.direct import BaseOptions, describe_fit, solve_base
+from iif_core.base.problem import CHANNELS, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, one_segment_per_view
+from iif_core.base.sgd import sgd_options, solve_base_sgd
+from iif_core.cells import (
+    COARSE_SHIFT,
+    INDEX_LIMIT,
+    coarse_cells,
+    grid_origin,
+    neighbour_pairs,
+    pack_keys,
+    unpack_keys,
+    voxel_indices,
+)
+from iif_core.emitters import face_geometry
 from iif_core.errors import InputError
+from iif_core.hashgrid import HashGridOptions
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
-BORDER_WEIGHT = 0.1
-"""Pixels next to another object: predictions bleed across borders, but thin objects have nothing else."""
+FOOTPRINT_WEIGHTS = (0.05, 4.0)
+"""Smallest and largest weight by footprint."""
 MEMORY = 1 << 30
 """Bytes of predictions that are kept in memory; more are read again every sweep."""
 
@@ -33,61 +44,97 @@ class Cells:
 
 
 def run(job: Job) -> None:
-    """Write cells, object means, selection, maps of every view and base.json."""
+    """Write cells, object means, segments, selection, maps of every view and base.json."""
     capture = CaptureReader(job.read("capture"))
     prior, segmentation = job.read("prior"), job.read("segmentation")
+    settings = job.settings.base
     views = [view for view in capture if view.split != "test" and prior.has(f"maps/{view.name}.exr")]
     surface = _Surface(capture, segmentation)
     cells, cell_maps = _cells(job, capture, surface, views)
-    weights, segment_maps = _pixels(capture, segmentation, views)
-    objects = unpack_keys(cells.keys)[1]
+    weights, segment_maps = _pixels(job, capture, segmentation, views)
+    segments = segmentation.table("segments.parquet")
     n_objects = int(segmentation.table("objects.parquet")["object_id"].max(initial=-1)) + 1
     samples = int(prior.table("predictions.parquet")["k"].max(initial=0)) + 1
-    segments = segmentation.table("segments.parquet")
-    settings = job.settings.base
+    used = 1 if settings.variant == "raw" else min(samples, settings.predictions or samples)
     problem = BaseProblem(
-        _predictions(prior, views, samples),
+        lambda position: _read_predictions(prior, views[position], used),
         cell_maps,
         segment_maps,
         len(cells.keys),
-        objects,
+        unpack_keys(cells.keys)[1],
         segments["object_id"].astype(np.int32),
         weights,
+        point=_points(capture, views),
+        neighbours=neighbour_pairs(cells.keys) if settings.seams else None,
     )
-    options = BaseOptions(settings.variant, settings.sweeps, anneal=settings.anneal, ridge=settings.ridge)
-    result = solve_base(problem, options, lambda done, total: job.progress(done, total, "passes over the views"), job.threads)
+    if settings.variant == "image_affine":
+        problem = one_segment_per_view(problem)
+    with job.timed("solve"):
+        result = _solve(job, problem)
     for dropped in result.dropped:
         if dropped.k < 0:
             job.log.warning("view %s: %s", views[dropped.view].name, dropped.reason)
-    _write_tables(job, cells, objects, n_objects, result, segments["segment_id"])
+    _write_tables(job, cells, n_objects, result, segments, problem)
     for done, view in enumerate(capture.views):
-        job.writer.exr(f"maps/{view.name}.exr", _maps(surface, cells, result, view))
+        maps = _maps(surface, cells, result, view)
+        if settings.variant == "raw" and view in views:
+            maps |= _raw_maps(prior, view, samples, ids_from_disk(maps["cell.id"]) >= 0)
+        job.writer.exr(f"maps/{view.name}.exr", maps)
         job.progress(done + 1, len(capture.views), "maps")
-    seen = np.unique(np.concatenate([np.unique(m[m >= 0]) for m in segment_maps]))
-    parts = covisible_parts(problem)
-    split = _parts_of_objects(problem.object_of_segment[seen], parts[seen])
+    seen = np.unique(np.concatenate([np.unique(m[m >= 0]) for m in problem.segment_of_pixel]))
+    last = result.history[-1]
     job.writer.json(
         "base.json",
         {
             "cell_edge_m": cells.edge,
             "origin": [float(x) for x in cells.origin],
             "cells": len(cells.keys),
+            "predictions": used,
             "solver": settings.solver,
             "variant": settings.variant,
             "sweeps": len(result.history),
-            "history": [{name: round(value, 8) for name, value in entry.items()} for entry in result.history],
-            "objects_in_separate_parts": split,
+            "history": [{name: round(float(value), 8) for name, value in entry.items()} for entry in result.history],
+            "objects_in_separate_parts": _parts_of_objects(unpack_keys(cells.keys)[1], result.part_of_cell),
+            "unseen_share": float((result.coverage == 0).mean()),
+            "seen_once_share": float((result.views == 1).mean()),
         },
     )
-    last = result.history[-1]
     job.log.info(
-        "%d cells of %.1f mm, %d segments; last sweep: albedo error %.5f, mean gain %.2f",
+        "%d cells of %.1f mm (%.0f %% seen in one view), %d segments; %s",
         len(cells.keys),
         1e3 * cells.edge,
+        100 * (result.views == 1).mean(),
         len(seen),
-        last["error_albedo"],
-        last["gain"],
+        ", ".join(f"{name} {value:.4g}" for name, value in last.items()),
     )
+
+
+def _solve(job: Job, problem: BaseProblem) -> BaseResult:
+    settings = job.settings.base
+
+    def progress(done: int, total: int) -> None:
+        job.progress(done, total, "passes over the views" if settings.solver == "direct" else "steps")
+
+    if settings.solver == "sgd":
+        grid = HashGridOptions(levels=settings.hash_levels, log2_entries=settings.hash_entries)
+        chosen = sgd_options(settings.preset, texture=settings.texture, iterations=settings.iterations, grid=grid, seed=job.seed)
+        fit = solve_base_sgd(problem, chosen, progress, job.threads)
+        return describe_fit(problem, fit.value, fit.scale, fit.corrections, fit.alpha, fit.history, job.threads, MEMORY)
+    variant = {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant)
+    options = BaseOptions(
+        variant,
+        settings.sweeps,
+        max(settings.temperature, settings.final_temperature),
+        settings.anneal,
+        settings.ridge,
+        final_temperature=settings.final_temperature,
+        robust=settings.robust,
+        objective=settings.objective,
+        polish=settings.polish,
+        seams=settings.seams,
+        memory=MEMORY,
+    )
+    return solve_base(problem, options, progress, job.threads)
 
 
 class _Surface:
@@ -151,27 +198,41 @@ def _cells(job: Job, capture: CaptureReader, surface: _Surface, views: list[View
     return Cells(edge, origin, keys, (summed / total[:, None]).astype(np.float32)), maps
 
 
-def _pixels(capture: CaptureReader, segmentation: StageReader, views: list[View]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _pixels(
+    job: Job, capture: CaptureReader, segmentation: StageReader, views: list[View]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weight and segment of every pixel of each view, flattened; pixels that the photograph does not show weigh 0."""
+    settings = job.settings.base
     weights, segments = [], []
-    for view in views:
+    footprints = _footprints(capture, views) if settings.footprint_power > 0 else None
+    for position, view in enumerate(views):
         channels = segmentation.exr(f"maps/{view.name}.exr")
         _, valid = capture.photo(view)
-        weight = np.where(channels["interior"] > 0.5, 1.0, BORDER_WEIGHT) * valid
+        weight = np.where(channels["interior"] > 0.5, 1.0, settings.border_weight) * valid
+        if footprints is not None:
+            weight *= np.clip(footprints[position] ** -settings.footprint_power, *FOOTPRINT_WEIGHTS)
         weights.append(weight.astype(np.float32).ravel())
         segments.append(ids_from_disk(channels["segment.id"]).ravel())
     return weights, segments
 
 
-def _predictions(prior: StageReader, views: list[View], samples: int) -> Callable[[int], np.ndarray]:
-    """view -> (K, H, W, 5) float16, NaN for predictions that were dropped; kept in memory as far as `MEMORY` goes."""
-    kept: dict[int, np.ndarray] = {}
-    budget = MEMORY
-    for position, view in enumerate(views):
-        budget -= samples * view.height * view.width * 10
-        if budget >= 0:
-            kept[position] = _read_predictions(prior, view, samples)
-    return lambda position: kept[position] if position in kept else _read_predictions(prior, views[position], samples)
+def _footprints(capture: CaptureReader, views: list[View]) -> list[np.ndarray]:
+    """(H, W) size of each pixel on the surface over the median: depth / focal length / sqrt(cosine at the surface)."""
+    vertices, faces = capture.mesh()
+    normals, _ = face_geometry(vertices, faces)
+    sizes = []
+    for view in views:
+        depth, face_id = capture.gbuffer(view)
+        direction = capture.directions(view)
+        cosine = np.abs(np.einsum("hwi,hwi->hw", direction, normals[face_id])) / np.linalg.norm(direction, axis=-1)
+        sizes.append(np.where(depth > 0, depth, np.nan) / view.fx / np.sqrt(np.maximum(cosine, 1e-3)))
+    median = np.nanmedian(np.concatenate([size.ravel() for size in sizes]))
+    return [np.nan_to_num(size / median, nan=1.0) for size in sizes]
+
+
+def _points(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
+    """view -> (H * W, 3) float32 surface points."""
+    return lambda position: capture.points(views[position], capture.gbuffer(views[position])[0]).reshape(-1, 3)
 
 
 def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarray:
@@ -185,71 +246,119 @@ def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarra
     return out
 
 
+def _raw_maps(prior: StageReader, view: View, samples: int, surface: np.ndarray) -> dict[str, np.ndarray]:
+    """The first usable prediction of a view as it is, where there is surface."""
+    maps = _read_predictions(prior, view, samples)
+    good = np.isfinite(maps).mean((1, 2, 3)) > 0.99
+    first = np.where(surface[..., None], maps[int(np.argmax(good))], 0).astype(np.float32)
+    return {**split_rgb(first[..., :3], "albedo"), "roughness": first[..., 3], "metallic": first[..., 4]}
+
+
 def _write_tables(
-    job: Job, cells: Cells, objects: np.ndarray, n_objects: int, result: BaseResult, segment_id: np.ndarray
+    job: Job,
+    cells: Cells,
+    n_objects: int,
+    result: BaseResult,
+    segments: dict[str, np.ndarray],
+    problem: BaseProblem,
 ) -> None:
-    ijk, _ = unpack_keys(cells.keys)
+    ijk, objects = unpack_keys(cells.keys)
     job.writer.table(
         "cells.parquet",
         {
             "cell_id": np.arange(len(cells.keys), dtype=np.int32),
             **{name: ijk[:, a] for a, name in enumerate("ijk")},
             "object_id": objects,
+            "part_id": result.part_of_cell,
             **{name: cells.centre[:, a] for a, name in enumerate("xyz")},
             "observations": result.observations,
             "views": result.views,
+            "coverage": result.coverage,
             **{name: result.value[:, c] for c, name in enumerate(CHANNELS)},
             **{f"scale_{name}": result.scale[:, c] for c, name in enumerate(CHANNELS)},
+            **{f"uncertainty_{name}": result.uncertainty[:, c] for c, name in enumerate(CHANNELS)},
         },
-        dict.fromkeys("xyz", "m"),
+        {**dict.fromkeys("xyz", "m"), "coverage": "weighted pixels"},
     )
     known = min(n_objects, len(result.object_value))
-    means = np.tile(np.float32([0.5, 0.5, 0.5, 0.9, 0.0]), (n_objects, 1))
+    means = np.tile(NEUTRAL, (n_objects, 1))
     counted = np.zeros(n_objects, np.int32)
     means[:known], counted[:known] = result.object_value[:known], result.object_cells[:known]
     columns = {name: means[:, c] for c, name in enumerate(CHANNELS)}
     job.writer.table("objects.parquet", {"object_id": np.arange(n_objects, dtype=np.int32), "cells": counted, **columns})
     n, k = result.weight.shape[:2]
+    ids = segments["segment_id"].astype(np.int32) if n == len(segments["segment_id"]) else np.arange(n, dtype=np.int32)
+    best = result.weight.argmax(1).astype(np.int32)
+    job.writer.table(
+        "segments.parquet",
+        {
+            "segment_id": ids,
+            "object_id": np.asarray(problem.object_of_segment, np.int32),
+            **{f"best_{name}": best[:, p] for p, name in enumerate(PROPERTIES)},
+            **{f"margin_{name}": result.margin[:, p] for p, name in enumerate(PROPERTIES)},
+            **{f"effective_{name}": result.effective[:, p] for p, name in enumerate(PROPERTIES)},
+        },
+    )
     job.writer.table(
         "selection.parquet",
         {
-            "segment_id": np.repeat(segment_id.astype(np.int32), k),
+            "segment_id": np.repeat(ids, k),
             "k": np.tile(np.arange(k, dtype=np.int32), n),
-            **{f"weight_{name}": result.weight[..., p].ravel() for p, name in enumerate(("albedo", "roughness", "metallic"))},
+            **{f"weight_{name}": result.weight[..., p].ravel() for p, name in enumerate(PROPERTIES)},
+            **{f"probability_{name}": result.probability[..., p].ravel() for p, name in enumerate(PROPERTIES)},
             "affine_albedo": result.affine_albedo.reshape(n * k, 12),
             "affine_roughness": result.affine_roughness.reshape(n * k, 2),
             "affine_metallic": result.affine_metallic.reshape(n * k, 2),
-            **{f"error_{name}": result.error[..., p].ravel() for p, name in enumerate(("albedo", "roughness", "metallic"))},
+            **{f"error_{name}": result.error[..., p].ravel() for p, name in enumerate(PROPERTIES)},
         },
     )
 
 
 def _maps(surface: _Surface, cells: Cells, result: BaseResult, view: View) -> dict[str, np.ndarray]:
-    """Channels of one view; surface in no cell (test views) has its object's mean, pixels without surface are 0."""
+    """Channels of one view; surface in no cell (test views) has the mean of the cells around or else of its object,
+    pixels without surface are 0."""
     index, points, objects = surface(view)
-    keys = pack_keys(voxel_indices(points, cells.edge, cells.origin), objects)
-    row = np.minimum(np.searchsorted(cells.keys, keys), len(cells.keys) - 1)
-    known = cells.keys[row] == keys
+    ijk = voxel_indices(points, cells.edge, cells.origin)
+    row, known = _rows_of(cells.keys, pack_keys(ijk, objects))
+    every = np.concatenate([result.value, result.scale, result.uncertainty], 1)
+    unsure = np.quantile(every[:, 5:], 0.9, axis=0)  # of surface that no prediction shows
+    values = np.concatenate([result.object_value[objects], np.broadcast_to(unsure, (len(index), 10))], 1)
+    if not known.all():
+        coarse_ijk, coarse_object, coarse = coarse_cells(*unpack_keys(cells.keys), every)
+        keys = pack_keys(coarse_ijk, coarse_object)
+        near, around = _rows_of(keys, pack_keys(ijk >> COARSE_SHIFT, objects))
+        values[around] = coarse[near[around]]
+    values[known] = every[row[known]]
     size = view.height * view.width
-    cell, value, scale = np.full(size, -1, np.int32), np.zeros((size, 5), np.float32), np.zeros((size, 5), np.float32)
+    cell, covered = np.full(size, -1, np.int32), np.zeros(size, np.float32)
     cell[index] = np.where(known, row, -1)
-    value[index] = np.where(known[:, None], result.value[row], result.object_value[objects])
-    unsure = np.quantile(result.scale, 0.9, axis=0)
-    scale[index] = np.where(known[:, None], result.scale[row], unsure)
+    covered[index] = np.where(known, result.coverage[row], 0)
+    full = np.zeros((size, 15), np.float32)
+    full[index] = values
     shape = (view.height, view.width)
-    return {
+    full = full.reshape(*shape, 15)
+    out = {
         "cell.id": ids_to_disk(cell.reshape(shape)),
-        **split_rgb(value[:, :3].reshape(*shape, 3), "albedo"),
-        "roughness": value[:, 3].reshape(shape),
-        "metallic": value[:, 4].reshape(shape),
-        "scale.albedo": scale[:, :3].mean(1).reshape(shape),
-        "scale.roughness": scale[:, 3].reshape(shape),
-        "scale.metallic": scale[:, 4].reshape(shape),
+        **split_rgb(full[..., :3], "albedo"),
+        "roughness": full[..., 3],
+        "metallic": full[..., 4],
+        "coverage": covered.reshape(shape),
     }
+    for name, first in (("scale", 5), ("uncertainty", 10)):
+        out[f"{name}.albedo"] = full[..., first : first + 3].mean(-1)
+        out[f"{name}.roughness"], out[f"{name}.metallic"] = full[..., first + 3], full[..., first + 4]
+    return out
+
+
+def _rows_of(keys: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row of each wanted key in the sorted `keys` (any row where it is missing), and whether it is there."""
+    row = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return row, keys[row] == wanted
 
 
 def _parts_of_objects(objects: np.ndarray, parts: np.ndarray) -> dict[str, int]:
-    """object id -> number of parts that share no cell, for objects with more than one (their tone may differ)."""
-    pairs = np.unique(np.stack([objects, parts]), axis=1)
+    """object id -> number of parts that share no cell, for objects with more than one (their levels are tied by seams)."""
+    seen = parts >= 0
+    pairs = np.unique(np.stack([objects[seen], parts[seen]]), axis=1)
     ids, count = np.unique(pairs[0], return_counts=True)
     return {str(i): int(n) for i, n in zip(ids.tolist(), count.tolist(), strict=True) if n > 1}

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,16 @@ from iif_core import metrics
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
+from workflow.scores import (
+    MATERIALS,
+    UNITS,
+    ScoreRows,
+    material_maps,
+    material_truth,
+    perceptual_networks,
+    prediction_numbers,
+)
 
-MATERIALS = ("albedo", "roughness", "metallic")
 BASELINES = {
     "prior_k0": "the first prediction of each view, as the prior gave it",
     "prior_mean_k": "mean score of all predictions of each view (not the score of their mean)",
@@ -26,42 +33,16 @@ BASELINES = {
 }
 
 
-@dataclass
-class _Rows:
-    """Columns of a metrics table, in order of arrival."""
-
-    columns: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
-    missing: list[dict[str, str]] = field(default_factory=list)
-
-    def add(self, variant: str, view: str, quantity: str, scores: list[metrics.Score]) -> None:
-        for score in scores:
-            facts = {"variant": variant, "view": view, "quantity": quantity, "metric": score.metric}
-            facts["protocol"] = score.protocol
-            if score.value is None:
-                self.missing.append({**facts, "reason": score.reason})
-                continue
-            for name, value in facts.items():
-                self.columns[name].append(value)
-            self.columns["value"].append(score.value)
-
-    def table(self, scene: str, variants: set[str] | None = None) -> dict[str, Any]:
-        chosen = [i for i, v in enumerate(self.columns["variant"]) if variants is None or v in variants]
-        names = ["view", "quantity", "metric", "protocol"] + ([] if variants else ["variant"])
-        out: dict[str, Any] = {"scene": np.array([scene] * len(chosen), object)}
-        out |= {name: np.array([self.columns[name][i] for i in chosen], object) for name in names}
-        out["value"] = np.array([self.columns["value"][i] for i in chosen], np.float64)
-        return out
-
-
 def run(job: Job) -> None:
     """Score every view; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
     capture = CaptureReader(job.read("capture"))
-    rows = _Rows()
+    rows = ScoreRows()
+    networks = perceptual_networks()
     means = _PredictionMeans(job, capture) if capture.has_truth else None
     exposures = capture.exposures()
 
     def scores_of(index: int) -> list[tuple[str, str, str, list[metrics.Score]]]:
-        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means))
+        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means, networks))
 
     with ThreadPoolExecutor(job.threads) as pool:
         # map keeps the order of the views, so the tables do not depend on the number of threads
@@ -69,14 +50,18 @@ def run(job: Job) -> None:
             for entry in scored:
                 rows.add(*entry)
             job.progress(done + 1, len(capture.views), "views scored")
-    units = {"value": "l2: squared; psnr: dB"}
-    job.writer.table("metrics.parquet", rows.table(job.scene, {"result"}), units)
-    job.writer.table("variants.parquet", rows.table(job.scene), units)
+    job.writer.table("metrics.parquet", rows.table(job.scene, {"result"}), UNITS)
+    job.writer.table("variants.parquet", rows.table(job.scene), UNITS)
     job.writer.json("summary.json", _summary(rows, capture))
 
 
 def _view_scores(
-    job: Job, capture: CaptureReader, view: View, exposure: float, means: _PredictionMeans | None
+    job: Job,
+    capture: CaptureReader,
+    view: View,
+    exposure: float,
+    means: _PredictionMeans | None,
+    networks: dict[str, dict[str, np.ndarray]],
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
     """(variant, view, quantity, scores) of one view."""
     photo, valid = capture.photo(view)
@@ -89,33 +74,29 @@ def _view_scores(
         "result",
         view.name,
         "rgb",
-        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr),
+        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr, networks=networks),
     )
     if capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), photo, valid & hit)
     if means is None:
         return
-    truth = capture.truth(view)
+    materials = material_truth(capture, job.read("segmentation"), view)
+    truth = materials.truth
     if not capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), truth.radiance, valid & hit)
-    masks = metrics.material_masks(truth.valid, hit, truth.emission, truth.roughness)
     yield (
         "result",
         view.name,
         "emission",
-        metrics.score_map("emission", rgb(rendered, "emission"), truth.emission, masks["emission"]),
+        metrics.score_map("emission", rgb(rendered, "emission"), truth.emission, materials.masks["emission"]),
     )
-    targets = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
-    object_id = ids_from_disk(job.read("segmentation").exr(file)["object.id"])
-
-    def scores(maps: dict[str, np.ndarray], quantity: str) -> list[metrics.Score]:
-        return metrics.score_map(quantity, maps[quantity], targets[quantity], masks[quantity], object_id)
-
+    # The learned metrics take longer than the others, so only what is looked at has them: base, result, first prediction.
+    learned = partial(materials.scores, networks=networks)
     for variant, stage in (("base", "base"), ("result", "affines")):
         if job.read(stage).has(file):
             maps = material_maps(job.read(stage).exr(file))
             for quantity in MATERIALS:
-                yield variant, view.name, quantity, scores(maps, quantity)
+                yield variant, view.name, quantity, learned(maps, quantity)
     if not job.read("prior").has(file):
         return
     channels = job.read("prior").exr(file)
@@ -123,14 +104,16 @@ def _view_scores(
     for k in prediction_numbers(channels):
         maps = material_maps(channels, f"prior.{k:03d}.")
         for quantity in MATERIALS:
-            each[quantity].append(scores(maps, quantity))
+            each[quantity].append(materials.scores(maps, quantity))
+            if len(each[quantity]) == 1:
+                yield "prior_k0", view.name, quantity, each[quantity][0]
+                yield "prior_k0", view.name, quantity, learned(maps, quantity, only=metrics.LPIPS_NETWORKS)
     for quantity, lists in each.items():
         if lists:
-            yield "prior_k0", view.name, quantity, lists[0]
             yield "prior_mean_k", view.name, quantity, _mean_scores(lists)
-    for variant, maps in means.maps(view, object_id):
+    for variant, maps in means.maps(view, materials.object_id):
         for quantity in MATERIALS:
-            yield variant, view.name, quantity, scores(maps, quantity)
+            yield variant, view.name, quantity, materials.scores(maps, quantity)
 
 
 def _log_scores(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[metrics.Score]:
@@ -148,20 +131,6 @@ def _mean_scores(lists: list[list[metrics.Score]]) -> list[metrics.Score]:
         value = float(np.mean(numbers)) if numbers else None
         out.append(metrics.Score(first.metric, first.protocol, value, first.reason))
     return out
-
-
-def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
-    """Numbers k of the predictions in the channels of one view."""
-    return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
-
-
-def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
-    """albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
-    return {
-        "albedo": rgb(channels, f"{prefix}albedo"),
-        "roughness": channels[f"{prefix}roughness"].astype(np.float32),
-        "metallic": channels[f"{prefix}metallic"].astype(np.float32),
-    }
 
 
 class _PredictionMeans:
@@ -209,16 +178,9 @@ def _stack(maps: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([maps["albedo"], maps["roughness"][..., None], maps["metallic"][..., None]], -1)
 
 
-def _summary(rows: _Rows, capture: CaptureReader) -> dict[str, Any]:
+def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
     """Means over the views per variant, and how far the result is ahead of the raw predictions."""
-    columns = rows.columns
-    sums: dict[tuple[str, ...], list[float]] = defaultdict(list)
-    for i, value in enumerate(columns["value"]):
-        sums[tuple(columns[c][i] for c in ("variant", "quantity", "protocol", "metric"))].append(value)
-    means: dict[str, Any] = {}
-    for (variant, quantity, protocol, metric), values in sorted(sums.items()):
-        entry = {"mean": round(float(np.mean(values)), 6), "views": len(values)}
-        means.setdefault(variant, {}).setdefault(quantity, {}).setdefault(protocol, {})[metric] = entry
+    means = rows.means()
 
     def gain(quantity: str, protocol: str) -> dict[str, float] | None:
         pair = [means.get(v, {}).get(quantity, {}).get(protocol) for v in ("prior_mean_k", "result")]

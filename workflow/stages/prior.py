@@ -22,10 +22,11 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
     views = [view for view in capture if view.split != "test"]
+    seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
     rows: list[tuple[int, int, bool, str]] = []
     for done, view in enumerate(views):
         job.progress(done, len(views), "views predicted")
-        maps = prior.predict(view, job.settings, capture, job.seed)
+        maps = prior.predict(view, job.settings, capture, seed)
         expected = (job.settings.prior.samples, view.height, view.width, 5)
         if maps.shape != expected:
             raise InputError(f"view {view.name}: the prior made {maps.shape}, needed {expected}; please report it")

@@ -1,0 +1,112 @@
+"""The usable pixels of a view in segment order: what the compiled loops of the direct solver read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import kernels
+from .problem import BaseProblem, Dropped, check_ids, prediction_faults
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class Block:
+    """Pixels of one view that have a cell, a segment, weight and finite predictions.
+
+    Attributes:
+        values: (K, 5, n) words (kernels.as_words), clamped to [0, 1]; predictions that cannot be used are 0.
+        cell: (n,) int32; weight: (n,) float32.
+        segments: (S,) int32 ids, ascending; start: (S + 1,) int64, pixels of segment s are start[s] ... start[s + 1] - 1.
+        usable: (K,) bool.
+        inside: (K, n) bool, no albedo channel is exactly 0 or 1; (0, 0) when that holds for all.
+    """
+
+    values: NDArray
+    cell: NDArray
+    weight: NDArray
+    segments: NDArray
+    start: NDArray
+    usable: NDArray
+    inside: NDArray
+
+    @property
+    def nbytes(self) -> int:
+        return sum(getattr(self, name).nbytes for name in ("values", "cell", "weight", "segments", "start", "inside"))
+
+
+def make_block(problem: BaseProblem, view: int) -> tuple[Block, list[Dropped]]:
+    """The block of a view, and what of its predictions was left out and why.
+
+    Raises:
+        InputError: an id beyond its table.
+    """
+    maps = problem.view(view)
+    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
+    check_ids(problem, view)
+    weight = np.ones(len(cell), np.float32) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float32)
+    words = kernels.as_words(maps)
+    good = kernels.finite_pixels(words)
+    faults = prediction_faults(maps, good)
+    dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
+    usable = np.array([not fault for fault in faults])
+    finite = good[usable].all(0)
+    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
+    lost = int((keep & ~finite).sum())
+    if lost and usable.any():
+        dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
+    keep = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
+    keep = keep[np.argsort(segment[keep], kind="stable")]
+    values, inside = kernels.gather(words, keep, usable)
+    segments, start = np.unique(segment[keep], return_index=True)
+    start = np.append(start, len(keep)).astype(np.int64)
+    return (
+        Block(
+            values,
+            cell[keep].astype(np.int32),
+            weight[keep],
+            segments.astype(np.int32),
+            start,
+            usable,
+            np.zeros((0, 0), bool) if inside.all() else inside,
+        ),
+        dropped,
+    )
+
+
+class Blocks:
+    """Blocks of all views; kept in memory as far as `memory` bytes go, made again each time beyond."""
+
+    def __init__(self, problem: BaseProblem, memory: int):
+        self.problem, self._left, self._kept = problem, memory, {}
+
+    def __call__(self, view: int) -> Block:
+        return self.first(view)[0]
+
+    def first(self, view: int) -> tuple[Block, list[Dropped]]:
+        """Block and what was left out."""
+        if view in self._kept:
+            return self._kept[view], []
+        return make_block(self.problem, view)
+
+    def keep(self, view: int, block: Block) -> None:
+        """Remember a block if there is room (call in the order of the views, so that the same ones are kept each time)."""
+        if block.nbytes <= self._left:
+            self._left -= block.nbytes
+            self._kept[view] = block
+
+
+def in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T]:
+    """work(0), work(1), ... in this order, `threads` of them under way at a time."""
+    if threads <= 1:
+        yield from map(work, range(n))
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, n, threads):  # in rounds, so that no more results wait than there are threads
+            yield from pool.map(work, range(first, min(first + threads, n)))

@@ -1,0 +1,575 @@
+"""The paper's optimiser: gradients against automatic differentiation, what it finds, its edge cases."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
+
+from iif_core.base import sgd, sgd_kernels
+from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.kernels import as_words
+from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem
+from iif_core.base.reference_loss import loss_of_result, reference_loss
+from iif_core.base.sgd import SgdOptions, converged, sgd_options, solve_base_sgd
+from iif_core.errors import InputError
+from iif_core.hashgrid import HashGridOptions
+
+torch = pytest.importorskip("torch")
+TERMS = ("data", "label", "regulariser", "entropy", "gain")
+QUICK = sgd_options(iterations=300, batch=4096)
+SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growth=1.6, hidden=16)
+
+
+# ----------------------------------------------------------------------------------------------------------- gradients
+
+
+def state(k, seed=0, n=150, segments=4, spread=0.15, low=0.0):
+    """Parameters and a batch sorted by segment, float64."""
+    rng = np.random.default_rng(seed)
+    affine = np.tile(sgd._IDENTITY.astype(np.float64), (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
+    usable = np.ones((segments, k), bool)
+    if k > 2:
+        usable[1, 0] = usable[1, 2] = False
+    return {
+        "values": rng.uniform(low, 1 - low, (n, k, 5)),
+        "raw": 1.5 * rng.standard_normal((n, 10)),
+        "affine": affine,
+        "z": rng.standard_normal((segments, k, 3)),
+        "segment": np.sort(rng.integers(0, segments, n)),
+        "usable": usable,
+        "share": rng.dirichlet(np.ones(n)),
+    }
+
+
+def compiled(p, options, temperature=0.3, divisor=0.7, real=np.float64):
+    """Terms of the loss and gradients from the closed forms."""
+    alpha, log_alpha = softmax(p["z"] / divisor, p["usable"])
+    start, segment = sgd._runs(p["segment"])
+    d_affine, d_alpha, votes = (np.zeros((*p["usable"].shape, m), real) for m in (16, 3, 3))
+    d_raw, error, sums = np.empty(p["raw"].shape, real), np.zeros(alpha.shape), np.zeros((len(segment), 5))
+    numbers = np.array([temperature, options.scale_floor, options.data_weight, options.regulariser], real)
+    flags = np.array([options.scale_floor_kind == "smooth", options.median_gradient, options.clamp_gradient == "inward"])
+    sgd_kernels.batch_loss(
+        *(0, len(segment), start, segment, p["values"].astype(real), np.arange(len(p["raw"]), dtype=np.int32)),
+        *(a.astype(real) for a in (p["share"], p["raw"], p["affine"], alpha, log_alpha)),
+        *(p["usable"], *sgd_kernels.selection_networks(alpha.shape[1]), numbers, flags),
+        *(d_raw, d_affine, d_alpha, votes, error, sums),
+    )
+    d_z = sgd._logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
+    return dict(zip(TERMS, sums.sum(0), strict=True)), {"raw": d_raw, "affine": d_affine, "z": d_z}, error
+
+
+def softmax(y, usable):
+    y = np.where(usable[..., None], y, -np.inf)
+    power = np.exp(y - y.max(1, keepdims=True))
+    alpha = power / power.sum(1, keepdims=True)
+    with np.errstate(divide="ignore"):
+        return alpha, np.where(alpha > 0, np.log(alpha), 0)
+
+
+def automatic(p, options, temperature=0.3, divisor=0.7):
+    """The same left to torch."""
+    t = {name: torch.from_numpy(a) for name, a in p.items()}
+    wanted = [t[name].requires_grad_() for name in ("raw", "affine", "z")]
+    found = sgd.torch_losses(
+        *(t[name] for name in ("raw", "values", "affine", "z", "segment", "usable", "share")), temperature, divisor, options
+    )
+    o = options
+    loss = o.data_weight * found["data"] + o.label_weight * found["label"] + o.regulariser * found["regulariser"]
+    slopes = dict(zip(("raw", "affine", "z"), (g.numpy() for g in torch.autograd.grad(loss, wanted)), strict=True))
+    return {name: float(found[name].detach()) for name in TERMS}, slopes, found["error"].numpy()
+
+
+@pytest.mark.parametrize("k", [1, 2, 5, 16])
+@pytest.mark.parametrize(
+    "options",
+    [
+        sgd_options(),
+        sgd_options("paper"),
+        sgd_options(median_gradient=True, data_weight=0.0),
+        sgd_options("paper", median_gradient=False, label_weight=3.0, regulariser=0.0),
+        sgd_options("paper", clamp_gradient="inward", scale_floor=0.2),
+    ],
+)
+def test_closed_form_gradients_equal_automatic_ones(k, options):
+    p = state(k)
+    terms, slopes, error = compiled(p, options)
+    expected, expected_slopes, each = automatic(p, options)
+    assert terms == pytest.approx(expected, rel=1e-12)
+    for name, slope in slopes.items():
+        np.testing.assert_allclose(slope, expected_slopes[name], rtol=1e-9, atol=1e-13, err_msg=name)
+    by_segment = np.zeros_like(error)
+    np.add.at(by_segment, p["segment"], p["share"][:, None, None] * each)
+    np.testing.assert_allclose(error, by_segment, rtol=1e-10, atol=1e-15)
+
+
+@pytest.mark.parametrize("options", [sgd_options("paper"), sgd_options("paper", scale_floor_kind="smooth", data_weight=2.0)])
+@pytest.mark.parametrize("name", ["raw", "affine", "z"])
+def test_gradients_equal_finite_differences(options, name):
+    """All but q, which is a constant: the label loss is compared in z alone, on which q does not depend."""
+    options = replace(options, label_weight=1.0 if name == "z" else 0.0)
+    p = state(5, low=0.3, spread=0.03)
+    _, slopes, _ = compiled(p, options)
+
+    def loss(x):
+        terms, _, _ = compiled({**p, name: x}, options)
+        parts = options.data_weight * terms["data"] + options.regulariser * terms["regulariser"]
+        return parts + options.label_weight * terms["label"]
+
+    rng, h = np.random.default_rng(1), 1e-6
+    for _ in range(12):
+        at = tuple(rng.integers(0, n) for n in p[name].shape)
+        step = np.zeros_like(p[name])
+        step[at] = h
+        numeric = (loss(p[name] + step) - loss(p[name] - step)) / (2 * h)
+        assert slopes[name][at] == pytest.approx(numeric, rel=2e-5, abs=2e-9)
+
+
+def test_label_loss_trains_the_logits_alone():
+    p = state(5)
+    options = sgd_options(data_weight=0.0, regulariser=0.0)
+    for _, slopes, _ in (compiled(p, options), automatic(p, options)):
+        assert not slopes["raw"].any() and not slopes["affine"].any()
+        assert (np.abs(slopes["z"]).max((1, 2)) > 1e-4).all()
+        np.testing.assert_allclose(slopes["z"].sum(1), 0, atol=1e-15)
+
+
+def test_clamped_values_pull_back_inside_or_not_at_all():
+    """One pixel whose corrected albedo is far too bright: only `inward` moves the correction, and towards less."""
+    p = state(1, n=1, segments=1, spread=0.0)
+    p["values"][:], p["raw"][:], p["affine"][0, 0, 3] = 0.9, -1.0, 0.5
+    dead, inward = (compiled(p, sgd_options(regulariser=0.0, clamp_gradient=g))[1]["affine"][0, 0] for g in ("dead", "inward"))
+    assert dead[3] == 0 and inward[3] > 0 and dead[7] == inward[7] > 0
+    p["raw"][:] = 9.0  # the texture is brighter still: outwards is no way
+    assert compiled(p, sgd_options(regulariser=0.0, scale_floor=0.5))[1]["affine"][0, 0, 3] >= 0
+
+
+def test_single_precision_is_close():
+    p = state(16, n=3000, segments=7)
+    options = sgd_options("paper", median_gradient=False)  # the median may be another element
+    (terms, slopes, _), (exact, expected, _) = compiled(p, options, real=np.float32), compiled(p, options)
+    assert terms == pytest.approx(exact, rel=3e-6)
+    for name in slopes:
+        np.testing.assert_allclose(slopes[name], expected[name], atol=2e-5 * np.abs(expected[name]).max())
+
+
+def test_half_precision_pools_are_read_as_they_are():
+    p = state(6, n=100)
+    options = sgd_options()
+    half = p["values"].astype(np.float16)
+    out = []
+    for pool in (as_words(half), half.astype(np.float32)):
+        sums, d_raw = np.zeros((4, 5)), np.zeros((100, 10), np.float32)
+        start, segment = sgd._runs(p["segment"])
+        alpha, log_alpha = (a.astype(np.float32) for a in softmax(p["z"], p["usable"]))
+        rest = [np.zeros((4, 6, m), np.float32) for m in (16, 3, 3)]
+        sgd_kernels.batch_loss(
+            *(0, 4, start, segment, pool, np.arange(100, dtype=np.int32)),
+            *(a.astype(np.float32) for a in (p["share"], p["raw"], p["affine"])),
+            *(alpha, log_alpha, p["usable"], *sgd_kernels.selection_networks(6), np.float32([0.3, 0.01, 1, 100])),
+            *(np.array([True, False, True]), d_raw, *rest, np.zeros((4, 6, 3)), sums),
+        )
+        out.append((sums, d_raw))
+    assert options.scale_floor == 0.01
+    np.testing.assert_array_equal(out[0][0], out[1][0])
+    np.testing.assert_array_equal(out[0][1], out[1][1])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 7, 8, 12, 16, 21])
+def test_selection_networks_find_the_lower_median(n):
+    values = np.random.default_rng(n).integers(0, 9, (n, sgd_kernels.TILE)).astype(np.float64)
+    networks, lengths = sgd_kernels.selection_networks(21)
+    found = values.copy()
+    sgd_kernels._select(found, networks[n], lengths[n], sgd_kernels.TILE)
+    np.testing.assert_array_equal(found[(n - 1) // 2], np.sort(values, 0)[(n - 1) // 2])
+
+
+def test_exponential():
+    x = np.linspace(-80, 80, 64 * 500).astype(np.float32)
+    found = x.copy()
+    for low in range(0, len(x), 64):
+        sgd_kernels._exp_float(found[low : low + 64], 64)
+    np.testing.assert_allclose(found, np.exp(x.astype(np.float64)), rtol=4e-7)
+    ends = np.array([0, -0.0, -np.inf, -1e30, 88], np.float32)
+    sgd_kernels._exp_float(ends, 5)
+    assert ends[0] == ends[1] == 1 and (0 <= ends[2:4]).all() and (ends[2:4] < 2e-38).all() and np.isfinite(ends[4])
+
+
+def test_adam_is_that_of_torch():
+    rng = np.random.default_rng(0)
+    start = rng.standard_normal(1000).astype(np.float32)
+    ours, theirs = start.copy(), torch.from_numpy(start.copy()).requires_grad_()
+    adam, optimiser = sgd._Adam(ours), torch.optim.Adam([theirs], lr=0.01)
+    for step in range(20):
+        gradient = (rng.standard_normal(1000) * (rng.random(1000) < 0.3)).astype(np.float32)
+        adam.gradient[:], theirs.grad = gradient, torch.from_numpy(gradient.copy())
+        adam.step(0.01 / (1 + step))
+        optimiser.param_groups[0]["lr"] = 0.01 / (1 + step)
+        optimiser.step()
+    np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=2e-6)
+    assert not adam.gradient.any()
+
+
+# ----------------------------------------------------------------------------------------------------------- schedules
+
+
+def test_published_schedules():
+    """METHOD 2.3.8: 81 multiplications on 8080 steps, the first after the first step; halved after 2, 4, 6, 8 epochs."""
+    paper = sgd_options("paper")
+    temperature = [sgd._temperature(paper, step, 8080) for step in (0, 1, 100, 101, 8079)]
+    np.testing.assert_allclose(temperature, 0.85 ** np.array([0, 1, 1, 2, 81]))
+    assert temperature[-1] == pytest.approx(1.9e-6, rel=0.02)
+    rate = [sgd._learning_rate(paper, step, 8080, 808) for step in (0, 1615, 1616, 8079)]
+    np.testing.assert_allclose(rate, 0.01 * 0.5 ** np.array([0, 0, 1, 4]))
+
+
+@pytest.mark.parametrize("steps", [10, 81, 1000])
+def test_safe_schedules_do_not_depend_on_the_number_of_steps(steps):
+    options = sgd_options(temperature_floor=0.0)
+    temperature = [sgd._temperature(options, step, steps) for step in range(steps)]
+    assert temperature[0] == 1 and temperature[-1] == pytest.approx(0.85 ** (81 - 81 / steps), rel=0.2)
+    assert min(sgd._temperature(SgdOptions(), step, steps) for step in range(steps)) == 1e-3
+    rate = [sgd._learning_rate(options, step, steps, 1) for step in range(steps)]
+    np.testing.assert_allclose(np.unique(rate), 0.01 / 2.0 ** np.arange(5)[::-1])
+
+
+def test_batches_are_permutations():
+    batches = sgd._batches(10, 3, np.random.default_rng(0))
+    first, second = ([next(batches) for _ in range(3)] for _ in range(2))
+    for epoch in (first, second):
+        assert len(np.unique(np.concatenate(epoch))) == 9 and all((np.diff(b) > 0).all() for b in epoch)
+    assert any((a != b).any() for a, b in zip(first, second, strict=True))
+
+
+# -------------------------------------------------------------------------------------------------------------- solver
+
+
+def test_loss_falls_and_the_history_says_so():
+    problem, truth = simulated()
+    calls = []
+    fit = solve_base_sgd(problem, sgd_options(iterations=800), lambda done, total: calls.append((done, total)))
+    before, after = fit.history[0], fit.history[-1]
+    assert after["data"] < 0.7 * before["data"] and calls[-1] == (800, 800)
+    assert converged(fit.history) and not converged(fit.history[:40])
+    assert before["temperature"] == 1 and after["temperature"] == 1e-3 and after["entropy"] == 0
+    assert before["learning_rate"] == 0.01 and after["step"] == 800 and 0.5 < after["gain"] < 1.5
+    found = loss_of_result(problem, fit)
+    assert found.total == pytest.approx(after["total"], rel=0.02)
+    regulariser = found.regulariser_albedo + found.regulariser_roughness + found.regulariser_metallic
+    assert regulariser == pytest.approx(after["regulariser"], rel=0.02)
+    mean = solve_base(problem, BaseOptions("texel_mean"))
+    assert oracle_psnr(problem, fit.value, truth) > oracle_psnr(problem, mean.value, truth) + 0.3
+    assert fit.value.shape == fit.scale.shape == (problem.n_cells, 5) and fit.scale.min() >= 0.01
+    assert (fit.value >= LOWEST).all() and (fit.value <= 1).all()
+
+
+def test_flat_and_falling_histories():
+    def history(total):
+        return [{"total": float(x) + 5.0, "label_part": 5.0} for x in total]
+
+    assert converged(history(np.full(100, 0.3))) and converged(history(np.zeros(100)))
+    assert not converged(history(np.linspace(2, 1, 100))) and not converged(history(np.ones(14)))
+    noise = 0.3 + 0.002 * np.random.default_rng(0).standard_normal(200)
+    assert converged(history(noise)) and not converged(history(noise), 1e-6)
+
+
+def test_good_predictions_are_selected_and_the_texture_found():
+    """One clean sample among patterns of noise, at another k in every view (clean: an affine map of the truth)."""
+    problem, truth = planted(views=8, samples=5, spread=0.03)
+    rng = np.random.default_rng(1)
+    good = rng.integers(0, 5, 8)
+    predictions = [p.copy() for p in problem.predictions]
+    for v, p in enumerate(predictions):
+        for k in range(5):
+            if k != good[v]:
+                p[k] = np.clip(p[k] + 0.12 * rng.standard_normal(p[k].shape), 0, 1)
+    problem = replace(problem, predictions=predictions)
+    fit = solve_base_sgd(problem, sgd_options(iterations=1200))
+    view_of_segment = np.array(
+        [next(v for v, m in enumerate(problem.segment_of_pixel) if (m == s).any()) for s in range(problem.n_segments)]
+    )
+    assert (fit.alpha.argmax(1) == good[view_of_segment][:, None]).mean() > 0.95
+    assert oracle_psnr(problem, fit.value, truth) > 38
+    assert fit.error.shape == (problem.n_segments, 5, 3) and (fit.error.argmin(1) == fit.alpha.argmax(1)).mean() > 0.95
+
+
+@pytest.mark.parametrize("preset", ["safe", "paper"])
+def test_loss_of_the_solver_is_the_reference_loss(preset):
+    """All pixels in one batch and a step of size 0: the first history entry is the loss of what is returned."""
+    problem, _ = simulated()
+    options = sgd_options(preset, texture="cells", init="mean", iterations=1, batch=1 << 20, learning_rate=1e-30)
+    for backend in ("numba", "torch"):
+        fit = solve_base_sgd(problem, replace(options, choice="soft"), backend=backend)
+        expected = reference_loss(
+            problem,
+            *(fit.value, fit.scale, (fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
+            log_weight=fit.log_alpha,
+            temperature=fit.temperature,
+        )
+        assert fit.history[0]["total"] == pytest.approx(expected.total, rel=1e-5)
+        assert fit.history[0]["data"] == pytest.approx(expected.data, rel=1e-5)
+        assert fit.history[0]["label"] == pytest.approx(expected.label, rel=1e-5)
+    weighted = solve_base_sgd(problem, replace(options, weighted=True))
+    assert weighted.history[0]["data"] == pytest.approx(loss_of_result(problem, weighted, weighted=True).data, rel=1e-5)
+
+
+def test_loss_with_moved_corrections_is_the_reference_loss():
+    problem, _ = simulated()
+    fit = solve_base_sgd(problem, sgd_options(iterations=120, batch=1 << 20, learning_rate=0.02))
+    assert np.abs(fit.corrections - sgd._IDENTITY).max() > 1e-3
+    assert loss_of_result(problem, fit).total == pytest.approx(fit.history[-1]["total"], rel=2e-3)  # one step later
+    packed = np.random.default_rng(0).random((7, 5)).astype(np.float32)
+    packed = np.c_[packed, np.ones(7, np.float32)]
+    rows = packed @ fit.affine[3, 2]
+    expected = packed[:, :3] @ fit.affine_albedo[3, 2, :, :3].T + fit.affine_albedo[3, 2, :, 3]
+    np.testing.assert_allclose(rows[:, :3], expected, rtol=1e-5)
+    gain, bias = fit.affine_metallic[3, 2]
+    np.testing.assert_allclose(rows[:, 4], gain * packed[:, 4] + bias, rtol=1e-5)
+
+
+@pytest.mark.parametrize("preset", ["safe", "paper"])
+def test_both_backends_walk_the_same_way(preset):
+    problem, _ = simulated()
+    options = sgd_options(preset, texture="cells", iterations=12, batch=2048, median_gradient=False, records=12)
+    a, b = (solve_base_sgd(problem, options, backend=backend) for backend in ("numba", "torch"))
+    for x, y in zip(a.history, b.history, strict=True):
+        assert {n: v for n, v in x.items() if n != "step"} == pytest.approx({n: v for n, v in y.items() if n != "step"}, rel=1e-4)
+    np.testing.assert_allclose(a.value, b.value, atol=1e-3)
+    np.testing.assert_allclose(a.scale, b.scale, atol=1e-3)
+
+
+def test_same_bytes_again_streamed_and_with_threads():
+    problem, _ = simulated()
+    options = replace(QUICK, iterations=60)
+    first = solve_base_sgd(problem, options, threads=1)
+    streamed = replace(problem, predictions=lambda view: simulated()[0].predictions[view])
+    for other in (solve_base_sgd(problem, options, threads=2), solve_base_sgd(streamed, options, threads=3)):
+        for name in ("value", "scale", "corrections", "alpha", "error"):
+            assert getattr(first, name).tobytes() == getattr(other, name).tobytes()
+        assert first.history == other.history
+    other = solve_base_sgd(problem, replace(options, seed=1))
+    assert first.value.tobytes() != other.value.tobytes()
+
+
+def test_order_of_predictions_does_not_matter():
+    problem, _ = simulated()
+    order = np.random.default_rng(0).permutation(6)
+    a = solve_base_sgd(problem, QUICK)
+    b = solve_base_sgd(replace(problem, predictions=[p[order] for p in problem.predictions]), QUICK)
+    assert (a.alpha[:, order].argmax(1) == b.alpha.argmax(1)).mean() > 0.95
+    assert b.history[-1]["total"] == pytest.approx(a.history[-1]["total"], rel=0.02)
+
+
+def test_a_given_selection_is_kept():
+    problem, _ = simulated()
+    direct = solve_base(problem)
+    fit = solve_base_sgd(problem, QUICK, weight=direct.weight)
+    np.testing.assert_array_equal(fit.alpha, direct.weight)
+    assert all(h["label"] == 0 for h in fit.history)
+    with pytest.raises(InputError, match="weight has shape"):
+        solve_base_sgd(problem, QUICK, weight=direct.weight[:, :2])
+
+
+def test_one_prediction_needs_no_selection():
+    problem, truth = simulated(samples=1)
+    fit = solve_base_sgd(problem, QUICK)
+    assert (fit.alpha == 1).all() and all(h["label"] == h["entropy"] == 0 for h in fit.history)
+    assert np.isfinite(fit.value).all() and fit.history[-1]["data"] < fit.history[0]["data"]
+    for backend in ("numba", "torch"):
+        paper = solve_base_sgd(problem, sgd_options("paper", texture="cells", iterations=5), backend=backend)
+        assert np.isfinite(paper.value).all() and (paper.alpha == 1).all()
+
+
+def test_equal_predictions_share():
+    problem, truth = simulated(strength=0.0, samples=1)
+    tripled = replace(problem, predictions=[np.repeat(p, 3, 0) for p in problem.predictions])
+    for choice in ("argmin", "soft"):
+        fit = solve_base_sgd(tripled, replace(QUICK, choice=choice))
+        np.testing.assert_allclose(fit.alpha, 1 / 3, atol=1e-6)
+    cells = seen(problem)
+    assert np.abs(fit.value - truth)[cells].mean() < 5e-3
+    assert np.median(fit.scale[cells]) < 0.03
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(value):
+    problem, _ = simulated()
+    predictions = [p.copy() for p in problem.predictions]
+    predictions[2][3] = value
+    predictions[4][1, 5, 5, 0] = value
+    predictions[0][:] = value
+    problem = replace(problem, predictions=predictions)
+    fit, direct = solve_base_sgd(problem, replace(QUICK, iterations=30)), solve_base(problem)
+    assert fit.dropped == direct.dropped
+    np.testing.assert_array_equal(fit.observations, direct.observations)
+    np.testing.assert_array_equal(fit.views, direct.views)
+    for name in ("value", "scale", "corrections", "alpha", "error"):
+        assert np.isfinite(getattr(fit, name)).all()
+    segments = np.unique(problem.segment_of_pixel[2])
+    assert (fit.alpha[segments, 3] == 0).all()
+    np.testing.assert_allclose(fit.alpha[segments].sum(1), 1, atol=1e-6)
+    assert (fit.alpha[np.unique(problem.segment_of_pixel[0])] == 0).all()
+
+
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+def test_coldest_temperatures_stay_finite(backend):
+    problem, _ = simulated()
+    options = sgd_options("paper", texture="cells", iterations=40, batch=1024, anneal_schedule="fraction", anneal=0.7)
+    fit = solve_base_sgd(problem, options, backend=backend)
+    assert fit.history[-1]["temperature"] < 2e-12
+    for array in (fit.value, fit.scale, fit.corrections, fit.alpha):
+        assert np.isfinite(array).all()
+    assert np.isfinite([list(h.values()) for h in fit.history]).all()
+    np.testing.assert_allclose(fit.alpha.sum(1), 1, atol=1e-5)
+    frozen = solve_base_sgd(problem, replace(options, anneal=0.01), backend=backend)  # to the last that float32 can divide by
+    assert frozen.history[-1]["temperature"] == 1e-30 and np.isfinite(frozen.value).all()
+
+
+def test_logits_that_are_not_scaled_tend_to_vote_shares():
+    problem, _ = simulated()
+    options = replace(QUICK, logits="direct", choice="soft", learning_rate=0.05)
+    fit = solve_base_sgd(problem, options)
+    assert 0.01 < fit.history[-1]["entropy"] < np.log(6) - 0.05
+
+
+def test_unseen_cells_and_objects_of_one_pixel():
+    obj = np.array([0, 0, 1, 2, 2])
+    problem = problem_of([np.array([[0, 2, -1]])], [np.full((2, 1, 3, 5), 0.3)], obj, 0)
+    fit = solve_base_sgd(problem, sgd_options(iterations=5))
+    np.testing.assert_allclose(fit.value[[0, 1, 2]], 0.3, atol=0.03)
+    np.testing.assert_array_equal(fit.value[1], fit.value[0])
+    np.testing.assert_array_equal(fit.value[3:], [NEUTRAL] * 2)
+    assert fit.observations.tolist() == [1, 0, 1, 0, 0] and np.isfinite(fit.scale).all()
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_constant_colour(level):
+    obj, _ = surface()
+    cells = [np.arange(SIZE * SIZE).reshape(SIZE, SIZE)] * 2
+    problem = problem_of(cells, [np.full((2, SIZE, SIZE, 5), level)] * 2, obj)
+    fit = solve_base_sgd(problem, replace(QUICK, iterations=50))
+    assert np.isfinite(fit.value).all()
+    np.testing.assert_allclose(fit.value[: SIZE * SIZE], max(level, 0.02), atol=0.03)
+
+
+def test_values_outside_the_unit_interval_are_not_misread():
+    """Half bits of negative numbers or above 1 are not what the compiled loop reads: such maps become float32."""
+    problem, _ = simulated()
+    odd = [p.astype(np.float16) for p in problem.predictions]
+    odd[1][2, 3, 4] = [-0.25, 1.5, 0.5, 1.25, -0.0]
+    pools = [sgd._gather(replace(problem, predictions=p), QUICK) for p in (odd, [p.astype(np.float32) for p in odd])]
+    np.testing.assert_array_equal(pools[0].values, pools[1].values)
+    inside = sgd._gather(replace(problem, predictions=[np.clip(p, 0, 1) for p in odd]), QUICK)
+    assert inside.values.dtype == np.uint16
+
+
+# ------------------------------------------------------------------------------------------------------------ hash grid
+
+
+def on_a_wall(problem):
+    """Surface points of the test wall: cell (row, column) of 60 x 60 at 2 m."""
+    points = []
+    for cell in problem.cell_of_pixel:
+        y, x = np.divmod(np.maximum(np.ravel(cell), 0), 60)
+        points.append(np.stack([x / 30, y / 30, 0.1 + 0 * x], 1).astype(np.float32))
+    tangents = [np.tile(np.float32([[1 / 30, 0, 0], [0, 1 / 30, 0]]), (len(p), 1, 1)) for p in points]
+    return replace(problem, point=points, tangent=lambda view: tangents[view])
+
+
+@pytest.mark.parametrize("preset", ["safe", "paper"])
+def test_hash_grid_texture(preset):
+    problem, truth = simulated()
+    problem = on_a_wall(problem)
+    options = sgd_options(preset, texture="hashgrid", grid=SMALL_GRID, iterations=150, batch=4096)
+    fit = solve_base_sgd(problem, options)
+    assert fit.history[-1]["data"] < 0.8 * fit.history[0]["data"]
+    cells = seen(problem)
+    assert np.abs(fit.value - truth)[cells, :3].mean() < 0.2 and np.isfinite(fit.scale).all()
+    value, scale = fit.at_pixels(3)
+    cell = np.ravel(problem.cell_of_pixel[3])
+    np.testing.assert_allclose(value, fit.value[cell], atol=1e-5)
+    assert scale.shape == (SIZE * SIZE, 5)
+    other = solve_base_sgd(problem, options, threads=1)
+    assert fit.value.tobytes() == other.value.tobytes()
+    by_pixel = reference_loss(
+        problem,
+        *(lambda view: fit.at_pixels(view)[0], lambda view: fit.at_pixels(view)[1]),
+        *((fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
+    )
+    assert by_pixel.data == pytest.approx(loss_of_result(problem, fit).data, rel=1e-3)
+
+
+def test_points_are_normalised_by_a_cube():
+    problem, _ = simulated()
+    pool = sgd._gather(on_a_wall(problem), sgd_options(texture="hashgrid", jitter=True))
+    low, high = 0.0, max(np.ravel(c).max() // 60 for c in problem.cell_of_pixel) / 30
+    high = max(high, max((np.ravel(c) % 60).max() for c in problem.cell_of_pixel) / 30)
+    low = min(min((np.ravel(c) % 60).min(), np.ravel(c).min() // 60) for c in problem.cell_of_pixel) / 30
+    low = min(low, 0.1)
+    edge = 1.02 * (high - low)
+    assert pool.box == pytest.approx((low - 0.01 * (high - low), high + 0.01 * (high - low)), rel=1e-5)
+    np.testing.assert_allclose(pool.coordinates[:, 2], (0.1 - pool.box[0]) / edge, rtol=1e-4)
+    np.testing.assert_allclose(pool.tangent[:, 0, 0], 1 / 30 / edge, rtol=1e-4)
+
+
+def test_jitter_moves_the_points():
+    problem = on_a_wall(simulated()[0])
+    options = sgd_options(texture="hashgrid", grid=SMALL_GRID, iterations=20, batch=2048)
+    still, moved = (solve_base_sgd(problem, replace(options, jitter=j)) for j in (False, True))
+    assert np.abs(still.value - moved.value).max() > 1e-4
+    without = solve_base_sgd(replace(problem, tangent=None), replace(options, jitter=True))
+    assert without.value.tobytes() == still.value.tobytes()
+
+
+# ---------------------------------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"texture": "voxels"}, "allowed: cells, hashgrid"),
+        ({"choice": "best"}, "argmin"),
+        ({"batch": 0}, "batch"),
+        ({"iterations": 0}, "epochs"),
+        ({"learning_rate": 0.0}, "positive"),
+        ({"temperature": float("nan")}, "positive"),
+        ({"temperature_floor": -1.0}, "0 or a positive"),
+        ({"anneal": 0.0}, "anneal"),
+        ({"choose_at": 1.5}, "choose_at"),
+        ({"texture": "hashgrid", "grid": HashGridOptions(outputs=4)}, "10 are needed"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        SgdOptions(**options)
+
+
+def test_bad_calls_are_refused():
+    problem, _ = simulated()
+    with pytest.raises(InputError, match="preset"):
+        sgd_options("fast")
+    with pytest.raises(InputError, match="surface points"):
+        solve_base_sgd(problem, sgd_options("paper"))
+    with pytest.raises(InputError, match="backend"):
+        solve_base_sgd(problem, QUICK, backend="jax")
+    with pytest.raises(InputError, match="threads"):
+        solve_base_sgd(problem, QUICK, threads=0)
+    with pytest.raises(InputError, match="no pixel"):
+        solve_base_sgd(BaseProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
+    with pytest.raises(InputError, match="MiB"):
+        solve_base_sgd(problem, replace(QUICK, memory=1000))
+    with pytest.raises(InputError, match="two views"):
+        solve_base_sgd(replace(problem, segment_of_pixel=[problem.segment_of_pixel[0]] * 8), QUICK)
+    with pytest.raises(InputError, match="cell id"):
+        solve_base_sgd(replace(problem, n_cells=10, object_of_cell=np.zeros(10, int)), QUICK)
+    fewer = [problem.predictions[0], *(p[:3] for p in problem.predictions[1:])]
+    with pytest.raises(InputError, match="same number"):
+        solve_base_sgd(replace(problem, predictions=fewer), QUICK)
+    assert OBJECTS == 4
+
+
+def test_a_loss_that_explodes_is_named():
+    problem, _ = simulated()
+    with pytest.raises(InputError, match="not finite at step"):
+        solve_base_sgd(problem, replace(QUICK, learning_rate=1e30))

@@ -1,0 +1,278 @@
+"""Studies: names of derived scenes, what they override, what they share, errors, and the arithmetic of the table."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iif_core.errors import InputError
+from workflow import fingerprint as fp
+from workflow import scores, settings, studies, study_table
+from workflow.job import Job
+from workflow.timings import read_parts
+
+SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, strength: 0.5}\ncapture: {views: 9, width: 32}\n"
+SHARED = "t: {capture: {width: 64}, prior: {samples: 4}}\n"
+STUDY = """\
+title: A study
+scenes: [t]
+variants:
+  full: {}
+  mean-2: {label: the mean, overrides: {base: {variant: object_mean}, capture: {views: 3}}}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """`folder(name, text)` writes config/<name>.yaml in an empty folder, which is the current one."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(name, text):
+        path = tmp_path / "config" / f"{name}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, studies._load_study):
+            cached.cache_clear()
+
+    write("scenes/t", SCENE)
+    write("studies/scenes", SHARED)
+    write("studies/a", STUDY)
+    yield write
+    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, studies._load_study):
+        cached.cache_clear()
+
+
+def test_names_come_apart_as_they_were_put_together(folder):
+    assert studies.derived("t--a-mean-2-s17") == ("t", "a", "mean-2", 17)
+    assert studies.derived(studies.scene_of("a", "my-room", "sgd-s3", 0)) == ("my-room", "a", "sgd-s3", 0)
+    assert studies.derived("t--s3") == ("t", "", "", 3)
+    for plain in ("t", "t--", "t--a", "t--s03", "t--a-full", "t--A-full-s0"):
+        assert studies.derived(plain) is None
+    folder("scenes/t--s3", SCENE)  # a scene of that name goes first
+    assert studies.derived("t--s3") is None and studies.bases("t--s3") == []
+
+
+def test_layers_lie_over_one_another(folder):
+    shared, variant = settings.load("t--s5"), settings.load("t--a-mean-2-s5")
+    assert (shared.capture.views, shared.capture.width, shared.prior.samples, shared.prior.strength) == (9, 64, 4, 0.5)
+    assert (variant.capture.views, variant.capture.width, variant.base.variant) == (3, 64, "object_mean")
+    assert shared.prior.seed == variant.prior.seed == 5 and shared.seed == variant.seed == 0
+    assert settings.load("t").prior.seed is None and settings.load("t").capture.width == 32
+
+
+def test_what_agrees_is_shared_and_what_does_not_is_not(folder):
+    def homes(scene):
+        return {stage: fp.home(stage, scene, "draft") for stage in ("capture", "segmentation", "prior", "base", "base_scores")}
+
+    assert set(homes("t--a-full-s0").values()) == {"t--s0"}
+    assert homes("t--a-full-s1") == {
+        "capture": "t--s0",
+        "segmentation": "t--s0",
+        "prior": "t--s1",
+        "base": "t--s1",
+        "base_scores": "t--s1",
+    }
+    assert set(homes("t--a-mean-2-s0").values()) == {"t--a-mean-2-s0"}  # its photographs are others
+    assert fp.home("capture", "t", "draft") == "t"
+    folder("studies/a", STUDY.replace(", capture: {views: 3}", ""))
+    assert homes("t--a-mean-2-s1") == {
+        "capture": "t--s0",
+        "segmentation": "t--s0",
+        "prior": "t--s1",
+        "base": "t--a-mean-2-s1",
+        "base_scores": "t--a-mean-2-s1",
+    }
+    assert len(study_table.inputs("a", "draft")) == 6
+
+
+def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):
+    job = Job("segmentation", "t--a-full-s1", "draft", 1)
+    with pytest.raises(InputError, match="results/t--s0/capture/manifest.json: missing"):
+        job.read("capture")
+
+
+def test_grids_are_variants(folder):
+    folder("studies/a", "title: x\nscenes: [t]\ngrids: [{base.ridge: [0.1, 1.0e-3], base.variant: [full, uniform]}]\n")
+    variants = studies.load_study("a").variants
+    assert list(variants) == ["0_1-full", "0_1-uniform", "0_001-full", "0_001-uniform"]
+    assert variants["0_001-uniform"].overrides == {"base": {"ridge": 0.001, "variant": "uniform"}}
+    assert settings.load("t--a-0_001-uniform-s2").base.ridge == 0.001
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (STUDY + "colour: 1\n", ["config/studies/a.yaml: `colour`: unknown key", "Allowed here: title, scenes"]),
+        (STUDY.replace("label:", "lable:"), ["`variants.mean-2.lable`: unknown key", "Did you mean `label`?"]),
+        (STUDY + "plot: {kind: pie}\n", ["`plot.kind`", "'pie'", "'bars'"]),
+        (STUDY + "plot: {kidn: bars}\n", ["`plot.kidn`", "Did you mean `kind`?"]),
+        (STUDY + "plot: {kind: line, x: base.sweeps}\n", ["no variant sets 'base.sweeps'", "base.variant"]),
+        (STUDY.replace("mean-2", "me an"), ["'me an'", "allowed are letters"]),
+        (STUDY.replace("scenes: [t]", "scenes: [tt]"), ["`scenes`: tt is not in config/studies/scenes.yaml", "Did you mean t?"]),
+        (STUDY.replace("scenes: [t]", "scenes: []"), ["`scenes`", "at least 1"]),
+        (STUDY.replace("scenes: [t]\n", ""), ["`scenes`: missing"]),
+        (STUDY + "show: [albedo/pnsr]\n", ["`show`", "'albedo/pnsr'", "psnr"]),
+        (STUDY + "paper: {best: {protocol: raw, values: {}}}\n", ["`paper.best`: no such variant", "full, mean-2"]),
+        (STUDY + "paper: {full: {protocol: raw, values: {albedo: 3}}}\n", ["paper.full.values", "'albedo'"]),
+        (STUDY + "paper: {full: {protocol: best, values: {}}}\n", ["`paper.full.protocol`", "'best'"]),
+        (STUDY + "grids: [{base: [1]}]\n", ["`grids.0`", "<section>.<key>"]),
+        ("title: x\nscenes: [t]\n", ["no variants"]),
+        ("title: x\n  scenes: [t]\n", ["a.yaml, line 2", "not valid YAML"]),
+    ],
+)
+def test_mistakes_in_a_study(folder, text, words):
+    folder("studies/a", text)
+    with pytest.raises(InputError) as caught:
+        studies.load_study("a")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_settings_are_blamed_on_the_file_that_spoils_them(folder):
+    folder("studies/a", STUDY.replace("object_mean", "mode"))
+    with pytest.raises(InputError, match=r"config/studies/a.yaml, variant mean-2: `base.variant`: found 'mode'"):
+        study_table.plan("a", "draft")
+    folder("studies/scenes", "t: {capture: {widht: 64}}\n")
+    with pytest.raises(InputError, match=r"config/studies/scenes.yaml, t: `capture.widht`: unknown key"):
+        study_table.plan("a", "draft")
+    folder("scenes/t", SCENE + "sed: 3\n")
+    with pytest.raises(InputError, match=r"config/scenes/t.yaml: `sed`: unknown key"):
+        study_table.plan("a", "draft")
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ("t--a-mean-s0", ["config/studies/a.yaml: no variant mean", "Did you mean mean-2?"]),
+        ("t--b-full-s0", ["config/studies/b.yaml: not found", "Known studies: a"]),
+        ("u--a-full-s0", ["config/scenes/u.yaml: not found"]),
+    ],
+)
+def test_unknown_derived_scenes(folder, scene, words):
+    with pytest.raises(InputError) as caught:
+        settings.load(scene)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_unlisted_scenes(folder):
+    folder("scenes/u", SCENE)
+    with pytest.raises(InputError, match="scenes.yaml: u is not listed. Known there: t"):
+        settings.load("u--a-full-s0")
+    folder("studies/scenes", SHARED + "kitchn: {}\n")
+    with pytest.raises(InputError, match="kitchn: no such scene"):
+        studies.load_study("a")
+
+
+def test_shipped_studies_are_sound(repository, monkeypatch):
+    monkeypatch.chdir(repository)
+    for name in studies.study_names():
+        study = studies.load_study(name)
+        for scene in study.scenes:
+            for variant in study.variants:
+                settings.load(studies.scene_of(name, scene, variant, study.seeds[0]))
+
+
+def test_parts_of_a_job_are_timed(folder):
+    job = Job("base", "t", "draft", 2)
+    for _ in range(2):
+        with job.timed("solve"):
+            sum(range(200000))
+    with pytest.raises(ZeroDivisionError), job.timed("rest"):
+        _ = 1 / 0
+    job.write_timings()
+    parts = read_parts("t", "base")
+    assert set(parts) == {"solve", "rest", "job"}
+    assert 0 < parts["solve"]["cpu_seconds"] <= parts["job"]["cpu_seconds"]
+    assert parts["job"]["max_rss_mb"] > 10 and parts["job"]["threads"] == 2
+    assert read_parts("t", "prior") == {}
+
+
+def test_pareto_front():
+    cost, value = [1, 2, 3, 3, 4], [5, 7, 6, 7, 9]
+    assert study_table.pareto_front(cost, value, True) == [True, True, False, False, True]
+    assert study_table.pareto_front(cost, value, False) == [True, False, False, False, False]
+    assert study_table.pareto_front([1, 1], [2, 2], True) == [True, True]
+    assert study_table.pareto_front([], [], True) == []
+
+
+def frame_of(values, **columns):
+    rows = [
+        {"scene": "t", "variant": variant, "seed": seed, "quantity": "albedo", "metric": metric, "protocol": "raw"}
+        | {"value": value, "cpu_seconds": cost, "status": "ok"}
+        for variant, seed, metric, value, cost in values
+    ]
+    return pd.DataFrame(rows, columns=[name for name, _ in study_table.COLUMNS]).assign(**columns)
+
+
+def test_front_is_of_means_over_seeds_and_knows_which_way_is_better():
+    frame = frame_of([("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 30.0, 3.0), ("b", 0, "psnr", 24.0, 2.5)])
+    assert study_table._pareto(frame).tolist() == [True, True, False]
+    assert study_table._pareto(frame.assign(metric="l2")).tolist() == [True, True, True]
+    assert study_table._pareto(frame.assign(cpu_seconds=np.nan)).tolist() == [None, None, None]
+    assert study_table._pareto(frame.assign(metric="coverage_95")).tolist() == [None, None, None]
+
+
+def test_page_shows_both_and_the_paper():
+    study = studies.Study(
+        title="T",
+        scenes=["t"],
+        seeds=[0, 1],
+        variants={"a": studies.Variant(label="first"), "b": studies.Variant()},
+        paper={"b": studies.Paper(protocol="oracle_affine", values={"albedo/psnr": 30.794})},
+        show=["albedo/psnr", "albedo/lpips_vgg"],
+    )
+    frame = frame_of([("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 22.0, 3.0), ("b", 0, "psnr", 24.0, 2.0)])
+    page = study_table.page(study, frame, {"u": "no data"})
+    lines = [line for line in page.splitlines() if line.startswith("| first") or line.startswith("| b ")]
+    assert "21.00 ± 1" in lines[0] and "24.00" in lines[1] and "30.79 (oracle)" in lines[1]
+    assert "Left out: u. no data" in page and "weights of VGG16 are not there" in page
+    empty = study_table.page(study, frame[:0], {"t": "no data"})
+    assert "Nothing was scored." in empty
+
+
+def test_table_on_disk_keeps_what_is_unknown_unknown(tmp_path):
+    frame = frame_of([("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", np.nan, np.nan)], pareto=[True, None])
+    study_table._write_table(frame, tmp_path / "x.parquet")
+    back = pd.read_parquet(tmp_path / "x.parquet")
+    assert list(back) == [name for name, _ in study_table.COLUMNS]
+    assert back["value"].isna().tolist() == [False, True] and back["pareto"].tolist() == [True, None]
+    assert back["paper"].isna().all() and back["seed"].tolist() == [0, 1]
+
+
+def test_every_kind_of_picture_is_drawn(tmp_path):
+    from workflow.study_plots import draw
+
+    variants = {str(k): studies.Variant(overrides={"base": {"sweeps": k, "variant": "full"}}) for k in (1, 2, 4)}
+    paper = {"2": studies.Paper(protocol="raw", values={"albedo/psnr": 21.0})}
+    frame = frame_of([(name, s, "psnr", 20.0 + s + int(name), 1.0 * int(name)) for name in variants for s in (0, 1)])
+    frame["pareto"] = study_table._pareto(frame)
+    histories = {study_table.Cell("t", name, 0, ""): [{"entropy": 2.0}, {"entropy": 1.0}] for name in variants}
+    for kind in ("bars", "line", "pareto", "history"):
+        plot = studies.Plot(kind=kind, x="base.sweeps", group=["base.variant"], log=True)
+        study = studies.Study(title="T", scenes=["t"], variants=variants, paper=paper, show=["albedo/psnr"], plot=plot)
+        draw(study, frame, histories, tmp_path / f"{kind}.png")
+        assert (tmp_path / f"{kind}.png").stat().st_size > 5000
+        draw(study, frame[:0], {}, tmp_path / "empty.png")
+
+
+def test_share_of_errors_within_the_claimed_interval():
+    rng = np.random.default_rng(0)
+    shape = (150, 150)
+    truth_map, scale = rng.uniform(0.2, 0.8, shape), rng.uniform(0.005, 0.02, shape).astype(np.float32)
+    value = (0.1 + 0.6 * truth_map + rng.laplace(0, scale)).astype(np.float32)
+    mask = np.ones(shape, bool)
+    mask[:5] = False
+    targets = {"albedo": np.stack([truth_map] * 3, -1), "roughness": truth_map, "metallic": truth_map}
+    truth = scores.MaterialTruth(None, targets, dict.fromkeys(targets, mask), np.zeros(shape, int))
+    channels = {f"albedo.{c}": value for c in "RGB"} | {"roughness": value, "metallic": value}
+    assert list(scores.interval_scores(channels, truth)) == []
+    out = dict(scores.interval_scores(channels | {"uncertainty.albedo": scale, "uncertainty.roughness": scale}, truth))
+    assert set(out) == {"albedo", "roughness"}
+    for quantity in out:
+        share = {(score.metric, score.protocol): score.value for score in out[quantity]}
+        for level in (50, 80, 95):
+            assert share[f"coverage_{level}", "oracle_affine"] == pytest.approx(level / 100, abs=0.015)
+        assert share["coverage_50", "raw"] < 0.3
+    nothing = scores.MaterialTruth(None, targets, dict.fromkeys(targets, mask & False), truth.object_id)
+    empty = dict(scores.interval_scores(channels | {"uncertainty.roughness": scale}, nothing))["roughness"]
+    assert {score.value for score in empty} == {None}

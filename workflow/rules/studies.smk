@@ -1,0 +1,75 @@
+# Studies: variants are derived scenes that the ordinary rules make (workflow/studies.py); a study collects their scores.
+from workflow import studies, study_table
+
+
+wildcard_constraints:
+    study=studies.STUDY,
+
+
+def of_study(compute):
+    """Call `compute(study, QUALITY)` for a rule; what is wrong in its file stops here, before any job."""
+
+    def value(wildcards):
+        try:
+            return compute(wildcards.study, QUALITY)
+        except InputError as error:
+            stop(error)
+
+    return value
+
+
+rule base_scores:
+    input:
+        upstream("base_scores"),
+    output:
+        manifest="results/{scene}/base_scores/manifest.json",
+    log:
+        "results/{scene}/logs/base_scores.log",
+    benchmark:
+        "results/{scene}/benchmarks/base_scores.jsonl"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 3000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        job=job("base_scores"),
+        python=sys.executable,
+    message:
+        "{wildcards.scene}: scores of the base texture"
+    shell:
+        "{params.python:q} -m workflow {params.job} --threads {threads} --log {log:q}"
+
+
+rule study:
+    input:
+        of_study(study_table.inputs),
+    output:
+        table="results/studies/{study}.parquet",
+        page="results/studies/{study}.md",
+        picture="results/studies/{study}.png",
+    log:
+        "results/studies/logs/{study}.log",
+    localrule: True
+    params:
+        mark=of_study(study_table.fingerprint),
+        quality=QUALITY,
+        python=sys.executable,
+    message:
+        "study {wildcards.study}: table and picture"
+    shell:
+        "{params.python:q} -m workflow study {wildcards.study} --quality {params.quality} --fingerprint {params.mark} --log {log:q}"
+
+
+# Once, with a connection; LPIPS with VGG16 is then part of every score of a study.
+rule lpips_vgg:
+    output:
+        "results/weights/lpips_vgg.npz",
+    log:
+        "results/weights/lpips_vgg.log",
+    localrule: True
+    params:
+        python=sys.executable,
+    message:
+        "fetching the weights of VGG16 (64 MB)"
+    shell:
+        "{params.python:q} -m workflow lpips_vgg --log {log:q}"

@@ -1,0 +1,141 @@
+"""Scores of the material maps of views against ground truth: what the stages metrics and base_scores share."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from iif_core import metrics
+from iif_core.base.uncertainty import LEVELS, coverage, gauge_free_error
+from iif_core.lpips import Weights
+from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.normal_form import CaptureReader, Truth, View
+from workflow.weights import lpips_weights
+
+MATERIALS = ("albedo", "roughness", "metallic")
+UNITS = {"value": "l2: squared; psnr: dB; coverage: share of values"}
+
+
+@dataclass
+class ScoreRows:
+    """Columns of a table of scores, in order of arrival, and the scores that could not be computed."""
+
+    columns: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    missing: list[dict[str, str]] = field(default_factory=list)
+
+    def add(self, variant: str, view: str, quantity: str, scores: list[metrics.Score]) -> None:
+        for score in scores:
+            facts = {"variant": variant, "view": view, "quantity": quantity, "metric": score.metric}
+            facts["protocol"] = score.protocol
+            if score.value is None:
+                self.missing.append({**facts, "reason": score.reason})
+                continue
+            for name, value in facts.items():
+                self.columns[name].append(value)
+            self.columns["value"].append(score.value)
+
+    def table(self, scene: str, variants: set[str] | None = None) -> dict[str, Any]:
+        """Columns scene, view, quantity, metric, protocol, variant (unless some are chosen), value."""
+        chosen = [i for i, v in enumerate(self.columns["variant"]) if variants is None or v in variants]
+        names = ["view", "quantity", "metric", "protocol"] + ([] if variants else ["variant"])
+        out: dict[str, Any] = {"scene": np.array([scene] * len(chosen), object)}
+        out |= {name: np.array([self.columns[name][i] for i in chosen], object) for name in names}
+        out["value"] = np.array([self.columns["value"][i] for i in chosen], np.float64)
+        return out
+
+    def means(self) -> dict[str, Any]:
+        """variant -> quantity -> protocol -> metric -> {mean over views, number of views}."""
+        sums: dict[tuple[str, ...], list[float]] = defaultdict(list)
+        for i, value in enumerate(self.columns["value"]):
+            sums[tuple(self.columns[c][i] for c in ("variant", "quantity", "protocol", "metric"))].append(value)
+        means: dict[str, Any] = {}
+        for (variant, quantity, protocol, metric), values in sorted(sums.items()):
+            entry = {"mean": round(float(np.mean(values)), 6), "views": len(values)}
+            means.setdefault(variant, {}).setdefault(quantity, {}).setdefault(protocol, {})[metric] = entry
+        return means
+
+
+@dataclass(frozen=True)
+class MaterialTruth:
+    """What the material maps of a view are compared with."""
+
+    truth: Truth
+    targets: dict[str, np.ndarray]  # quantity -> (H, W, 3) or (H, W)
+    masks: dict[str, np.ndarray]  # quantity, or emission -> (H, W) bool
+    object_id: np.ndarray  # (H, W) int32
+
+    def scores(
+        self,
+        maps: dict[str, np.ndarray],
+        quantity: str,
+        networks: Mapping[str, Weights] | None = None,
+        only: Iterable[str] | None = None,
+    ) -> list[metrics.Score]:
+        """Every score of one quantity (or the `only` ones) under every protocol."""
+        target, mask = self.targets[quantity], self.masks[quantity]
+        return metrics.score_map(quantity, maps[quantity], target, mask, self.object_id, only, networks=networks)
+
+
+def material_truth(capture: CaptureReader, segmentation: StageReader, view: View) -> MaterialTruth:
+    """Targets, masks and objects of a view of a capture that has truth."""
+    truth = capture.truth(view)
+    _, face_id = capture.gbuffer(view)
+    masks = metrics.material_masks(truth.valid, face_id >= 0, truth.emission, truth.roughness)
+    targets = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
+    return MaterialTruth(truth, targets, masks, ids_from_disk(segmentation.exr(f"maps/{view.name}.exr")["object.id"]))
+
+
+def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
+    """Numbers k of the predictions in the channels of one view."""
+    return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
+
+
+def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
+    """albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
+    return {
+        "albedo": rgb(channels, f"{prefix}albedo"),
+        "roughness": channels[f"{prefix}roughness"].astype(np.float32),
+        "metallic": channels[f"{prefix}metallic"].astype(np.float32),
+    }
+
+
+def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:
+    """Weights of LPIPS for a stage that scores its views in threads of its own: torch gets one thread in each."""
+    import torch
+
+    torch.set_num_threads(1)  # a convolution's last bits depend on how many threads share it
+    return lpips_weights(with_vgg)
+
+
+def interval_scores(channels: dict[str, np.ndarray], truth: MaterialTruth) -> Iterator[tuple[str, list[metrics.Score]]]:
+    """Share of the values whose error lies within the interval that the maps claim for it, at 50, 80 and 95 %.
+
+    The channels `uncertainty.<quantity>` are Laplace scales of the error that is left when each object's truth is mapped to
+    the maps by its nearest affine (iif_core.base.uncertainty): protocol `oracle_affine`. `raw` is the same without the
+    affine, which no such scale can know. Nothing where a map claims none.
+    """
+    maps = material_maps(channels)
+    for quantity in MATERIALS:
+        scale = channels.get(f"uncertainty.{quantity}")
+        if scale is None:
+            continue
+        mask, target, value = truth.masks[quantity], truth.targets[quantity], maps[quantity]
+        names = [f"coverage_{round(100 * level)}" for level in LEVELS]
+        if not mask.any():
+            yield quantity, [metrics.Score(name, "raw", None, "no pixel counts") for name in names]
+            continue
+        claimed, x, y = scale[mask].reshape(-1, 1), value[mask], target[mask]
+        x, y = x.reshape(len(claimed), -1), y.reshape(len(claimed), -1)
+        errors = {"raw": x - y.astype(np.float64), "oracle_affine": gauge_free_error(x, y, truth.object_id[mask])}
+        yield (
+            quantity,
+            [
+                metrics.Score(name, protocol, share)
+                for protocol, error in errors.items()
+                for name, share in zip(names, coverage(error, claimed), strict=True)
+            ],
+        )

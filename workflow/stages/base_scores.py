@@ -1,0 +1,45 @@
+"""base_scores: the base texture of every view against ground truth; what the studies collect."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+from iif_core import metrics
+from iif_core.errors import InputError
+from workflow import scores as scoring
+from workflow.job import Job
+from workflow.normal_form import CaptureReader
+
+
+def run(job: Job) -> None:
+    """Write scores.parquet (every view) and scores.json (means, what could not be scored).
+
+    Raises:
+        InputError: the capture has no ground truth.
+    """
+    capture = CaptureReader(job.read("capture"))
+    if not capture.has_truth:
+        raise InputError(f"scene {job.scene}: no ground truth to score against; a study needs a source with truth")
+    networks = scoring.perceptual_networks(with_vgg=True)
+    rows = scoring.ScoreRows()
+    is_raw = job.read("base").json("base.json")["variant"] == "raw"
+
+    def scores_of(index: int) -> list[tuple[str, list[metrics.Score]]]:
+        view = capture.views[index]
+        file = f"maps/{view.name}.exr"
+        if not job.read("base").has(file):
+            return []
+        channels = job.read("base").exr(file)
+        maps, truth = scoring.material_maps(channels), scoring.material_truth(capture, job.read("segmentation"), view)
+        scored = [(quantity, truth.scores(maps, quantity, networks)) for quantity in scoring.MATERIALS]
+        # Uncertainties are those of the fused cells; raw predictions claim none.
+        return scored if is_raw else scored + list(scoring.interval_scores(channels, truth))
+
+    with ThreadPoolExecutor(job.threads) as pool:
+        # map keeps the order of the views, so the table does not depend on the number of threads
+        for done, scored in enumerate(pool.map(scores_of, range(len(capture.views)))):
+            for quantity, of_view in scored:
+                rows.add("base", capture.views[done].name, quantity, of_view)
+            job.progress(done + 1, len(capture.views), "views scored")
+    job.writer.table("scores.parquet", rows.table(job.scene, {"base"}), scoring.UNITS)
+    job.writer.json("scores.json", {"means": rows.means().get("base", {}), "not_scored": rows.missing})
