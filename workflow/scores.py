@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core import metrics
+from iif_core.base.problem import CHANNELS
 from iif_core.base.uncertainty import LEVELS, coverage, gauge_free_error
 from iif_core.lpips import Weights
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
@@ -17,7 +18,7 @@ from workflow.normal_form import CaptureReader, Truth, View
 from workflow.weights import lpips_weights
 
 MATERIALS = ("albedo", "roughness", "metallic")
-UNITS = {"value": "l2: squared; psnr: dB; coverage: share of values"}
+UNITS = {"value": "l2: squared; psnr: dB; coverage: share of cells"}
 
 
 @dataclass
@@ -111,31 +112,56 @@ def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarra
     return lpips_weights(with_vgg)
 
 
-def interval_scores(channels: dict[str, np.ndarray], truth: MaterialTruth) -> Iterator[tuple[str, list[metrics.Score]]]:
-    """Share of the values whose error lies within the interval that the maps claim for it, at 50, 80 and 95 %.
+_CHANNELS_OF = {"albedo": CHANNELS[:3], "roughness": CHANNELS[3:4], "metallic": CHANNELS[4:]}
 
-    The channels `uncertainty.<quantity>` are Laplace scales of the error that is left when each object's truth is mapped to
-    the maps by its nearest affine (iif_core.base.uncertainty): protocol `oracle_affine`. `raw` is the same without the
-    affine, which no such scale can know. Nothing where a map claims none.
+
+def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageReader) -> dict[str, np.ndarray]:
+    """Mean truth of every cell: quantity -> (cells, channels) float64, NaN where no pixel of the cell counts."""
+    n = len(base.table("cells.parquet")["cell_id"])
+    sums = {quantity: np.zeros((n, 1 + len(names))) for quantity, names in _CHANNELS_OF.items()}
+    for view in capture.views:
+        file = f"maps/{view.name}.exr"
+        if not base.has(file):
+            continue
+        cell = ids_from_disk(base.exr(file)["cell.id"])
+        truth = material_truth(capture, segmentation, view)
+        for quantity, summed in sums.items():
+            mask = truth.masks[quantity] & (cell >= 0)
+            target = truth.targets[quantity][mask].reshape(np.count_nonzero(mask), -1)
+            summed[:, 0] += np.bincount(cell[mask], minlength=n)
+            for c in range(target.shape[1]):
+                summed[:, 1 + c] += np.bincount(cell[mask], target[:, c], n)
+    return {q: np.where(s[:, :1] > 0, s[:, 1:] / np.maximum(s[:, :1], 1), np.nan) for q, s in sums.items()}
+
+
+def interval_scores(
+    cells: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
+) -> Iterator[tuple[str, list[metrics.Score]]]:
+    """Share of the surface cells whose error lies within the interval that the base claims, at 50, 80 and 95 %.
+
+    The columns `uncertainty_*` are Laplace scales of the error that is left when each object's truth is mapped to the base
+    by its nearest affine, over all views together (iif_core.base.uncertainty): protocol `oracle_affine`. `raw` is the same
+    without the affine, which no such scale can know.
+
+    Args:
+        cells: table base/cells.parquet; truth: of `cell_truth`.
     """
-    maps = material_maps(channels)
-    for quantity in MATERIALS:
-        scale = channels.get(f"uncertainty.{quantity}")
-        if scale is None:
+    for quantity, names in _CHANNELS_OF.items():
+        labels = [f"coverage_{round(100 * level)}" for level in LEVELS]
+        known = np.isfinite(truth[quantity]).all(1) & (cells["coverage"] > 0)
+        if not known.any():
+            yield quantity, [metrics.Score(name, "raw", None, "no cell counts") for name in labels]
             continue
-        mask, target, value = truth.masks[quantity], truth.targets[quantity], maps[quantity]
-        names = [f"coverage_{round(100 * level)}" for level in LEVELS]
-        if not mask.any():
-            yield quantity, [metrics.Score(name, "raw", None, "no pixel counts") for name in names]
-            continue
-        claimed, x, y = scale[mask].reshape(-1, 1), value[mask], target[mask]
-        x, y = x.reshape(len(claimed), -1), y.reshape(len(claimed), -1)
-        errors = {"raw": x - y.astype(np.float64), "oracle_affine": gauge_free_error(x, y, truth.object_id[mask])}
+        target = truth[quantity][known]
+        value, claimed = (
+            np.stack([cells[f"{prefix}{name}"][known] for name in names], 1).astype(np.float64) for prefix in ("", "uncertainty_")
+        )
+        errors = {"raw": value - target, "oracle_affine": gauge_free_error(value, target, cells["object_id"][known])}
         yield (
             quantity,
             [
                 metrics.Score(name, protocol, share)
                 for protocol, error in errors.items()
-                for name, share in zip(names, coverage(error, claimed), strict=True)
+                for name, share in zip(labels, coverage(error, claimed), strict=True)
             ],
         )

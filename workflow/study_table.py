@@ -280,7 +280,7 @@ def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str])
             digits = [0 if cost == "max_rss_mb" else 1 for cost in COSTS]
             cells = [_mean(runs[cost].dropna().tolist(), n) for cost, n in zip(COSTS, digits, strict=True)]
             body.append([scene, label, *cells])
-    return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB"], body)
+    return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB"], body, words=2)
 
 
 def _why(metric: str) -> str:
@@ -311,15 +311,15 @@ def _mean(values: list[float], digits: int) -> str:
     return f"{sum(values) / len(values):.{digits}f}" if values else ""
 
 
-def _markdown(head: list[str], body: list[list[str]]) -> list[str]:
-    """Aligned, so that it reads in a terminal too; numbers to the right."""
+def _markdown(head: list[str], body: list[list[str]], words: int = 1) -> list[str]:
+    """Aligned, so that it reads in a terminal too; the first `words` columns to the left, numbers to the right."""
     widths = [max(len(row[i]) for row in [head, *body]) for i in range(len(head))]
 
     def line(row: list[str]) -> str:
         cells = [
-            text.ljust(width) if i == 0 else text.rjust(width) for i, (text, width) in enumerate(zip(row, widths, strict=True))
+            text.ljust(width) if i < words else text.rjust(width) for i, (text, width) in enumerate(zip(row, widths, strict=True))
         ]
         return f"| {' | '.join(cells)} |"
 
-    rule = "|" + "|".join("-" * (width + 2) if i == 0 else "-" * (width + 1) + ":" for i, width in enumerate(widths)) + "|"
+    rule = "|" + "|".join("-" * (width + 2) if i < words else "-" * (width + 1) + ":" for i, width in enumerate(widths)) + "|"
     return [line(head), rule, *map(line, body)]

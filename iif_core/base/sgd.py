@@ -352,6 +352,8 @@ def _gather(problem: BaseProblem, options: SgdOptions) -> _Pool:
 
 def _half_in_range(values: NDArray) -> NDArray:
     """Half bits as they are if all are in [0, 1] (what the kernel reads), else float32."""
+    if values.dtype == np.uint16:
+        values[values == 0x8000] = 0  # minus zero
     if values.dtype == np.uint16 and values.max(initial=0) > 0x3C00:
         return as_floats(values)
     return values
@@ -546,6 +548,8 @@ class _Numba:
             divisor = step.temperature if options.logits == "scaled" else 1.0
             slope = _logit_slope(alpha[segment], self.d_alpha[segment], self.votes[segment], options.label_weight, divisor)
             self.adam_z.gradient.reshape(self.z.shape)[segment] = slope
+        else:
+            sums[:, 1] = 0  # a kept selection has no label loss
         return d_raw, sums.sum(0)
 
     def step(self, step: _Step) -> NDArray:
@@ -672,7 +676,7 @@ class _Torch:
         segment = self.segment[pixels]
         share = self.weight[pixels] if self.options.weighted else self.torch.ones_like(self.weight[pixels])
         divisor = temperature if self.options.logits == "scaled" else 1.0
-        return torch_losses(
+        found = torch_losses(
             raw,
             self.values[pixels].to(self.torch.float32),
             self.affine,
@@ -685,6 +689,9 @@ class _Torch:
             self.options,
             self.fixed,
         )
+        if self.fixed is not None:
+            found["label"] = self.torch.zeros_like(found["label"])  # a kept selection has no label loss
+        return found
 
     def step(self, step: _Step) -> NDArray:
         pixels = self.tensor(step.pixels.astype(np.int64))
@@ -792,9 +799,12 @@ def torch_losses(
     alpha_n = alpha[segment]
     mixed = (alpha_n[..., _PROPERTY_OF_CHANNEL] * corrected).sum(1)
     spread = (mixed[:, None] - corrected).abs()
-    ranked = torch.where(use[..., None], spread, torch.inf).sort(1, stable=True).indices
-    middle = ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5)
-    b_ref = spread.gather(1, ranked.gather(1, middle))[:, 0].clamp_min(floor)
+    ranked = torch.where(use[..., None], spread.detach(), torch.inf).sort(dim=1).values
+    median = ranked.gather(1, ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5))
+    index = torch.arange(usable.shape[1], device=raw.device)[None, :, None]
+    is_median = (spread.detach() == median) & use[..., None]
+    first = torch.where(is_median, index, usable.shape[1] - 1).amin(1, keepdim=True)  # of those that are equal
+    b_ref = spread.gather(1, first)[:, 0].clamp_min(floor)
     if not options.median_gradient:
         b_ref = b_ref.detach()
     d = (mixed - mu).abs()

@@ -226,7 +226,7 @@ def _texture(raw, floor, smooth, m, mu, b, d_mu, d_b):
     x = np.empty(TILE, raw.dtype)
     one = np.float32(1)
     for c in range(5):
-        span = one - _LOW[c]
+        low = _LOW[c]
         for part in range(2):
             source = LOCATION[c] if part == 0 else SCALE[c]
             for i in range(m):
@@ -236,8 +236,8 @@ def _texture(raw, floor, smooth, m, mu, b, d_mu, d_b):
                 s = one / (one + x[i])
                 slope = s * (one - s)
                 if part == 0:
-                    mu[c, i] = _LOW[c] + span * s
-                    d_mu[c, i] = span * slope
+                    mu[c, i] = low + s - low * s  # not 1 - low: it would be rounded to float32
+                    d_mu[c, i] = slope - low * slope
                 elif smooth:
                     floored = np.sqrt(s * s + floor * floor)
                     b[c, i] = floored

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
 from iif_core.base import sgd, sgd_kernels
 from iif_core.base.direct import BaseOptions, solve_base
@@ -14,6 +13,7 @@ from iif_core.base.reference_loss import loss_of_result, reference_loss
 from iif_core.base.sgd import SgdOptions, converged, sgd_options, solve_base_sgd
 from iif_core.errors import InputError
 from iif_core.hashgrid import HashGridOptions
+from tests.unit.test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
 torch = pytest.importorskip("torch")
 TERMS = ("data", "label", "regulariser", "entropy", "gain")
@@ -331,12 +331,13 @@ def test_loss_with_moved_corrections_is_the_reference_loss():
 @pytest.mark.parametrize("preset", ["safe", "paper"])
 def test_both_backends_walk_the_same_way(preset):
     problem, _ = simulated()
-    options = sgd_options(preset, texture="cells", iterations=12, batch=2048, median_gradient=False, records=12)
+    options = sgd_options(preset, texture="cells", iterations=8, batch=1024, median_gradient=False, records=8)
     a, b = (solve_base_sgd(problem, options, backend=backend) for backend in ("numba", "torch"))
     for x, y in zip(a.history, b.history, strict=True):
         assert {n: v for n, v in x.items() if n != "step"} == pytest.approx({n: v for n, v in y.items() if n != "step"}, rel=1e-4)
-    np.testing.assert_allclose(a.value, b.value, atol=1e-3)
-    np.testing.assert_allclose(a.scale, b.scale, atol=1e-3)
+    for x, y in ((a.value, b.value), (a.scale, b.scale)):  # Adam's steps have the size of a gradient's sign
+        np.testing.assert_allclose(x, y, atol=0.02)
+        assert np.abs(x - y).mean() < 1e-5
 
 
 def test_same_bytes_again_streamed_and_with_threads():
@@ -415,9 +416,9 @@ def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(val
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 def test_coldest_temperatures_stay_finite(backend):
     problem, _ = simulated()
-    options = sgd_options("paper", texture="cells", iterations=40, batch=1024, anneal_schedule="fraction", anneal=0.7)
+    options = sgd_options("paper", texture="cells", iterations=20, batch=512, anneal_schedule="fraction", anneal=0.7)
     fit = solve_base_sgd(problem, options, backend=backend)
-    assert fit.history[-1]["temperature"] < 2e-12
+    assert fit.history[-1]["temperature"] < 2e-11
     for array in (fit.value, fit.scale, fit.corrections, fit.alpha):
         assert np.isfinite(array).all()
     assert np.isfinite([list(h.values()) for h in fit.history]).all()

@@ -46,9 +46,7 @@ def by_pixel(problem, value, scale, corrections, weight, weighted=False, tempera
             w = problem.weight[view][n] if weighted else 1.0
             v = np.stack(
                 [
-                    np.r_[
-                        albedo[s, k] @ np.r_[m[n, :3], 1], roughness[s, k] @ [m[n, 3], 1], metallic[s, k] @ [m[n, 4], 1]
-                    ]
+                    np.r_[albedo[s, k] @ np.r_[m[n, :3], 1], roughness[s, k] @ [m[n, 3], 1], metallic[s, k] @ [m[n, 4], 1]]
                     for k, m in enumerate(maps)
                 ]
             )

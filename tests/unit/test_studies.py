@@ -257,22 +257,20 @@ def test_every_kind_of_picture_is_drawn(tmp_path):
 
 def test_share_of_errors_within_the_claimed_interval():
     rng = np.random.default_rng(0)
-    shape = (150, 150)
-    truth_map, scale = rng.uniform(0.2, 0.8, shape), rng.uniform(0.005, 0.02, shape).astype(np.float32)
-    value = (0.1 + 0.6 * truth_map + rng.laplace(0, scale)).astype(np.float32)
-    mask = np.ones(shape, bool)
-    mask[:5] = False
-    targets = {"albedo": np.stack([truth_map] * 3, -1), "roughness": truth_map, "metallic": truth_map}
-    truth = scores.MaterialTruth(None, targets, dict.fromkeys(targets, mask), np.zeros(shape, int))
-    channels = {f"albedo.{c}": value for c in "RGB"} | {"roughness": value, "metallic": value}
-    assert list(scores.interval_scores(channels, truth)) == []
-    out = dict(scores.interval_scores(channels | {"uncertainty.albedo": scale, "uncertainty.roughness": scale}, truth))
-    assert set(out) == {"albedo", "roughness"}
-    for quantity in out:
+    n = 20_000
+    truth, scale = rng.uniform(0.2, 0.8, n), rng.uniform(0.005, 0.02, n)
+    value = 0.1 + 0.6 * truth + rng.laplace(0, scale)
+    names = ["albedo_r", "albedo_g", "albedo_b", "roughness", "metallic"]
+    cells = dict.fromkeys(names, value) | {f"uncertainty_{name}": scale for name in names}
+    cells |= {"object_id": np.zeros(n, int), "coverage": np.where(np.arange(n) % 10 == 0, 0.0, 1.0)}
+    column = truth[:, None].copy()
+    column[:100] = np.nan
+    truths = {"albedo": np.repeat(column, 3, 1), "roughness": column, "metallic": column * np.nan}
+    out = dict(scores.interval_scores(cells, truths))
+    assert set(out) == {"albedo", "roughness", "metallic"}
+    for quantity in ("albedo", "roughness"):
         share = {(score.metric, score.protocol): score.value for score in out[quantity]}
         for level in (50, 80, 95):
             assert share[f"coverage_{level}", "oracle_affine"] == pytest.approx(level / 100, abs=0.015)
         assert share["coverage_50", "raw"] < 0.3
-    nothing = scores.MaterialTruth(None, targets, dict.fromkeys(targets, mask & False), truth.object_id)
-    empty = dict(scores.interval_scores(channels | {"uncertainty.roughness": scale}, nothing))["roughness"]
-    assert {score.value for score in empty} == {None}
+    assert {score.value for score in out["metallic"]} == {None}

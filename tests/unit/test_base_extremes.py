@@ -1,0 +1,140 @@
+"""The base solver where numbers stop being friendly (METHOD 5, H1-H14, H40-H45)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.problem import LOWEST, BaseProblem, one_segment_per_view
+from iif_core.base.selection import selection_weights
+from iif_core.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.errors import InputError
+from tests.unit.test_base import finite, oracle_psnr, simulated
+
+
+def every_array_is_finite(result):
+    return all(np.isfinite(v).all() for v in vars(result).values() if isinstance(v, np.ndarray))
+
+
+def test_ten_thousand_objects_of_a_few_pixels():
+    rng = np.random.default_rng(0)
+    n = 10_000
+    truth = rng.uniform(0.1, 0.9, (n, 5))
+    cell = np.arange(4 * n, dtype=np.int32)  # four cells an object, seen in two views
+    objects = cell // 4
+    predictions = [np.clip(truth[objects] + 0.02 * rng.standard_normal((3, 4 * n, 5)), 0, 1) for _ in range(2)]
+    segments = [objects, n + objects]
+    problem = BaseProblem(predictions, [cell, cell], segments, 4 * n, objects, np.tile(np.arange(n, dtype=np.int32), 2))
+    result = solve_base(problem)
+    assert every_array_is_finite(result) and result.value.shape == (4 * n, 5)
+    assert np.abs(result.object_value - truth).mean() < 0.02
+
+
+@pytest.mark.parametrize("temperature", [1e-3, 1e-6, 1e-12])
+def test_cold_selection_in_float32_inputs_equals_float64(temperature):
+    error = np.random.default_rng(1).uniform(1e-8, 1e-2, (500, 16))
+    single, double = (selection_weights(error.astype(t), temperature) for t in (np.float32, np.float64))
+    assert np.isfinite(single).all() and (np.abs(single.sum(-1) - 1) < 1e-12).all()
+    gap = np.diff(np.partition(error, 1, -1)[:, :2], axis=-1)[:, 0] > 1e-6 * error.max(-1)
+    np.testing.assert_array_equal(single[gap].argmax(-1), double[gap].argmax(-1))
+
+
+@pytest.mark.parametrize("temperature", [1e-12, 0.0, 1e12])
+def test_solver_at_extreme_temperatures(temperature):
+    problem, truth = simulated()
+    options = BaseOptions(temperature=max(temperature, 1e-12), final_temperature=temperature)
+    result = solve_base(problem, options)
+    assert every_array_is_finite(result)
+    entropy = result.history[-1]["entropy"]
+    assert entropy == pytest.approx(np.log(len(problem.predictions[0])), abs=1e-6) if temperature > 1 else entropy < 1e-6
+
+
+def test_scale_to_zero():
+    """Predictions that agree exactly: every scale at the floor, none below, none NaN."""
+    problem, truth = simulated()
+    maps = [np.broadcast_to(p[:1], p.shape).copy() for p in problem.predictions]
+    for floor in (1e-2, 1e-6):
+        result = solve_base(replace(problem, predictions=maps), BaseOptions(scale_floor=floor))
+        assert every_array_is_finite(result) and result.scale.min() >= np.float32(floor)
+    assert (result.margin == 0).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_predictions_at_the_ends_of_the_range(value, dtype):
+    problem, _ = simulated()
+    maps = [np.full(p.shape, value, dtype) for p in problem.predictions]
+    result = solve_base(replace(problem, predictions=maps))
+    assert every_array_is_finite(result)
+    np.testing.assert_allclose(result.value, np.maximum(np.full_like(result.value, value), LOWEST), atol=1e-4)
+
+
+def test_one_view_misses_the_mesh():
+    problem, truth = simulated()
+    blind = replace(
+        problem,
+        cell_of_pixel=[*problem.cell_of_pixel, np.full_like(problem.cell_of_pixel[0], -1)],
+        segment_of_pixel=[*problem.segment_of_pixel, np.full_like(problem.segment_of_pixel[0], -1)],
+        predictions=[*problem.predictions, np.full_like(problem.predictions[0], np.nan)],
+        weight=[*problem.weight, problem.weight[0]],
+    )
+    a, b = solve_base(problem), solve_base(blind)
+    np.testing.assert_array_equal(a.value, b.value)
+
+
+def test_ids_above_sixteen_bits():
+    """H43: objects, segments and cells beyond 65,535 keep apart."""
+    problem, truth = simulated()
+    shift = 70_000
+    result = solve_base(problem)
+    moved = solve_base(
+        replace(
+            problem,
+            object_of_cell=problem.object_of_cell + shift,
+            object_of_segment=np.concatenate([np.full(shift, shift, np.int32), problem.object_of_segment + shift]),
+            segment_of_pixel=[np.where(s >= 0, s + shift, -1).astype(np.int32) for s in problem.segment_of_pixel],
+        )
+    )
+    np.testing.assert_array_equal(moved.value, result.value)
+    np.testing.assert_array_equal(moved.object_value[shift:], result.object_value)
+    with pytest.raises(InputError, match="object ids span"):
+        pack_keys(np.ones((1, 3)), 70_000)  # the cell grid has 16 bits for objects: refused, never wrapped
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_millimetres_and_kilometres_make_the_same_cells(unit):
+    rng = np.random.default_rng(2)
+    points = rng.uniform(0, 5, (20_000, 3)).astype(np.float32)
+    edge = 0.01
+    keys = [voxel_indices(points * np.float32(s), edge * s, grid_origin(points * np.float32(s), edge * s)) for s in (1.0, unit)]
+    assert (keys[0] == keys[1]).all(1).mean() > 0.995  # float32 rounds a few points over a face
+
+
+def test_one_correction_an_image_underfits():
+    """The paper's ablation: objects err differently, so one affine an image cannot put them right."""
+    problem, truth = simulated()
+    image = one_segment_per_view(problem)
+    assert image.n_segments == len(problem.cell_of_pixel)
+    by_object, by_image = solve_base(problem), solve_base(image)
+    assert finite(by_image)
+    assert oracle_psnr(problem, by_object.value, truth) > oracle_psnr(problem, by_image.value, truth)
+    assert by_image.object_value.shape[0] == by_object.object_value.shape[0]
+
+
+def test_memory_bound_changes_nothing():
+    """Predictions that do not fit are read again: the same bytes."""
+    problem, _ = simulated()
+    reads = []
+
+    def read(view):
+        reads.append(view)
+        return problem.predictions[view]
+
+    streamed = replace(problem, predictions=read)
+    kept, again = (solve_base(streamed, BaseOptions(sweeps=4, memory=m)) for m in (1 << 30, 0))
+    n_views = len(problem.cell_of_pixel)
+    assert len(reads) == n_views + n_views * 6  # once; then the first pass, four sweeps, the scales
+    for name, value in vars(kept).items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(again, name), err_msg=name)

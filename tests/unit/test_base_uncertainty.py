@@ -1,0 +1,80 @@
+"""Calibrated uncertainty: planted laws are found, intervals cover what they say, the base's own claim holds on new data."""
+
+import numpy as np
+import pytest
+
+from iif_core.base import uncertainty
+from iif_core.base.direct import solve_base
+from iif_core.base.selection import effective_number, margin
+from iif_core.base.uncertainty import LEVELS, Calibration, coverage, fit_calibration, gauge_free_error, interval
+from iif_core.errors import InputError
+from tests.unit.test_base import simulated
+
+
+def test_planted_law_is_found_and_covers():
+    rng = np.random.default_rng(0)
+    n = 60_000
+    b, views = rng.uniform(0.01, 0.1, n), rng.integers(1, 9, n)
+    planted = Calibration(0.3, 0.8, 0.5)
+    error = rng.laplace(0, planted.scale(b, views))
+    found = fit_calibration(error, b, views)
+    assert found.c == pytest.approx(0.3, rel=0.1) and found.g == pytest.approx(0.8, abs=0.03)
+    assert found.h == pytest.approx(0.5, abs=0.03)
+    fresh = rng.laplace(0, planted.scale(b, views))
+    np.testing.assert_allclose(coverage(fresh, found.scale(b, views)), LEVELS, atol=0.01)
+
+
+def test_intervals_are_those_of_a_laplace_distribution():
+    assert interval(np.float64(2.0), 0.95) == pytest.approx(2 * np.log(20))
+    sample = np.random.default_rng(1).laplace(0, 0.2, 100_000)
+    np.testing.assert_allclose(coverage(sample, np.float64(0.2)), LEVELS, atol=0.006)
+
+
+def test_gauge_free_error_ignores_any_affine_of_the_object():
+    rng = np.random.default_rng(2)
+    truth, objects = rng.random((300, 3)), rng.integers(0, 3, 300)
+    a, b = rng.standard_normal((3, 3, 3)), rng.standard_normal((3, 3))
+    noise = 0.01 * rng.standard_normal((300, 3))
+    value = np.einsum("nij,nj->ni", a[objects], truth) + b[objects] + noise
+    error = gauge_free_error(value, truth, objects)
+    assert 0.9 * noise.std() < error.std() < 1.01 * noise.std()
+    flat = gauge_free_error(0.3 + noise, np.full((300, 3), 0.7), objects)  # one colour: the affine is a level
+    for o in range(3):
+        np.testing.assert_allclose(flat[objects == o], noise[objects == o] - noise[objects == o].mean(0), atol=1e-9)
+    assert gauge_free_error(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int)).shape == (0, 3)
+
+
+def test_the_base_knows_where_it_is_wrong():
+    """On predictions and a room that had no part in the calibration: cells that claim more are more wrong."""
+    problem, truth = simulated()
+    result = solve_base(problem)
+    seen = result.coverage > 0
+    error = np.abs(gauge_free_error(result.value[seen, :3], truth[seen, :3], problem.object_of_cell[seen]))
+    claimed = result.uncertainty[seen, :3]
+    sure, unsure = claimed < np.quantile(claimed, 0.3), claimed > np.quantile(claimed, 0.7)
+    assert error[unsure].mean() > 1.3 * error[sure].mean()
+    assert np.isfinite(result.uncertainty).all() and (result.uncertainty > 0).all()
+
+
+def test_uncertainty_shrinks_with_views_and_grows_with_scale():
+    scale = np.full((4, 5), 0.03)
+    one = uncertainty.location_uncertainty(scale, np.array([0, 1, 2, 8]))
+    assert (one[0] == one[1]).all() and (np.diff(one[1:], axis=0) < 0).all()
+    assert (uncertainty.location_uncertainty(2 * scale, np.ones(4)) > uncertainty.location_uncertainty(scale, np.ones(4))).all()
+
+
+def test_margin_and_effective_number():
+    error, usable = np.array([[1.0, 4.0, 2.0], [1, 1, 3], [5, 1, 1], [0, 0, 0]]), np.ones((4, 3), bool)
+    np.testing.assert_allclose(margin(error, usable), [0.5, 0, 0, 0])
+    usable[0, 2] = False
+    np.testing.assert_allclose(margin(error, usable)[0], 0.75)
+    assert margin(np.array([[0.2]]), np.array([[True]]))[0] == 1 and margin(np.array([[0.2]]), np.array([[False]]))[0] == 0
+    assert margin(np.array([[0.2, 0.1]]), np.array([[True, False]]))[0] == 1
+    np.testing.assert_allclose(effective_number([[1, 0, 0], [1 / 3] * 3, [0.5, 0.5, 0], [0, 0, 0]]), [1, 3, 2, 0])
+
+
+def test_bad_calls_are_refused():
+    with pytest.raises(InputError, match="0.95"):
+        interval(np.ones(2), 95)
+    with pytest.raises(InputError, match="no errors"):
+        coverage(np.zeros(0), np.zeros(0))
