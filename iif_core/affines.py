@@ -165,20 +165,20 @@ def apply_affines(affine: np.ndarray, object_id: np.ndarray, base: np.ndarray) -
 
 
 def albedo_uncertainty(
-    affine: np.ndarray, covariance: np.ndarray, object_id: np.ndarray, base: np.ndarray, base_scale: np.ndarray
+    affine: np.ndarray, covariance: np.ndarray, object_id: np.ndarray, base: np.ndarray, base_deviation: np.ndarray
 ) -> np.ndarray:
     """Standard deviation of the fitted albedo, mean over the channels: (n,) float64.
 
-    Adds the fit's covariance at the base colour and the base's own Laplace scale b (variance 2 b^2) through A.
+    Adds the fit's covariance at the base colour and the base's own standard deviation through A.
 
     Args:
-        affine: (O, 16); covariance: (O, 16, 16); object_id: (n,), -1 = no fit; base: (n, 5); base_scale: (n, 3) b.
+        affine: (O, 16); covariance: (O, 16, 16); object_id: (n,), -1 = no fit; base: (n, 5); base_deviation: (n, 3).
     """
     known = object_id >= 0
     o = np.where(known, object_id, 0)
     one = np.concatenate([np.asarray(base, np.float64)[:, :3], np.ones((len(base), 1))], 1)
     variance = np.zeros((len(base), 3))
-    spread = 2.0 * np.asarray(base_scale, np.float64) ** 2
+    spread = np.asarray(base_deviation, np.float64) ** 2
     for c in range(3):
         rows = slice(4 * c, 4 * c + 4)
         if len(affine):

@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core import metrics
 from iif_core.base.problem import CHANNELS
-from iif_core.base.uncertainty import LEVELS, coverage, gauge_free_error
+from iif_core.base.uncertainty import CALIBRATION, LEVELS, coverage, gauge_free_error
 from iif_core.lpips import Weights
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.normal_form import CaptureReader, Truth, View
@@ -139,7 +139,7 @@ def interval_scores(
 ) -> Iterator[tuple[str, list[metrics.Score]]]:
     """Share of the surface cells whose error lies within the interval that the base claims, at 50, 80 and 95 %.
 
-    The columns `uncertainty_*` are Laplace scales of the error that is left when each object's truth is mapped to the base
+    The columns `uncertainty_*` are standard deviations of the error that is left when each object's truth is mapped to the base
     by its nearest affine, over all views together (iif_core.base.uncertainty): protocol `oracle_affine`. `raw` is the same
     without the affine, which no such scale can know.
 
@@ -162,6 +162,6 @@ def interval_scores(
             [
                 metrics.Score(name, protocol, share)
                 for protocol, error in errors.items()
-                for name, share in zip(labels, coverage(error, claimed), strict=True)
+                for name, share in zip(labels, coverage(error, claimed, CALIBRATION[quantity].beta), strict=True)
             ],
         )

@@ -182,7 +182,7 @@ class Base(Section):
     """`direct`: `distribution` then minimises the paper's own loss for the selection found."""
     robust: bool = False
     """`direct`: cells take an M-estimate instead of the mean (outliers in few views, at the price of sharpness)."""
-    sweeps: int = Field(12, ge=1, le=200)
+    sweeps: int = Field(9, ge=1, le=200)
     """`direct`: alternations."""
     polish: int = Field(25, ge=1, le=1000)
     """`direct`, `objective: distribution`: sweeps on the paper's loss."""

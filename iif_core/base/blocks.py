@@ -41,6 +41,16 @@ class Block:
         return sum(getattr(self, name).nbytes for name in ("values", "cell", "weight", "segments", "start", "inside"))
 
 
+def shared_weight(views: NDArray, floor: float) -> NDArray:
+    """(n_cells,) float32 weight of a cell's pixels in the fit of the corrections: 1 - 1 / n + floor, n viewpoints.
+
+    With the cell's value eliminated (it is the mean of n observations u_j), what remains of the squares is, as a function of
+    one observation, (1 - 1/n) (u - mean of the others)^2: a cell seen once says nothing about the corrections. The floor
+    keeps segments that share no cell; without it they would collapse to a constant.
+    """
+    return (1 - 1 / np.maximum(views, 1) + floor).astype(np.float32)
+
+
 def make_block(problem: BaseProblem, view: int) -> tuple[Block, list[Dropped]]:
     """The block of a view, and what of its predictions was left out and why.
 

@@ -4,12 +4,15 @@ Each segment i (one object in one view) and prediction k has an affine correctio
 metallic 1x2) and, per property, a selection weight alpha_ik. One pass over the views a sweep:
 
 1. T: least squares of the corrected prediction against the texture of the sweep before, with a ridge to identity
-   that grows with the pixel count (without it, a constant texture would be a perfect fit);
+   that grows with the pixel count (without it, a constant texture would be a perfect fit). Pixels count by how much
+   their cell can say (blocks.shared_weight): next to nothing where only this view sees it, for there the texture is
+   this view's own mixture and would hold back the agreement with the others;
 2. alpha: softmax over k of minus the segment's mean squared error, at a temperature that falls from sweep to sweep
    to a last one at which only predictions nearly as good as the best count (0 = the best alone);
 3. texture: weighted mean (or M-estimate) in each cell of the mixture sum_k alpha_ik T_ik v_nk;
 4. gauge: an affine map of a part's texture and its inverse on all T cancel, so the level of a part would drift from
-   sweep to sweep. It is moved back to the mean over all predictions (gauge.anchor_shifts). Contrast is held by the
+   sweep to sweep. It is moved back to that of the predictions' median (gauge.anchor_shifts; their mean was
+   0.8 dB worse on Country Kitchen: bad predictions are bad upwards). Contrast is held by the
    ridge: with predictions of variance v that correlate by rho it settles at about ridge / (ridge + v (1 - rho)) of
    theirs, it cannot collapse; `history` has the mean gain. Stretching it back every sweep was tried and only
    amplified the noise of plain objects, with no gain elsewhere. At the end, seams between the parts of an object
@@ -27,6 +30,7 @@ The same bytes whatever the number of threads; the order of the predictions matt
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,7 +41,7 @@ from numpy.typing import NDArray
 from .. import laplace
 from ..errors import InputError
 from . import kernels, matching
-from .blocks import Block, Blocks, in_order
+from .blocks import Block, Blocks, in_order, shared_weight
 from .gauge import Parts, anchor_shifts, covisible_parts, seam_shifts
 from .problem import LOWEST, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, Dropped, object_means
 from .selection import effective_number, margin, selection_weights
@@ -74,12 +78,13 @@ class BaseOptions:
             share of the segment is, and at least so many pixels remain.
         scale_floor: smallest Laplace scale.
         objective: `least_squares`, or `distribution`: afterwards `polish` sweeps on the paper's loss, hard selection.
+        alone: weight in the fit of T of cells that one viewpoint sees (1 - 1/n + this for n viewpoints); must not be 0.
         seams: close seams between parts of an object (needs `BaseProblem.neighbours`).
         memory: bytes of predictions that may stay in memory between sweeps; the others are read again.
     """
 
     variant: str = "full"
-    sweeps: int = 12
+    sweeps: int = 9
     temperature: float = 1.0
     anneal: float = 0.6
     ridge: float = 0.01
@@ -93,6 +98,7 @@ class BaseOptions:
     objective: str = "least_squares"
     polish: int = 20
     seams: bool = True
+    alone: float = 0.01
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
@@ -104,9 +110,10 @@ class BaseOptions:
                 f"base options: temperature {self.temperature} must not be below final_temperature {self.final_temperature}"
                 f" (>= 0), polish {self.polish} must be >= 1"
             )
-        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1:
+        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1 or not self.alone > 0:
             raise InputError(
-                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1)"
+                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1),"
+                f" alone {self.alone} (> 0)"
             )
 
 
@@ -122,34 +129,37 @@ class _State:
 class _Sums:
     """What does not change: Gram matrices of every (segment, prediction) and the regularised inverses."""
 
-    def __init__(self, n_segments: int, k: int):
+    def __init__(self, n_segments: int, k: int, fit_of_cell: NDArray):
+        self.fit_of_cell = fit_of_cell
         self.weight = np.zeros(n_segments)
         self.gram = np.zeros((n_segments, k, kernels.GRAM))
         self.usable = np.zeros((n_segments, k), bool)
-        self.predicted = np.zeros((n_segments, 5))  # weighted sums of the mean usable prediction
         self.masked = np.zeros((n_segments, k), bool)  # fitted without its clipped pixels
         self.ridge = np.zeros(n_segments)
         self.inverse = (np.zeros((n_segments, k, 4, 4)), np.zeros((n_segments, k, 2, 2)), np.zeros((n_segments, k, 2, 2)))
 
+    def fit_weight(self, block: Block) -> NDArray:
+        """(n,) float32 weight of the pixels of a view in the fit of the corrections."""
+        return block.weight * self.fit_of_cell[block.cell]
+
     def add(self, block: Block, options: BaseOptions) -> None:
+        """Sums of the segments of one view."""
         rows = block.segments
         if not len(rows):
             return
         if (self.weight[rows] > 0).any():
             segment = rows[np.argmax(self.weight[rows] > 0)]
             raise InputError(f"segment {segment} has pixels in two views; a segment is one object in one view")
-        gram = kernels.gram(block.values, block.weight, block.start, _NO_MASK)
+        weight = self.fit_weight(block)
+        gram = kernels.gram(block.values, weight, block.start, _NO_MASK)
         self.gram[rows], self.weight[rows], self.usable[rows] = gram, gram[:, 0, 13], block.usable
-        self.predicted[rows] = gram[:, block.usable][..., [6, 7, 8, 10, 12]].mean(1)
         fit = gram
         if block.inside.size:
             count = np.diff(block.start)
             remain = np.add.reduceat(block.inside, block.start[:-1], axis=1, dtype=np.int64).T
             enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * count[:, None])
             self.masked[rows] = block.usable & enough & (remain < count[:, None])
-            fit = np.where(
-                self.masked[rows][..., None], kernels.gram(block.values, block.weight, block.start, block.inside), gram
-            )
+            fit = np.where(self.masked[rows][..., None], kernels.gram(block.values, weight, block.start, block.inside), gram)
         self.ridge[rows] = options.ridge * np.maximum(self.weight[rows], options.ridge_pixels)
         for out, where, source in zip(self.inverse, (_GRAM_4, _GRAM_R, _GRAM_M), (fit, gram, gram), strict=True):
             out[rows] = np.linalg.inv(source[..., where] + self.ridge[rows, None, None, None] * np.eye(len(where)))
@@ -203,8 +213,12 @@ def solve_base(
     options: BaseOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 1,
+    chosen: NDArray | None = None,
 ) -> BaseResult:
     """Base texture of a problem by alternating closed forms; deterministic.
+
+    `chosen` (S, 3) int: with `objective="distribution"`, the prediction of each segment and property to use instead of
+    those that the solver would select (twins are compared at one selection).
 
     `progress(done, total)` is called after every pass over the views. `threads` views are worked on at a time (and are
     in memory); the result does not depend on it.
@@ -214,14 +228,15 @@ def solve_base(
     """
     options = options or BaseOptions()
     means = options.variant in ("texel_mean", "object_mean")
-    sweeps = 1 if means else options.sweeps
+    sweeps = 1 if means or chosen is not None else options.sweeps
     n_views = len(problem.cell_of_pixel)
     polish = options.polish if options.objective == "distribution" and not means else 0
     total = sweeps + polish + 2
     blocks = Blocks(problem, options.memory)
     parts = covisible_parts(problem)
 
-    sums, state, texture, dropped, counts = _first_pass(problem, blocks, options, threads)
+    sums, state, first, dropped, counts = _first_pass(problem, blocks, options, threads)
+    texture = first
     _notify(progress, 1, total)
     history: list[dict[str, float]] = []
     for sweep in range(sweeps):
@@ -234,7 +249,7 @@ def solve_base(
             cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
         updated = cells.mean(texture)
         if not means:
-            shift = anchor_shifts(parts, sums.predicted, updated, counts.weight)
+            shift = anchor_shifts(parts, first, updated, counts.weight)
             updated = _shifted(parts, shift, updated, state)
         seen = counts.weight > 0
         change = float(np.sqrt(np.mean((updated - texture)[seen] ** 2, dtype=np.float64))) if seen.any() else 0.0
@@ -243,7 +258,7 @@ def solve_base(
         _notify(progress, sweep + 2, total)
 
     if polish:
-        chosen = _hard(state, sums)
+        chosen = _select(state, sums, chosen)
         texture = _polish(blocks, problem, options, sums, state, chosen, texture, threads, history, progress, total)
     elif options.seams and not means and problem.neighbours is not None:
         shift, _ = seam_shifts(parts, texture, counts.weight, problem.neighbours)
@@ -281,8 +296,9 @@ def describe_fit(
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
     for block in in_order(blocks, len(problem.cell_of_pixel), threads):
         rows, target = block.segments, kernels.texture_at(texture, block.cell)
-        cross = kernels.cross(block.values, target, block.weight, block.start, _NO_MASK)
-        square = kernels.square(target, block.weight, block.start)
+        weight = sums.fit_weight(block)
+        cross = kernels.cross(block.values, target, weight, block.start, _NO_MASK)
+        square = kernels.square(target, weight, block.start)
         state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
     result = _outcome(problem, blocks, options, sums, parts, counts, texture, state, threads)
     own = np.where((counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
@@ -342,14 +358,15 @@ def _sweep_view(
     block = blocks(view)
     rows = block.segments
     values, target = block.values, kernels.texture_at(texture, block.cell)
-    cross = kernels.cross(values, target, block.weight, block.start, _NO_MASK)
+    weight = sums.fit_weight(block)
+    cross = kernels.cross(values, target, weight, block.start, _NO_MASK)
     if options.variant in ("full", "uniform"):
         albedo = cross
         if sums.masked[rows].any():
-            inside = kernels.cross(values, target, block.weight, block.start, block.inside)
+            inside = kernels.cross(values, target, weight, block.start, block.inside)
             albedo = np.where(sums.masked[rows][..., None], inside, cross)
         state.affine[rows] = sums.corrections(rows, cross, albedo)
-    square = kernels.square(target, block.weight, block.start)
+    square = kernels.square(target, weight, block.start)
     state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
     if options.variant == "full" and len(rows):
         for p in range(3):
@@ -361,6 +378,8 @@ def _sweep_view(
 
 @dataclass
 class _Counts:
+    """Per cell: pixels, views, weight of the pixels."""
+
     observations: NDArray
     views: NDArray
     weight: NDArray
@@ -371,9 +390,10 @@ def _first_pass(
 ) -> tuple[_Sums, _State, NDArray, list[Dropped], _Counts]:
     """Gram matrices, the first texture (cell mean of the predictions' median), what was dropped, counts."""
     counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
-    cells = _CellSums(problem.n_cells)
-    sums, state = None, _State(problem.n_segments, 1)
+    cells, n_k = _CellSums(problem.n_cells), 0
     dropped: list[Dropped] = []
+    viewpoints, known = np.zeros(problem.n_cells, np.int32), set()
+    n_views = len(problem.cell_of_pixel)
 
     def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
         block, left_out = blocks.first(view)
@@ -385,25 +405,29 @@ def _first_pass(
             start = kernels.medians(block.values, block.usable, kernels.sorting_network(int(block.usable.sum())))
         return block, left_out, start
 
-    for view, (block, left_out, start) in enumerate(in_order(start_of, len(problem.cell_of_pixel), threads)):
-        if sums is None:
-            sums, state = _Sums(problem.n_segments, len(block.usable)), _State(problem.n_segments, len(block.usable))
-        if len(block.usable) != sums.usable.shape[1]:
+    for view, (block, left_out, start) in enumerate(in_order(start_of, n_views, threads)):
+        n_k = n_k or len(block.usable)
+        if len(block.usable) != n_k:
             raise InputError(
-                f"view {view} has {len(block.usable)} predictions, view 0 has {sums.usable.shape[1]};"
-                " give every view the same number"
+                f"view {view} has {len(block.usable)} predictions, view 0 has {n_k}; give every view the same number"
             )
         blocks.keep(view, block)
         dropped += left_out
-        sums.add(block, options)
         cells.add(block.cell, start, block.weight)
         counts.observations += np.bincount(block.cell, minlength=problem.n_cells).astype(np.int32)
-        counts.views[np.unique(block.cell)] += 1
-    if sums is None:
-        sums = _Sums(problem.n_segments, 1)
+        seen = np.unique(block.cell)
+        counts.views[seen] += 1
+        digest = hashlib.sha256(block.cell.tobytes()).digest()
+        if digest not in known:  # the same photograph twice is one viewpoint
+            known.add(digest)
+            viewpoints[seen] += 1
+    counts.weight = cells.total[:, 0]
+    sums = _Sums(problem.n_segments, max(n_k, 1), shared_weight(viewpoints, options.alone))
+    for block in in_order(blocks, n_views, threads):
+        sums.add(block, options)
+    state = _State(problem.n_segments, max(n_k, 1))
     share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
     state.alpha = np.repeat(share[:, :, None], 3, 2)
-    counts.weight = cells.total[:, 0]
     return sums, state, cells.mean(NEUTRAL), dropped, counts
 
 
@@ -465,12 +489,11 @@ def _scales(
     return laplace.floored(cells.mean(np.zeros(5)), np.float32(options.scale_floor)), votes
 
 
-def _hard(state: _State, sums: _Sums) -> NDArray:
-    """Chosen prediction (S, 3) int64; alpha becomes one-hot there and unchosen corrections the identity."""
-    chosen = state.alpha.argmax(1)
+def _select(state: _State, sums: _Sums, chosen: NDArray | None) -> NDArray:
+    """Chosen prediction (S, 3) int64, by default that of the largest weight; alpha becomes one-hot there."""
+    chosen = state.alpha.argmax(1) if chosen is None else np.asarray(chosen, np.int64)
     one_hot = (np.arange(state.alpha.shape[1])[None, :, None] == chosen[:, None]) & sums.usable[:, :, None]
     state.alpha = one_hot.astype(np.float64)
-    state.affine = np.where(one_hot[..., _PROPERTY_OF_ENTRY], state.affine, _IDENTITY)
     return chosen
 
 
@@ -489,8 +512,16 @@ def _polish(
 ) -> NDArray:
     """Texture (n_cells, 5) after `options.polish` sweeps of majorisation on the paper's loss."""
     n_views, n_k = len(problem.cell_of_pixel), state.alpha.shape[1]
-    scale, _ = _scales(blocks, problem, options, texture, state, threads)
     floor = options.scale_floor
+    pixels = np.zeros(problem.n_segments)
+    state.affine[:] = _IDENTITY  # its optimum lies near the identity, far from that of the least squares
+    cells = _CellSums(problem.n_cells)
+    for block in in_order(blocks, n_views, threads):
+        pixels[block.segments] = np.add.reduceat(block.weight, block.start[:-1], dtype=np.float64) if len(block.cell) else 0
+        planes = kernels.choose(block.values, chosen[block.segments], block.start)
+        cells.add(block.cell, np.maximum(planes, LOWEST[:, None]), block.weight)
+    texture, total_weight = cells.mean(texture), max(pixels.sum(), 1e-30)
+    scale, _ = _scales(blocks, problem, options, texture, state, threads)
 
     def one_view(view: int) -> tuple[Block, NDArray, NDArray, NDArray, float]:
         block = blocks(view)
@@ -500,7 +531,7 @@ def _polish(
         mixed, b_ref = _against(block, state, rows, target, options)
         weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
         second, first = kernels.channel_moments(planes, target, weight, block.start)
-        strength = matching.REGULARISER * sums.weight[rows] / n_k
+        strength = matching.REGULARISER * pixels[rows] / n_k
         state.affine[rows] = _penalised(state.affine[rows], chosen[rows], second, first, strength)
         mixed, b_ref = _against(block, state, rows, target, options)
         loss = (block.weight * laplace.kl(mixed - target, b_ref, b, floor)).sum(dtype=np.float64) / 5
@@ -518,12 +549,11 @@ def _polish(
         change = float(np.sqrt(np.mean((updated - texture) ** 2, dtype=np.float64)))
         texture = updated
         scale = laplace.floored(scales.mean(scale), np.float32(floor))
-        pixels = max(sums.weight.sum(), 1e-30)
         penalty = matching.identity_penalty(state.affine[..., :12].reshape(*state.affine.shape[:2], 3, 4))
         penalty = penalty + ((state.affine[..., 12:] - _IDENTITY[12:]) ** 2).sum(-1)
-        terms = {"data": data / pixels, "regulariser": matching.REGULARISER * (sums.weight @ penalty.mean(1)) / pixels}
+        terms = {"data": data / total_weight, "regulariser": matching.REGULARISER * (pixels @ penalty.mean(1)) / total_weight}
         history.append({"temperature": 0.0, **_summary(sums, state), "change": change, **terms})
-        _notify(progress, options.sweeps + sweep + 2, total)
+        _notify(progress, total - options.polish + sweep, total)
     return texture
 
 

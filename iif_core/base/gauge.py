@@ -2,7 +2,7 @@
 
 A shift of the texture and the opposite shift of every correction cancel. Segments are tied to one another only through
 the cells that they share: a *part* is a set of segments and cells that hang together, and each part has a level of its
-own. `anchor_shifts` holds each part at the mean of its predictions. Where an object falls into several parts (two sides
+own. `anchor_shifts` holds each part at the level of its predictions. Where an object falls into several parts (two sides
 of a cupboard that no photograph shows together), their levels differ by the error of the predictions, and an edge runs
 through the object that no correction per object can undo: `seam_shifts` closes it.
 """
@@ -60,22 +60,18 @@ def covisible_parts(problem: BaseProblem) -> Parts:
     return Parts(compact[: problem.n_segments].astype(np.int32), cells, len(used))
 
 
-def anchor_shifts(parts: Parts, predicted: NDArray, texture: NDArray, weight: NDArray) -> NDArray:
-    """(parts, 5) shifts that give every part the mean level of its predictions.
+def anchor_shifts(parts: Parts, level: NDArray, texture: NDArray, weight: NDArray) -> NDArray:
+    """(parts, 5) shifts that give the texture the mean that `level` has over every part.
 
     Args:
-        predicted: (S, 5) weighted sums of the predictions over each segment's pixels, mean over usable predictions.
-        texture: (n_cells, 5); weight: (n_cells,) pixel weight of each cell.
+        level, texture: (n_cells, 5); weight: (n_cells,) pixel weight of each cell.
     """
     seen = parts.of_cell >= 0
     of_cell, weight = parts.of_cell[seen], weight[seen]
     total = np.bincount(of_cell, weight, parts.count)
-    shift = np.zeros((parts.count, 5))
-    for c in range(5):
-        wanted = np.bincount(parts.of_segment, predicted[:, c], parts.count)
-        found = np.bincount(of_cell, weight * texture[seen, c], parts.count)
-        shift[:, c] = (wanted - found) / np.where(total > 0, total, np.inf)
-    return shift
+    missing = level[seen] - texture[seen]
+    sums = np.stack([np.bincount(of_cell, weight * missing[:, c], parts.count) for c in range(5)], 1)
+    return sums / np.where(total > 0, total, np.inf)[:, None]
 
 
 def seam_shifts(

@@ -85,7 +85,7 @@ class BaseResult:
         value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells nobody saw have their object's mean,
             objects nobody saw `NEUTRAL`.
         scale: (n_cells, 5) float32 Laplace scale b of the cell's distribution, same units (METHOD 2.3.4).
-        uncertainty: (n_cells, 5) float32 Laplace scale of the location's error, calibrated (uncertainty.py).
+        uncertainty: (n_cells, 5) float32 standard deviation of the location's error, calibrated (uncertainty.py).
         observations: (n_cells,) int32 pixels; views: (n_cells,) int32 views that saw the cell.
         coverage: (n_cells,) float32 pixels weighted by how well they see the cell; 0 = `value` is a fill.
         part_of_cell: (n_cells,) int32 part that the cell hangs together with through shared cells (gauge.py), or -1.

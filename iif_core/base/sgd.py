@@ -186,10 +186,11 @@ class SgdFit:
         error: (S, K, 3) float32 mean L1 error of each corrected prediction against the texture, at the end.
         observations, views: (n_cells,) int32 pixels and views that saw the cell.
         dropped: predictions that were not used.
-        history: step, data, label, regulariser (without its weight), total: means over the steps since the last entry;
-            temperature, learning_rate, entropy (nats), gain (mean of trace A / 3, METHOD H14).
-        at_pixels: view -> (location, scale) of the texture at its pixels, (N, 5) float32 each, NEUTRAL-free: any value
-            where the pixel is not used.
+        history: step; data, label, regulariser (without weights), label_part (with its weight), total: means over the
+            steps since the last entry; label is 0 once the selection is kept, and for K = 1; temperature,
+            learning_rate, entropy (nats), gain (mean of trace A / 3, METHOD H14).
+        at_pixels: view -> (location, scale) of the texture at its pixels, (N, 5) float32 each; without meaning where a
+            pixel is not used.
     """
 
     value: NDArray

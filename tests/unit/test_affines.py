@@ -289,10 +289,10 @@ def test_uncertainty_and_application_without_objects():
     got = apply_affines(np.zeros((0, 16)), none, base)
     np.testing.assert_allclose(got[0], [0.5, 0.5, 0.5, 0.02, 1.0])
     spread = albedo_uncertainty(np.zeros((0, 16)), np.zeros((0, 16, 16)), none, base, np.full((4, 3), 0.1))
-    np.testing.assert_allclose(spread, 0.1 * np.sqrt(2))
+    np.testing.assert_allclose(spread, 0.1)
     t = IDENTITY[None] * 2.0
     double = albedo_uncertainty(t, np.zeros((1, 16, 16)), np.zeros(4, int), base, np.full((4, 3), 0.1))
-    np.testing.assert_allclose(double, 0.2 * np.sqrt(2))
+    np.testing.assert_allclose(double, 0.2)
 
 
 def test_nothing_to_fit():

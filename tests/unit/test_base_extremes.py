@@ -134,7 +134,7 @@ def test_memory_bound_changes_nothing():
     streamed = replace(problem, predictions=read)
     kept, again = (solve_base(streamed, BaseOptions(sweeps=4, memory=m)) for m in (1 << 30, 0))
     n_views = len(problem.cell_of_pixel)
-    assert len(reads) == n_views + n_views * 6  # once; then the first pass, four sweeps, the scales
+    assert len(reads) == n_views + n_views * 7  # once; then start, sums, four sweeps, scales
     for name, value in vars(kept).items():
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(again, name), err_msg=name)

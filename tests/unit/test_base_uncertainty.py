@@ -11,22 +11,27 @@ from iif_core.errors import InputError
 from tests.unit.test_base import simulated
 
 
-def test_planted_law_is_found_and_covers():
+@pytest.mark.parametrize("beta", [1.0, 2.0])
+def test_planted_law_is_found_and_covers(beta):
     rng = np.random.default_rng(0)
     n = 60_000
     b, views = rng.uniform(0.01, 0.1, n), rng.integers(1, 9, n)
-    planted = Calibration(0.3, 0.8, 0.5)
-    error = rng.laplace(0, planted.scale(b, views))
-    found = fit_calibration(error, b, views)
-    assert found.c == pytest.approx(0.3, rel=0.1) and found.g == pytest.approx(0.8, abs=0.03)
-    assert found.h == pytest.approx(0.5, abs=0.03)
-    fresh = rng.laplace(0, planted.scale(b, views))
-    np.testing.assert_allclose(coverage(fresh, found.scale(b, views)), LEVELS, atol=0.01)
+    planted = Calibration(0.3, 0.8, 0.5, beta)
+
+    def draw():
+        unit = rng.laplace(0, 1 / np.sqrt(2), n) if beta == 1 else rng.standard_normal(n)
+        return unit * planted.deviation(b, views)
+
+    found = fit_calibration(draw(), b, views)
+    assert found.c == pytest.approx(0.3, rel=0.12) and found.g == pytest.approx(0.8, abs=0.03)
+    assert found.h == pytest.approx(0.5, abs=0.03) and found.beta == pytest.approx(beta, abs=0.3)
+    np.testing.assert_allclose(coverage(draw(), found.deviation(b, views), found.beta), LEVELS, atol=0.01)
 
 
-def test_intervals_are_those_of_a_laplace_distribution():
-    assert interval(np.float64(2.0), 0.95) == pytest.approx(2 * np.log(20))
-    sample = np.random.default_rng(1).laplace(0, 0.2, 100_000)
+def test_intervals_are_those_of_the_distribution():
+    assert interval(0.95, 1.0) == pytest.approx(np.log(20) / np.sqrt(2))
+    assert interval(0.95, 2.0) == pytest.approx(1.959964)
+    sample = np.random.default_rng(1).laplace(0, 0.2 / np.sqrt(2), 100_000)
     np.testing.assert_allclose(coverage(sample, np.float64(0.2)), LEVELS, atol=0.006)
 
 
@@ -75,6 +80,6 @@ def test_margin_and_effective_number():
 
 def test_bad_calls_are_refused():
     with pytest.raises(InputError, match="0.95"):
-        interval(np.ones(2), 95)
+        interval(95)
     with pytest.raises(InputError, match="no errors"):
         coverage(np.zeros(0), np.zeros(0))

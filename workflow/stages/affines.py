@@ -226,10 +226,10 @@ def _write_response(job: Job, curve: Response) -> None:
 def _write_cells(job: Job, fit: FitResult) -> None:
     cells = job.read("base").table("cells.parquet")
     base = np.stack([cells[name] for name in MATERIAL], 1)
-    scale = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
+    deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
-    spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, scale)
+    spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, deviation)
     columns = {
         "cell_id": cells["cell_id"],
         **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)},
@@ -243,9 +243,9 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
         file = f"maps/{view.name}.exr"
         object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)
         values = base_maps(job, view)
-        scale = base.exr(file)["uncertainty.albedo"].ravel().astype(np.float32)
+        deviation = base.exr(file)["uncertainty.albedo"].ravel().astype(np.float32)
         fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
-        spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(scale[:, None], 3, 1))
+        spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(deviation[:, None], 3, 1))
         seen = object_id >= 0
         fitted[~seen], spread[~seen] = 0.0, 0.0
         shape = (view.height, view.width)
