@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import kernels
-from .problem import BaseProblem, Dropped, check_ids, prediction_faults
+from .problem import BaseProblem, Dropped, usable_pixels
 
 _T = TypeVar("_T")
 
@@ -58,36 +58,20 @@ def make_block(problem: BaseProblem, view: int) -> tuple[Block, list[Dropped]]:
         InputError: an id beyond its table.
     """
     maps = problem.view(view)
-    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
-    check_ids(problem, view)
-    weight = np.ones(len(cell), np.float32) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float32)
     words = kernels.as_words(maps)
-    good = kernels.finite_pixels(words)
-    faults = prediction_faults(maps, good)
-    dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
-    usable = np.array([not fault for fault in faults])
-    finite = good[usable].all(0)
-    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
-    lost = int((keep & ~finite).sum())
-    if lost and usable.any():
-        dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
-    keep = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
-    keep = keep[np.argsort(segment[keep], kind="stable")]
-    values, inside = kernels.gather(words, keep, usable)
-    segments, start = np.unique(segment[keep], return_index=True)
-    start = np.append(start, len(keep)).astype(np.int64)
-    return (
-        Block(
-            values,
-            cell[keep].astype(np.int32),
-            weight[keep],
-            segments.astype(np.int32),
-            start,
-            usable,
-            np.zeros((0, 0), bool) if inside.all() else inside,
-        ),
-        dropped,
+    found = usable_pixels(problem, view, maps, kernels.finite_pixels(words))
+    values, inside = kernels.gather(words, found.pixel, found.usable)
+    segments, start = np.unique(found.segment, return_index=True)
+    block = Block(
+        values,
+        found.cell.astype(np.int32),
+        found.weight.astype(np.float32),
+        segments.astype(np.int32),
+        np.append(start, len(found.pixel)).astype(np.int64),
+        found.usable,
+        np.zeros((0, 0), bool) if inside.all() else inside,
     )
+    return block, found.dropped
 
 
 class Blocks:

@@ -172,6 +172,48 @@ def prediction_faults(maps: NDArray, finite: NDArray | None = None, not_finite_s
     return faults
 
 
+@dataclass(frozen=True)
+class UsablePixels:
+    """Pixels of a view with a cell, a segment, weight > 0 and finite predictions, in segment order.
+
+    pixel: (n,) index into the flattened view; cell, segment (n,); weight (n,) float64; usable (K,) predictions;
+    dropped: what was left out and why.
+    """
+
+    pixel: NDArray
+    cell: NDArray
+    segment: NDArray
+    weight: NDArray
+    usable: NDArray
+    dropped: list[Dropped]
+
+
+def usable_pixels(problem: BaseProblem, view: int, maps: NDArray | None = None, finite: NDArray | None = None) -> UsablePixels:
+    """The pixels and predictions of a view that every base solver uses.
+
+    `maps`: problem.view(view), if at hand; `finite` (K, N) bool, all five values finite, if known.
+
+    Raises:
+        InputError: shapes that do not match, an id beyond its table.
+    """
+    maps = problem.view(view) if maps is None else maps
+    check_ids(problem, view)
+    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
+    weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
+    good = np.stack([np.isfinite(prediction).all(-1) for prediction in maps]) if finite is None else finite
+    faults = prediction_faults(maps, good)
+    usable = np.array([not fault for fault in faults])
+    dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
+    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
+    finite = good[usable].all(0)
+    lost = int((keep & ~finite).sum())
+    if lost and usable.any():
+        dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
+    pixel = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
+    pixel = pixel[np.argsort(segment[pixel], kind="stable")]
+    return UsablePixels(pixel, cell[pixel], segment[pixel], weight[pixel], usable, dropped)
+
+
 def object_means(
     value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None, n_objects: int = 0
 ) -> tuple[NDArray, NDArray]:

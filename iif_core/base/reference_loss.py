@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from .. import laplace
 from ..errors import InputError
-from .problem import LOWEST, BaseProblem, BaseResult, Dropped, check_ids, prediction_faults
+from .matching import identity_penalty
+from .problem import LOWEST, BaseProblem, BaseResult, usable_pixels
 
 if TYPE_CHECKING:
     from .sgd import SgdFit
@@ -50,57 +51,11 @@ class ReferenceLoss:
     n_pixels: int
 
 
-@dataclass(frozen=True)
-class UsablePixels:
-    """Pixels of a view with a cell, a segment, weight > 0 and finite predictions, in segment order.
-
-    pixel: (n,) index into the flattened view; cell, segment (n,); weight (n,) float64; usable (K,) predictions;
-    dropped: what was left out and why.
-    """
-
-    pixel: NDArray
-    cell: NDArray
-    segment: NDArray
-    weight: NDArray
-    usable: NDArray
-    dropped: list[Dropped]
-
-
-def usable_pixels(problem: BaseProblem, view: int, maps: NDArray | None = None) -> UsablePixels:
-    """The pixels and predictions of a view that every base solver uses. `maps`: problem.view(view), if at hand.
-
-    Raises:
-        InputError: shapes that do not match, an id beyond its table.
-    """
-    maps = problem.view(view) if maps is None else maps
-    check_ids(problem, view)
-    cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
-    weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
-    good = np.stack([np.isfinite(prediction).all(-1) for prediction in maps])
-    faults = prediction_faults(maps, good)
-    usable = np.array([not fault for fault in faults])
-    dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
-    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
-    finite = good[usable].all(0)
-    lost = int((keep & ~finite).sum())
-    if lost and usable.any():
-        dropped.append(Dropped(view, -1, f"{lost} pixels are not finite in some prediction and were left out"))
-    pixel = np.flatnonzero(keep & finite) if usable.any() else np.zeros(0, np.intp)
-    pixel = pixel[np.argsort(segment[pixel], kind="stable")]
-    return UsablePixels(pixel, cell[pixel], segment[pixel], weight[pixel], usable, dropped)
-
-
 def identity_regulariser(corrections: Corrections) -> NDArray:
-    """Distance of every correction to identity, (S, K, 3) float64 (METHOD 2.3.7).
-
-    R_a = |A - I|^2 + |b|^2 + |A A' - I|^2 (Frobenius), R_r = (g - 1)^2 + h^2, R_m likewise. Near identity, A = I + D:
-    R_a = 5 |sym D|^2 + |skew D|^2 + |b|^2.
-    """
+    """Distance of every correction to identity, (S, K, 3) float64 (METHOD 2.3.7): `matching.identity_penalty` of albedo,
+    (g - 1)^2 + h^2 of roughness and metallic."""
     albedo, roughness, metallic = (np.asarray(c, np.float64) for c in corrections)
-    a, identity = albedo[..., :3], np.eye(3)
-    r_a = ((a - identity) ** 2).sum((-1, -2)) + (albedo[..., 3] ** 2).sum(-1)
-    r_a += ((a @ a.swapaxes(-1, -2) - identity) ** 2).sum((-1, -2))
-    return np.stack([r_a, *(((c - [1.0, 0.0]) ** 2).sum(-1) for c in (roughness, metallic))], -1)
+    return np.stack([identity_penalty(albedo), *(((c - [1.0, 0.0]) ** 2).sum(-1) for c in (roughness, metallic))], -1)
 
 
 def reference_loss(

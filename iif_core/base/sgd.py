@@ -34,8 +34,7 @@ from .. import laplace
 from ..errors import InputError
 from ..hashgrid import HashGridOptions, HashGridTexture
 from .kernels import CROSS, as_floats, as_words
-from .problem import LOWEST, BaseProblem, Dropped, object_means
-from .reference_loss import usable_pixels
+from .problem import LOWEST, BaseProblem, Dropped, object_means, usable_pixels
 from .selection import selection_weights
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.problem import LOWEST, BaseProblem
-from iif_core.base.reference_loss import identity_regulariser, reference_loss, usable_pixels
+from iif_core.base.problem import LOWEST, BaseProblem, usable_pixels
+from iif_core.base.reference_loss import identity_regulariser, reference_loss
 from iif_core.errors import InputError
 
 LOW = LOWEST.astype(np.float64)
