@@ -206,6 +206,8 @@ class Base(Section):
     """`sgd`, `texture: hashgrid`: levels of the grid (the paper: 32)."""
     hash_entries: int = Field(17, ge=8, le=24)
     """`sgd`, `texture: hashgrid`: log2 of the entries a level (the paper: 19)."""
+    judge: bool = False
+    """Evaluate the paper's loss of the result, of `sgd` also that of `direct` at the same selection (base.json)."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Base:

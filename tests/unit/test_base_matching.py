@@ -9,6 +9,7 @@ from scipy.optimize import minimize
 from iif_core.base.direct import BaseOptions, describe_fit, solve_base
 from iif_core.base.matching import identity_penalty, penalised_affine, penalised_gain
 from iif_core.base.reference_loss import loss_of_result
+from iif_core.base.sgd import converged, sgd_options, solve_base_sgd
 from tests.unit.test_base import simulated
 
 
@@ -82,6 +83,21 @@ def test_polishing_lowers_the_papers_loss():
     totals = [h["data"] + h["regulariser"] for h in many.history if "data" in h]
     assert all(b < a * 1.002 for a, b in zip(totals, totals[1:], strict=False))  # b_ref is renewed, so not strictly
     assert abs(totals[-1] - totals[-2]) < 0.01 * totals[-1]
+
+
+def test_direct_is_not_above_the_papers_optimiser_on_the_papers_loss():
+    """The same selection for both, the optimiser run until its loss is flat."""
+    problem, _ = simulated()
+    problem = replace(problem, weight=None)
+    fit = solve_base_sgd(problem, sgd_options("safe", iterations=1500))
+    assert converged(fit.history)
+    direct = solve_base(problem, BaseOptions(objective="distribution", polish=40), chosen=fit.alpha.argmax(1))
+
+    def judged(result):
+        loss = loss_of_result(problem, result)
+        return loss.data + 100 * (loss.regulariser_albedo + loss.regulariser_roughness + loss.regulariser_metallic)
+
+    assert judged(direct) <= judged(fit)
 
 
 def test_described_fit_is_the_fit():

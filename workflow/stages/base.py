@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from iif_core.base.direct import BaseOptions, describe_fit, solve_base
+from iif_core.base.matching import REGULARISER
 from iif_core.base.problem import CHANNELS, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, one_segment_per_view
-from iif_core.base.sgd import sgd_options, solve_base_sgd
+from iif_core.base.reference_loss import loss_of_result
+from iif_core.base.sgd import SgdFit, converged, sgd_options, solve_base_sgd
 from iif_core.cells import (
     COARSE_SHIFT,
     INDEX_LIMIT,
@@ -70,7 +72,7 @@ def run(job: Job) -> None:
     if settings.variant == "image_affine":
         problem = one_segment_per_view(problem)
     with job.timed("solve"):
-        result = _solve(job, problem)
+        result, fit = _solve(job, problem)
     for dropped in result.dropped:
         if dropped.k < 0:
             job.log.warning("view %s: %s", views[dropped.view].name, dropped.reason)
@@ -97,6 +99,7 @@ def run(job: Job) -> None:
             "objects_in_separate_parts": _parts_of_objects(unpack_keys(cells.keys)[1], result.part_of_cell),
             "unseen_share": float((result.coverage == 0).mean()),
             "seen_once_share": float((result.views == 1).mean()),
+            **({"reference_loss": _judged(job, problem, result, fit)} if settings.judge else {}),
         },
     )
     job.log.info(
@@ -109,7 +112,8 @@ def run(job: Job) -> None:
     )
 
 
-def _solve(job: Job, problem: BaseProblem) -> BaseResult:
+def _solve(job: Job, problem: BaseProblem) -> tuple[BaseResult, SgdFit | None]:
+    """The result, and what the paper's optimiser left when it was asked for."""
     settings = job.settings.base
 
     def progress(done: int, total: int) -> None:
@@ -119,7 +123,8 @@ def _solve(job: Job, problem: BaseProblem) -> BaseResult:
         grid = HashGridOptions(levels=settings.hash_levels, log2_entries=settings.hash_entries)
         chosen = sgd_options(settings.preset, texture=settings.texture, iterations=settings.iterations, grid=grid, seed=job.seed)
         fit = solve_base_sgd(problem, chosen, progress, job.threads)
-        return describe_fit(problem, fit.value, fit.scale, fit.corrections, fit.alpha, fit.history, job.threads, MEMORY)
+        texture = fit.value, fit.scale, fit.corrections, fit.alpha
+        return describe_fit(problem, *texture, fit.history, job.threads, MEMORY), fit
     variant = {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant)
     options = BaseOptions(
         variant,
@@ -134,7 +139,7 @@ def _solve(job: Job, problem: BaseProblem) -> BaseResult:
         seams=settings.seams,
         memory=MEMORY,
     )
-    return solve_base(problem, options, progress, job.threads)
+    return solve_base(problem, options, progress, job.threads), None
 
 
 class _Surface:
@@ -228,6 +233,24 @@ def _footprints(capture: CaptureReader, views: list[View]) -> list[np.ndarray]:
         sizes.append(np.where(depth > 0, depth, np.nan) / view.fx / np.sqrt(np.maximum(cosine, 1e-3)))
     median = np.nanmedian(np.concatenate([size.ravel() for size in sizes]))
     return [np.nan_to_num(size / median, nan=1.0) for size in sizes]
+
+
+def _judged(job: Job, problem: BaseProblem, result: BaseResult, fit: SgdFit | None) -> dict[str, dict[str, float]]:
+    """The paper's loss of the result; of `sgd` also of `direct` on the same objective at the same selection."""
+    problem = replace(problem, weight=[(np.asarray(w) > 0).astype(np.float32) for w in problem.weight])  # the paper's pool
+    judged = {job.settings.base.solver: loss_of_result(problem, result if fit is None else fit)}
+    if fit is not None:
+        options = BaseOptions(objective="distribution", polish=job.settings.base.polish, memory=MEMORY)
+        with job.timed("direct_at_the_same_selection"):
+            twin = solve_base(problem, options, threads=job.threads, chosen=fit.alpha.argmax(1))
+        judged["direct_at_the_same_selection"] = loss_of_result(problem, twin)
+    out = {}
+    for name, loss in judged.items():
+        regulariser = REGULARISER * (loss.regulariser_albedo + loss.regulariser_roughness + loss.regulariser_metallic)
+        out[name] = {"data": loss.data, "regulariser": regulariser, "total": loss.data + regulariser}
+    if fit is not None:
+        out["sgd"]["converged"] = converged(fit.history)
+    return out
 
 
 def _points(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
