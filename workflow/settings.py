@@ -435,6 +435,8 @@ def _explain(error: ValidationError, path: str) -> str:
             union = _UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
             lines.append(f"{path}: `{dotted}.kind`: found {got!r}, allowed: {', '.join(union)}.")
+        elif kind == "value_error" and isinstance(found, dict):  # keys that do not go together: the message says which
+            lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
         else:
             shown = found if not isinstance(found, dict) else "a mapping"
             lines.append(f"{path}: `{dotted}`: found {shown!r}. {problem['msg']}.")
