@@ -1,9 +1,12 @@
 # Studies: variants are derived scenes that the ordinary rules make (workflow/studies.py); a study collects their scores.
 from workflow import studies, study_table
 
+BENCHMARKS = "hashgrid|base_cost"
+
 
 wildcard_constraints:
-    study=studies.STUDY,
+    study=rf"(?!(?:{BENCHMARKS})\.){studies.STUDY}",
+    benchmark=BENCHMARKS,
 
 
 def of_study(compute):
@@ -73,3 +76,19 @@ rule lpips_vgg:
         "fetching the weights of VGG16 (64 MB)"
     shell:
         "{params.python:q} -m workflow lpips_vgg --log {log:q}"
+
+
+# Benchmarks of kernels: ratios within one run, on an idle machine.
+rule benchmark:
+    output:
+        "results/studies/{benchmark}.parquet",
+    log:
+        "results/studies/logs/{benchmark}.log",
+    threads: 2
+    params:
+        script=lambda wildcards: f"{workflow.basedir}/tests/benchmarks/{wildcards.benchmark}.py",
+        python=sys.executable,
+    message:
+        "benchmark {wildcards.benchmark}"
+    shell:
+        "{params.python:q} {params.script:q} --output {output:q} 2>&1 | tee {log:q}"
