@@ -163,12 +163,13 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     start = 0
     for view, p, _, values in seen:
         channels = {"cell.id": ids_to_disk(cell_of[start : start + len(p)].reshape(HEIGHT, WIDTH))}
+        channels["coverage"] = np.ones((HEIGHT, WIDTH), np.float32)
         channels |= material_channels(values * [0.8, 0.8, 0.8, 1, 1], (HEIGHT, WIDTH))
         job.writer.exr(f"maps/{view.name}.exr", channels)
         start += len(p)
     plan = [{"component": "metallic", "included": False, "measure": "median predicted metalness", "value": 0.02}]
     plan[0] |= {"threshold": 0.25, "reason": "no object looks like a <metal>"}
-    job.writer.json("base.json", {"cell_edge_m": edge, "origin": origin.tolist(), "plan": plan})
+    job.writer.json("base.json", {"cell_edge_m": edge, "origin": origin.tolist(), "plan": plan, "seen_once_share": 0.25})
     job.writer.finish()
 
     job = FakeJob("emission", root)

@@ -19,6 +19,7 @@ from workflow.timings import read_timings
 
 PLAN_KEYS = ("component", "included", "measure", "value", "threshold", "reason")
 ERROR_RANGE = 0.25
+COVERAGE_RANGE = 4.0
 UNCERTAINTY_RANGE = 0.2
 CHANNEL_COLOURS = ("#c33", "#292", "#34c")
 
@@ -125,7 +126,11 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         ("mesh", f"{len(recovered.surface.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
         ("objects", str(len(recovered.object_names))),
         ("material fit", _fit_fact(job.read("affines").json("affines.json"))),
-        ("surface cells", f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm"),
+        (
+            "surface cells",
+            f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm,"
+            f" {100 * job.read('base').json('base.json')['seen_once_share']:.0f} % seen in one photograph only",
+        ),
         ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
     ]
     if held_out:
@@ -263,8 +268,11 @@ def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> li
         note = f"of the albedo, 0 to {UNCERTAINTY_RANGE}"
         out.append(tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
     if job.read("base").has(file):
-        out.append(tile("base albedo", pic.linear(rgb(job.read("base").exr(file), "albedo")), "before the fit"))
-    return out[:6]
+        base = job.read("base").exr(file)
+        out.append(tile("base albedo", pic.linear(rgb(base, "albedo")), "before the fit"))
+        note = f"weighted pixels of the surface cell, 0 (filled in) to {COVERAGE_RANGE:g}"
+        out.append(tile("coverage", pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted), note))
+    return out
 
 
 # ----------------------------------------------------------------------------------------------- emitters and response
