@@ -138,3 +138,28 @@ def test_memory_bound_changes_nothing():
     for name, value in vars(kept).items():
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(again, name), err_msg=name)
+
+
+def test_tangents_lead_to_the_point_of_the_next_pixel():
+    """On a tilted plane, the point of a pixel plus its tangent is the point of its neighbour."""
+    from types import SimpleNamespace
+
+    from workflow.stages.base import _tangents
+
+    h, w, f = 6, 8, 50.0
+    u, v = np.meshgrid(np.arange(w) + 0.5 - w / 2, np.arange(h) + 0.5 - h / 2)
+    direction = np.stack([u / f, v / f, np.ones_like(u)], -1)
+    normal = np.array([0.3, -0.2, -1.0])
+    depth = (normal[2] * 2.0) / (direction @ normal)  # plane through (0, 0, 2)
+    corners = np.array([[0, 0, 2.0], [1, 0, 2 + 0.3], [0, 1, 2 - 0.2]])
+    view = SimpleNamespace(height=h, width=w, fx=f)
+    capture = SimpleNamespace(
+        mesh=lambda: (corners, np.array([[0, 1, 2]])),
+        gbuffer=lambda _: (depth, np.zeros((h, w), int)),
+        directions=lambda _: direction,
+    )
+    points = depth[..., None] * direction
+    tangent = _tangents(capture, [view])(0).reshape(h, w, 2, 3)
+    # to first order: half of the step to the left and half of that to the right
+    np.testing.assert_allclose(tangent[:, 1:-1, 0], (points[:, 2:] - points[:, :-2]) / 2, atol=3e-5)
+    np.testing.assert_allclose(tangent[1:-1, :, 1], (points[2:] - points[:-2]) / 2, atol=3e-5)

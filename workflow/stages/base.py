@@ -31,6 +31,8 @@ from workflow.normal_form import CaptureReader, View
 
 FOOTPRINT_WEIGHTS = (0.05, 4.0)
 """Smallest and largest weight by footprint."""
+STEEPEST = 5.0
+"""Longest step on the surface over one pixel, in steps across the line of sight."""
 MEMORY = 1 << 30
 """Bytes of predictions that are kept in memory; more are read again every sweep."""
 
@@ -67,6 +69,7 @@ def run(job: Job) -> None:
         segments["object_id"].astype(np.int32),
         weights,
         point=_points(capture, views),
+        tangent=_tangents(capture, views),
         neighbours=neighbour_pairs(cells.keys) if settings.seams else None,
     )
     if settings.variant == "image_affine":
@@ -256,6 +259,32 @@ def _judged(job: Job, problem: BaseProblem, result: BaseResult, fit: SgdFit | No
 def _points(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
     """view -> (H * W, 3) float32 surface points."""
     return lambda position: capture.points(views[position], capture.gbuffer(views[position])[0]).reshape(-1, 3)
+
+
+def _tangents(capture: CaptureReader, views: list[View]) -> Callable[[int], np.ndarray]:
+    """view -> (H * W, 2, 3) float32 how the surface point moves over one pixel to the right and down, on its face's plane.
+
+    x = o + z d with z = n.(x - o) / n.d, so dx = z (dd - d n.dd / n.d); at grazing angles limited to `STEEPEST` of z dd.
+    """
+    vertices, faces = capture.mesh()
+    normals, _ = face_geometry(vertices, faces)
+
+    def of_view(position: int) -> np.ndarray:
+        view = views[position]
+        depth, face_id = capture.gbuffer(view)
+        direction, normal = capture.directions(view).astype(np.float64), normals[face_id]
+        across = np.einsum("hwi,hwi->hw", normal, direction)
+        out = np.empty((view.height, view.width, 2, 3), np.float32)
+        for axis in range(2):
+            change = np.gradient(direction, axis=1 - axis)
+            slide = np.einsum("hwi,hwi->hw", normal, change) / np.where(across == 0, 1e-12, across)
+            moved = change - direction * slide[..., None]
+            length, limit = np.linalg.norm(moved, axis=-1), STEEPEST * np.linalg.norm(change, axis=-1)
+            moved *= np.minimum(1, limit / np.maximum(length, 1e-20))[..., None]
+            out[..., axis, :] = np.where(depth > 0, depth, 0)[..., None] * moved
+        return out.reshape(-1, 2, 3)
+
+    return of_view
 
 
 def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarray:
