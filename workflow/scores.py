@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core import metrics
 from iif_core.base.problem import CHANNELS
-from iif_core.base.uncertainty import CALIBRATION, LEVELS, coverage, gauge_free_error
+from iif_core.base.uncertainty import CALIBRATION, LEVELS, SMALLEST, coverage, gauge_free_error
 from iif_core.lpips import Weights
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.normal_form import CaptureReader, Truth, View
@@ -135,20 +135,25 @@ def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageRea
 
 
 def interval_scores(
-    cells: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
+    cells: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], predictions: int
 ) -> Iterator[tuple[str, list[metrics.Score]]]:
     """Share of the surface cells whose error lies within the interval that the base claims, at 50, 80 and 95 %.
 
     The columns `uncertainty_*` are standard deviations of the error that is left when each object's truth is mapped to the base
     by its nearest affine, over all views together (iif_core.base.uncertainty): protocol `oracle_affine`. `raw` is the same
-    without the affine, which no such scale can know.
+    without the affine, which no such scale can know. Objects of few cells are left out (their affine follows the errors).
+
+    `psnr_3d` is over cells, with one affine per object for all views together: unlike the score of each
+    view it sees levels that differ from view to view.
 
     Args:
-        cells: table base/cells.parquet; truth: of `cell_truth`.
+        cells: table base/cells.parquet; truth: of `cell_truth`; predictions: K.
     """
     for quantity, names in _CHANNELS_OF.items():
         labels = [f"coverage_{round(100 * level)}" for level in LEVELS]
         known = np.isfinite(truth[quantity]).all(1) & (cells["coverage"] > 0)
+        of_object = np.bincount(cells["object_id"][known], minlength=int(cells["object_id"].max(initial=0)) + 1)
+        known &= of_object[cells["object_id"]] >= SMALLEST
         if not known.any():
             yield quantity, [metrics.Score(name, "raw", None, "no cell counts") for name in labels]
             continue
@@ -157,11 +162,18 @@ def interval_scores(
             np.stack([cells[f"{prefix}{name}"][known] for name in names], 1).astype(np.float64) for prefix in ("", "uncertainty_")
         )
         errors = {"raw": value - target, "oracle_affine": gauge_free_error(value, target, cells["object_id"][known])}
+        fitted = gauge_free_error(target, value, cells["object_id"][known])
+        whole = metrics.Score("psnr_3d", "oracle_affine", float(-10 * np.log10(max(np.mean(fitted**2), 1e-10))))
         yield (
             quantity,
             [
-                metrics.Score(name, protocol, share)
-                for protocol, error in errors.items()
-                for name, share in zip(labels, coverage(error, claimed, CALIBRATION[quantity].beta), strict=True)
+                whole,
+                *(
+                    metrics.Score(name, protocol, share)
+                    for protocol, error in errors.items()
+                    for name, share in zip(
+                        labels, coverage(error, claimed, float(CALIBRATION[quantity].beta(predictions))), strict=True
+                    )
+                ),
             ],
         )

@@ -196,16 +196,18 @@ class Base(Section):
     """`direct`: where annealing stops; 0 = the single best prediction, more = near-ties are averaged."""
     seams: bool = True
     """`direct`: close seams between parts of an object that no photograph shows together."""
-    texture: Literal["cells", "hashgrid"] = "cells"
-    """`sgd`: texture model."""
-    iterations: int = Field(2000, ge=1)
-    """`sgd`: optimiser steps of 65,536 pixels."""
     preset: Literal["safe", "paper"] = "safe"
-    """`sgd`: `paper` = the published behaviour; `safe` = with the treatments of docs/base.md."""
-    hash_levels: int = Field(16, ge=1, le=32)
-    """`sgd`, `texture: hashgrid`: levels of the grid (the paper: 32)."""
-    hash_entries: int = Field(17, ge=8, le=24)
-    """`sgd`, `texture: hashgrid`: log2 of the entries a level (the paper: 19)."""
+    """`sgd`: `paper` = the published behaviour; `safe` = with the treatments of docs/base.md. Decides what is not set below."""
+    texture: Literal["cells", "hashgrid"] | None = None
+    """`sgd`: texture model; default: `cells`, `preset: paper` the hash grid."""
+    iterations: int | None = Field(None, ge=1)
+    """`sgd`: optimiser steps of 65,536 pixels; default: 3000, `preset: paper` 10 passes over the pixels."""
+    hash_levels: int | None = Field(None, ge=1, le=32)
+    """`sgd`, hash grid: levels; default: 16, `preset: paper` 32."""
+    hash_entries: int | None = Field(None, ge=8, le=24)
+    """`sgd`, hash grid: log2 of the entries a level; default: 17, `preset: paper` 19."""
+    median_gradient: bool | None = None
+    """`sgd`: follow the slope of the median over the predictions; default: no, `preset: paper` yes."""
     judge: bool = False
     """Evaluate the paper's loss of the result, of `sgd` also that of `direct` at the same selection (base.json)."""
 

@@ -23,7 +23,16 @@ if TYPE_CHECKING:
 
 RESULTS = Path("results/studies")
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "l2": False, "flip": False, "lpips": False, "lpips_vgg": False}
-NAMES = {"psnr": "PSNR", "ssim": "SSIM", "l2": "L2", "flip": "FLIP", "lpips": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
+NAMES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "l2": "L2",
+    "flip": "FLIP",
+    "lpips": "LPIPS (AlexNet)",
+    "lpips_vgg": "LPIPS (VGG)",
+}
+HIGHER_IS_BETTER["psnr_3d"] = True
+NAMES["psnr_3d"] = "PSNR over cells, one affine an object"
 NAMES |= {f"coverage_{n}": f"share within the claimed {n} % interval" for n in (50, 80, 95)}
 PROTOCOLS = {"raw": "raw", "oracle_affine": "oracle"}  # those that the page and the pictures show
 COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb")

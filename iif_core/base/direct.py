@@ -72,7 +72,7 @@ class BaseOptions:
             median error, its factor per sweep, and where it stops. At the default 0.1 a prediction whose error exceeds
             the best by a tenth of the median has 1/e of its weight: averaging near-ties is worth 0.5-1.3 dB over
             the single best one (0).
-        ridge: pull of T to identity, times the segment's pixel weight (at least `ridge_pixels`).
+        ridge: pull of T to identity, times the segment's weight in the fit; more for segments below `ridge_pixels` pixels.
         robust: cells take the M-estimate of the Laplace divergence instead of the mean.
         clip_share, clip_pixels: predicted albedo at exactly 0 or 1 is left out of the fit of T where at most this
             share of the segment is, and at least so many pixels remain.
@@ -160,7 +160,8 @@ class _Sums:
             enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * count[:, None])
             self.masked[rows] = block.usable & enough & (remain < count[:, None])
             fit = np.where(self.masked[rows][..., None], kernels.gram(block.values, weight, block.start, block.inside), gram)
-        self.ridge[rows] = options.ridge * np.maximum(self.weight[rows], options.ridge_pixels)
+        few = np.maximum(1, options.ridge_pixels / np.diff(block.start))  # small segments are held more
+        self.ridge[rows] = options.ridge * self.weight[rows] * few
         for out, where, source in zip(self.inverse, (_GRAM_4, _GRAM_R, _GRAM_M), (fit, gram, gram), strict=True):
             out[rows] = np.linalg.inv(source[..., where] + self.ridge[rows, None, None, None] * np.eye(len(where)))
 
@@ -227,15 +228,16 @@ def solve_base(
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
     options = options or BaseOptions()
+    if chosen is not None and options.objective != "distribution":
+        raise InputError("a given selection needs objective `distribution`; least squares selects for itself")
     means = options.variant in ("texel_mean", "object_mean")
     sweeps = 1 if means or chosen is not None else options.sweeps
     n_views = len(problem.cell_of_pixel)
     polish = options.polish if options.objective == "distribution" and not means else 0
     total = sweeps + polish + 2
     blocks = Blocks(problem, options.memory)
-    parts = covisible_parts(problem)
 
-    sums, state, first, dropped, counts = _first_pass(problem, blocks, options, threads)
+    sums, state, first, dropped, counts, parts = _first_pass(problem, blocks, options, threads)
     texture = first
     _notify(progress, 1, total)
     history: list[dict[str, float]] = []
@@ -261,9 +263,11 @@ def solve_base(
         chosen = _select(state, sums, chosen)
         texture = _polish(blocks, problem, options, sums, state, chosen, texture, threads, history, progress, total)
     elif options.seams and not means and problem.neighbours is not None:
-        shift, _ = seam_shifts(parts, texture, counts.weight, problem.neighbours)
+        shift, _ = seam_shifts(parts, texture, counts.weight, problem.neighbours, _level_spread(parts, sums))
         texture = _shifted(parts, shift, texture, state)
     texture = np.clip(texture, LOWEST, 1.0)
+    if polish:
+        _measure_errors(problem, blocks, sums, state, texture, threads)
     if options.variant == "object_mean":
         object_value, _ = object_means(texture, problem.object_of_cell, counts.weight)
         texture = object_value[problem.object_of_cell]
@@ -290,19 +294,24 @@ def describe_fit(
     Errors, votes, counts and fills are measured on the problem; `scale` is kept as the solver found it.
     """
     options = BaseOptions(memory=memory)
-    blocks, parts = Blocks(problem, memory), covisible_parts(problem)
-    sums, state, _, dropped, counts = _first_pass(problem, blocks, replace(options, variant="texel_mean"), threads)
+    blocks = Blocks(problem, memory)
+    sums, state, _, dropped, counts, parts = _first_pass(problem, blocks, replace(options, variant="texel_mean"), threads)
     state.affine, state.alpha = affine.astype(np.float64), weight.astype(np.float64)
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
+    _measure_errors(problem, blocks, sums, state, texture, threads)
+    result = _outcome(problem, blocks, options, sums, parts, counts, texture, state, threads)
+    own = np.where((counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
+    return replace(result, scale=own, dropped=dropped, history=history or [])
+
+
+def _measure_errors(problem: BaseProblem, blocks: Blocks, sums: _Sums, state: _State, texture: NDArray, threads: int) -> None:
+    """Mean squared error of every corrected prediction against the texture, into `state`."""
     for block in in_order(blocks, len(problem.cell_of_pixel), threads):
         rows, target = block.segments, kernels.texture_at(texture, block.cell)
         weight = sums.fit_weight(block)
         cross = kernels.cross(block.values, target, weight, block.start, _NO_MASK)
         square = kernels.square(target, weight, block.start)
         state.error[rows] = sums.errors(rows, state.affine[rows], cross, square)
-    result = _outcome(problem, blocks, options, sums, parts, counts, texture, state, threads)
-    own = np.where((counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
-    return replace(result, scale=own, dropped=dropped, history=history or [])
 
 
 def _outcome(
@@ -319,7 +328,8 @@ def _outcome(
     scale, votes = _scales(blocks, problem, options, texture, state, threads)
     value, object_value, object_cells = _filled(problem, texture, counts)
     seen = counts.weight > 0
-    uncertainty = location_uncertainty(scale, counts.views)
+    repeats = np.maximum(counts.views, 1) / np.maximum(counts.viewpoints, 1)  # of the same photograph
+    uncertainty = location_uncertainty(scale, counts.viewpoints, counts.observations / repeats, state.alpha.shape[1])
     for array in (scale, uncertainty):
         array[~seen] = _unseen_scale(array, seen)
     n, k = state.alpha.shape[:2]
@@ -378,21 +388,23 @@ def _sweep_view(
 
 @dataclass
 class _Counts:
-    """Per cell: pixels, views, weight of the pixels."""
+    """Per cell: pixels, views, different viewpoints, weight of the pixels."""
 
     observations: NDArray
     views: NDArray
+    viewpoints: NDArray
     weight: NDArray
 
 
 def _first_pass(
     problem: BaseProblem, blocks: Blocks, options: BaseOptions, threads: int
-) -> tuple[_Sums, _State, NDArray, list[Dropped], _Counts]:
-    """Gram matrices, the first texture (cell mean of the predictions' median), what was dropped, counts."""
-    counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.float64)))
+) -> tuple[_Sums, _State, NDArray, list[Dropped], _Counts, Parts]:
+    """Gram matrices, the first texture (cell mean of the predictions' median), what was dropped, counts, parts."""
+    counts = _Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.int32, np.float64)))
     cells, n_k = _CellSums(problem.n_cells), 0
     dropped: list[Dropped] = []
-    viewpoints, known = np.zeros(problem.n_cells, np.int32), set()
+    known: set[bytes] = set()
+    pairs = []
     n_views = len(problem.cell_of_pixel)
 
     def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
@@ -420,15 +432,17 @@ def _first_pass(
         digest = hashlib.sha256(block.cell.tobytes()).digest()
         if digest not in known:  # the same photograph twice is one viewpoint
             known.add(digest)
-            viewpoints[seen] += 1
+            counts.viewpoints[seen] += 1
+        pairs.append((np.repeat(block.segments, np.diff(block.start)), block.cell))
     counts.weight = cells.total[:, 0]
-    sums = _Sums(problem.n_segments, max(n_k, 1), shared_weight(viewpoints, options.alone))
+    sums = _Sums(problem.n_segments, max(n_k, 1), shared_weight(counts.viewpoints, options.alone))
     for block in in_order(blocks, n_views, threads):
         sums.add(block, options)
     state = _State(problem.n_segments, max(n_k, 1))
     share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
     state.alpha = np.repeat(share[:, :, None], 3, 2)
-    return sums, state, cells.mean(NEUTRAL), dropped, counts
+    parts = covisible_parts(problem.n_segments, problem.n_cells, pairs)
+    return sums, state, cells.mean(NEUTRAL), dropped, counts, parts
 
 
 def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: _State) -> NDArray:
@@ -438,6 +452,17 @@ def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: _State) -> N
     state.affine[..., _BIAS] += shift[parts.of_segment][:, None, :]
     of_cell = np.where((parts.of_cell >= 0)[:, None], shift[parts.of_cell], 0)
     return texture + of_cell.astype(np.float32)
+
+
+def _level_spread(parts: Parts, sums: _Sums) -> NDArray:
+    """(parts, 5) standard deviation over the predictions of a segment's mean, pixel-weighted mean over the part's segments."""
+    means = sums.gram[:, :, [6, 7, 8, 10, 12]] / np.maximum(sums.weight, 1e-30)[:, None, None]
+    share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
+    centre = np.einsum("sk,skc->sc", share, means)
+    spread = np.sqrt(np.einsum("sk,skc->sc", share, (means - centre[:, None]) ** 2))
+    total = np.bincount(parts.of_segment, sums.weight, parts.count)
+    summed = np.stack([np.bincount(parts.of_segment, sums.weight * spread[:, c], parts.count) for c in range(5)], 1)
+    return summed / np.maximum(total, 1e-30)[:, None]
 
 
 def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: BaseOptions) -> NDArray:
@@ -491,6 +516,11 @@ def _scales(
 
 def _select(state: _State, sums: _Sums, chosen: NDArray | None) -> NDArray:
     """Chosen prediction (S, 3) int64, by default that of the largest weight; alpha becomes one-hot there."""
+    shape = (len(state.alpha), 3)
+    if chosen is not None and (
+        np.shape(chosen) != shape or np.min(chosen, initial=0) < 0 or np.max(chosen, initial=0) >= state.alpha.shape[1]
+    ):
+        raise InputError(f"chosen predictions: {np.shape(chosen)}; needed is {shape} with numbers below {state.alpha.shape[1]}")
     chosen = state.alpha.argmax(1) if chosen is None else np.asarray(chosen, np.int64)
     one_hot = (np.arange(state.alpha.shape[1])[None, :, None] == chosen[:, None]) & sums.usable[:, :, None]
     state.alpha = one_hot.astype(np.float64)
@@ -511,7 +541,7 @@ def _polish(
     total: int,
 ) -> NDArray:
     """Texture (n_cells, 5) after `options.polish` sweeps of majorisation on the paper's loss."""
-    n_views, n_k = len(problem.cell_of_pixel), state.alpha.shape[1]
+    n_views = len(problem.cell_of_pixel)
     floor = options.scale_floor
     pixels = np.zeros(problem.n_segments)
     state.affine[:] = _IDENTITY  # its optimum lies near the identity, far from that of the least squares
@@ -531,7 +561,7 @@ def _polish(
         mixed, b_ref = _against(block, state, rows, target, options)
         weight = block.weight * laplace.kl_weight(mixed - target, b_ref, b, floor).astype(np.float32) / 5
         second, first = kernels.channel_moments(planes, target, weight, block.start)
-        strength = matching.REGULARISER * pixels[rows] / n_k
+        strength = matching.REGULARISER * pixels[rows] / np.maximum(sums.usable[rows].sum(1), 1)
         state.affine[rows] = _penalised(state.affine[rows], chosen[rows], second, first, strength)
         mixed, b_ref = _against(block, state, rows, target, options)
         loss = (block.weight * laplace.kl(mixed - target, b_ref, b, floor)).sum(dtype=np.float64) / 5
@@ -551,7 +581,8 @@ def _polish(
         scale = laplace.floored(scales.mean(scale), np.float32(floor))
         penalty = matching.identity_penalty(state.affine[..., :12].reshape(*state.affine.shape[:2], 3, 4))
         penalty = penalty + ((state.affine[..., 12:] - _IDENTITY[12:]) ** 2).sum(-1)
-        terms = {"data": data / total_weight, "regulariser": matching.REGULARISER * (pixels @ penalty.mean(1)) / total_weight}
+        mean_penalty = (penalty * sums.usable).sum(1) / np.maximum(sums.usable.sum(1), 1)
+        terms = {"data": data / total_weight, "regulariser": matching.REGULARISER * (pixels @ mean_penalty) / total_weight}
         history.append({"temperature": 0.0, **_summary(sums, state), "change": change, **terms})
         _notify(progress, total - options.polish + sweep, total)
     return texture

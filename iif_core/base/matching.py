@@ -11,16 +11,17 @@ present distance, so that
 2. texture: weighted mean of the chosen corrected predictions in each cell;
 3. Laplace scale of the cell: closed form.
 
-Each step lowers the loss for the reference scale b_ref of the sweep (which depends on T and is renewed every sweep).
-Predictions that are not chosen stay at the identity, where the regulariser has its minimum.
+Each step lowers the loss for the reference scale b_ref of the sweep. b_ref depends on T and is renewed every sweep but its
+slope is not followed (METHOD H3: the median's subgradient moves one arbitrary prediction); clamps are not followed
+either. The sum of the terms may therefore rise a little in a sweep (by 1e-4 of itself). An optimiser that does follow the
+median's slope gets below, by moving predictions that are not chosen: see docs/base.md. Predictions that are not chosen stay
+at the identity, where the regulariser has its minimum.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
-from .. import laplace
 
 REGULARISER = 100.0
 """Weight of the identity regulariser against the data term (METHOD 2.3.8)."""
@@ -43,7 +44,6 @@ def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: ND
     Gauss-Newton on R with halved steps where the objective would rise.
     """
     n = len(gram)
-    jacobian_of = _quartic_jacobian
     full = np.zeros((n, 12, 12))
     for c in range(3):
         full[:, 4 * c : 4 * c + 4, 4 * c : 4 * c + 4] = gram[:, c]
@@ -58,7 +58,7 @@ def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: ND
     value = objective(t)
     weight = 2 * strength[:, None, None]
     for _ in range(steps):
-        residual, jacobian = jacobian_of(t)
+        residual, jacobian = _quartic_jacobian(t)
         hessian = full + weight * (np.eye(12) + jacobian.swapaxes(1, 2) @ jacobian)
         gradient = np.einsum("sij,sj->si", full, t) - right
         gradient += weight[..., 0] * ((t - identity) + np.einsum("sji,sj->si", jacobian, residual))
@@ -93,8 +93,3 @@ def penalised_gain(gram: NDArray, cross: NDArray, strength: NDArray) -> NDArray:
     """(S, 2) gain and bias: argmin of 1/2 t'Gt - t'c + strength ((g - 1)^2 + h^2)."""
     ridge = 2 * strength[:, None]
     return np.linalg.solve(gram + ridge[..., None] * np.eye(2), (cross + ridge * [1.0, 0.0])[..., None])[..., 0]
-
-
-def observed_weight(mixed: NDArray, b_ref: NDArray, target: NDArray, scale: NDArray, floor: float) -> NDArray:
-    """(5, n) float32 weight of the quadratic above the divergence of each pixel and channel."""
-    return laplace.kl_weight(mixed - target, b_ref, scale, floor).astype(np.float32)

@@ -60,6 +60,8 @@ class BaseProblem:
         maps = self.predictions(view) if callable(self.predictions) else self.predictions[view]
         if maps.ndim not in (3, 4) or maps.shape[-1] != 5 or maps.shape[0] == 0:
             raise InputError(f"predictions of view {view} have shape {maps.shape}; (K, H, W, 5) with K >= 1 is needed")
+        if not np.issubdtype(maps.dtype, np.floating):
+            raise InputError(f"predictions of view {view} are {maps.dtype}; half or float values in [0, 1] are needed")
         maps = maps.reshape(maps.shape[0], -1, 5)
         if maps.shape[1] != np.size(self.cell_of_pixel[view]):
             raise InputError(
@@ -143,16 +145,20 @@ def check_ids(problem: BaseProblem, view: int) -> None:
             raise InputError(f"view {view}: {name} id {highest}, but there are {n}; map and table differ")
 
 
-def prediction_faults(maps: NDArray, finite: NDArray | None = None, not_finite_share: float = 0.01) -> list[str]:
+def prediction_faults(
+    maps: NDArray, finite: NDArray | None = None, counted: NDArray | None = None, not_finite_share: float = 0.01
+) -> list[str]:
     """Why each of the K predictions of a view cannot be used; "" for those that can.
 
-    `maps` (K, ..., 5); `finite` (K, pixels) bool where it is known already. Faults (METHOD H51, half-precision overflow
+    `maps` (K, ..., 5); `finite` (K, pixels) bool where it is known already; `counted` (pixels,) bool: pixels whose values
+    matter (default all). Faults (METHOD H51, half-precision overflow
     of a diffusion model): more than `not_finite_share` of the pixels not finite; albedo constant over the picture while
     that of another prediction is not.
     """
     maps = maps.reshape(len(maps), -1, 5)
     finite = np.isfinite(maps).all(-1) if finite is None else finite
-    bad_share = 1 - finite.mean(1) if maps.shape[1] else np.zeros(len(maps))
+    relevant = finite if counted is None else finite[:, counted]
+    bad_share = 1 - relevant.mean(1) if relevant.shape[1] else np.zeros(len(maps))
     spread = np.zeros(len(maps))
     for k, prediction in enumerate(maps):
         some = slice(None, None, max(1, len(prediction) // 4096))  # enough to tell a picture from a constant
@@ -201,10 +207,10 @@ def usable_pixels(problem: BaseProblem, view: int, maps: NDArray | None = None, 
     cell, segment = np.ravel(problem.cell_of_pixel[view]), np.ravel(problem.segment_of_pixel[view])
     weight = np.ones(len(cell)) if problem.weight is None else np.ravel(problem.weight[view]).astype(np.float64)
     good = np.stack([np.isfinite(prediction).all(-1) for prediction in maps]) if finite is None else finite
-    faults = prediction_faults(maps, good)
+    keep = (cell >= 0) & (segment >= 0) & (weight.astype(np.float32) > 0)  # the kernels' precision
+    faults = prediction_faults(maps, good, keep)
     usable = np.array([not fault for fault in faults])
     dropped = [Dropped(view, k, fault) for k, fault in enumerate(faults) if fault]
-    keep = (cell >= 0) & (segment >= 0) & (weight > 0)
     finite = good[usable].all(0)
     lost = int((keep & ~finite).sum())
     if lost and usable.any():

@@ -244,7 +244,7 @@ def test_corrections_equal_ridge_regression_in_float64():
         o = problem.object_of_segment[segment]
         for k in range(3):
             x = problem.predictions[view][k][pixels].astype(np.float64)
-            ridge = 0.01 * max(w.sum(), 30)
+            ridge = 0.01 * w.sum() * max(1, 30 / len(w))
             inside = ((x[:, :3] > 0) & (x[:, :3] < 1)).all(1)
             fitted = np.empty((pixels.sum(), 5))
             for rows, channels, target in (
@@ -296,7 +296,7 @@ def base_level_shift(problem, result):
             o, pixels = problem.object_of_segment[s], segments == s
             w, x = fit_weight(problem, view)[pixels], problem.predictions[view][:, pixels].astype(np.float64)
             t, mixture = texture[problem.cell_of_pixel[view][pixels]], 0
-            ridge = 0.01 * max(w.sum(), 30)
+            ridge = 0.01 * w.sum() * max(1, 30 / len(w))
             for k in range(3):
                 inside = ((x[k, :, :3] > 0) & (x[k, :, :3] < 1)).all(1)
                 out = np.empty_like(t)
@@ -540,13 +540,11 @@ def test_object_means():
 
 
 def test_parts_of_an_object_that_share_no_cell():
-    cells = [np.array([[0, 1]]), np.array([[1, 2]]), np.array([[3, 3]]), np.array([[-1, -1]])]
-    segments = [np.array([[0, 0]]), np.array([[1, 1]]), np.array([[2, 2]]), np.array([[-1, -1]])]
-    problem = BaseProblem([], cells, segments, 4, np.zeros(4, int), np.zeros(3, int))
-    parts = covisible_parts(problem)
+    pairs = [(np.array([0, 0]), np.array([0, 1])), (np.array([1, 1]), np.array([1, 2])), (np.array([2]), np.array([3]))]
+    parts = covisible_parts(3, 5, pairs)
     assert parts.of_segment[0] == parts.of_segment[1] != parts.of_segment[2]
     assert parts.count == 2
-    np.testing.assert_array_equal(parts.of_cell, [*parts.of_segment[[0, 0, 1, 2]]])
+    np.testing.assert_array_equal(parts.of_cell, [*parts.of_segment[[0, 0, 1, 2]], -1])
 
 
 def test_no_views():

@@ -6,19 +6,20 @@ import numpy as np
 
 from iif_core import cells
 from iif_core.base.direct import BaseOptions, solve_base
-from iif_core.base.gauge import Parts, anchor_shifts, covisible_parts, seam_shifts
+from iif_core.base.gauge import Parts, anchor_shifts, seam_shifts
 from iif_core.base.problem import BaseProblem
 
 
-def two_sides(level=(0.4, 0.6), size=20):
-    """One wall, its left half in one view and its right half in the other; the predictions' levels differ."""
+def two_sides(level=(0.4, 0.6), size=20, spread=0.15, k=6):
+    """One wall, its left half in one view and its right half in the other; the predictions' levels scatter by `spread`
+    about means that differ."""
     cell = np.arange(2 * size * size, dtype=np.int32).reshape(size, 2 * size)
     x = np.linspace(0, 3, 2 * size)[None, :, None]
     wall = 0.05 * np.sin(7 * x) * np.ones((size, 1, 5))
-    left, right = (wall[:, :size] + level[0])[None], (wall[:, size:] + level[1])[None]
-    pairs = np.concatenate(
-        [np.stack([cell[:, :-1].ravel(), cell[:, 1:].ravel()], 1), np.stack([cell[:-1], cell[1:]], -1).reshape(-1, 2)]
-    )
+    scatter = spread * np.linspace(-1, 1, k)[:, None, None, None]
+    left, right = wall[:, :size] + level[0] + scatter, wall[:, size:] + level[1] + scatter
+    across, down = (np.stack(p, -1).reshape(-1, 2) for p in ((cell[:, :-1], cell[:, 1:]), (cell[:-1], cell[1:])))
+    pairs = np.concatenate([across, down])
     maps = [cell[:, :size].copy(), cell[:, size:].copy()]
     segments = [np.zeros((size, size), np.int32), np.ones((size, size), np.int32)]
     problem = BaseProblem([left, right], maps, segments, cell.size, np.zeros(cell.size, np.int32), np.zeros(2, np.int32))
@@ -32,11 +33,31 @@ def step(value, cell):
 
 def test_seam_between_parts_is_closed_and_the_mean_kept():
     problem, cell = two_sides()
-    assert covisible_parts(problem).count == 2
+    assert len(np.unique(solve_base(problem).part_of_cell)) == 2
     open_, closed = (solve_base(problem, BaseOptions(seams=s)) for s in (False, True))
     assert step(open_.value, cell) > 0.18
     assert abs(step(closed.value, cell)) < 0.1 * step(open_.value, cell)
     np.testing.assert_allclose(closed.value.mean(0), open_.value.mean(0), atol=1e-3)  # equal parts meet half-way
+
+
+def test_true_edge_at_a_seam_stays():
+    """Predictions that agree on their levels mean what they show: 0.2 against 0.8 is an edge, not a gauge."""
+    problem, cell = two_sides((0.2, 0.8), spread=0.0)
+    result = solve_base(problem)
+    truth = np.concatenate([np.full((20, 20), 0.2), np.full((20, 20), 0.8)], 1)
+    wave = 0.05 * np.sin(7 * np.linspace(0, 3, 40))
+    np.testing.assert_allclose(result.value[cell, 0], truth + wave, atol=0.02)
+    small, _ = two_sides((0.2, 0.8), spread=0.05)  # a jump of 0.6 is far beyond a spread of 0.03
+    np.testing.assert_array_equal(solve_base(small).value, solve_base(small, BaseOptions(seams=False)).value)
+
+
+def test_properties_are_closed_each_on_its_own():
+    problem, cell = two_sides()
+    maps = [p.copy() for p in problem.predictions]
+    maps[0][..., 4], maps[1][..., 4] = 0.0, 1.0  # metal starts at the seam, and every prediction says so
+    value = solve_base(replace(problem, predictions=maps)).value
+    assert abs(step(value, cell)) < 0.03
+    np.testing.assert_allclose([value[cell[:, 0], 4].max(), value[cell[:, -1], 4].min()], [0, 1], atol=0.02)
 
 
 def test_corrections_move_with_the_seam():
@@ -44,38 +65,57 @@ def test_corrections_move_with_the_seam():
     problem, _ = two_sides()
     result = solve_base(problem)
     for view in range(2):
-        v = problem.predictions[view].reshape(-1, 5)
-        albedo = v[:, :3] @ result.affine_albedo[view, 0, :, :3].T + result.affine_albedo[view, 0, :, 3]
-        np.testing.assert_allclose(albedo, result.value[problem.cell_of_pixel[view].ravel(), :3], atol=5e-3)
+        mixed = 0
+        for k in range(6):
+            v = problem.predictions[view][k].reshape(-1, 5)
+            corrected = v[:, :3] @ result.affine_albedo[view, k, :, :3].T + result.affine_albedo[view, k, :, 3]
+            mixed = mixed + result.weight[view, k, 0] * corrected
+        np.testing.assert_allclose(mixed, result.value[problem.cell_of_pixel[view].ravel(), :3], atol=5e-3)
 
 
 def test_objects_that_hang_together_have_no_seam_to_close():
     problem, _ = two_sides()
-    shared = np.minimum(problem.cell_of_pixel[1], problem.cell_of_pixel[1].min() + 5)
+    shared = problem.cell_of_pixel[1].copy()
     shared[0, 0] = problem.cell_of_pixel[0][0, 0]  # one common cell
     joined = replace(problem, cell_of_pixel=[problem.cell_of_pixel[0], shared])
-    parts = covisible_parts(joined)
-    assert parts.count == 1
-    a, b = (solve_base(joined, BaseOptions(seams=s)).value for s in (False, True))
-    np.testing.assert_array_equal(a, b)
+    result = solve_base(joined)
+    assert len(np.unique(result.part_of_cell[result.part_of_cell >= 0])) == 1
+    np.testing.assert_array_equal(result.value, solve_base(joined, BaseOptions(seams=False)).value)
+
+
+def test_a_view_without_usable_predictions_ties_nothing():
+    problem, cell = two_sides()
+    across = np.tile(cell[:, 10:30].ravel()[:, None], 1).reshape(20, 20).astype(np.int32)
+    blind = replace(
+        problem,
+        predictions=[*problem.predictions, np.full_like(problem.predictions[0], np.nan)],
+        cell_of_pixel=[*problem.cell_of_pixel, across],
+        segment_of_pixel=[*problem.segment_of_pixel, np.full((20, 20), 2, np.int32)],
+        object_of_segment=np.zeros(3, np.int32),
+    )
+    a, b = solve_base(problem), solve_base(blind)
+    np.testing.assert_array_equal(a.value, b.value)
+    np.testing.assert_array_equal(a.part_of_cell == a.part_of_cell[0], b.part_of_cell == b.part_of_cell[0])
 
 
 def test_small_part_moves_to_the_large_one():
     texture = np.concatenate([np.full((100, 5), 0.5), np.full((10, 5), 0.7)])
     parts = Parts(np.arange(2, dtype=np.int32), np.repeat([0, 1], [100, 10]).astype(np.int32), 2)
     pairs = np.stack([np.arange(90, 100), np.arange(100, 110)], 1)
-    shift, count = seam_shifts(parts, texture, np.ones(110), pairs)
+    shift, count = seam_shifts(parts, texture, np.ones(110), pairs, np.ones((2, 5)))
     assert count.tolist() == [10, 10]
     assert abs(shift[0]).max() < 0.02 and (shift[1] < -0.12).all()
-    few, _ = seam_shifts(parts, texture, np.ones(110), pairs[:1])
+    few, _ = seam_shifts(parts, texture, np.ones(110), pairs[:1], np.ones((2, 5)))
     assert abs(few).max() < abs(shift).max()  # one pair says little
 
 
 def test_seams_of_nothing():
     empty = Parts(np.zeros(0, np.int32), np.full(4, -1, np.int32), 0)
-    assert seam_shifts(empty, np.zeros((4, 5)), np.zeros(4), np.array([[0, 1]]))[0].shape == (0, 5)
+    assert seam_shifts(empty, np.zeros((4, 5)), np.zeros(4), np.array([[0, 1]]), np.zeros((0, 5)))[0].shape == (0, 5)
     parts = Parts(np.zeros(1, np.int32), np.zeros(4, np.int32), 1)
-    assert not seam_shifts(parts, np.random.default_rng(0).random((4, 5)), np.ones(4), np.array([[0, 1], [2, 3]]))[0].any()
+    assert not seam_shifts(
+        parts, np.random.default_rng(0).random((4, 5)), np.ones(4), np.array([[0, 1], [2, 3]]), np.ones((1, 5))
+    )[0].any()
 
 
 def test_anchor_gives_each_part_the_wanted_level():

@@ -260,7 +260,7 @@ def test_every_kind_of_picture_is_drawn(tmp_path):
 def test_share_of_errors_within_the_claimed_interval():
     rng = np.random.default_rng(0)
     n = 20_000
-    truth, scale, beta = rng.uniform(0.2, 0.8, n), rng.uniform(0.005, 0.02, n), CALIBRATION["albedo"].beta
+    truth, scale, beta = rng.uniform(0.2, 0.8, n), rng.uniform(0.005, 0.02, n), CALIBRATION["albedo"].beta(16)
     value = 0.1 + 0.6 * truth + scale * stats.gennorm.rvs(beta, size=n, random_state=rng) / stats.gennorm.std(beta)
     names = ["albedo_r", "albedo_g", "albedo_b", "roughness", "metallic"]
     cells = dict.fromkeys(names, value) | {f"uncertainty_{name}": scale for name in names}
@@ -268,11 +268,12 @@ def test_share_of_errors_within_the_claimed_interval():
     column = truth[:, None].copy()
     column[:100] = np.nan
     truths = {"albedo": np.repeat(column, 3, 1), "roughness": column, "metallic": column * np.nan}
-    out = dict(scores.interval_scores(cells, truths))
+    out = dict(scores.interval_scores(cells, truths, 16))
     assert set(out) == {"albedo", "roughness", "metallic"}
     for quantity in ("albedo",):
         share = {(score.metric, score.protocol): score.value for score in out[quantity]}
         for level in (50, 80, 95):
             assert share[f"coverage_{level}", "oracle_affine"] == pytest.approx(level / 100, abs=0.015)
         assert share["coverage_50", "raw"] < 0.3
+        assert share["psnr_3d", "oracle_affine"] == pytest.approx(-20 * np.log10(np.std(scale) + np.mean(scale) / 0.6), abs=3)
     assert {score.value for score in out["metallic"]} == {None}

@@ -76,6 +76,7 @@ def run(job: Job) -> None:
         problem = one_segment_per_view(problem)
     with job.timed("solve"):
         result, fit = _solve(job, problem)
+    result = _with_every_object(result, n_objects)
     for dropped in result.dropped:
         if dropped.k < 0:
             job.log.warning("view %s: %s", views[dropped.view].name, dropped.reason)
@@ -100,7 +101,7 @@ def run(job: Job) -> None:
             "sweeps": len(result.history),
             "history": [{name: round(float(value), 8) for name, value in entry.items()} for entry in result.history],
             "objects_in_separate_parts": _parts_of_objects(unpack_keys(cells.keys)[1], result.part_of_cell),
-            "unseen_share": float((result.coverage == 0).mean()),
+            "filled_share": float((result.coverage == 0).mean()),
             "seen_once_share": float((result.views == 1).mean()),
             **({"reference_loss": _judged(job, problem, result, fit)} if settings.judge else {}),
         },
@@ -123,8 +124,20 @@ def _solve(job: Job, problem: BaseProblem) -> tuple[BaseResult, SgdFit | None]:
         job.progress(done, total, "passes over the views" if settings.solver == "direct" else "steps")
 
     if settings.solver == "sgd":
-        grid = HashGridOptions(levels=settings.hash_levels, log2_entries=settings.hash_entries)
-        chosen = sgd_options(settings.preset, texture=settings.texture, iterations=settings.iterations, grid=grid, seed=job.seed)
+        published = settings.preset == "paper"
+        size = {"levels": settings.hash_levels, "log2_entries": settings.hash_entries}
+        grid = {} if published else {"levels": 16, "log2_entries": 17}
+        own = {
+            "texture": settings.texture or ("hashgrid" if published else "cells"),
+            "iterations": settings.iterations,
+            "median_gradient": settings.median_gradient,
+        }
+        chosen = sgd_options(
+            settings.preset,
+            grid=HashGridOptions(**grid | {name: value for name, value in size.items() if value is not None}),
+            seed=job.seed,
+            **{name: value for name, value in own.items() if value is not None},
+        )
         fit = solve_base_sgd(problem, chosen, progress, job.threads)
         texture = fit.value, fit.scale, fit.corrections, fit.alpha
         return describe_fit(problem, *texture, fit.history, job.threads, MEMORY), fit
@@ -238,8 +251,18 @@ def _footprints(capture: CaptureReader, views: list[View]) -> list[np.ndarray]:
     return [np.nan_to_num(size / median, nan=1.0) for size in sizes]
 
 
+def _with_every_object(result: BaseResult, n_objects: int) -> BaseResult:
+    """Rows for objects that no prediction shows."""
+    missing = max(0, n_objects - len(result.object_value))
+    value = np.concatenate([result.object_value, np.tile(NEUTRAL, (missing, 1))])
+    return replace(result, object_value=value, object_cells=np.pad(result.object_cells, (0, missing)))
+
+
 def _judged(job: Job, problem: BaseProblem, result: BaseResult, fit: SgdFit | None) -> dict[str, dict[str, float]]:
-    """The paper's loss of the result; of `sgd` also of `direct` on the same objective at the same selection."""
+    """The paper's loss of the result; of `sgd` also of `direct` on the same objective at the same selection.
+
+    Every pixel counts 1, as in the paper; `direct` solves with `border_weight`, so set that to 1 to compare.
+    """
     problem = replace(problem, weight=[(np.asarray(w) > 0).astype(np.float32) for w in problem.weight])  # the paper's pool
     judged = {job.settings.base.solver: loss_of_result(problem, result if fit is None else fit)}
     if fit is not None:
@@ -295,7 +318,7 @@ def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarra
         if f"{layer}.roughness" in channels:
             out[k, ..., :3] = rgb(channels, f"{layer}.albedo")
             out[k, ..., 3], out[k, ..., 4] = channels[f"{layer}.roughness"], channels[f"{layer}.metallic"]
-    return out
+    return np.clip(out, 0, 1, out=out)  # every solver reads the same values; NaN stays
 
 
 def _raw_maps(prior: StageReader, view: View, samples: int, surface: np.ndarray) -> dict[str, np.ndarray]:
@@ -332,10 +355,7 @@ def _write_tables(
         },
         {**dict.fromkeys("xyz", "m"), "coverage": "weighted pixels"},
     )
-    known = min(n_objects, len(result.object_value))
-    means = np.tile(NEUTRAL, (n_objects, 1))
-    counted = np.zeros(n_objects, np.int32)
-    means[:known], counted[:known] = result.object_value[:known], result.object_cells[:known]
+    means, counted = result.object_value[:n_objects], result.object_cells[:n_objects].astype(np.int32)
     columns = {name: means[:, c] for c, name in enumerate(CHANNELS)}
     job.writer.table("objects.parquet", {"object_id": np.arange(n_objects, dtype=np.int32), "cells": counted, **columns})
     n, k = result.weight.shape[:2]

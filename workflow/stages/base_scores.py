@@ -43,7 +43,8 @@ def run(job: Job) -> None:
             job.progress(done + 1, len(capture.views), "views scored")
     if not is_raw:  # raw predictions claim nothing
         truth = scoring.cell_truth(capture, job.read("segmentation"), job.read("base"))
-        for quantity, of_scene in scoring.interval_scores(job.read("base").table("cells.parquet"), truth):
+        k = job.read("base").json("base.json")["predictions"]
+        for quantity, of_scene in scoring.interval_scores(job.read("base").table("cells.parquet"), truth, k):
             rows.add("base", "all", quantity, of_scene)
     job.writer.table("scores.parquet", rows.table(job.scene, {"base"}), scoring.UNITS)
     job.writer.json("scores.json", {"means": rows.means().get("base", {}), "not_scored": rows.missing})
