@@ -163,3 +163,30 @@ def test_tangents_lead_to_the_point_of_the_next_pixel():
     # to first order: half of the step to the left and half of that to the right
     np.testing.assert_allclose(tangent[:, 1:-1, 0], (points[:, 2:] - points[:, :-2]) / 2, atol=3e-5)
     np.testing.assert_allclose(tangent[1:-1, :, 1], (points[2:] - points[:-2]) / 2, atol=3e-5)
+
+
+def test_nan_where_there_is_no_surface_costs_nothing():
+    problem, _ = simulated()
+    hole = [c.copy() for c in problem.cell_of_pixel]
+    maps = [p.copy() for p in problem.predictions]
+    for c, p in zip(hole, maps, strict=True):
+        c[:4] = -1
+        p[:, :4] = np.nan
+    a = solve_base(replace(problem, cell_of_pixel=hole))
+    b = solve_base(replace(problem, cell_of_pixel=hole, predictions=maps))
+    assert not b.dropped
+    np.testing.assert_array_equal(a.value, b.value)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e6])
+def test_units_of_the_weights_do_not_matter(factor):
+    problem, _ = simulated()
+    a, b = solve_base(problem), solve_base(replace(problem, weight=[w * factor for w in problem.weight]))
+    np.testing.assert_allclose(a.value, b.value, atol=2e-3)
+
+
+def test_integer_maps_are_refused():
+    problem, _ = simulated()
+    maps = [(255 * p).astype(np.uint8) for p in problem.predictions]
+    with pytest.raises(InputError, match="uint8; half or float"):
+        solve_base(replace(problem, predictions=maps))

@@ -73,7 +73,9 @@ def test_mixture_and_disagreement_equal_numpy(half):
     for p in range(3):
         expected = np.zeros((segments, 5))
         np.add.at(expected, (of_pixel, nearest[p]), weight)
-        np.testing.assert_allclose(votes[..., p], expected, atol=2e-3 * weight.sum())  # near-ties may flip in float32
+        flipped = np.abs(votes[..., p] - expected).sum() / 2  # near-ties may flip in float32
+        assert flipped <= 0.003 * weight.sum()
+        assert (votes[0, :, p] > 0).sum() == 1  # one pixel, one vote
 
 
 @given(st.integers(1, 40))
@@ -104,9 +106,8 @@ def test_half_bits_are_widened_exactly():
     every = np.arange(0x3C01, dtype=np.uint16).view(np.float16)
     values = np.tile(every, (1, 5, 1))
     start = np.arange(len(every) + 1, dtype=np.int64)
-    one = np.ones((1, 5), np.float32)
     gram = kernels.gram(kernels.as_words(values), np.ones(len(every), np.float32), start, NONE)
-    assert one.size and (gram[:, 0, 6] == every.astype(np.float64)).all()
+    assert (gram[:, 0, 6] == every.astype(np.float64)).all()
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])

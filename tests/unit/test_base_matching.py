@@ -10,6 +10,7 @@ from iif_core.base.direct import BaseOptions, describe_fit, solve_base
 from iif_core.base.matching import identity_penalty, penalised_affine, penalised_gain
 from iif_core.base.reference_loss import loss_of_result
 from iif_core.base.sgd import converged, sgd_options, solve_base_sgd
+from iif_core.errors import InputError
 from tests.unit.test_base import simulated
 
 
@@ -98,6 +99,34 @@ def test_direct_is_not_above_the_papers_optimiser_on_the_papers_loss():
         return loss.data + 100 * (loss.regulariser_albedo + loss.regulariser_roughness + loss.regulariser_metallic)
 
     assert judged(direct) <= judged(fit)
+    own, twin = (loss_of_result(problem, result) for result in (direct, fit))
+    assert own.data <= twin.data + 1e-3  # no term is bought with the other
+    assert abs(own.regulariser_albedo - twin.regulariser_albedo) < 1e-5
+
+
+def test_polish_counts_usable_predictions_alone():
+    """With some predictions dropped, the objective that is minimised is the one that judges."""
+    problem, _ = simulated()
+    maps = [p.copy() for p in problem.predictions]
+    for p in maps:
+        p[1:4] = np.nan
+    problem = replace(problem, predictions=maps, weight=None)
+    result = solve_base(problem, BaseOptions(objective="distribution", polish=10, final_temperature=0))
+    loss = loss_of_result(problem, result)
+    regulariser = 100 * (loss.regulariser_albedo + loss.regulariser_roughness + loss.regulariser_metallic)
+    assert result.history[-1]["regulariser"] == pytest.approx(regulariser, rel=1e-4)
+    assert result.history[-1]["data"] == pytest.approx(loss.data, rel=0.05)  # before the last update of texture and scale
+
+
+@pytest.mark.parametrize("chosen", [np.zeros((2, 3), int), None])
+def test_a_selection_that_does_not_fit_is_refused(chosen):
+    problem, _ = simulated()
+    if chosen is None:
+        with pytest.raises(InputError, match="needs objective `distribution`"):
+            solve_base(problem, chosen=np.zeros((problem.n_segments, 3), int))
+    else:
+        with pytest.raises(InputError, match="chosen predictions"):
+            solve_base(problem, BaseOptions(objective="distribution"), chosen=chosen)
 
 
 def test_described_fit_is_the_fit():
@@ -107,6 +136,6 @@ def test_described_fit_is_the_fit():
         [result.affine_albedo.reshape(*result.weight.shape[:2], 12), result.affine_roughness, result.affine_metallic], -1
     )
     again = describe_fit(problem, result.value, result.scale, affine, result.weight)
-    for name in ("value", "scale", "uncertainty", "views", "coverage", "object_value", "probability"):
+    for name in ("value", "scale", "uncertainty", "views", "coverage", "object_value", "probability", "weight", "affine_albedo"):
         np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=2e-3, err_msg=name)
     assert again.history == []
