@@ -229,7 +229,7 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
     table = {"cell_id": np.arange(len(unique), dtype=np.int32), **{c: ijk[:, i] for i, c in enumerate("ijk")}}
     table |= {"object_id": owner, **{c: centre[:, i].astype(np.float32) for i, c in enumerate("xyz")}}
     table |= {name: mean[:, i].astype(np.float32) for i, name in enumerate(names)}
-    table |= {f"scale_{name}": np.full(len(unique), 0.02, np.float32) for name in names}
+    table |= {f"{claim}_{name}": np.full(len(unique), 0.02, np.float32) for claim in ("scale", "uncertainty") for name in names}
     base.table("cells.parquet", table)
     cells = np.bincount(owner, minlength=len(room.names))
     sums = [np.bincount(owner, mean[:, i], len(room.names)) / np.maximum(cells, 1) for i in range(5)]
@@ -249,9 +249,7 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
                 **split_rgb(maps[..., :3], "albedo"),
                 "roughness": maps[..., 3],
                 "metallic": maps[..., 4],
-                "scale.albedo": flat,
-                "scale.roughness": flat,
-                "scale.metallic": flat,
+                **{f"{claim}.{name}": flat for claim in ("scale", "uncertainty") for name in ("albedo", "roughness", "metallic")},
             },
         )
     base.json("base.json", {"cell_edge_m": CELL, "origin": [float(v) for v in origin]})
