@@ -54,8 +54,7 @@ _PROPERTY_OF_ENTRY = np.repeat([0, 1, 2], [12, 2, 2])  # of the CROSS layout
 _GRAM_4 = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 13]])  # where a 4x4 entry is in the GRAM layout
 _GRAM_R = np.array([[9, 10], [10, 13]])
 _GRAM_M = np.array([[11, 12], [12, 13]])
-_IDENTITY = np.zeros(kernels.CROSS)
-_IDENTITY[[0, 5, 10, 12, 14]] = 1.0
+_IDENTITY = kernels.IDENTITY.astype(np.float64)
 _BIAS = [3, 7, 11, 13, 15]  # entries of the CROSS layout that multiply 1
 _NO_MASK = np.zeros((0, 0), bool)
 
@@ -70,7 +69,7 @@ class BaseOptions:
         sweeps: alternations.
         temperature, anneal, final_temperature: selection temperature of the first sweep, in units of the segment's
             median error, its factor per sweep, and where it stops. At the default 0.1 a prediction whose error exceeds
-            the best by a tenth of the median has 1/e of its weight: averaging near-ties is worth 0.5-1.3 dB over
+            the best by a tenth of the median has 1/e of its weight: averaging near-ties is worth 0.7-1.4 dB over
             the single best one (0).
         ridge: pull of T to identity, times the segment's weight in the fit; more for segments below `ridge_pixels` pixels.
         robust: cells take the M-estimate of the Laplace divergence instead of the mean.

@@ -27,9 +27,14 @@ _exact = numba.njit(nogil=True, cache=True)
 GRAM = 14
 """Sums that `gram` makes: aa ab ac bb bc cc a b c (albedo), rr r, mm m, 1."""
 CROSS = 16
-"""Sums that `cross` makes: albedo 3 x 4 (row = output channel; inputs r g b 1), roughness (r, 1), metallic (m, 1)."""
+"""Sums that `cross` makes: albedo 3 x 4 (row = output channel; inputs r g b 1), roughness (r, 1), metallic (m, 1).
+Corrections are kept in the same layout."""
+IDENTITY = np.zeros(CROSS, np.float32)
+"""The correction that changes nothing."""
+IDENTITY[[0, 5, 10, 12, 14]] = 1
 
 
+# The four functions without a body of their own get one for each type from their `overload`, when a loop is compiled.
 def _widen(plane, bits, out, m):
     """out[:m] = plane[:m] as float32; `bits` is the memory of `out` seen as int32."""
     raise NotImplementedError

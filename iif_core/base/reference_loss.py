@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 
 from .. import laplace
 from ..errors import InputError
-from .matching import identity_penalty
+from .matching import REGULARISER, identity_penalty
 from .problem import LOWEST, BaseProblem, BaseResult, usable_pixels
 
 if TYPE_CHECKING:
     from .sgd import SgdFit
 
-REGULARISER_WEIGHT = 100.0
-"""Weight of each of the three identity regularisers in the total (METHOD 2.3.8)."""
 
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 _LOWEST = LOWEST.astype(np.float64)
@@ -68,7 +66,7 @@ def reference_loss(
     weighted: bool = False,
     log_weight: NDArray | None = None,
     temperature: float | None = None,
-    regulariser: float = REGULARISER_WEIGHT,
+    regulariser: float = REGULARISER,
     floor: float = laplace.SCALE_FLOOR,
 ) -> ReferenceLoss:
     """The published loss of a texture, corrections and selection, over every usable pixel.

@@ -33,15 +33,13 @@ from numpy.typing import NDArray
 from .. import laplace
 from ..errors import InputError
 from ..hashgrid import HashGridOptions, HashGridTexture
-from .kernels import CROSS, as_floats, as_words
+from .kernels import IDENTITY, as_floats, as_words
 from .problem import LOWEST, BaseProblem, Dropped, object_means, usable_pixels
 from .selection import selection_weights
 
 if TYPE_CHECKING:
     import torch
 
-_IDENTITY = np.zeros(CROSS, np.float32)
-_IDENTITY[[0, 5, 10, 12, 14]] = 1
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 _FULL_ANNEALS = 81  # multiplications of the paper's largest scene, 8080 steps
 _HALVINGS = 4
@@ -494,7 +492,7 @@ class _Numba:
         self.kernels, self.pool, self.options = sgd_kernels, pool, options
         self.threads = ThreadPoolExecutor(threads) if threads > 1 else None
         s, k = pool.usable.shape
-        self.affine = np.tile(_IDENTITY, (s, k, 1))
+        self.affine = np.tile(IDENTITY, (s, k, 1))
         self.z = np.zeros((s, k, 3), np.float32)
         self.fixed: NDArray | None = None
         self.networks = sgd_kernels.selection_networks(k)
@@ -654,7 +652,7 @@ class _Torch:
         self.values = self.tensor(values)
         self.segment, self.cell = self.tensor(pool.segment.astype(np.int64)), self.tensor(pool.cell.astype(np.int64))
         self.usable, self.weight = self.tensor(pool.usable), self.tensor(pool.weight)
-        self.affine = self.tensor(np.tile(_IDENTITY, (s, k, 1))).requires_grad_()
+        self.affine = self.tensor(np.tile(IDENTITY, (s, k, 1))).requires_grad_()
         self.z = torch.zeros((s, k, 3), device=self.device, requires_grad=True)
         self.fixed = None
         self.grid, self.table = None, None

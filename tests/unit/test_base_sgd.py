@@ -7,7 +7,7 @@ import pytest
 
 from iif_core.base import sgd, sgd_kernels
 from iif_core.base.direct import BaseOptions, solve_base
-from iif_core.base.kernels import as_words
+from iif_core.base.kernels import IDENTITY, as_words
 from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem
 from iif_core.base.reference_loss import loss_of_result, reference_loss
 from iif_core.base.sgd import SgdOptions, converged, sgd_options, solve_base_sgd
@@ -27,7 +27,7 @@ SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growt
 def state(k, seed=0, n=150, segments=4, spread=0.15, low=0.0):
     """Parameters and a batch sorted by segment, float64."""
     rng = np.random.default_rng(seed)
-    affine = np.tile(sgd._IDENTITY.astype(np.float64), (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
+    affine = np.tile(IDENTITY.astype(np.float64), (segments, k, 1)) + spread * rng.standard_normal((segments, k, 16))
     usable = np.ones((segments, k), bool)
     if k > 2:
         usable[1, 0] = usable[1, 2] = False
@@ -317,7 +317,7 @@ def test_loss_of_the_solver_is_the_reference_loss(preset):
 def test_loss_with_moved_corrections_is_the_reference_loss():
     problem, _ = simulated()
     fit = solve_base_sgd(problem, sgd_options(iterations=120, batch=1 << 20, learning_rate=0.02))
-    assert np.abs(fit.corrections - sgd._IDENTITY).max() > 1e-3
+    assert np.abs(fit.corrections - IDENTITY).max() > 1e-3
     assert loss_of_result(problem, fit).total == pytest.approx(fit.history[-1]["total"], rel=2e-3)  # one step later
     packed = np.random.default_rng(0).random((7, 5)).astype(np.float32)
     packed = np.c_[packed, np.ones(7, np.float32)]
