@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base import sgd, sgd_kernels
 from iif_core.base.direct import BaseOptions, solve_base
 from iif_core.base.kernels import IDENTITY, as_words
 from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem
 from iif_core.base.reference_loss import loss_of_result, reference_loss
-from iif_core.base.sgd import SgdOptions, converged, sgd_options, solve_base_sgd
+from iif_core.base.sgd import SgdOptions, converged, kernels, numba_engine, sgd_options, solve_base_sgd, torch_engine
+from iif_core.base.sgd import pool as sgd_pool
 from iif_core.errors import InputError
 from iif_core.hashgrid import HashGridOptions
 from tests.unit.test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
@@ -45,18 +45,18 @@ def state(k, seed=0, n=150, segments=4, spread=0.15, low=0.0):
 def compiled(p, options, temperature=0.3, divisor=0.7, real=np.float64):
     """Terms of the loss and gradients from the closed forms."""
     alpha, log_alpha = softmax(p["z"] / divisor, p["usable"])
-    start, segment = sgd._runs(p["segment"])
+    start, segment = sgd_pool.runs(p["segment"])
     d_affine, d_alpha, votes = (np.zeros((*p["usable"].shape, m), real) for m in (16, 3, 3))
     d_raw, error, sums = np.empty(p["raw"].shape, real), np.zeros(alpha.shape), np.zeros((len(segment), 5))
     numbers = np.array([temperature, options.scale_floor, options.data_weight, options.regulariser], real)
     flags = np.array([options.scale_floor_kind == "smooth", options.median_gradient, options.clamp_gradient == "inward"])
-    sgd_kernels.batch_loss(
+    kernels.batch_loss(
         *(0, len(segment), start, segment, p["values"].astype(real), np.arange(len(p["raw"]), dtype=np.int32)),
         *(a.astype(real) for a in (p["share"], p["raw"], p["affine"], alpha, log_alpha)),
-        *(p["usable"], *sgd_kernels.selection_networks(alpha.shape[1]), numbers, flags),
+        *(p["usable"], *kernels.selection_networks(alpha.shape[1]), numbers, flags),
         *(d_raw, d_affine, d_alpha, votes, error, sums),
     )
-    d_z = sgd._logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
+    d_z = numba_engine.logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
     return dict(zip(TERMS, sums.sum(0), strict=True)), {"raw": d_raw, "affine": d_affine, "z": d_z}, error
 
 
@@ -72,7 +72,7 @@ def automatic(p, options, temperature=0.3, divisor=0.7):
     """The same left to torch."""
     t = {name: torch.from_numpy(a) for name, a in p.items()}
     wanted = [t[name].requires_grad_() for name in ("raw", "affine", "z")]
-    found = sgd.torch_losses(
+    found = torch_engine.torch_losses(
         *(t[name] for name in ("raw", "values", "affine", "z", "segment", "usable", "share")), temperature, divisor, options
     )
     o = options
@@ -161,13 +161,13 @@ def test_half_precision_pools_are_read_as_they_are():
     out = []
     for pool in (as_words(half), half.astype(np.float32)):
         sums, d_raw = np.zeros((4, 5)), np.zeros((100, 10), np.float32)
-        start, segment = sgd._runs(p["segment"])
+        start, segment = sgd_pool.runs(p["segment"])
         alpha, log_alpha = (a.astype(np.float32) for a in softmax(p["z"], p["usable"]))
         rest = [np.zeros((4, 6, m), np.float32) for m in (16, 3, 3)]
-        sgd_kernels.batch_loss(
+        kernels.batch_loss(
             *(0, 4, start, segment, pool, np.arange(100, dtype=np.int32)),
             *(a.astype(np.float32) for a in (p["share"], p["raw"], p["affine"])),
-            *(alpha, log_alpha, p["usable"], *sgd_kernels.selection_networks(6), np.float32([0.3, 0.01, 1, 100])),
+            *(alpha, log_alpha, p["usable"], *kernels.selection_networks(6), np.float32([0.3, 0.01, 1, 100])),
             *(np.array([True, False, True]), d_raw, *rest, np.zeros((4, 6, 3)), sums),
         )
         out.append((sums, d_raw))
@@ -178,10 +178,10 @@ def test_half_precision_pools_are_read_as_they_are():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 7, 8, 12, 16, 21])
 def test_selection_networks_find_the_lower_median(n):
-    values = np.random.default_rng(n).integers(0, 9, (n, sgd_kernels.TILE)).astype(np.float64)
-    networks, lengths = sgd_kernels.selection_networks(21)
+    values = np.random.default_rng(n).integers(0, 9, (n, kernels.TILE)).astype(np.float64)
+    networks, lengths = kernels.selection_networks(21)
     found = values.copy()
-    sgd_kernels._select(found, networks[n], lengths[n], sgd_kernels.TILE)
+    kernels._select(found, networks[n], lengths[n], kernels.TILE)
     np.testing.assert_array_equal(found[(n - 1) // 2], np.sort(values, 0)[(n - 1) // 2])
 
 
@@ -189,10 +189,10 @@ def test_exponential():
     x = np.linspace(-80, 80, 64 * 500).astype(np.float32)
     found = x.copy()
     for low in range(0, len(x), 64):
-        sgd_kernels._exp_float(found[low : low + 64], 64)
+        kernels._exp_float(found[low : low + 64], 64)
     np.testing.assert_allclose(found, np.exp(x.astype(np.float64)), rtol=4e-7)
     ends = np.array([0, -0.0, -np.inf, -1e30, 88], np.float32)
-    sgd_kernels._exp_float(ends, 5)
+    kernels._exp_float(ends, 5)
     assert ends[0] == ends[1] == 1 and (0 <= ends[2:4]).all() and (ends[2:4] < 2e-38).all() and np.isfinite(ends[4])
 
 
@@ -200,7 +200,7 @@ def test_adam_is_that_of_torch():
     rng = np.random.default_rng(0)
     start = rng.standard_normal(1000).astype(np.float32)
     ours, theirs = start.copy(), torch.from_numpy(start.copy()).requires_grad_()
-    adam, optimiser = sgd._Adam(ours), torch.optim.Adam([theirs], lr=0.01)
+    adam, optimiser = numba_engine.Adam(ours), torch.optim.Adam([theirs], lr=0.01)
     for step in range(20):
         gradient = (rng.standard_normal(1000) * (rng.random(1000) < 0.3)).astype(np.float32)
         adam.gradient[:], theirs.grad = gradient, torch.from_numpy(gradient.copy())
@@ -217,25 +217,25 @@ def test_adam_is_that_of_torch():
 def test_published_schedules():
     """METHOD 2.3.8: 81 multiplications on 8080 steps, the first after the first step; halved after 2, 4, 6, 8 epochs."""
     paper = sgd_options("paper")
-    temperature = [sgd._temperature(paper, step, 8080) for step in (0, 1, 100, 101, 8079)]
+    temperature = [sgd_pool.temperature_at(paper, step, 8080) for step in (0, 1, 100, 101, 8079)]
     np.testing.assert_allclose(temperature, 0.85 ** np.array([0, 1, 1, 2, 81]))
     assert temperature[-1] == pytest.approx(1.9e-6, rel=0.02)
-    rate = [sgd._learning_rate(paper, step, 8080, 808) for step in (0, 1615, 1616, 8079)]
+    rate = [sgd_pool.learning_rate_at(paper, step, 8080, 808) for step in (0, 1615, 1616, 8079)]
     np.testing.assert_allclose(rate, 0.01 * 0.5 ** np.array([0, 0, 1, 4]))
 
 
 @pytest.mark.parametrize("steps", [10, 81, 1000])
 def test_safe_schedules_do_not_depend_on_the_number_of_steps(steps):
     options = sgd_options(temperature_floor=0.0)
-    temperature = [sgd._temperature(options, step, steps) for step in range(steps)]
+    temperature = [sgd_pool.temperature_at(options, step, steps) for step in range(steps)]
     assert temperature[0] == 1 and temperature[-1] == pytest.approx(0.85 ** (81 - 81 / steps), rel=0.2)
-    assert min(sgd._temperature(SgdOptions(), step, steps) for step in range(steps)) == 1e-3
-    rate = [sgd._learning_rate(options, step, steps, 1) for step in range(steps)]
+    assert min(sgd_pool.temperature_at(SgdOptions(), step, steps) for step in range(steps)) == 1e-3
+    rate = [sgd_pool.learning_rate_at(options, step, steps, 1) for step in range(steps)]
     np.testing.assert_allclose(np.unique(rate), 0.01 / 2.0 ** np.arange(5)[::-1])
 
 
 def test_batches_are_permutations():
-    batches = sgd._batches(10, 3, np.random.default_rng(0))
+    batches = sgd_pool.batches(10, 3, np.random.default_rng(0))
     first, second = ([next(batches) for _ in range(3)] for _ in range(2))
     for epoch in (first, second):
         assert len(np.unique(np.concatenate(epoch))) == 9 and all((np.diff(b) > 0).all() for b in epoch)
@@ -459,9 +459,9 @@ def test_values_outside_the_unit_interval_are_not_misread():
     problem, _ = simulated()
     odd = [p.astype(np.float16) for p in problem.predictions]
     odd[1][2, 3, 4] = [-0.25, 1.5, 0.5, 1.25, -0.0]
-    pools = [sgd._gather(replace(problem, predictions=p), QUICK) for p in (odd, [p.astype(np.float32) for p in odd])]
+    pools = [sgd_pool.gather(replace(problem, predictions=p), QUICK) for p in (odd, [p.astype(np.float32) for p in odd])]
     np.testing.assert_array_equal(pools[0].values, pools[1].values)
-    inside = sgd._gather(replace(problem, predictions=[np.clip(p, 0, 1) for p in odd]), QUICK)
+    inside = sgd_pool.gather(replace(problem, predictions=[np.clip(p, 0, 1) for p in odd]), QUICK)
     assert inside.values.dtype == np.uint16
 
 
@@ -503,7 +503,7 @@ def test_hash_grid_texture(preset):
 
 def test_points_are_normalised_by_a_cube():
     problem, _ = simulated()
-    pool = sgd._gather(on_a_wall(problem), sgd_options(texture="hashgrid", jitter=True))
+    pool = sgd_pool.gather(on_a_wall(problem), sgd_options(texture="hashgrid", jitter=True))
     low, high = 0.0, max(np.ravel(c).max() // 60 for c in problem.cell_of_pixel) / 30
     high = max(high, max((np.ravel(c) % 60).max() for c in problem.cell_of_pixel) / 30)
     low = min(min((np.ravel(c) % 60).min(), np.ravel(c).min() // 60) for c in problem.cell_of_pixel) / 30

@@ -17,7 +17,7 @@ from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
-from .kernels import sorting_network
+from ..kernels import sorting_network
 
 TILE = 64
 _kernel = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
