@@ -95,6 +95,13 @@ def _groups(study: Study) -> dict[str, list[str]]:
     return out
 
 
+def _others(study: Study, variant: str) -> str:
+    """What the variant sets besides what its group has in common: `16, 0.4`."""
+    settings = study.variants[variant].overrides
+    dotted = [(f"{section}.{key}", value) for section, keys in settings.items() for key, value in keys.items()]
+    return ", ".join(str(value) for name, value in dotted if name not in study.plot.group)
+
+
 def _axis(axes: Any, key: str, which: str, values: pd.Series) -> None:
     metric = key.split("/")[1]
     getattr(axes, f"set_{which}label")(_UNITS.get(metric, metric), fontsize=8)
@@ -173,9 +180,14 @@ def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: s
                 front.append((x, y))
             face = colour if best else "none"
             axes.errorbar(x, y, xerr=dx, yerr=dy, fmt="o", ms=5, mfc=face, color=colour, elinewidth=0.8)
+            if best:
+                axes.annotate(
+                    _others(study, name), (x, y), xytext=(4, -6 + 8 * (len(front) % 2)), textcoords="offset points", fontsize=5.5
+                )
     if front:
         axes.plot(*np.array(sorted(front)).T, color="grey", lw=1, zorder=0, label="Pareto front (filled)")
     _logarithmic_if_wide(axes, "x", chosen["cpu_seconds"].dropna())
+    axes.margins(x=0.12)
     axes.set_xlabel("CPU time of the base job / s", fontsize=8)
     _axis(axes, key, "y", chosen["value"])
 
