@@ -231,3 +231,29 @@ def test_only_the_environment_and_any_chunk(T):
         for chunk in (1 << 18, 77)
     )
     assert np.isfinite(first).all() and first.mean() > 1e3 and first.tobytes() == second.tobytes()
+
+
+def test_texel_table_becomes_a_map():
+    from workflow.base_scene import _environment
+
+    row, column = (index.ravel() for index in np.indices((4, 8)))
+    owner = np.full(32, -1)
+    owner[5], owner[20:22], owner[31] = 7, 8, 9
+
+    class Reader:
+        def __init__(self, names):
+            self.names = names
+
+        def has(self, name):
+            return name in self.names
+
+        def table(self, name):
+            return {"row": row, "column": column, "emitter_id": owner}
+
+    emitters = {"emitter_id": np.array([3, 7, 8, 9])}
+    radiance = np.float32([[1, 1, 1], [2, 3, 4], [5, 6, 7], [8, 8, 8]])
+    shines = np.array([False, True, True, False])  # 3 is an area emitter, 9 was dropped
+    out = _environment(Reader(["environment_texels.parquet"]), emitters, radiance, shines)
+    assert out.shape == (4, 8, 3) and np.count_nonzero(out.any(-1)) == 3
+    assert out[0, 5].tolist() == [2, 3, 4] and out[2, 4].tolist() == out[2, 5].tolist() == [5, 6, 7]
+    assert _environment(Reader([]), emitters, radiance, shines).tolist() == [7, 9, 11]
