@@ -46,8 +46,13 @@ class BaseScene:
     cell_values: np.ndarray
     object_values: np.ndarray
 
-    def traceable(self, black: np.ndarray | None = None) -> tuple[Geometry, CellMaterials]:
-        """Geometry and materials on the device; faces in `black` (m,) bool reflect nothing."""
+    def traceable(
+        self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[Geometry, CellMaterials]:
+        """Geometry and materials on the device; faces in `black` (m,) bool reflect nothing.
+
+        extra: vertices (v, 3) and faces (f, 3) of a black thing to add; its faces come last.
+        """
         import mitsuba
 
         mitsuba.set_variant("llvm_ad_rgb")
@@ -58,7 +63,12 @@ class BaseScene:
         material = CellMaterials(
             self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object, self.cell_values, object_values
         )
-        return build_geometry(self.vertices, self.faces, object_id), material
+        if extra is None:
+            return build_geometry(self.vertices, self.faces, object_id), material
+        vertices = np.concatenate([self.vertices, extra[0]])
+        faces = np.concatenate([self.faces, extra[1] + len(self.vertices)])
+        object_id = np.concatenate([object_id, np.full(len(extra[1]), self.n_objects, np.int32)])
+        return build_geometry(vertices, faces, object_id), material
 
 
 def read_base_scene(job: Job) -> BaseScene:

@@ -11,7 +11,7 @@ from .emitters import Emitters
 from .geometry import Geometry, build_geometry, trace
 from .materials import CellMaterials, FaceMaterials
 from .matrix import transport_matrix
-from .render import render
+from .render import first_hits, render
 from .shading import shading_caches
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Geometry",
     "RadianceCache",
     "build_geometry",
+    "first_hits",
     "render",
     "shading_caches",
     "trace",

@@ -53,11 +53,15 @@ class RadianceCache:
 
     `ijk` (n, 3) voxel indices from `cells.voxel_indices(points, edge, origin)`, `radiance` (n, 3) linear, >=
     0. A voxel in the table with radiance 0 is a black surface; a voxel not in the table is a miss and the
-    path goes on (METHOD H27).
+    path goes on (METHOD H27). first_bounce: surface interactions after which a path may end here; 2 = direct and once
+    reflected light are traced, the cache stands for what comes after.
     """
 
-    def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike):
+    def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike, first_bounce: int = 1):
         ijk = np.asarray(ijk).reshape(-1, 3)
+        if first_bounce < 1:
+            raise InputError(f"first_bounce is {first_bounce}; the cache takes over after 1 interaction or more")
+        self.first_bounce = first_bounce
         radiance = rows_of(radiance, len(ijk), 3, "cache radiance")
         if radiance.size and radiance.min() < 0:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
