@@ -247,13 +247,20 @@ class Shading(Section):
     """Cached incident shading: diffuse and split specular."""
 
     samples: int = Field(32, ge=2)
-    """Paths a pixel, over both halves."""
+    """Paths a pixel (specular) and paths a cell to begin with (diffuse), over both halves."""
     levels: int = Field(10, ge=3, le=32)
     """Roughness levels."""
+    cell_edge: float = Field(0.03, gt=0)
+    """Diffuse light is cached once a piece of surface of this edge (metres), for all views."""
+    noise: float = Field(0.08, gt=0)
+    """Relative standard error of diffuse light (median of an object) at which no more paths are added."""
+    max_samples: int = Field(512, ge=2)
+    """Most paths a cell."""
     max_bounces: int = Field(6, ge=1, le=64)
     """Path length where the radiance cache does not answer."""
-    indirect: Literal["cache", "path"] = "cache"
-    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials."""
+    indirect: Literal["auto", "cache", "path"] = "auto"
+    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials; `auto`:
+    `cache` where enough of what the surface sees was photographed."""
 
 
 class Affines(Section):

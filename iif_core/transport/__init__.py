@@ -8,7 +8,7 @@ size: one lane owns one point, loops over its samples itself, and draws from its
 
 from .cache import RadianceCache
 from .emitters import Emitters
-from .geometry import Geometry, build_geometry, trace
+from .geometry import Geometry, build_geometry, cosine_directions, trace
 from .materials import CellMaterials, FaceMaterials
 from .matrix import transport_matrix
 from .render import first_hits, render
@@ -21,6 +21,7 @@ __all__ = [
     "Geometry",
     "RadianceCache",
     "build_geometry",
+    "cosine_directions",
     "first_hits",
     "render",
     "shading_caches",

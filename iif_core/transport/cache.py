@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..cells import CellTable, hash_words, inverse_edge, pack_keys, probe_step
+from ..cells import CellTable, hash_words, inverse_edge, pack_keys, probe_step, voxel_indices
 from ..errors import InputError
 from .arrays import rows_of, table
 
@@ -53,21 +53,22 @@ class RadianceCache:
 
     `ijk` (n, 3) voxel indices from `cells.voxel_indices(points, edge, origin)`, `radiance` (n, 3) linear, >=
     0. A voxel in the table with radiance 0 is a black surface; a voxel not in the table is a miss and the
-    path goes on (METHOD H27). first_bounce: surface interactions after which a path may end here; 2 = direct and once
-    reflected light are traced, the cache stands for what comes after.
+    path goes on (METHOD H27).
     """
 
-    def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike, first_bounce: int = 1):
+    def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike):
         ijk = np.asarray(ijk).reshape(-1, 3)
-        if first_bounce < 1:
-            raise InputError(f"first_bounce is {first_bounce}; the cache takes over after 1 interaction or more")
-        self.first_bounce = first_bounce
         radiance = rows_of(radiance, len(ijk), 3, "cache radiance")
         if radiance.size and radiance.min() < 0:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
         self.count = len(ijk)
+        self.edge, self.origin = edge, np.asarray(origin, np.float32)
         self._rows = VoxelRows(edge, origin, ijk, -1)
         self._radiance = table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
+
+    def covers(self, points: ArrayLike) -> Array:
+        """(n,) bool: the voxel around each point (n, 3) is in the table."""
+        return self._rows.table.lookup(pack_keys(voxel_indices(points, self.edge, self.origin))) >= 0
 
     def radiance(self, point: Any, active: Any) -> tuple[Any, Any]:
         """(found, radiance) at a surface point (device types)."""

@@ -13,7 +13,7 @@ from ..environment import as_map, direction_in, solid_angles, texel_of, texel_we
 from ..errors import InputError
 from ..xp import DRJIT
 from .arrays import rows_of, table
-from .geometry import Geometry, trace
+from .geometry import Geometry, cosine_directions, trace
 
 Array = np.ndarray
 
@@ -145,9 +145,8 @@ def _escape_share(geometry: Geometry, rays: int = 4096) -> float:
     corners = geometry.vertices[geometry.faces[face]].astype(np.float64)
     weights = np.stack([1 - root, root * (1 - u2), root * u2], 1)
     normal = geometry.normals[face] * rng.choice([-1.0, 1.0], rays)[:, None]
-    way = rng.normal(size=(rays, 3))
-    way = normal + way / np.linalg.norm(way, axis=1, keepdims=True)  # a unit ball that touches the surface: cosine
-    hit, _ = trace(geometry, np.einsum("ij,ijk->ik", weights, corners) + 1e-3 * normal, way + 1e-6 * normal)
+    start = np.einsum("ij,ijk->ik", weights, corners) + 1e-3 * normal
+    hit, _ = trace(geometry, start, cosine_directions(normal, rng))
     return float((hit < 0).mean())
 
 

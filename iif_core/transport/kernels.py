@@ -177,11 +177,11 @@ def roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, 
     return survives, dr.select(survives, 1 / chance, 0)
 
 
-def take_from_cache(world: World, point: Any, throughput: Any, bounce: Any, active: Any) -> tuple[Any, Any]:
+def take_from_cache(world: World, point: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
     """(found, gain) of ending the path with the cached radiance."""
     if world.cache is None or world.cache.count == 0:
         return mi.Bool(False), mi.Color3f(0)
-    found, radiance = world.cache.radiance(point, active & (bounce >= world.cache.first_bounce))
+    found, radiance = world.cache.radiance(point, active)
     return found, dr.select(found, throughput * radiance, 0)
 
 
@@ -202,7 +202,7 @@ def incoming(
 
     `pdf` is the density with which the direction was drawn where emitters were sampled as well, inf where
     they were not; `bounce` counts the surface interactions so far. The path ends at the environment, in the
-    radiance cache (from its `first_bounce` on and never on an emitting face), after `max_bounces` interactions, or
+    radiance cache (only for bounce >= 1 and never on an emitting face), after `max_bounces` interactions, or
     by Russian roulette.
     """
     gain = mi.Color3f(0)
@@ -222,7 +222,7 @@ def incoming(
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))
         gain += world.collector.emitter(hit.face, radiance, throughput * weight, emits)
-        found, cached = take_from_cache(world, hit.point, throughput, bounce, hit.valid & ~is_emitter)
+        found, cached = take_from_cache(world, hit.point, throughput, hit.valid & ~is_emitter & (bounce >= 1))
         gain += cached
 
         active &= hit.valid & ~found & (bounce < max_bounces) & (cos_front != 0)
