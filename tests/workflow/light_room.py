@@ -266,5 +266,13 @@ EMISSION = {
     "prune": 0.01,
     "environment": "auto",
 }
-SHADING = {"samples": 32, "levels": 10, "max_bounces": 6, "indirect": "cache"}
+SHADING = {
+    "samples": 32,
+    "levels": 10,
+    "cell_edge": 0.03,
+    "noise": 0.08,
+    "max_samples": 512,
+    "max_bounces": 6,
+    "indirect": "auto",
+}
 AFFINES = {"response": "auto", "iterations": 12, "pixels": 200000, "ridge": 2e-3, "robust_width": 0.1, "scale": "prior"}

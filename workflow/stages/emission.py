@@ -458,7 +458,7 @@ def _trace(
                 job.settings.emission.max_bounces,
                 ((job.seed << 32) | _SEEDS) * 2 + half,
                 cache,
-                environment_group,
+                None if environment_group is None else np.full((1, 1), environment_group, np.int32),
             )
         )
     job.progress(2, 2, "halves of the transport matrix traced")
