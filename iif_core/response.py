@@ -24,6 +24,7 @@ the origin that has the same value and slope there.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -363,8 +364,16 @@ def project(family: str, params: np.ndarray) -> np.ndarray:
     return theta
 
 
-def family_for(setting: str, dynamic_range: str) -> str:
-    """Family that a setting means: `auto` is `identity` for HDR and `ggcm` for LDR photographs."""
-    if setting != "auto":
-        return setting
-    return "identity" if dynamic_range == "hdr" else "ggcm"
+def response_facts(curve: Response) -> dict[str, Any]:
+    """A response as plain values for a JSON file; `response_from_facts` reads them."""
+    facts: dict[str, Any] = {"family": curve.family, "names": list(curve.names), "parameters": curve.params.tolist()}
+    if curve.samples is not None:
+        facts["samples"] = {"x": curve.samples[0].tolist(), "y": curve.samples[1].tolist()}
+    return facts
+
+
+def response_from_facts(facts: dict[str, Any]) -> Response:
+    """The response that `response_facts` wrote."""
+    if facts["family"] == "sampled":
+        return sampled_response(facts["samples"]["x"], facts["samples"]["y"])
+    return response(facts["family"], np.asarray(facts["parameters"], np.float64))

@@ -1,10 +1,12 @@
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.errors import InputError
-from iif_core.response import family_for, project, response, sampled_response
+from iif_core.response import project, response, response_facts, response_from_facts, sampled_response
 
 CURVES = {
     "identity": response("identity"),
@@ -129,8 +131,12 @@ def test_refused(call):
         call()
 
 
-def test_empty_and_families():
+def test_empty():
     assert response("ggcm")(np.zeros((0, 3))).shape == (0, 3)
     assert response("ggcm").inverse(np.zeros((0, 3))).shape == (0, 3)
-    assert family_for("auto", "hdr") == "identity" and family_for("auto", "ldr") == "ggcm"
-    assert family_for("gamma", "ldr") == "gamma"
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_facts_bring_the_curve_back(name):
+    again = response_from_facts(json.loads(json.dumps(response_facts(CURVES[name]))))
+    np.testing.assert_allclose(again(X), CURVES[name](X), atol=1e-12)
