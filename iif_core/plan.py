@@ -16,7 +16,7 @@ ESCAPE_PRIMARY = 1e-3
 ESCAPE_SECONDARY = 2e-3
 ESCAPE_BRIGHTNESS = 0.02
 EXPOSURE_LOG_RATIO = 0.05
-RESPONSE_EXPLAINED = 0.05
+RESPONSE_ERRORS = 1.0
 METALLIC_PRIOR = 0.25
 SPECULAR_ROUGHNESS = 0.85
 CACHE_COVERAGE = 0.3
@@ -89,16 +89,16 @@ def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
     return _decision("radiance_cache", coverage > CACHE_COVERAGE, measure, coverage, CACHE_COVERAGE, reason)
 
 
-def camera_response(dynamic_range: str, family: str, start_residual: float, fitted_residual: float) -> Decision:
-    """Camera response: never for linear radiance; for LDR its parameters count when they explain more than 5 % of the
-    squared residual (below that the starting curve would have done)."""
-    explained = 1.0 - (fitted_residual / start_residual) ** 2 if start_residual > 0 else 0.0
-    measure = "share of the squared residual that the fitted response explains"
-    if dynamic_range == "hdr":
-        return _decision("camera_response", False, measure, 0.0, RESPONSE_EXPLAINED, "photographs are linear radiance")
-    useful = explained > RESPONSE_EXPLAINED
-    verdict = "was needed" if useful else "changes little; the starting curve would have done"
-    return _decision("camera_response", True, measure, explained, RESPONSE_EXPLAINED, f"LDR; fitting {family} {verdict}")
+def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision:
+    """Camera response: never for linear radiance; for LDR whatever `calibration.calibrate_response` chose, and why.
+
+    Args:
+        calibration: `calibration.calibration_facts`.
+    """
+    table = calibration["candidates"]
+    measure = "log likelihood by which the simplest curve is behind the best, in standard errors"
+    value = table[0]["behind"] / max(table[0]["error"], 1e-9) if table else 0.0
+    return _decision("camera_response", dynamic_range != "hdr", measure, value, RESPONSE_ERRORS, calibration["reason"])
 
 
 def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:

@@ -10,7 +10,12 @@ H32). `identity` (HDR) is a straight line everywhere.
 | srgb | - | IEC 61966-2-1 |
 | gamma | gamma | x^(1 / gamma) |
 | ggcm | a0, a1, a2 | x^exp(a0 + a1 x + a2 x^2)  (Ng, Chang and Tsui: generalised gamma curve model) |
+| spline | rise_1 ... rise_{K-1}, slope_0 ... slope_K | S(x^0.45), K even bins (ECOSYSTEM 8) |
 | sampled | - | straight lines between given samples |
+
+S is the monotone rational-quadratic spline (Gregory and Delbourgo): knots at k / K, slopes exp(slope_k) there, and rises
+between knots that are the softmax of (rise_1, ..., rise_{K-1}, 0). Any numbers give a strictly rising curve with a closed
+inverse; all zeros give x^0.45.
 
 Powers have an infinite slope at 0. Below x = 1e-4 (less than one 8-bit step) they are continued by the parabola through
 the origin that has the same value and slope there.
@@ -19,19 +24,26 @@ the origin that has the same value and slope there.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from iif_core.errors import InputError
 
-FAMILIES = ("identity", "srgb", "gamma", "ggcm", "sampled")
-PARAMETERS: dict[str, tuple[str, ...]] = {
+FAMILIES = ("identity", "srgb", "gamma", "ggcm", "spline", "sampled")
+START: dict[str, tuple[float, ...]] = {
     "identity": (),
     "srgb": (),
-    "gamma": ("gamma",),
-    "ggcm": ("a0", "a1", "a2"),
+    "gamma": (2.2,),
+    "ggcm": (-0.8, 0.0, 0.0),
+    "spline": (0.0,) * 6,
     "sampled": (),
 }
+"""Starting parameters, near sRGB."""
+SPLINE_BINS = (2, 8)
+"""Fewest and most bins of a spline; K bins have 2 K parameters, and 3 unless said."""
+_SPLINE_POWER = 0.45
+_SPLINE_BOUND = 5.0  # rises between 1e-5 and 1, slopes between 1/150 and 150 of x^0.45's
 _TOE = 1e-4  # end of the parabola that replaces a power near 0
 _GAMMA_BOUNDS = (0.6, 6.0)
 _A0_BOUNDS = (-2.0, 0.5)  # exponent at 0 between 0.135 and 1.65
@@ -58,7 +70,7 @@ class Response:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
-        return PARAMETERS[self.family]
+        return parameter_names(self.family, self.params.shape[-1])
 
     def with_params(self, params: np.ndarray) -> Response:
         """The same family with other parameters, moved into the range where the curve is monotone."""
@@ -131,6 +143,8 @@ class Response:
         if self.family == "sampled":
             f, slope = self._interpolate(x)
             return f, slope, none, none
+        if self.family == "spline":
+            return self._spline(x, jacobian)
         return self._power(x, jacobian)
 
     def _interpolate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -188,6 +202,65 @@ class Response:
         dslope_toe = (dy * end + y[..., None] * dq * (2.0 * t - 1.0)[..., None]) / _TOE
         return f, slope_out, np.where(toe[..., None], df_toe, dy), np.where(toe[..., None], dslope_toe, dslope)
 
+    def _knots(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rises (..., K), heights (..., K + 1) and slopes (..., K + 1) of the spline at its knots."""
+        bins = self.params.shape[-1] // 2
+        rise = np.exp(np.concatenate([self.params[..., : bins - 1], np.zeros((*self.params.shape[:-1], 1))], -1))
+        rise /= rise.sum(-1, keepdims=True)
+        height = np.concatenate([np.zeros_like(rise[..., :1]), np.cumsum(rise, -1)], -1)
+        return rise, height / height[..., -1:], np.exp(self.params[..., bins - 1 :])
+
+    def _spline(self, x: np.ndarray, jacobian: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """S(u), u = x^0.45 (parabola below the toe); within a bin, with s = h K and q = xi (1 - xi),
+        S = y + h [s xi^2 + d0 q] / [s + (d0 + d1 - 2 s) q]."""
+        rise, height, slopes = self._knots()
+        bins = rise.shape[-1]
+        t = np.minimum(x / _TOE, 1.0)
+        z = np.maximum(x, _TOE)
+        u, p = z**_SPLINE_POWER, _SPLINE_POWER
+        rate = np.where(x < _TOE, ((2.0 - p) + 2.0 * (p - 1.0) * t) / _TOE, p / z) * u  # du/dx
+        u = u * t * ((2.0 - p) + (p - 1.0) * t)
+        j = np.minimum((u * bins).astype(np.int64), bins - 1)
+        at = (j,) if self.params.ndim == 1 else (np.broadcast_to(np.arange(len(self.params)), x.shape), j)
+        nxt = (*at[:-1], j + 1)
+        h, low, d0, d1 = rise[at], height[at], slopes[at], slopes[nxt]
+        xi = u * bins - j
+        s, q = h * bins, xi * (1.0 - xi)
+        above, below = s * xi**2 + d0 * q, s + (d0 + d1 - 2.0 * s) * q
+        f = low + h * above / below
+        end = s**2 * (d1 * xi**2 + 2.0 * s * q + d0 * (1.0 - xi) ** 2) / below**2  # dS/du
+        if not jacobian:
+            empty = np.zeros((*x.shape, 2 * bins))
+            return f, end * rate, empty, empty
+        df, dslope = np.zeros((*x.shape, 2 * bins)), np.zeros((*x.shape, 2 * bins))
+        by_h = above / below + s * (xi**2 * below - above * (1.0 - 2.0 * q)) / below**2
+        knot = np.arange(bins + 1)
+        by_d0, by_d1 = h * q * (below - above) / below**2, -h * q * above / below**2
+        df[..., bins - 1 :] = (by_d0 * d0)[..., None] * (knot == j[..., None]) + (by_d1 * d1)[..., None] * (
+            knot == j[..., None] + 1
+        )
+        # df/d rise_i = [i < j] + [i = j] by_h; the softmax turns it into r_i (df/d rise_i - sum_k r_k df/d rise_k).
+        by_rise = (knot[:-1] < j[..., None]) + by_h[..., None] * (knot[:-1] == j[..., None])
+        df[..., : bins - 1] = (rise * (by_rise - (rise * by_rise).sum(-1, keepdims=True)))[..., :-1]
+        for k, where in ((0, x <= 0.0), (bins, x >= 1.0)):  # the slope there is that knot's
+            dslope[..., bins - 1 + k] = np.where(where, end * rate, 0.0)
+        return f, end * rate, df, dslope
+
+    def _inverse_spline(self, y: np.ndarray) -> np.ndarray:
+        rise, height, slopes = self._knots()
+        bins = len(rise)
+        j = np.clip(np.searchsorted(height, y, side="right") - 1, 0, bins - 1)
+        h, d0, d1, part = rise[j], slopes[j], slopes[j + 1], y - height[j]
+        s = h * bins
+        bend = part * (d0 + d1 - 2.0 * s)
+        a, b, c = h * (s - d0) + bend, h * d0 - bend, -s * part
+        xi = 2.0 * c / (-b - np.sqrt(np.maximum(b**2 - 4.0 * a * c, 0.0)))
+        u, p = (j + xi) / bins, _SPLINE_POWER
+        # Toe: u = u_t t ((2 - p) - (1 - p) t).
+        low = np.minimum(u / _TOE**p, 1.0)
+        t = 2.0 * low / ((2.0 - p) + np.sqrt(np.maximum((2.0 - p) ** 2 - 4.0 * (1.0 - p) * low, 0.0)))
+        return np.where(low < 1.0, _TOE * t, u ** (1.0 / p))
+
     def _inverse_shared(self, y: np.ndarray) -> np.ndarray:
         inside = np.clip(y, 0.0, 1.0)
         if self.family == "srgb":
@@ -197,6 +270,8 @@ class Response:
         elif self.family == "sampled":
             assert self.samples is not None
             x = np.interp(inside, self.samples[1], self.samples[0])
+        elif self.family == "spline":
+            x = self._inverse_spline(inside)
         else:
             x = self._invert_by_table(inside)
         ends = self.derivative(np.array([0.0, 1.0]))
@@ -220,7 +295,7 @@ class Response:
 def response(family: str, params: np.ndarray | None = None) -> Response:
     """A response of a named family, at its starting parameters unless given.
 
-    The starting parameters are near sRGB: gamma 2.2; ggcm (-0.8, 0, 0), i.e. x^0.449.
+    The starting parameters are near sRGB: gamma 2.2; ggcm (-0.8, 0, 0), i.e. x^0.449; spline 0, i.e. x^0.45.
 
     Example: `response("gamma")(0.5)` is 0.7297.
 
@@ -230,11 +305,21 @@ def response(family: str, params: np.ndarray | None = None) -> Response:
     if family not in FAMILIES or family == "sampled":
         allowed = ", ".join(f for f in FAMILIES if f != "sampled")
         raise InputError(f"camera response {family!r}: unknown; allowed: {allowed} (sampled curves: `sampled_response`)")
-    start = {"gamma": [2.2], "ggcm": [-0.8, 0.0, 0.0]}.get(family, [])
-    theta = np.asarray(start if params is None else params, np.float64)
-    if theta.ndim not in (1, 2) or theta.shape[-1] != len(PARAMETERS[family]) or not np.isfinite(theta).all():
-        raise InputError(f"camera response {family}: parameters {theta.tolist()}, needed {PARAMETERS[family]}, finite")
+    theta = np.asarray(START[family] if params is None else params, np.float64)
+    size = theta.shape[-1] if theta.ndim else 0
+    fits = size % 2 == 0 and SPLINE_BINS[0] <= size // 2 <= SPLINE_BINS[1] if family == "spline" else size == len(START[family])
+    if theta.ndim not in (1, 2) or not fits or not np.isfinite(theta).all():
+        names = parameter_names(family, len(START[family]))
+        raise InputError(f"camera response {family}: parameters {theta.tolist()}, needed {names}, finite")
     return Response(family, project(family, theta))
+
+
+def parameter_names(family: str, size: int) -> tuple[str, ...]:
+    """Names of the `size` parameters of a family."""
+    if family == "spline":
+        bins = size // 2
+        return (*(f"rise_{k}" for k in range(1, bins)), *(f"slope_{k}" for k in range(bins + 1)))
+    return {"gamma": ("gamma",), "ggcm": ("a0", "a1", "a2")}.get(family, ())
 
 
 def sampled_response(x: np.ndarray, y: np.ndarray) -> Response:
@@ -274,11 +359,21 @@ def project(family: str, params: np.ndarray) -> np.ndarray:
         a1 = np.clip(theta[..., 1], -_A_BOUND, _SLOPE_BOUND)
         a2 = np.minimum(np.clip(theta[..., 2], -_A_BOUND, _A_BOUND), (_SLOPE_BOUND - a1) / 2.0)
         theta = np.stack([a0, a1, a2], -1)
+    elif family == "spline":
+        theta = np.clip(theta, -_SPLINE_BOUND, _SPLINE_BOUND)
     return theta
 
 
-def family_for(setting: str, dynamic_range: str) -> str:
-    """Family that a setting means: `auto` is `identity` for HDR and `ggcm` for LDR photographs."""
-    if setting != "auto":
-        return setting
-    return "identity" if dynamic_range == "hdr" else "ggcm"
+def response_facts(curve: Response) -> dict[str, Any]:
+    """A response as plain values for a JSON file; `response_from_facts` reads them."""
+    facts: dict[str, Any] = {"family": curve.family, "names": list(curve.names), "parameters": curve.params.tolist()}
+    if curve.samples is not None:
+        facts["samples"] = {"x": curve.samples[0].tolist(), "y": curve.samples[1].tolist()}
+    return facts
+
+
+def response_from_facts(facts: dict[str, Any]) -> Response:
+    """The response that `response_facts` wrote."""
+    if facts["family"] == "sampled":
+        return sampled_response(facts["samples"]["x"], facts["samples"]["y"])
+    return response(facts["family"], np.asarray(facts["parameters"], np.float64))

@@ -40,6 +40,8 @@ PLUGINS = {
     "capture": (("source", "kind", "workflow.sources.{}"),),
     "prior": (("prior", "kind", "workflow.priors.{}"),),
 }
+# Modules that know (and check) further input files of a stage.
+FILE_MODULES = {"emission": ("workflow.response_file",)}
 # Files that a stage reads if they are there.
 OPTIONAL_FILES = {"base_scores": (Path("results/weights/lpips_vgg.npz"),)}
 
@@ -166,6 +168,8 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
         module = importlib.import_module(pattern.format(document[section][key]))
         if hasattr(module, "raw_inputs"):
             out.extend(module.raw_inputs(document))
+    for name in FILE_MODULES.get(stage, ()):
+        out.extend(importlib.import_module(name).raw_inputs(document))
     return out
 
 

@@ -33,7 +33,12 @@ STAGES: dict[str, Stage] = {
         Stage("segmentation", ("capture",), ("segmentation",)),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
         Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics",), reads_raw=True, on_demand=True),
-        Stage("emission", ("capture", "segmentation", "base"), ("emission", "capture.dynamic_range", "affines.response", "seed")),
+        Stage(
+            "emission",
+            ("capture", "segmentation", "base"),
+            ("emission", "capture.dynamic_range", "affines.response", "seed"),
+            reads_raw=True,
+        ),
         Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
             "affines",

@@ -263,11 +263,21 @@ class Shading(Section):
     `cache` where enough of what the surface sees was photographed."""
 
 
+class ResponseFile(Section):
+    """A measured camera response."""
+
+    file: Path
+    """CSV or Parquet with columns `x, R, G, B` (exposed radiance from 0 to 1, sensor values), or NPY (3, samples) over
+    even steps of x."""
+
+
 class Affines(Section):
     """One affine per object and the camera response."""
 
-    response: Literal["auto", "identity", "srgb", "gamma", "ggcm"] = "auto"
-    """Family of the camera response; `auto`: identity for HDR, ggcm for LDR."""
+    response: Literal["auto", "identity", "srgb", "gamma", "ggcm", "spline"] | ResponseFile = "auto"
+    """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`; NPY
+    (3, samples)). `auto`: identity for HDR; for LDR the smallest of srgb, gamma, ggcm and spline that explains how
+    differently exposed photographs show the same surface, srgb where there are none."""
     iterations: int = Field(12, ge=1, le=200)
     """Gauss-Newton steps."""
     pixels: int = Field(200000, ge=100)

@@ -5,6 +5,10 @@ import pytest
 
 from iif_core import plan
 
+CHOSEN = {
+    "candidates": [{"family": "srgb", "behind": 60.0, "error": 20.0}, {"family": "gamma", "behind": 0.0, "error": 0.0}],
+    "reason": "gamma it is",
+}
 KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
 
 
@@ -24,9 +28,9 @@ KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
         (plan.emitters(3, 1, 4), True),
         (plan.emitters(0, 0, 0), False),
         (plan.emitters(0, 2, 2), False),
-        (plan.camera_response("hdr", "identity", 1.0, 0.1), False),
-        (plan.camera_response("ldr", "ggcm", 1.0, 0.5), True),
-        (plan.camera_response("ldr", "ggcm", 0.0, 0.0), True),
+        (plan.camera_response("hdr", {"candidates": [], "reason": "linear"}), False),
+        (plan.camera_response("ldr", {"candidates": [], "reason": "too few"}), True),
+        (plan.camera_response("ldr", CHOSEN), True),
         (plan.exposure("given", np.array([1.0, -1.0]), 0), False),
         (plan.exposure("estimate", np.array([1.0, -1.0]), 2), True),
         (plan.exposure("estimate", np.array([0.01, -0.01]), 2), False),
@@ -48,8 +52,8 @@ def test_decisions(decision, included):
 
 
 def test_values_say_what_was_measured():
-    assert plan.camera_response("ldr", "ggcm", 1.0, 0.5)["value"] == 0.75
-    assert "changes little" in plan.camera_response("ldr", "ggcm", 1.0, 0.99)["reason"]
+    assert plan.camera_response("ldr", CHOSEN)["value"] == 3.0
+    assert plan.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
     assert plan.second_pass(np.array([1.5, 1.0, 0.7]), np.array([10, 1, 2]))["value"] == 0.5
     assert "1 because it pays" in plan.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
     assert plan.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"

@@ -1,10 +1,12 @@
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.errors import InputError
-from iif_core.response import family_for, project, response, sampled_response
+from iif_core.response import project, response, response_facts, response_from_facts, sampled_response
 
 CURVES = {
     "identity": response("identity"),
@@ -12,6 +14,8 @@ CURVES = {
     "gamma": response("gamma"),
     "ggcm": response("ggcm", [-0.7, 0.4, -0.3]),
     "ggcm_per_channel": response("ggcm", [[-0.8, 0, 0], [-0.5, 0.3, 0.2], [-1.0, -0.5, 0.6]]),
+    "spline": response("spline", [0.3, -0.4, 0.5, -0.2, 0.1, -0.6]),
+    "spline_per_channel": response("spline", np.random.default_rng(0).normal(0, 0.7, (3, 8))),
     "sampled": sampled_response(np.linspace(0, 1, 101), np.linspace(0, 1, 101) ** 0.5),
     "sampled_per_channel": sampled_response(
         np.linspace(0, 1, 65), np.stack([np.linspace(0, 1, 65) ** p for p in (0.4, 0.6, 0.9)])
@@ -48,7 +52,7 @@ def test_derivative_against_differences(name):
     np.testing.assert_allclose(f.derivative(x), (f(x + h) - f(x - h)) / (2 * h), rtol=2e-5)
 
 
-@pytest.mark.parametrize("name", ["gamma", "ggcm", "ggcm_per_channel"])
+@pytest.mark.parametrize("name", ["gamma", "ggcm", "ggcm_per_channel", "spline", "spline_per_channel"])
 def test_parameter_derivatives_against_differences(name):
     f = CURVES[name]
     exact = f.parameter_derivatives(X)
@@ -67,8 +71,17 @@ def test_known_values():
     np.testing.assert_allclose(response("gamma")(3.0), 1 + 2 / 2.2)
 
 
+def test_zero_spline_is_the_power_and_knots_are_where_they_should_be():
+    x = np.linspace(1e-4, 1, 300)
+    np.testing.assert_allclose(response("spline")(x), x**0.45, rtol=1e-12)
+    f = response("spline", [np.log(2.0), 0.0, 0.4, 0.1, 0.2, -0.3])
+    knot = (np.arange(4) / 3) ** (1 / 0.45)
+    np.testing.assert_allclose(f(knot), [0, 0.5, 0.75, 1], atol=1e-12)
+    np.testing.assert_allclose(f.derivative(knot[1:]), np.exp([0.1, 0.2, -0.3]) * 0.45 * knot[1:] ** -0.55, rtol=1e-9)
+
+
 def test_continuous_with_slope_at_the_toe():
-    for name in ("gamma", "ggcm"):
+    for name in ("gamma", "ggcm", "spline"):
         f = CURVES[name]
         edge = np.array([1e-4 * (1 - 1e-9), 1e-4 * (1 + 1e-9)])
         np.testing.assert_allclose(np.diff(f(edge)), 0, atol=1e-9)
@@ -76,12 +89,14 @@ def test_continuous_with_slope_at_the_toe():
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.floats(-50, 50), min_size=3, max_size=3), st.floats(0, 1))
-def test_any_parameters_give_a_monotone_invertible_curve(params, y):
-    f = response("ggcm", params)
+@given(st.sampled_from([("gamma", 1), ("ggcm", 3), ("spline", 6), ("spline", 8)]), st.data())
+def test_any_parameters_give_a_monotone_invertible_curve(family, data):
+    name, size = family
+    f = response(name, data.draw(st.lists(st.floats(-50, 50), min_size=size, max_size=size)))
+    y = np.array(data.draw(st.floats(0, 1)))
     grid = np.linspace(0, 1, 2001)
-    assert (np.diff(f(grid)) > 0).all()
-    assert abs(f(f.inverse(np.array(y))) - y) < 1e-7
+    assert (np.diff(f(grid)) > 0).all() and f(0.0) == 0 and abs(f(1.0) - 1) < 1e-12
+    assert abs(f(f.inverse(y)) - y) < 1e-9
 
 
 def test_project_is_idempotent():
@@ -103,6 +118,8 @@ def test_sampled_curve_with_flat_and_falling_pieces():
         lambda: response("sampled"),
         lambda: response("gamma", [1.0, 2.0]),
         lambda: response("ggcm", [0, np.nan, 0]),
+        lambda: response("spline", np.zeros(7)),
+        lambda: response("spline", np.zeros(2)),
         lambda: sampled_response([0, 1], [1, 1]),
         lambda: sampled_response([0, 2], [0, 1]),
         lambda: sampled_response([0, 0.5, 1], [0, 1]),
@@ -114,8 +131,12 @@ def test_refused(call):
         call()
 
 
-def test_empty_and_families():
+def test_empty():
     assert response("ggcm")(np.zeros((0, 3))).shape == (0, 3)
     assert response("ggcm").inverse(np.zeros((0, 3))).shape == (0, 3)
-    assert family_for("auto", "hdr") == "identity" and family_for("auto", "ldr") == "ggcm"
-    assert family_for("gamma", "ldr") == "gamma"
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_facts_bring_the_curve_back(name):
+    again = response_from_facts(json.loads(json.dumps(response_facts(CURVES[name]))))
+    np.testing.assert_allclose(again(X), CURVES[name](X), atol=1e-12)

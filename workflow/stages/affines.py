@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from iif_core import plan
 from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
-from iif_core.response import Response, response
+from iif_core.response import Response, response_facts, response_from_facts
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.base_scene import (
     MATERIAL,
@@ -24,7 +24,6 @@ from workflow.normal_form import CaptureReader, View
 
 SATURATION = 0.99
 RESPONSE_SAMPLES = 101
-PROBE_PIXELS = 20_000
 THIN_PIXELS = 50
 """Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
 _SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
@@ -37,12 +36,13 @@ def run(job: Job) -> None:
     emits = read_light(job, len(scene.faces)).emits
     exposures = dict(zip((v.view_id for v in capture.views), capture.exposures(), strict=True))
     problem = _problem(job, capture, scene, emits, exposures)
-    start = _starting_response(job)
+    start, prior, calibration = _starting_response(job)
     options = FitOptions(
         iterations=settings.iterations,
         ridge=settings.ridge,
         robust_width=settings.robust_width,
         scale="none" if capture.is_hdr else settings.scale,
+        response_prior=prior,
     )
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     fit = fit_affines(problem, start, options)
@@ -54,7 +54,7 @@ def run(job: Job) -> None:
         _write_response(job, fit.response)
     _write_cells(job, fit)
     _write_maps(job, capture, fit)
-    decisions = _plan(problem, fit, start, options, capture.facts["dynamic_range"])
+    decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
     job.writer.json(
         "affines.json",
         {
@@ -65,11 +65,7 @@ def run(job: Job) -> None:
             "residual": float(np.sqrt(np.average(fit.residual**2, weights=np.maximum(fit.pixels, 1e-9))))
             if len(fit.pixels)
             else 0.0,
-            "response": {
-                "family": fit.response.family,
-                "names": list(fit.response.names),
-                "parameters": np.ravel(fit.response.params).tolist(),
-            },
+            "response": response_facts(fit.response),
             "plan": decisions,
         },
     )
@@ -78,14 +74,14 @@ def run(job: Job) -> None:
 # -------------------------------------------------------------------------------------------------------------- input
 
 
-def _starting_response(job: Job) -> Response:
-    """Where stage emission left the response; one row of parameters a channel, because cameras differ between
-    channels."""
+def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray] | None, dict[str, Any]]:
+    """Where stage emission left the response, one row of parameters a channel; its prior; what is known about it."""
     facts = job.read("emission").json("emission.json")["response"]
-    params = np.asarray(facts["parameters"], np.float64)
-    if not params.size:
-        return response(facts["family"])
-    return response(facts["family"], params if params.ndim == 2 else np.tile(params, (3, 1)))
+    start, known = response_from_facts(facts), facts["calibration"]
+    if not start.names:
+        return start, None, known
+    start = start if start.params.ndim == 2 else start.with_params(np.tile(start.params, (3, 1)))
+    return start, (start.params.ravel(), np.linalg.inv(np.asarray(known["covariance"], np.float64))), known
 
 
 @dataclass(frozen=True)
@@ -262,7 +258,7 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
 # --------------------------------------------------------------------------------------------------------------- plan
 
 
-def _plan(problem: FitProblem, fit: FitResult, start: Response, options: FitOptions, dynamic_range: str) -> list[plan.Decision]:
+def _plan(problem: FitProblem, fit: FitResult, calibration: dict[str, Any], dynamic_range: str) -> list[plan.Decision]:
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
     medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)
@@ -275,30 +271,10 @@ def _plan(problem: FitProblem, fit: FitResult, start: Response, options: FitOpti
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
             gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
     free_metal = fit.free[:, 15] if len(fit.free) else np.zeros(0, bool)
-    fixed, freed = _response_probe(problem, start, options)
     return [
-        plan.camera_response(dynamic_range, start.family, fixed, freed),
+        plan.camera_response(dynamic_range, calibration),
         plan.metallic(free_metal, medians),
         plan.specular(glossy, free_metal),
         plan.affine_size(fit.model),
         plan.second_pass(gains, fit.pixels),
     ]
-
-
-def _response_probe(problem: FitProblem, start: Response, options: FitOptions) -> tuple[float, float]:
-    """Residual of a small fit with the starting response and with a fitted one."""
-    if not start.params.size or not len(problem.object_id):
-        return 0.0, 0.0
-    stride = max(1, len(problem.object_id) // PROBE_PIXELS)
-    arrays = {
-        name: tuple(part[::stride] for part in value) if isinstance(value, tuple) else value[::stride]
-        for name, value in problem.__dict__.items()
-        if name not in ("n_objects", "levels")
-    }
-    few = replace(problem, **arrays)
-    out = []
-    for free in (False, True):
-        fit = fit_affines(few, start, replace(options, iterations=6, multi_start=False, free_response=free))
-        weight = fit.pixels.astype(np.float64)
-        out.append(float(np.sqrt((weight * fit.residual**2).sum() / max(weight.sum(), 1.0))))
-    return out[0], out[1]

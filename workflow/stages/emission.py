@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from iif_core import plan
+from iif_core.calibration import (
+    CalibratedResponse,
+    calibrate_response,
+    calibration_facts,
+    candidates,
+    given_response,
+    needs_rows,
+)
+from iif_core.cells import grid_origin
 from iif_core.emitters import (
     EmitterGroups,
     FaceStatistics,
@@ -19,7 +29,6 @@ from iif_core.emitters import (
     group_emitters,
     hdr_threshold,
 )
-from iif_core.exposure import calibrate_response
 from iif_core.nnls import (
     EmissionRows,
     EmissionSolution,
@@ -30,11 +39,12 @@ from iif_core.nnls import (
     scale_rows,
     solve_emission,
 )
-from iif_core.response import Response, family_for, response
-from workflow.artifacts.store import ids_from_disk
+from iif_core.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
+from iif_core.response import Response, response_facts
 from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, read_base_scene, view_pixels
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
+from workflow.response_file import read_response_file
 
 TILE = 8
 """Pixels of one object in one tile of this edge are averaged into one row (COMPUTE 4)."""
@@ -70,11 +80,11 @@ def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
-    family = family_for(job.settings.affines.response, capture.facts["dynamic_range"])
-    light = _Light(response(family), capture.is_hdr, job.settings.emission.saturation)
     notes: list[str] = []
     exposures, exposure_plan = _exposures(capture, views, notes)
-    light = _calibrated(job, capture, scene, views, light, exposures, notes)
+    calibrated = _camera_response(job, capture, scene, views, exposures)
+    job.log.info("camera response: %s", calibrated.reason)
+    light = _Light(calibrated.response, capture.is_hdr, job.settings.emission.saturation)
     statistics, threshold = _statistics(job, capture, scene, views, light)
     groups, candidates = _groups(job, scene, statistics, threshold)
     cache, misses = _radiance_cache(job, capture, scene, views, light, exposures, groups)
@@ -107,7 +117,7 @@ def run(job: Job) -> None:
             },
             "escape_share": {"primary": misses.share, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
-            "response": {"family": family, "parameters": light.curve.params.tolist()},
+            "response": {**response_facts(light.curve), "calibration": calibration_facts(calibrated)},
             "plan": decisions,
             "notes": notes,
         },
@@ -130,46 +140,36 @@ def _exposures(capture: CaptureReader, views: list[View], notes: list[str]) -> t
     return exposures, plan.exposure("estimate", logs, len(views))
 
 
-def _calibrated(
-    job: Job,
-    capture: CaptureReader,
-    scene: BaseScene,
-    views: list[View],
-    light: _Light,
-    exposures: dict[int, float],
-    notes: list[str],
-) -> _Light:
-    """The starting response, or the one that known exposures of shared surface imply (estimated ones assumed a response)."""
-    estimated = capture.facts.get("exposure_estimated", False)
-    if light.is_hdr or not light.curve.names or estimated or len(views) < 2:
-        return light
-    cell, owner, value = _shared_surface(job, capture, scene, views)
+def _camera_response(
+    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View], exposures: dict[int, float]
+) -> CalibratedResponse:
+    """The measured curve, the family that is set, or the one that surface under different exposures speaks for."""
+    setting = job.settings.affines.response
+    if not isinstance(setting, str):
+        return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}")
+    families = candidates(setting, capture.facts["dynamic_range"])
+    rows = _shared_surface(capture, scene, views, job) if needs_rows(families) else no_rows()
     exposure = np.array([exposures[view.view_id] for view in views])
-    found = calibrate_response(cell, owner, value, exposure, light.curve, light.saturation)
-    if not found.pairs:
-        notes.append("exposures differ by less than a stop where views overlap: the response starts at the family's default")
-        return light
-    notes.append(
-        f"response from {found.pairs} pairs of differently exposed views of the same surface ({found.stops:.1f} stops):"
-        f" they disagree by {found.after:.3f} in log radiance, {found.before:.3f} with the default curve"
+    return calibrate_response(
+        rows, exposure, families, job.settings.emission.saturation, given=not capture.facts.get("exposure_estimated", False)
     )
-    job.log.info(notes[-1])
-    return replace(light, curve=found.response)
 
 
-def _shared_surface(
-    job: Job, capture: CaptureReader, scene: BaseScene, views: list[View]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Surface cell, number of the view and sensor value of the interior pixels."""
-    cells, owners, values = [], [], []
+def _shared_surface(capture: CaptureReader, scene: BaseScene, views: list[View], job: Job) -> PatchRows:
+    """Patches of interior surface as the views show them."""
+    footprints = [np.median(depth[depth > 0]) / view.fx for view in views if (depth := capture.gbuffer(view)[0]).any()]
+    edge = patch_edge(float(np.median(footprints))) if footprints else 1.0
+    origin = grid_origin(scene.vertices[scene.faces.ravel()], edge)
+    share = min(1.0, STATISTICS_PIXELS / max(sum(view.width * view.height for view in views), 1))
+    parts = [no_rows()]
     for number, view in enumerate(views):
         pixels = view_pixels(job, capture, scene, view)
-        cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
-        use = pixels.valid & pixels.interior & (cell >= 0)
-        cells.append(cell[use])
-        owners.append(np.full(int(use.sum()), number, np.int32))
-        values.append(pixels.value[use].astype(np.float32))
-    return np.concatenate(cells), np.concatenate(owners), np.concatenate(values)
+        pixels = pixels.take(np.flatnonzero(pixels.valid & pixels.interior))
+        patch = patch_numbers(pixels.points, pixels.object_id, edge, origin)
+        saturation = job.settings.emission.saturation
+        parts.append(patch_rows(patch, pixels.normals, pixels.object_id, pixels.value, number, saturation, share=share))
+        job.progress(number + 1, len(views), "views compared for the camera response")
+    return join_rows(parts)
 
 
 # ------------------------------------------------------------------------------------------------------------- groups

@@ -1,0 +1,167 @@
+"""Camera response from shared surface: planted curves, the choice of the family, honest errors, extremes."""
+
+import numpy as np
+import pytest
+
+from iif_core.calibration import CANDIDATES, calibrate_response, candidates
+from iif_core.overlap import PatchRows, join_rows, no_rows, patch_rows
+from iif_core.photography import response_curve
+from iif_core.response import response
+
+EXPOSURES = np.array([0.25, 0.5, 1.0, 2.0, 4.0, 0.25, 1.0, 4.0])
+X = np.linspace(0, 1, 101)[:, None].repeat(3, 1)
+
+
+def _rows(rng, curve, exposure=EXPOSURES, n_patches=500, gloss=0.02, blocks=20, rounding=True, common=0.0):
+    """Patches seen by every view; `common`: error that the patches of a block share in a view."""
+    n_views = len(exposure)
+    surface = np.exp(rng.normal(-1.3, 1.0, (n_patches, 3)))
+    patch, view = (part.ravel() for part in np.meshgrid(np.arange(n_patches), np.arange(n_views), indexing="ij"))
+    block = patch % blocks
+    shift = gloss * rng.standard_t(4, (len(patch), 3)) + common * rng.normal(size=(blocks, n_views))[block, view][:, None]
+    value = curve(np.clip(exposure[view, None] * surface[patch] * np.exp(shift), 0, 1))
+    value = np.round(255 * value) / 255 if rounding else value
+    count = np.full(len(patch), 9)
+    zero = np.zeros(len(patch), np.int8)
+    return PatchRows(patch.astype(np.uint64), zero, block, view, value, value >= 0.99, count), exposure
+
+
+def _rms(found, truth):
+    return 100 * np.sqrt(np.mean((found(X) - truth(X)) ** 2, 0)).max()
+
+
+@pytest.mark.parametrize(
+    ("truth", "family", "limit"),
+    [
+        (response("gamma", [1.9]), "gamma", 0.2),
+        (response_curve("srgb"), "srgb", 1e-9),
+        (response_curve("filmic"), "spline", 0.6),
+        (response_curve("soft"), "spline", 0.6),
+    ],
+    ids=["gamma 1.9", "srgb", "filmic", "soft"],
+)
+def test_known_exposures_give_curve_and_family(truth, family, limit):
+    rows, exposure = _rows(np.random.default_rng(1), truth)
+    out = calibrate_response(rows, exposure)
+    assert out.response.family == family and family in out.reason
+    assert _rms(out.response, truth) < limit
+    assert [entry["family"] for entry in out.candidates] == list(CANDIDATES)
+    if out.response.names:
+        assert out.after < 0.05 and out.after < 0.5 * out.before
+
+
+def test_exact_data_give_exact_parameters():
+    truth = response("ggcm", [[-0.7, 0.3, -0.1], [-0.8, 0.0, 0.0], [-0.75, 0.1, 0.2]])
+    out = calibrate_response(*_rows(np.random.default_rng(5), truth, gloss=0.0, rounding=False), families=("ggcm",))
+    assert _rms(out.response, truth) < 0.1
+
+
+def test_a_glossy_block_and_outliers_do_not_matter():
+    rng = np.random.default_rng(6)
+    truth = response_curve("filmic")
+    rows, exposure = _rows(rng, truth)
+    rows.value[rows.block < 4] = np.clip(
+        rows.value[rows.block < 4] * np.exp(rng.normal(0, 0.4, ((rows.block < 4).sum(), 3))), 0, 1
+    )
+    bad = rng.random(len(rows.view)) < 0.05
+    rows.value[bad] = rng.uniform(0, 1, (bad.sum(), 3))
+    rows.clipped[:] = rows.value >= 0.99
+    assert _rms(calibrate_response(rows, exposure, ("spline",)).response, truth) < 1.0
+
+
+def test_claimed_errors_cover_the_truth():
+    """Errors that patches of an object share make naive standard errors far too small."""
+    square = []
+    for seed in range(8):
+        rows, exposure = _rows(np.random.default_rng(seed), response("gamma", [1.9]), n_patches=300, common=0.1)
+        out = calibrate_response(rows, exposure, ("gamma",))
+        square.append((out.response.params.ravel() - 1.9) ** 2 / np.diag(out.covariance))
+    assert 0.3 < np.mean(square) < 2.5  # some 40 if rows were independent
+
+
+def test_equal_exposures_or_no_overlap_say_so_and_take_the_simplest():
+    rng = np.random.default_rng(7)
+    rows, _ = _rows(rng, response("gamma", [1.8]), n_patches=300)
+    same = calibrate_response(rows, np.ones(8))
+    assert same.response.family == "srgb" and "less than 1 stop" in same.reason
+    fixed = calibrate_response(rows, np.ones(8), ("ggcm",))
+    np.testing.assert_array_equal(fixed.response.params, response("ggcm", np.tile([-0.8, 0, 0], (3, 1))).params)
+    apart = calibrate_response(rows.take(rows.patch % 8 == rows.view), EXPOSURES)
+    assert apart.rows == 0 and "less than 1 stop" in apart.reason
+    unknown = calibrate_response(rows, EXPOSURES, given=False)
+    assert unknown.response.family == "srgb" and "not known" in unknown.reason
+
+
+@pytest.mark.parametrize("kind", ["saturated", "black", "one view", "nan", "constant", "bright", "flat curve", "none"])
+def test_extremes_are_finite_and_explained(kind):
+    rng = np.random.default_rng(8)
+    rows, exposure = _rows(rng, response("gamma", [1.8]), n_patches=150)
+    if kind == "saturated":
+        rows.value[:], rows.clipped[:] = 1.0, True
+    elif kind == "black":
+        rows.value[rows.view == 2] = 0.0
+    elif kind == "one view":
+        rows = rows.take(rows.view == 0)
+    elif kind == "nan":
+        rows.value[:] = np.nan
+    elif kind == "constant":
+        rows.value[:], rows.clipped[:] = 0.5, False
+    elif kind == "bright":
+        exposure = exposure * 1e6
+    elif kind == "flat curve":
+        rows.value[:] = np.where((rows.value > 0.3) & (rows.value < 0.6), 0.45, rows.value)
+    else:
+        rows = no_rows()
+    out = calibrate_response(rows, exposure)
+    assert np.isfinite(out.response(X)).all() and (np.diff(out.response(X), axis=0) > 0).all()
+    assert np.isfinite(out.covariance).all() and np.isfinite([out.before, out.after, out.stops]).all() and out.reason
+    if kind in ("saturated", "one view", "nan", "none"):
+        assert out.rows == 0 and out.response.family == "srgb"
+    if kind in ("black", "bright"):
+        assert out.response.family == "gamma" and abs(out.response.params.mean() - 1.8) < 0.05
+
+
+def test_which_families_a_setting_allows():
+    assert candidates("auto", "hdr") == ("identity",) and candidates("auto", "ldr") == CANDIDATES
+    assert candidates("gamma", "ldr") == ("gamma",)
+    for family in ("identity", "srgb"):
+        out = calibrate_response(no_rows(), np.ones(0), (family,))
+        assert out.response.family == family and out.reason
+
+
+def _photograph(rng, n=4000, patches=40):
+    patch = rng.integers(0, patches, n).astype(np.uint64)
+    value = np.linspace(0.1, 1.1, patches)[patch.astype(int), None] * (1 + 0.01 * rng.normal(size=(n, 3)))
+    normal = np.where(patch[:, None] % 2 == 0, [0, 0, 1.0], [0.1, -0.9, 0])
+    return patch, normal, (patch // 4).astype(int), np.clip(value, 0, 1)
+
+
+def test_patch_rows_are_medians_of_even_surface():
+    rng = np.random.default_rng(0)
+    patch, normal, block, value = _photograph(rng)
+    value[patch == 3] = rng.uniform(0.1, 0.9, ((patch == 3).sum(), 3))  # uneven
+    value[(patch == 7) & (rng.random(len(patch)) < 0.2)] = 0.95  # a few highlights
+    value[patch == 11] = np.nan
+    rows = patch_rows(patch, normal, block, value, 5)
+    assert 3 not in rows.patch and 11 not in rows.patch and (rows.view == 5).all()
+    at = int(np.flatnonzero(rows.patch == 7)[0])
+    np.testing.assert_allclose(rows.value[at], 0.1 + 7 / 39, atol=0.01)
+    np.testing.assert_array_equal(rows.facing, np.where(rows.patch % 2 == 0, 5, 2))
+    assert rows.clipped[rows.patch == 39].all() and not rows.clipped[rows.value[:, 0] < 0.98].any()
+
+
+def test_patch_rows_pass_through_a_curve():
+    """The row of f(radiance) is f of the row of radiance."""
+    patch, normal, block, value = _photograph(np.random.default_rng(1))
+    f = response("gamma")
+    plain, curved = (patch_rows(patch, normal, block, v, 0, saturation=2.0) for v in (value, f(value)))
+    np.testing.assert_allclose(f(plain.value), curved.value, atol=2e-4)
+
+
+def test_thinning_keeps_the_same_patches_in_every_view_and_joining_numbers_them():
+    rng = np.random.default_rng(2)
+    parts = [patch_rows(*_photograph(rng), view, share=0.5) for view in range(3)]
+    assert {*parts[0].patch} == {*parts[1].patch} and 5 < len(parts[0].patch) < 35
+    rows = join_rows([*parts, no_rows()])
+    assert (np.bincount(rows.patch.astype(int)) == 3).all()
+    assert len(patch_rows(*(a[:0] for a in _photograph(rng)), 0).patch) == 0

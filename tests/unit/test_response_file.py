@@ -1,0 +1,91 @@
+"""A measured camera response from a file: read, checked, part of the fingerprint of what uses it."""
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+
+from iif_core.errors import InputError
+from iif_core.photography import response_curve
+from workflow import settings
+from workflow.fingerprint import raw_inputs
+from workflow.response_file import read_response_file
+
+GRID = np.linspace(0, 1, 1024)
+CURVE = response_curve("filmic").samples(1024)
+
+
+def _write(path, y=CURVE, x=GRID):
+    if path.suffix == ".npy":
+        np.save(path, y)
+    elif path.suffix == ".parquet":
+        pyarrow.parquet.write_table(pyarrow.table({"x": x, "R": y[0], "G": y[1], "B": y[2]}), path)
+    else:
+        rows = [", ".join(repr(float(v)) for v in row) for row in zip(x, *y, strict=True)]
+        path.write_text("\n".join(["x, R, G, B", *rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npy", "parquet", "csv"])
+def test_read_in_every_form(tmp_path, kind):
+    curve = read_response_file(_write(tmp_path / f"curve.{kind}"))
+    at = np.linspace(0, 1, 333)[:, None].repeat(3, 1)
+    np.testing.assert_allclose(curve(at), response_curve("filmic")(at), atol=2e-3)
+    np.testing.assert_allclose(curve.inverse(curve(at)), at, atol=1e-9)
+
+
+def test_flat_ends_and_noise_are_made_invertible(tmp_path):
+    y = np.clip(CURVE * 1.05, 0, 1) + 2e-4 * np.random.default_rng(0).uniform(-1, 0, CURVE.shape)
+    y[:, 0] = 0
+    curve = read_response_file(_write(tmp_path / "c.npy", y))
+    assert (np.diff(curve(GRID[:, None].repeat(3, 1)), axis=0) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "y", "x", "words"),
+    [
+        ("c.npy", CURVE[:2], GRID, "shape (2, 1024)"),
+        ("c.npy", CURVE * 255, GRID, "divide 8-bit values by 255"),
+        ("c.npy", CURVE[:, ::-1], GRID, "a response rises"),
+        ("c.npy", np.where(GRID > 0.5, CURVE - 0.2, CURVE), GRID, "falls by up to 0.199"),
+        ("c.npy", np.where(GRID > 0.5, np.nan, CURVE), GRID, "finite"),
+        ("c.npy", CURVE * 0.3, GRID, "at least half of the range"),
+        ("c.csv", CURVE, GRID * 2, "from 0 to 1"),
+        ("c.parquet", CURVE, GRID[::-1], "from 0 to 1"),
+        ("c.txt", CURVE, GRID, ".csv, .parquet"),
+    ],
+)
+def test_refused(tmp_path, name, y, x, words):
+    with pytest.raises(InputError, match=words.replace("(", r"\(").replace(")", r"\)").replace(".", r"\.")):
+        read_response_file(_write(tmp_path / name, y, x))
+
+
+@pytest.mark.parametrize("text", ["", "x,R,G\n0,0,0\n1,1,1\n", "x,R,G,B\n0,0,0\n1,1,1,1\n", "x,R,G,B\n0,a,0,0\n1,1,1,1\n"])
+def test_a_spoilt_csv_is_an_error_that_names_it(tmp_path, text):
+    (tmp_path / "c.csv").write_text(text)
+    with pytest.raises(InputError, match=r"c\.csv"):
+        read_response_file(tmp_path / "c.csv")
+
+
+def test_the_file_is_an_input_of_the_stage_that_reads_it(tmp_path):
+    path = _write(tmp_path / "c.npy")
+    assert raw_inputs("emission", {"affines": {"response": {"file": str(path)}}}) == [path]
+    assert raw_inputs("emission", {"affines": {"response": "auto"}}) == []
+    with pytest.raises(InputError, match="not found"):
+        raw_inputs("emission", {"affines": {"response": {"file": str(tmp_path / "d.npy")}}})
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [("{file: a.csv}", None), ("spline", None), ("{fiel: a.csv}", "affines.response"), ("emor", "affines.response")],
+)
+def test_setting(tmp_path, value, words):
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    text = f"source: {{kind: builtin}}\nprior: {{kind: simulated}}\naffines: {{response: {value}}}\n"
+    (tmp_path / "config/scenes/x.yaml").write_text(text)
+    if words:
+        with pytest.raises(InputError, match=words):
+            settings.load("x", "draft", tmp_path)
+    else:
+        got = settings.dump(settings.load("x", "draft", tmp_path))["affines"]["response"]
+        assert got == ({"file": "a.csv"} if "file" in value else value)
