@@ -85,8 +85,7 @@ def _given(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _R
     deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1).mean(1)
     objects = scene.object_values if model == "base" else _object_means(job, capture, scene)
     values = scene.cell_values if model == "base" else objects[scene.cell_object]
-    count = np.bincount(scene.cell_object, cells["observations"], scene.n_objects)
-    return _Result(values, objects, deviation, _start(job), count, {})
+    return _Result(values, objects, deviation, _start(job), np.zeros(scene.n_objects), {})
 
 
 def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndarray:
