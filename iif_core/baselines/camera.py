@@ -6,19 +6,20 @@ and the pull of cells to their object's prior. Roughness and metalness are solve
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..affines import interpolate_levels
 from ..response import Response
 from .direct import solve_direct
-from .loss import F0, IRIS, CellFit, CellOptions, checked_prior
+from .loss import F0, IRIS, CellFit, CellOptions, best_albedo, checked_prior, lobes_at, prior_scale
 from .problem import BOUND_WEIGHT, CellProblem, CellSums, PixelRows
 
 RESPONSE_PULL = 1e-3
 """IRIS's weight of the mean squared response parameters; here of their distance to the start."""
 _HALVINGS = 6
+_SEARCH_EVERY = 5  # steps; roughness and metalness move little with the response, their search takes most of the time
 
 
 @dataclass(frozen=True)
@@ -66,10 +67,13 @@ def fit_camera(
     rows = rows.take(np.argsort(rows.cell, kind="stable"))
     if not response.params.size or not len(rows.cell):
         return CameraFit(response, [])
-    begin, history = response.params, []
-    for _ in range(iterations):
+    begin, history, fit = response.params, [], None
+    for step in range(iterations):
         problem = _problem(rows, sums, response)
-        fit = solve_direct(problem, options, prior, rounds=2, scales=2)
+        if fit is None or step % _SEARCH_EVERY == 0:
+            fit = solve_direct(problem, options, prior, rounds=2, scales=2)
+        else:
+            fit = _albedo_again(problem, fit, checked_prior(problem, options, prior), options)
         state = _state(rows, problem, fit, checked_prior(problem, options, prior), options)
         if not len(state.rows.cell):
             return CameraFit(response, history)
@@ -79,6 +83,16 @@ def fit_camera(
             break
         response = stepped
     return CameraFit(response, history)
+
+
+def _albedo_again(problem: CellProblem, fit: CellFit, prior: np.ndarray, options: CellOptions) -> CellFit:
+    """The fit with albedo and scale for another response, roughness and metalness as they were."""
+    pull = options.prior * problem.pixels[:, None] * fit.scale**2
+    goal = prior / fit.scale if fit.scale > 0 else prior
+    albedo = best_albedo(problem.dd, lobes_at(problem, fit.value[:, 3]), fit.value[:, 4:], pull, goal)
+    value = np.where(problem.known[:, None], np.concatenate([albedo, fit.value[:, 3:]], 1), 0.0)
+    scale = prior_scale(problem, value, prior) if options.prior else fit.scale
+    return replace(fit, value=value, scale=scale, known=problem.known)
 
 
 def _problem(rows: PixelRows, sums: CellSums, response: Response) -> CellProblem:

@@ -1,6 +1,7 @@
 """Studies: names of derived scenes, what they override, what they share, errors, and the arithmetic of the table."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from iif_core.base.uncertainty import CALIBRATION
 from iif_core.errors import InputError
 from workflow import fingerprint as fp
 from workflow import scores, settings, studies, study_table
+from workflow.artifacts import StageWriter
 from workflow.job import Job
 from workflow.timings import read_parts
 
@@ -155,6 +157,37 @@ def test_costs_are_added_over_stages(folder, tmp_path):
     costs = study_table._costs(cell, "draft", ["base", "affines"])
     assert (costs["cpu_seconds"], costs["max_rss_mb"], costs["solver_cpu_seconds"]) == (7.0, 900, 2.0)
     assert study_table._costs(cell, "draft", ["base", "render", "affines"])["cpu_seconds"] is None
+
+
+def test_table_of_the_result_reads_the_row_of_each_variant(folder, tmp_path):
+    """From what stage metrics leaves to table, page and picture."""
+    folder("studies/late", LATE.replace("[0, 1]", "[0]") + "paper: {other: {protocol: scaled, values: {albedo/psnr: 10.6}}}\n")
+    for scene, gain in (("t--late-first-s0", 0.0), ("t--late-other-s0", 1.0), ("t--late-far-s0", 2.0)):
+        rows = [
+            (variant, view, quantity, "psnr", protocol, base + gain + view_gain)
+            for variant, base in (("result", 20.0), ("prior_k0", 10.0))
+            for view, view_gain in (("a", 0.0), ("b", 1.0))
+            for quantity, protocol in (("albedo", "raw"), ("albedo", "scaled"), ("rgb", "raw"))
+            if quantity == "albedo" or variant == "result"
+        ]
+        writer = StageWriter(tmp_path / "results" / scene / "metrics", {"scene": scene, "stage": "metrics", "fingerprint": "x"})
+        names = ("variant", "view", "quantity", "metric", "protocol", "value")
+        writer.table(
+            "variants.parquet", {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+        )
+        writer.finish()
+    study_table.write_study("late", "draft")
+    frame = pd.read_parquet("results/studies/late.parquet")
+    raw = frame[(frame["protocol"] == "raw") & (frame["quantity"] == "albedo")].set_index("variant")
+    assert raw["value"].to_dict() == {"first": 20.5, "same": 10.5, "other": 21.5, "far": 22.5} and (raw["views"] == 2).all()
+    assert frame[frame["quantity"] == "rgb"]["variant"].tolist() == ["first", "other", "far"]
+    paper = frame[frame["paper"].notna()]
+    assert paper[["variant", "protocol", "paper"]].to_numpy().tolist() == [["other", "scaled", 10.6]]
+    assert "10.60 (scaled)" in Path("results/studies/late.md").read_text()
+    assert Path("results/studies/late.png").stat().st_size > 5000
+    folder("studies/late", LATE.replace("[0, 1]", "[0]").replace("prior_k0", "prior_k9"))
+    with pytest.raises(InputError, match="`row: prior_k9`.*which has prior_k0, result"):
+        study_table.table("late", "draft")
 
 
 def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_number():
