@@ -11,7 +11,7 @@ stage emission, exposures, saturated values as bounds, dark pixels left out, bor
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +20,9 @@ from iif_core.affines import IDENTITY
 from iif_core.baselines.adam import solve_adam
 from iif_core.baselines.camera import fit_camera
 from iif_core.baselines.direct import solve_direct
-from iif_core.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown
-from iif_core.baselines.problem import DARK, CellProblem, CellSums, PixelRows
+from iif_core.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown, object_means
+from iif_core.baselines.problem import DARK, CellSums, PixelRows
+from iif_core.baselines.texture import AlbedoSums, BlockLight, blocks_of
 from iif_core.response import Response, response
 from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
 from workflow.base_scene import MATERIAL, UNKNOWN_MATERIAL, BaseScene, base_maps, read_base_scene, read_light, view_pixels
@@ -30,8 +31,10 @@ from workflow.normal_form import CaptureReader, View
 
 SATURATION = 0.99
 BORDER_WEIGHT = 0.1
+BLOCK = 4
+"""Edge in cells of the blocks that share roughness, metalness and diffuse light: about 1.6 pixel footprints."""
 CAMERA_PIXELS = 200_000
-"""Pixels, of whole cells, that the camera response is fitted to."""
+"""Pixels, of whole blocks, that the camera response is fitted to."""
 RESPONSE_SAMPLES = 101
 _SEEDS = 0x626C6E  # keeps the random numbers of this module apart from those of others
 WORDS = {
@@ -113,78 +116,97 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
 
 
 def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
+    """Roughness and metalness of blocks of cells, then the albedo of every cell."""
     levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
     options = FIPT if model == "fipt" else IRIS
+    block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, BLOCK)
     prior = _object_means(job, capture, scene) if model == "iris" else None
-    goal = prior[scene.cell_object, :3] if prior is not None else None
-    sums = CellSums(scene.cell_object, scene.n_objects, levels)
-    dark, share = _survey(job, capture, scene)
+    goal = prior[owner, :3] if prior is not None else None
+    views = _Pixels(job, capture, scene, block_of, len(owner))
+    sums = CellSums(owner, scene.n_objects, levels)
     curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
-    if model == "iris" and goal is not None and not capture.is_hdr:
-        chosen = np.random.default_rng([job.seed, _SEEDS]).random(len(scene.cell_object)) < share
-        rows = _joined([r.take(chosen[r.cell]) for r in _rows(job, capture, scene)])
+    if goal is not None and not capture.is_hdr:
+        share = min(1.0, CAMERA_PIXELS / max(views.count, 1))
+        chosen = np.random.default_rng([job.seed, _SEEDS]).random(len(owner)) < share
+        rows = _joined([rows.take(np.flatnonzero(chosen[rows.cell])) for rows, _ in views])
         with job.timed("solve"):
-            fit = fit_camera(rows, sums, _start(job), goal, options, dark=dark)
-        curve, camera = fit.response, fit.history
+            fitted = fit_camera(rows, sums, _start(job), goal, options, dark=views.dark)
+        curve, camera = fitted.response, fitted.history
         del rows
-    for rows in _rows(job, capture, scene):
+    for rows, _ in views:
         with job.timed("solve"):
-            sums.add(rows, curve, dark)
+            sums.add(rows, curve, views.dark)
     problem = sums.problem()
     with job.timed("solve"):
         solve = solve_direct if job.settings.affines.solver == "direct" else solve_adam
         fit = solve(problem, options, goal)
     unseen = prior if prior is not None else np.tile(np.float64(UNKNOWN_MATERIAL), (scene.n_objects, 1))
-    values = fill_unknown(fit, problem, unseen)
-    pixels = np.bincount(scene.cell_object, problem.pixels, scene.n_objects)
-    job.log.info("%d of %d cells seen, loss %s", fit.known.sum(), len(fit.known), fit.history[-1:])
-    objects = _means(values, problem, unseen)
+    blocks = fill_unknown(fit, problem, unseen)
+    job.log.info("%d of %d blocks seen, loss %s", fit.known.sum(), len(fit.known), fit.history[-1:])
+    fine = AlbedoSums(len(block_of))
+    for rows, cell in views:
+        own = blocks[rows.cell]
+        with job.timed("solve"):
+            fine.add(replace(rows, cell=cell), levels, own[:, 3], own[:, 4], curve, views.dark)
+    values = blocks[block_of]
+    pull = {"prior": goal[block_of] / max(fit.scale, 1e-6), "weight": options.prior * fit.scale**2} if goal is not None else {}
+    values[:, :3] = fine.albedo(values[:, :3], **pull)
+    pixels = np.bincount(owner, problem.pixels, scene.n_objects)
     facts = {"history": fit.history, "camera_history": camera, "residual": _residual(fit), "prior_scale": fit.scale}
-    facts |= {"cells_seen": int(fit.known.sum()), "solver": job.settings.affines.solver}
-    return _Result(values, objects, albedo_deviation(problem, values), curve, pixels, facts)
+    facts |= {"blocks": len(owner), "blocks_seen": int(fit.known.sum()), "solver": job.settings.affines.solver}
+    deviation = albedo_deviation(problem, blocks)[block_of]
+    return _Result(values, object_means(problem, blocks, unseen), deviation, curve, pixels, facts)
 
 
 def _residual(fit: CellFit) -> float:
     return float(np.sqrt(max(fit.history[-1], 0.0))) if fit.history else 0.0
 
 
-def _means(values: np.ndarray, problem: CellProblem, unseen: np.ndarray) -> np.ndarray:
-    """(O, 5) mean of the cells of each object, for surface that has no cell."""
-    weight = np.where(problem.known, problem.pixels, 0.0)
-    total = np.bincount(problem.object_id, weight, problem.n_objects)
-    sums = [np.bincount(problem.object_id, weight * values[:, c], problem.n_objects) for c in range(5)]
-    return np.where((total > 0)[:, None], np.stack(sums, 1) / np.maximum(total, 1e-300)[:, None], unseen)
+class _Pixels:
+    """Valid pixels of surface that does not shine, view by view: rows by block, and the cell of each.
 
+    Attributes:
+        count: how many there are; dark: light below which a pixel says nothing (`PixelRows.usable`).
+    """
 
-def _survey(job: Job, capture: CaptureReader, scene: BaseScene) -> tuple[float, float]:
-    """Light below which a pixel is dark, and the share of the cells whose pixels make `CAMERA_PIXELS`."""
-    light, count = [], 0
-    for rows in _rows(job, capture, scene, lobes=False):
-        own = rows.light()
-        own = own[np.isfinite(own)]
-        light.append(own[:: max(1, len(own) // 4096)])
-        count += len(rows.cell)
-    joined = np.concatenate([*light, np.zeros(0)])
-    return DARK * float(np.median(joined)) if len(joined) else 0.0, min(1.0, CAMERA_PIXELS / max(count, 1))
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, block_of: np.ndarray, blocks: int):
+        self.job, self.capture, self.scene, self.block_of = job, capture, scene, block_of
+        self.emits = read_light(job, len(scene.faces)).emits
+        self.levels = len(job.read("shading").table("levels.parquet")["roughness"])
+        light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
+        for rows, _ in self._views(None):
+            light.add(rows.cell, rows.diffuse)
+            own = rows.light()
+            samples.append(own[np.isfinite(own)][:: max(1, len(own) // 4096)])
+            self.count += len(own)
+        joined = np.concatenate(samples)
+        self.dark = DARK * float(np.median(joined)) if len(joined) else 0.0
+        self.diffuse = light.mean()
 
+    def __iter__(self) -> Iterator[tuple[PixelRows, np.ndarray]]:
+        return self._views(self.diffuse)
 
-def _rows(job: Job, capture: CaptureReader, scene: BaseScene, lobes: bool = True) -> Iterator[PixelRows]:
-    """Valid pixels, view by view, of surface cells that do not shine; without `lobes` s0 and s1 are empty."""
-    emits = read_light(job, len(scene.faces)).emits
-    levels = len(job.read("shading").table("levels.parquet")["roughness"])
-    for view in [view for view in capture.views if view.split != "test"] or capture.views:
-        pixels = view_pixels(job, capture, scene, view)
-        cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
-        use = pixels.valid & (cell >= 0) & ~emits[pixels.face]
-        pixels, cell = pixels.take(use), cell[use]
-        channels = job.read("shading").exr(f"maps/{view.name}.exr")
-        s0, s1 = (_lobes(channels, name, levels if lobes else 0, pixels.index) for name in ("s0", "s1"))
-        value = np.asarray(pixels.value, np.float32)
-        saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
-        value = np.minimum(value, SATURATION) if not capture.is_hdr else value
-        exposure = np.full(len(cell), view.exposure if not capture.is_hdr else 1.0)
-        weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
-        yield PixelRows(cell, weight, _mean_of_halves(channels, "diffuse", pixels.index), s0, s1, value, exposure, saturated)
+    def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
+        """With the diffuse light of blocks; without: that of the pixels, and no lobes."""
+        job, capture = self.job, self.capture
+        views = [view for view in capture.views if view.split != "test"] or capture.views
+        for done, view in enumerate(views):
+            pixels = view_pixels(job, capture, self.scene, view)
+            cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+            use = pixels.valid & (cell >= 0) & ~self.emits[pixels.face]
+            pixels, cell = pixels.take(use), cell[use]
+            block = self.block_of[cell]
+            channels = job.read("shading").exr(f"maps/{view.name}.exr")
+            levels = self.levels if diffuse is not None else 0
+            s0, s1 = (_lobes(channels, name, levels, pixels.index) for name in ("s0", "s1"))
+            d = diffuse[block] if diffuse is not None else _mean_of_halves(channels, "diffuse", pixels.index)
+            value = np.asarray(pixels.value, np.float32)
+            saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
+            value = np.minimum(value, SATURATION) if not capture.is_hdr else value
+            exposure = np.full(len(cell), view.exposure if not capture.is_hdr else 1.0)
+            weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
+            yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
+            job.progress(done + 1, len(views), "views read")
 
 
 def _mean_of_halves(channels: dict[str, np.ndarray], layer: str, index: np.ndarray) -> np.ndarray:

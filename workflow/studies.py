@@ -85,6 +85,8 @@ class Study(Section):
     """Protocols in the printed table and the picture; the Parquet file has all."""
     common: dict[str, dict[str, Any]] = {}
     """Settings of all variants, under their own."""
+    reference: str = ""
+    """Variant that the printed table compares the others with: the difference stands in brackets."""
     variants: dict[str, Variant] = {}
     """Name -> variant."""
     grids: list[dict[str, list[Any]]] = []
@@ -163,6 +165,8 @@ def _load_study(path: Path, root: Path, _stamp: int) -> Study:
         if dotted not in varied:
             raise InputError(f"{path}: `plot`: no variant sets {dotted or 'x'!r}. Allowed here: {', '.join(varied) or 'none'}.")
     shared = scene_overrides(root)
+    if study.reference and study.reference not in variants:
+        raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
     for stage in study.costs:
         if stage not in STAGES:
             raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")

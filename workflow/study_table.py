@@ -273,6 +273,9 @@ def page(study: studies.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> 
         return "\n".join([*lines, "Nothing was scored.", ""])
     seeds = len(study.seeds)
     note = f"Mean over views and {seeds} seed{'s' * (seeds > 1)} of the prior" + (" (± standard deviation)" if seeds > 1 else "")
+    if study.reference:
+        label = study.variants[study.reference].label or study.reference
+        lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
     explained = "; ".join(f"*{PROTOCOLS[protocol]}*: {EXPLAINED[protocol]}" for protocol in study.protocols)
     lines += [f"{note}. {explained}. The paper's numbers are of other scenes; in brackets the protocol that they follow.", ""]
     front = study.plot.kind == "pareto"
@@ -301,6 +304,9 @@ def page(study: studies.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> 
                     row.append(_mean_cell(metric, cell.groupby("scene")["value"].mean().tolist()))
                     continue
                 cell = cell[cell["scene"] == scene]
+                if study.reference and name != study.reference and len(cell):
+                    row.append(_moved(metric, cell, chosen, study.reference))
+                    continue
                 star = " *" if front and len(cell) and cell["pareto"].iloc[0] is True else ""
                 row.append(_number(metric, cell["value"].tolist()) + star)
             paper = study.paper.get(name)
@@ -339,6 +345,20 @@ def _direction(metric: str) -> str:
 
 def _shown(metric: str, value: float) -> str:
     return f"{value:.2f}" if metric == "psnr" else f"{value:.3g}" if metric in ("l2", "log_l2") else f"{value:.3f}"
+
+
+def _moved(metric: str, cell: pd.DataFrame, chosen: pd.DataFrame, reference: str) -> str:
+    """Mean over the seeds, and in brackets how far it is from the reference's, seed by seed (± standard deviation)."""
+    import numpy as np
+
+    keys = ["scene", "protocol", "seed"]
+    both = cell.merge(chosen[chosen["variant"] == reference], on=keys, suffixes=("", "_reference"))
+    moved = (both["value"] - both["value_reference"]).to_numpy(np.float64)
+    text = _shown(metric, float(cell["value"].mean()))
+    if not len(moved):
+        return text
+    spread = f" ± {float(np.std(moved, ddof=1)):.1g}" if len(moved) > 1 else ""
+    return f"{text} ({float(moved.mean()):+.2g}{spread})"
 
 
 def _mean_cell(metric: str, values: list[float]) -> str:

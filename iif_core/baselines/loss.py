@@ -151,13 +151,17 @@ def checked_prior(problem: CellProblem, options: CellOptions, prior: np.ndarray 
     return prior.astype(np.float64)
 
 
+def object_means(problem: CellProblem, value: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """(O, 5) mean of the known cells of each object over their pixels; `unseen` (O, 5) without any."""
+    weight = np.where(problem.known, problem.pixels, 0.0)
+    total = np.bincount(problem.object_id, weight, problem.n_objects)
+    sums = [np.bincount(problem.object_id, weight * value[:, c], problem.n_objects) for c in range(5)]
+    return np.where((total > 0)[:, None], np.stack(sums, 1) / np.maximum(total, 1e-300)[:, None], unseen)
+
+
 def fill_unknown(fit: CellFit, problem: CellProblem, unseen: np.ndarray) -> np.ndarray:
     """(C, 5) values with unknown cells at the mean of their object's known ones, or at `unseen` (O, 5) without any."""
-    weight = np.where(fit.known, problem.pixels, 0.0)
-    total = np.bincount(problem.object_id, weight, problem.n_objects)
-    sums = [np.bincount(problem.object_id, weight * fit.value[:, c], problem.n_objects) for c in range(5)]
-    mean = np.where((total > 0)[:, None], np.stack(sums, 1) / np.maximum(total, 1e-300)[:, None], unseen)
-    return np.where(fit.known[:, None], fit.value, mean[problem.object_id])
+    return np.where(fit.known[:, None], fit.value, object_means(problem, fit.value, unseen)[problem.object_id])
 
 
 def albedo_deviation(problem: CellProblem, value: np.ndarray) -> np.ndarray:

@@ -12,6 +12,7 @@ from iif_core.baselines.camera import fit_camera
 from iif_core.baselines.direct import METALNESS, solve_direct
 from iif_core.baselines.loss import FIPT, IRIS, CellFit, CellOptions
 from iif_core.baselines.problem import CellSums, PixelRows
+from iif_core.baselines.texture import AlbedoSums, BlockLight, blocks_of
 from iif_core.errors import InputError
 from iif_core.response import response
 
@@ -287,3 +288,48 @@ def test_bad_input(make, words):
         make()
     for word in words:
         assert word in str(caught.value)
+
+
+def test_blocks_keep_objects_apart():
+    ijk = np.array([[0, 0, 0], [3, 1, 2], [4, 0, 0], [0, 0, 1]])
+    block, owner = blocks_of(ijk, np.array([0, 0, 0, 1]), 4)
+    assert block[0] == block[1] and len(set(block.tolist())) == 3 and owner[block].tolist() == [0, 0, 0, 1]
+    block, owner = blocks_of(np.zeros((0, 3), int), np.zeros(0, int), 4)
+    assert len(block) == len(owner) == 0
+
+
+def test_light_of_blocks_is_the_mean_of_what_is_finite():
+    light = BlockLight(3)
+    light.add(np.array([0, 0, 2, -1]), np.array([[1.0, 2, 3], [3, 4, 5], [np.nan, 0, 0], [9, 9, 9]]))
+    light.add(np.array([0]), np.array([[2.0, 3, 7]]))
+    np.testing.assert_allclose(light.mean(), [[2, 3, 5], [0, 0, 0], [0, 0, 0]])
+
+
+def test_albedo_of_cells_in_known_blocks():
+    """Exact without shrinkage; with it a cell without pixels takes its block's, and a pull moves it where the prior is."""
+    rows, object_id, objects, truth, curve = plant(cells=60, family="srgb")
+    fine = AlbedoSums(61)
+    for part in np.array_split(np.arange(len(rows.cell)), 2):
+        own = truth[rows.cell[part]]
+        fine.add(rows.take(part), LEVELS, own[:, 3], own[:, 4], curve)
+    block = np.full((61, 3), 0.3)
+    clear = truth[:, 4] < 0.9
+    np.testing.assert_allclose(fine.albedo(block, shrink=0.0)[:60][clear], truth[clear, :3], atol=1e-3)
+    np.testing.assert_array_equal(fine.albedo(block)[60], [0.3] * 3)
+    target = np.full((61, 3), 0.9)
+    away = [np.abs(fine.albedo(block, target, weight)[:60] - 0.9).mean() for weight in (0.0, 0.01, 1.0, 1e6)]
+    assert away[0] > away[1] > away[2] > away[3] and away[3] < 1e-3
+    shrunk = np.abs(fine.albedo(block, shrink=0.5)[:60] - truth[:, :3])[clear].mean()
+    assert 0 < shrunk < 0.5 * np.abs(truth[clear, :3] - 0.3).mean()
+
+
+def test_cells_of_blocks_survive_the_extremes():
+    rows, object_id, objects, truth, curve = plant(cells=20)
+    d, value = np.array(rows.diffuse), np.array(rows.value)
+    d[rows.cell < 4], value[rows.cell == 5] = 0.0, np.nan
+    rows = PixelRows(**{**rows.__dict__, "diffuse": d, "value": value})
+    fine, own = AlbedoSums(20), truth[rows.cell]
+    fine.add(rows, LEVELS, own[:, 3], own[:, 4], curve)
+    out = fine.albedo(np.full((20, 3), 0.5))
+    assert np.isfinite(out).all() and (out >= 0).all() and (out <= 1).all() and (out[5] == 0.5).all()
+    assert (AlbedoSums(3).albedo(np.full((3, 3), 0.2)) == 0.2).all()

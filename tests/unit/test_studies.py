@@ -131,6 +131,7 @@ def test_variants_share_what_an_earlier_one_made(folder):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (LATE + "reference: best\n", ["`reference: best`: no such variant", "first, same"]),
         (LATE.replace("affines]", "affine]"), ["`costs`: affine is no stage", "affines"]),
         (LATE.replace("scores: metrics", "scores: report"), ["`scores`", "'report'", "'metrics'"]),
         (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
@@ -224,6 +225,16 @@ def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_numbe
     cells = [text.strip() for text in lines[roughness + 4].strip("|").split("|")]
     assert cells == ["first", "0.1", "0.3", "0.2", "0.5 (raw)"]
     assert "## cost of affines" in lines
+
+
+def test_page_says_by_how_much_the_reference_moves():
+    study = studies.Study(
+        title="T", scenes=["t"], reference="a", variants={"a": studies.Variant(), "b": studies.Variant()}, show=["albedo/psnr"]
+    )
+    rows = [("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 24.0, 1.0), ("b", 0, "psnr", 21.0, 1.0), ("b", 1, "psnr", 27.0, 1.0)]
+    lines = study_table.page(study, frame_of(rows), {}).splitlines()
+    cells = {line.split("|")[1].strip(): line.split("|")[2].strip() for line in lines if line.startswith(("| a", "| b"))}
+    assert cells == {"a": "22.00 ± 3", "b": "24.00 (+2 ± 1)"}
 
 
 def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):
