@@ -42,7 +42,7 @@ STAGES: dict[str, Stage] = {
         Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
             "affines",
-            ("capture", "segmentation", "base", "emission", "shading"),
+            ("capture", "prior", "segmentation", "base", "emission", "shading"),
             ("affines", "capture.dynamic_range", "seed"),
         ),
         Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),

@@ -274,6 +274,11 @@ class ResponseFile(Section):
 class Affines(Section):
     """One affine per object and the camera response."""
 
+    model: Literal["objects", "base", "object_mean", "fipt", "iris"] = "objects"
+    """`objects`: one affine an object; the others are baselines over the same light: `base` fits nothing, `object_mean`: the
+    predictions' mean of each object, `fipt`, `iris`: a free BRDF in every surface cell (docs/studies.md)."""
+    solver: Literal["direct", "sgd"] = "direct"
+    """`fipt`, `iris`: `direct`: exact per cell; `sgd`: Adam, to compare with."""
     response: Literal["auto", "identity", "srgb", "gamma", "ggcm", "spline"] | ResponseFile = "auto"
     """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`; NPY
     (3, samples)). `auto`: identity for HDR; for LDR the smallest of srgb, gamma, ggcm and spline that explains how
@@ -288,6 +293,12 @@ class Affines(Section):
     """Cauchy width of the residual in sensor units."""
     scale: Literal["prior", "none"] = "prior"
     """LDR leaves emission x albedo undetermined; `prior` keeps the prior's mean albedo."""
+
+    @model_validator(mode="after")
+    def _known_pairs(self) -> Affines:
+        if self.solver == "sgd" and self.model not in ("fipt", "iris"):
+            raise ValueError(f"`solver: sgd` fits `model: fipt` or `iris`, not `{self.model}`; use `solver: direct`")
+        return self
 
 
 class Render(Section):

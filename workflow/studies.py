@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic import Field, ValidationError
 
 from iif_core.errors import InputError
+from workflow.registry import STAGES
 from workflow.settings import Section, read_yaml, scene_names
 
 FOLDER = Path("config/studies")
@@ -27,8 +28,8 @@ _DERIVED = re.compile(
     rf"(?P<scene>[A-Za-z0-9_-]+?)--(?:(?P<study>{STUDY})-(?P<variant>{_VARIANT.pattern})-)?s(?P<seed>0|[1-9]\d{{0,8}})"
 )
 
-METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg", "coverage_50", "coverage_80", "coverage_95")
-QUANTITIES = ("albedo", "roughness", "metallic")
+METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg", "coverage_50", "coverage_80", "coverage_95", "log_l2", "iou")
+QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb")
 Protocol = Literal["raw", "scaled", "oracle_affine"]
 
 
@@ -37,6 +38,8 @@ class Variant(Section):
 
     label: str = ""
     """Words for tables and pictures; default: the variant's name."""
+    row: str = ""
+    """`scores: metrics`: which row of variants.parquet is scored; default: `result`."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
 
@@ -74,6 +77,16 @@ class Study(Section):
     """Names of entries in config/studies/scenes.yaml."""
     seeds: list[int] = Field([0, 1, 2], min_length=1)
     """Seeds of the prior; everything else keeps the scene's seed."""
+    scores: Literal["base_scores", "metrics"] = "base_scores"
+    """Stage whose scores are collected: of the base texture, or of the result and its re-rendering."""
+    costs: list[str] = ["base"]
+    """Stages whose times are added up."""
+    protocols: list[Protocol] = Field(["raw", "oracle_affine"], min_length=1)
+    """Protocols in the printed table and the picture; the Parquet file has all."""
+    common: dict[str, dict[str, Any]] = {}
+    """Settings of all variants, under their own."""
+    reference: str = ""
+    """Variant that the printed table compares the others with: the difference stands in brackets."""
     variants: dict[str, Variant] = {}
     """Name -> variant."""
     grids: list[dict[str, list[Any]]] = []
@@ -152,6 +165,11 @@ def _load_study(path: Path, root: Path, _stamp: int) -> Study:
         if dotted not in varied:
             raise InputError(f"{path}: `plot`: no variant sets {dotted or 'x'!r}. Allowed here: {', '.join(varied) or 'none'}.")
     shared = scene_overrides(root)
+    if study.reference and study.reference not in variants:
+        raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
+    for stage in study.costs:
+        if stage not in STAGES:
+            raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")
     for scene in study.scenes:
         if scene not in shared:
             near = difflib.get_close_matches(scene, shared, 1)
@@ -216,17 +234,30 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
             raise InputError(
                 f"{FOLDER / parts.study}.yaml: no variant {parts.variant}.{hint} Known: {', '.join(study.variants)}."
             )
+        if study.common:
+            out.append((f"{FOLDER / parts.study}.yaml, `common`", study.common))
         out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].overrides))
     return [*out, ("seed of the study", {"prior": {"seed": parts.seed}})]
 
 
 def bases(name: str, root: Path = Path(".")) -> list[str]:
-    """Derived scenes whose folders hold what `name` has in common with others, most common first."""
+    """Derived scenes whose folders hold what `name` has in common with others, most common first.
+
+    They are what all studies share, then the variants of its own study up to itself, of the first seed and of its own: so
+    a variant that differs late (a baseline of the last fit) finds everything before it where the first variant left it.
+    """
     parts = derived(name, root)
     if parts is None:
         return []
     candidates = [f"{parts.scene}--s0", f"{parts.scene}--s{parts.seed}"]
-    return [candidate for candidate in dict.fromkeys(candidates) if candidate != name]
+    if parts.study:
+        study = load_study(parts.study, root)
+        variants = list(study.variants)
+        earlier = variants[: variants.index(parts.variant) + 1] if parts.variant in variants else []
+        seeds = [study.seeds[0], parts.seed]
+        candidates += [scene_of(parts.study, parts.scene, variant, seed) for variant in earlier for seed in seeds]
+    candidates = list(dict.fromkeys(candidates))
+    return candidates[: candidates.index(name)] if name in candidates else candidates
 
 
 def scene_of(study: str, scene: str, variant: str, seed: int) -> str:

@@ -13,11 +13,12 @@ from workflow.studies import Study
 if TYPE_CHECKING:
     import pandas as pd
 
-PROTOCOLS = {"raw": "as it is", "oracle_affine": "best affine per object (oracle)"}
-_MARKERS = {"raw": "o", "oracle_affine": "s"}
-_LINES = {"raw": "-", "oracle_affine": "--"}
+PROTOCOLS = {"raw": "as it is", "scaled": "one gain per image and channel", "oracle_affine": "best affine per object (oracle)"}
+_MARKERS = {"raw": "o", "scaled": "^", "oracle_affine": "s"}
+_LINES = {"raw": "-", "scaled": ":", "oracle_affine": "--"}
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # told apart by everyone (Okabe, Ito)
 _UNITS = {"psnr": "PSNR / dB", "ssim": "SSIM", "l2": "L2", "flip": "FLIP", "lpips": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
+_UNITS |= {"log_l2": "L2 of log(1 + E)", "iou": "IoU"}
 _UNITS |= {f"coverage_{n}": f"share within {n} % interval" for n in (50, 80, 95)}
 _PANEL = (3.1, 2.9)  # inches
 
@@ -39,7 +40,9 @@ def draw(study: Study, frame: pd.DataFrame, histories: Mapping[Any, list[dict[st
     else:
         kind = study.plot.kind
         rows = (
-            [(scene, protocol) for scene in scenes for protocol in PROTOCOLS] if kind == "pareto" else [(s, "") for s in scenes]
+            [(scene, protocol) for scene in scenes for protocol in study.protocols]
+            if kind == "pareto"
+            else [(s, "") for s in scenes]
         )
         columns = len(keys) + (kind == "history")
         height = max(_PANEL[1], 0.3 * len(study.variants) + 1) if kind == "bars" else _PANEL[1]
@@ -71,9 +74,9 @@ def _of(frame: pd.DataFrame, key: str, protocol: str = "") -> pd.DataFrame:
     return chosen[chosen["protocol"] == protocol] if protocol else chosen
 
 
-def _shown_values(frame: pd.DataFrame, key: str) -> pd.Series:
+def _shown_values(study: Study, frame: pd.DataFrame, key: str) -> pd.Series:
     chosen = _of(frame, key)
-    return chosen[chosen["protocol"].isin(list(PROTOCOLS))]["value"]
+    return chosen[chosen["protocol"].isin(study.protocols)]["value"]
 
 
 def _mean_and_spread(values: pd.Series) -> tuple[float, float]:
@@ -105,7 +108,7 @@ def _others(study: Study, variant: str) -> str:
 def _axis(axes: Any, key: str, which: str, values: pd.Series) -> None:
     metric = key.split("/")[1]
     getattr(axes, f"set_{which}label")(_UNITS.get(metric, metric), fontsize=8)
-    if metric == "l2":
+    if metric in ("l2", "log_l2"):
         _logarithmic_if_wide(axes, which, values)
     axes.grid(alpha=0.3)
     axes.tick_params(labelsize=8)
@@ -120,8 +123,8 @@ def _logarithmic_if_wide(axes: Any, which: str, values: pd.Series) -> None:
 def _dots(axes: Any, study: Study, frame: pd.DataFrame, key: str, first: bool) -> None:
     """Variants from top to bottom."""
     names = list(study.variants)
-    for shift, (protocol, words), colour in zip((-0.12, 0.12), PROTOCOLS.items(), _COLOURS, strict=False):
-        chosen = _of(frame, key, protocol)
+    for shift, protocol, colour in zip((-0.12, 0.12, 0.0), study.protocols, _COLOURS, strict=False):
+        chosen, words = _of(frame, key, protocol), PROTOCOLS[protocol]
         points = [(i, *_mean_and_spread(v)) for i, n in enumerate(names) if len(v := chosen[chosen["variant"] == n]["value"])]
         if points:
             y, mean, spread = np.array(points).T
@@ -134,14 +137,14 @@ def _dots(axes: Any, study: Study, frame: pd.DataFrame, key: str, first: bool) -
         )
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_yticks(range(len(names)), [study.variants[n].label or n for n in names] if first else [])
-    _axis(axes, key, "x", _shown_values(frame, key))
+    _axis(axes, key, "x", _shown_values(study, frame, key))
 
 
 def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
     """Score over a setting, a colour a group."""
     for colour, (words, names) in zip(_cycle(), _groups(study).items(), strict=False):
-        for protocol, kind in PROTOCOLS.items():
-            chosen, points = _of(frame, key, protocol), []
+        for protocol in study.protocols:
+            kind, chosen, points = PROTOCOLS[protocol], _of(frame, key, protocol), []
             for name in names:
                 x, values = _setting(study, name, study.plot.x), chosen[chosen["variant"] == name]["value"]
                 if x is not None and len(values):
@@ -160,7 +163,7 @@ def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
     axes.set_xlabel(study.plot.x, fontsize=8)
-    _axis(axes, key, "y", _shown_values(frame, key))
+    _axis(axes, key, "y", _shown_values(study, frame, key))
     if study.plot.log:
         axes.tick_params(axis="x", which="minor", bottom=False)
 
@@ -188,7 +191,7 @@ def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: s
         axes.plot(*np.array(sorted(front)).T, color="grey", lw=1, zorder=0, label="Pareto front (filled)")
     _logarithmic_if_wide(axes, "x", chosen["cpu_seconds"].dropna())
     axes.margins(x=0.12)
-    axes.set_xlabel("CPU time of the base job / s", fontsize=8)
+    axes.set_xlabel(f"CPU time of {', '.join(study.costs)} / s", fontsize=8)
     _axis(axes, key, "y", chosen["value"])
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 RESULTS = Path("results/studies")
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "l2": False, "flip": False, "lpips": False, "lpips_vgg": False}
+HIGHER_IS_BETTER |= {"log_l2": False, "iou": True}
 NAMES = {
     "psnr": "PSNR",
     "ssim": "SSIM",
@@ -30,11 +31,18 @@ NAMES = {
     "flip": "FLIP",
     "lpips": "LPIPS (AlexNet)",
     "lpips_vgg": "LPIPS (VGG)",
+    "log_l2": "L2 of log(1 + E)",
+    "iou": "IoU",
 }
 HIGHER_IS_BETTER["psnr_3d"] = True
 NAMES["psnr_3d"] = "PSNR over cells, one affine an object"
 NAMES |= {f"coverage_{n}": f"share within the claimed {n} % interval" for n in (50, 80, 95)}
-PROTOCOLS = {"raw": "raw", "oracle_affine": "oracle"}  # those that the page and the pictures show
+PROTOCOLS = {"raw": "raw", "scaled": "scaled", "oracle_affine": "oracle"}
+EXPLAINED = {
+    "raw": "as it is",
+    "scaled": "after one gain per image and channel, which 8-bit photographs leave open",
+    "oracle_affine": "each object mapped by its best affine to the truth first, an upper bound and not a result",
+}
 COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb")
 KEY = ["scene", "quantity", "metric", "protocol"]
 
@@ -89,7 +97,8 @@ def home(cell: Cell, quality: str, stage: str = "base_scores") -> Path:
 
 def inputs(name: str, quality: str) -> list[str]:
     """Manifests that the study collects; variants that agree with what studies share have one in common."""
-    return sorted({str(home(cell, quality) / "manifest.json") for cell in plan(name, quality).cells})
+    study, cells, _ = plan(name, quality)
+    return sorted({str(home(cell, quality, study.scores) / "manifest.json") for cell in cells})
 
 
 def fingerprint(name: str, quality: str) -> str:
@@ -98,7 +107,7 @@ def fingerprint(name: str, quality: str) -> str:
     facts = {
         "study": study.model_dump(mode="json"),
         "skipped": skipped,
-        "scores": [fp.fingerprint("base_scores", cell.name, quality) for cell in cells],
+        "scores": [fp.fingerprint(study.scores, cell.name, quality) for cell in cells],
         "code": fp.modules_digest(fp.import_closure("workflow.study_table")),
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
@@ -136,12 +145,13 @@ def table(name: str, quality: str) -> pd.DataFrame:
             "label": variant.label or cell.variant,
             "settings": json.dumps(variant.overrides, sort_keys=True),
             "seed": cell.seed,
-            **_costs(cell, quality),
+            **(_costs(cell, quality, study.costs) if not variant.row else {}),
             "status": "ok",
         }
         paper = study.paper.get(cell.variant)
-        for (quantity, metric, protocol), (value, views) in _scores(cell, quality).items():
-            printed = paper.values.get(f"{quantity}/{metric}") if paper and paper.protocol == protocol else None
+        for (quantity, metric, protocol), (value, views) in _scores(cell, quality, study.scores, variant.row or "result").items():
+            agrees = paper is not None and protocol == _protocol_of(paper, quantity)
+            printed = paper.values.get(f"{quantity}/{metric}") if paper and agrees else None
             scored = {"quantity": quantity, "metric": metric, "protocol": protocol, "value": value, "views": views}
             rows.append({**facts, **scored, "paper": printed})
     rows += [{"study": name, "scene": scene, "status": "skipped", "reason": reason} for scene, reason in skipped.items()]
@@ -179,27 +189,45 @@ def _write_table(frame: pd.DataFrame, path: Path) -> None:
     pq.write_table(pa.table(columns), path, compression="zstd")
 
 
-def _scores(cell: Cell, quality: str) -> dict[tuple[str, str, str], tuple[float, int]]:
+def _protocol_of(paper: studies.Paper, quantity: str) -> str:
+    """The protocol that a publication's numbers follow: `raw` for quantities that its own does not apply to."""
+    from iif_core.metrics import PROTOCOLS_OF
+
+    return paper.protocol if paper.protocol in PROTOCOLS_OF[quantity] else "raw"
+
+
+def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, str, str], tuple[float, int]]:
     """(quantity, metric, protocol) -> (mean over views, views)."""
     import pandas as pd
 
     from workflow.artifacts import StageReader
 
-    directory = home(cell, quality)
-    columns = StageReader(directory, "base_scores", directory.parent.name).table("scores.parquet")
-    means = pd.DataFrame(columns).groupby(["quantity", "metric", "protocol"])["value"].agg(["mean", "count"])
+    directory = home(cell, quality, stage)
+    reader = StageReader(directory, stage, directory.parent.name)
+    frame = pd.DataFrame(reader.table("scores.parquet" if stage == "base_scores" else "variants.parquet"))
+    if "variant" in frame:
+        if row not in set(frame["variant"]):
+            known = ", ".join(sorted(set(frame["variant"])))
+            raise InputError(f"{studies.FOLDER}: `row: {row}` of {cell.name}: not in variants.parquet, which has {known}")
+        frame = frame[frame["variant"] == row]
+    means = frame.groupby(["quantity", "metric", "protocol"])["value"].agg(["mean", "count"])
     return {key: (float(row["mean"]), int(row["count"])) for key, row in means.iterrows()}
 
 
-def _costs(cell: Cell, quality: str) -> dict[str, Any]:
-    """Time and memory of the job that made the base texture, and of its solver if it was timed; {} if not recorded."""
-    scene = fp.home("base", cell.name, quality)
-    parts = read_parts(scene, "base")  # the base stage times its solver as `solve`
-    whole: dict[str, Any] = parts.get("job", {})
-    if not whole:
-        whole = next((row for row in read_timings(scene) if row["rule"] == "base"), {})
-    out = {name: whole.get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb", "threads")}
-    solver = parts.get("solve", {})
+def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
+    """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`); what
+    one of them did not record is missing."""
+    jobs, solver = [], {}
+    for stage in stages:
+        scene = fp.home(stage, cell.name, quality)
+        parts = read_parts(scene, stage)
+        whole: dict[str, Any] = parts.get("job", {})
+        jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
+        solver = parts.get("solve", {})
+    out: dict[str, Any] = {}
+    for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("threads", max)):
+        known = [job[name] for job in jobs if job.get(name) is not None]
+        out[name] = together(known) if known and len(known) == len(jobs) else None
     return out | {f"solver_{name}": solver.get(name) for name in ("seconds", "cpu_seconds")}
 
 
@@ -245,11 +273,11 @@ def page(study: studies.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> 
         return "\n".join([*lines, "Nothing was scored.", ""])
     seeds = len(study.seeds)
     note = f"Mean over views and {seeds} seed{'s' * (seeds > 1)} of the prior" + (" (± standard deviation)" if seeds > 1 else "")
-    lines += [
-        f"{note}. *raw*: as it is; *oracle*: each object mapped by its best affine to the truth first, an upper bound and not a"
-        " result. The paper's numbers are of other scenes; in brackets the protocol that they follow.",
-        "",
-    ]
+    if study.reference:
+        label = study.variants[study.reference].label or study.reference
+        lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
+    explained = "; ".join(f"*{PROTOCOLS[protocol]}*: {EXPLAINED[protocol]}" for protocol in study.protocols)
+    lines += [f"{note}. {explained}. The paper's numbers are of other scenes; in brackets the protocol that they follow.", ""]
     front = study.plot.kind == "pareto"
     if front:
         lines += ["A star marks the Pareto front: no other variant is both better and cheaper in CPU seconds.", ""]
@@ -257,8 +285,11 @@ def page(study: studies.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> 
     for key in study.show:
         quantity, metric = key.split("/")
         chosen = shown[(shown["quantity"] == quantity) & (shown["metric"] == metric)]
-        columns = [(scene, protocol) for scene in scenes for protocol in PROTOCOLS]
+        columns = [(scene, protocol) for scene in scenes for protocol in study.protocols]
         columns = [c for c in columns if ((chosen["scene"] == c[0]) & (chosen["protocol"] == c[1])).any()]
+        if len(scenes) > 1 and study.scores == "metrics":
+            columns += [("mean", protocol) for protocol in study.protocols if ("mean", protocol) not in columns and columns]
+            columns = [c for c in columns if (chosen["protocol"] == c[1]).any()]
         if not columns:
             lines += [f"## {quantity} {NAMES.get(metric, metric)}", "", f"Not scored{_why(metric)}.", ""]
             continue
@@ -268,16 +299,25 @@ def page(study: studies.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> 
         for name, label in labels.items():
             row = [label]
             for scene, protocol in columns:
-                cell = chosen[(chosen["scene"] == scene) & (chosen["protocol"] == protocol) & (chosen["variant"] == name)]
+                cell = chosen[(chosen["protocol"] == protocol) & (chosen["variant"] == name)]
+                if scene == "mean":  # of the scenes' means, so that each counts once
+                    row.append(_mean_cell(metric, cell.groupby("scene")["value"].mean().tolist()))
+                    continue
+                cell = cell[cell["scene"] == scene]
+                if study.reference and name != study.reference and len(cell):
+                    row.append(_moved(metric, cell, chosen, study.reference))
+                    continue
                 star = " *" if front and len(cell) and cell["pareto"].iloc[0] is True else ""
                 row.append(_number(metric, cell["value"].tolist()) + star)
             paper = study.paper.get(name)
             if printed:
                 known = paper is not None and key in paper.values
-                row.append(f"{_shown(metric, paper.values[key])} ({PROTOCOLS.get(paper.protocol)})" if known else "")
+                protocol = PROTOCOLS[_protocol_of(paper, quantity)] if paper else ""
+                row.append(f"{_shown(metric, paper.values[key])} ({protocol})" if paper and known else "")
             body.append(row)
         lines += [f"## {quantity} {NAMES.get(metric, metric)}{_direction(metric)}", "", *_markdown(["variant", *head], body), ""]
-    lines += ["## cost of the base texture", "", *_costs_table(shown, scenes, labels), ""]
+    what = "the base texture" if study.costs == ["base"] else ", ".join(study.costs)
+    lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
     return "\n".join(lines)
 
 
@@ -304,7 +344,25 @@ def _direction(metric: str) -> str:
 
 
 def _shown(metric: str, value: float) -> str:
-    return f"{value:.2f}" if metric == "psnr" else f"{value:.3g}" if metric == "l2" else f"{value:.3f}"
+    return f"{value:.2f}" if metric == "psnr" else f"{value:.3g}" if metric in ("l2", "log_l2") else f"{value:.3f}"
+
+
+def _moved(metric: str, cell: pd.DataFrame, chosen: pd.DataFrame, reference: str) -> str:
+    """Mean over the seeds, and in brackets how far it is from the reference's, seed by seed (± standard deviation)."""
+    import numpy as np
+
+    keys = ["scene", "protocol", "seed"]
+    both = cell.merge(chosen[chosen["variant"] == reference], on=keys, suffixes=("", "_reference"))
+    moved = (both["value"] - both["value_reference"]).to_numpy(np.float64)
+    text = _shown(metric, float(cell["value"].mean()))
+    if not len(moved):
+        return text
+    spread = f" ± {float(np.std(moved, ddof=1)):.1g}" if len(moved) > 1 else ""
+    return f"{text} ({float(moved.mean()):+.2g}{spread})"
+
+
+def _mean_cell(metric: str, values: list[float]) -> str:
+    return _shown(metric, sum(values) / len(values)) if values else ""
 
 
 def _number(metric: str, values: list[float]) -> str:

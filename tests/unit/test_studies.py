@@ -1,5 +1,8 @@
 """Studies: names of derived scenes, what they override, what they share, errors, and the arithmetic of the table."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -9,6 +12,7 @@ from iif_core.base.uncertainty import CALIBRATION
 from iif_core.errors import InputError
 from workflow import fingerprint as fp
 from workflow import scores, settings, studies, study_table
+from workflow.artifacts import StageWriter
 from workflow.job import Job
 from workflow.timings import read_parts
 
@@ -84,6 +88,153 @@ def test_what_agrees_is_shared_and_what_does_not_is_not(folder):
         "base_scores": "t--a-mean-2-s1",
     }
     assert len(study_table.inputs("a", "draft")) == 6
+
+
+LATE = """\
+title: Late
+scenes: [t]
+seeds: [0, 1]
+scores: metrics
+costs: [base, affines]
+protocols: [raw, scaled]
+common: {base: {predictions: 2}, affines: {ridge: 0.1}}
+variants:
+  first: {}
+  same: {row: prior_k0}
+  other: {overrides: {affines: {model: fipt}}}
+  far: {overrides: {base: {ridge: 0.5}, affines: {ridge: 0.2}}}
+"""
+
+
+def test_variants_share_what_an_earlier_one_made(folder):
+    folder("studies/late", LATE)
+
+    def home(variant, seed, stage):
+        return fp.home(stage, f"t--late-{variant}-s{seed}", "draft")
+
+    for seed in (0, 1):
+        assert home("first", seed, "prior") == f"t--s{seed}"
+        for stage in ("base", "emission", "shading", "affines", "metrics"):
+            assert home("same", seed, stage) == home("first", seed, stage) == f"t--late-first-s{seed}"
+        for stage in ("base", "emission", "shading"):
+            assert home("other", seed, stage) == f"t--late-first-s{seed}"
+        for stage in ("affines", "render", "metrics"):
+            assert home("other", seed, stage) == f"t--late-other-s{seed}"
+        assert home("far", seed, "capture") == "t--s0" and home("far", seed, "base") == f"t--late-far-s{seed}"
+    assert settings.load("t--late-far-s0").base.predictions == 2 and settings.load("t--late-far-s0").affines.ridge == 0.2
+    # What depends on the variant but not on the seed is made once.
+    folder("studies/late", LATE.replace("base: {ridge: 0.5}", "capture: {views: 3}"))
+    assert home("far", 1, "capture") == "t--late-far-s0" and home("far", 1, "prior") == "t--late-far-s1"
+    assert len(study_table.inputs("late", "draft")) == 6  # `same` needs nothing of its own
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (LATE + "reference: best\n", ["`reference: best`: no such variant", "first, same"]),
+        (LATE.replace("affines]", "affine]"), ["`costs`: affine is no stage", "affines"]),
+        (LATE.replace("scores: metrics", "scores: report"), ["`scores`", "'report'", "'metrics'"]),
+        (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
+        (LATE.replace("predictions: 2}", "predictions: 0}"), ["late.yaml, `common`", "`base.predictions`: found 0"]),
+        (LATE.replace("model: fipt", "solver: sgd"), ["late.yaml, variant other", "`solver: sgd` fits `model: fipt`"]),
+    ],
+)
+def test_mistakes_in_a_study_of_the_result(folder, text, words):
+    folder("studies/late", text)
+    with pytest.raises(InputError) as caught:
+        study_table.plan("late", "draft")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_costs_are_added_over_stages(folder, tmp_path):
+    folder("studies/late", LATE)
+    cell = study_table.Cell("t", "other", 0, "t--late-other-s0")
+    for scene, stage, cpu, memory in (("t--late-first-s0", "base", 3.0, 900), ("t--late-other-s0", "affines", 4.0, 300)):
+        path = tmp_path / "results" / scene / "benchmarks" / f"{stage}.parts.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        job = {"seconds": 2 * cpu, "cpu_seconds": cpu, "max_rss_mb": memory, "threads": 2}
+        path.write_text(json.dumps({"job": job, "solve": {"seconds": 1.0, "cpu_seconds": cpu / 2}}))
+    costs = study_table._costs(cell, "draft", ["base", "affines"])
+    assert (costs["cpu_seconds"], costs["max_rss_mb"], costs["solver_cpu_seconds"]) == (7.0, 900, 2.0)
+    assert study_table._costs(cell, "draft", ["base", "render", "affines"])["cpu_seconds"] is None
+
+
+def test_table_of_the_result_reads_the_row_of_each_variant(folder, tmp_path):
+    """From what stage metrics leaves to table, page and picture."""
+    folder("studies/late", LATE.replace("[0, 1]", "[0]") + "paper: {other: {protocol: scaled, values: {albedo/psnr: 10.6}}}\n")
+    for scene, gain in (("t--late-first-s0", 0.0), ("t--late-other-s0", 1.0), ("t--late-far-s0", 2.0)):
+        rows = [
+            (variant, view, quantity, "psnr", protocol, base + gain + view_gain)
+            for variant, base in (("result", 20.0), ("prior_k0", 10.0))
+            for view, view_gain in (("a", 0.0), ("b", 1.0))
+            for quantity, protocol in (("albedo", "raw"), ("albedo", "scaled"), ("rgb", "raw"))
+            if quantity == "albedo" or variant == "result"
+        ]
+        writer = StageWriter(tmp_path / "results" / scene / "metrics", {"scene": scene, "stage": "metrics", "fingerprint": "x"})
+        names = ("variant", "view", "quantity", "metric", "protocol", "value")
+        writer.table(
+            "variants.parquet", {name: list(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)}
+        )
+        writer.finish()
+    study_table.write_study("late", "draft")
+    frame = pd.read_parquet("results/studies/late.parquet")
+    raw = frame[(frame["protocol"] == "raw") & (frame["quantity"] == "albedo")].set_index("variant")
+    assert raw["value"].to_dict() == {"first": 20.5, "same": 10.5, "other": 21.5, "far": 22.5} and (raw["views"] == 2).all()
+    assert frame[frame["quantity"] == "rgb"]["variant"].tolist() == ["first", "other", "far"]
+    paper = frame[frame["paper"].notna()]
+    assert paper[["variant", "protocol", "paper"]].to_numpy().tolist() == [["other", "scaled", 10.6]]
+    assert "10.60 (scaled)" in Path("results/studies/late.md").read_text()
+    assert Path("results/studies/late.png").stat().st_size > 5000
+    folder("studies/late", LATE.replace("[0, 1]", "[0]").replace("prior_k0", "prior_k9"))
+    with pytest.raises(InputError, match="`row: prior_k9`.*which has prior_k0, result"):
+        study_table.table("late", "draft")
+
+
+def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_number():
+    study = studies.Study(
+        title="T",
+        scenes=["t", "u"],
+        seeds=[0],
+        scores="metrics",
+        costs=["affines"],
+        protocols=["raw", "scaled"],
+        variants={"a": studies.Variant(label="first")},
+        paper={"a": studies.Paper(protocol="scaled", values={"albedo/psnr": 20.0, "roughness/l2": 0.5})},
+        show=["albedo/psnr", "roughness/l2"],
+    )
+    row = {"variant": "a", "seed": 0, "cpu_seconds": 1.0, "status": "ok"}
+    frame = pd.DataFrame(
+        [
+            row | {"scene": s, "quantity": q, "metric": m, "protocol": p, "value": v}
+            for s, q, m, p, v in (
+                ("t", "albedo", "psnr", "raw", 10.0),
+                ("u", "albedo", "psnr", "raw", 20.0),
+                ("t", "albedo", "psnr", "scaled", 22.0),
+                ("u", "albedo", "psnr", "scaled", 23.0),
+                ("t", "roughness", "l2", "raw", 0.1),
+                ("u", "roughness", "l2", "raw", 0.3),
+            )
+        ],
+        columns=[name for name, _ in study_table.COLUMNS],
+    )
+    lines = study_table.page(study, frame, {}).splitlines()
+    albedo, roughness = (next(i for i, line in enumerate(lines) if line.startswith(f"## {q}")) for q in ("albedo", "roughness"))
+    cells = [text.strip() for text in lines[albedo + 4].strip("|").split("|")]
+    assert cells == ["first", "10.00", "22.00", "20.00", "23.00", "15.00", "22.50", "20.00 (scaled)"]
+    cells = [text.strip() for text in lines[roughness + 4].strip("|").split("|")]
+    assert cells == ["first", "0.1", "0.3", "0.2", "0.5 (raw)"]
+    assert "## cost of affines" in lines
+
+
+def test_page_says_by_how_much_the_reference_moves():
+    study = studies.Study(
+        title="T", scenes=["t"], reference="a", variants={"a": studies.Variant(), "b": studies.Variant()}, show=["albedo/psnr"]
+    )
+    rows = [("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 24.0, 1.0), ("b", 0, "psnr", 21.0, 1.0), ("b", 1, "psnr", 27.0, 1.0)]
+    lines = study_table.page(study, frame_of(rows), {}).splitlines()
+    cells = {line.split("|")[1].strip(): line.split("|")[2].strip() for line in lines if line.startswith(("| a", "| b"))}
+    assert cells == {"a": "22.00 ± 3", "b": "24.00 (+2 ± 1)"}
 
 
 def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):

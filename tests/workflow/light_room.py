@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -130,6 +131,9 @@ class StubJob:
     def progress(self, done: int, total: int, what: str) -> None:
         pass
 
+    def timed(self, name: str) -> Any:
+        return nullcontext()
+
 
 def build(
     folder: Path,
@@ -213,7 +217,7 @@ def _spoil(room: Room, strength: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
-    base = StubJob("base", folder, {}).writer
+    base, prior = StubJob("base", folder, {}).writer, StubJob("prior", folder, {}).writer
     points = np.concatenate([p for _, p, _, _ in pixels])
     origin = grid_origin(room.vertices, CELL)
     objects = np.concatenate([o for _, _, o, _ in pixels])
@@ -252,7 +256,12 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
                 **{f"{claim}.{name}": flat for claim in ("scale", "uncertainty") for name in ("albedo", "roughness", "metallic")},
             },
         )
-    base.json("base.json", {"cell_edge_m": CELL, "origin": [float(v) for v in origin]})
+    for view, _, _, values in pixels:
+        maps = values.reshape(size, size, 5).astype(np.float16)
+        names = [f"prior.000.{name}" for name in ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")]
+        prior.exr(f"maps/{view.name}.exr", {name: maps[..., i] for i, name in enumerate(names)})
+    prior.finish()
+    base.json("base.json", {"predictions": 1, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()
 
 
@@ -275,4 +284,13 @@ SHADING = {
     "max_bounces": 6,
     "indirect": "auto",
 }
-AFFINES = {"response": "auto", "iterations": 12, "pixels": 200000, "ridge": 2e-3, "robust_width": 0.1, "scale": "prior"}
+AFFINES = {
+    "model": "objects",
+    "solver": "direct",
+    "response": "auto",
+    "iterations": 12,
+    "pixels": 200000,
+    "ridge": 2e-3,
+    "robust_width": 0.1,
+    "scale": "prior",
+}

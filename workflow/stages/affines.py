@@ -10,6 +10,7 @@ import numpy as np
 from iif_core import plan
 from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
 from iif_core.response import Response, response_facts, response_from_facts
+from workflow import baselines
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.base_scene import (
     MATERIAL,
@@ -31,6 +32,8 @@ _SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of 
 
 def run(job: Job) -> None:
     """Write objects.parquet, camera_response.parquet (LDR), cells.parquet, maps/<view>.exr and affines.json."""
+    if job.settings.affines.model != "objects":
+        return baselines.run(job)
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     settings = job.settings.affines
     emits = read_light(job, len(scene.faces)).emits
