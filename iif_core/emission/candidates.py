@@ -1,8 +1,8 @@
 """Which faces may shine by themselves.
 
-A face is a candidate when nearly all of its pixels in all views are saturated (LDR) or far brighter than the room
-(HDR). That is generous on purpose: the linear solve that follows gives a surface which merely reflects an emission
-near zero, and such groups are dropped again.
+A face is a candidate when nearly all of its pixels in all views are far brighter than the room, or saturated whatever
+the exposure. That is generous on purpose: a surface that merely reflects is recognised by the solve that follows
+(`pruning`).
 """
 
 from __future__ import annotations
@@ -23,42 +23,86 @@ class FaceStatistics:
     Attributes:
         count: (F,) int32 observations.
         low: (F,) float32, lower quantile over the observations of the largest channel; 0 where unobserved.
-        mean: (F, 3) float32 mean value; 0 where unobserved.
+        bounded: (F,) bool, saturation hides that quantile: `low` is the highest radiance that was reached.
+        mean: (F, 3) float32 mean of the observations that are not saturated, of the bounds where all are; 0 where
+            unobserved.
+        clear: (F,) int32 observations that are not saturated in any channel.
         front: (F,) float32 in [0, 1]: share of the observations from the side of the face normal.
     """
 
     count: np.ndarray
     low: np.ndarray
+    bounded: np.ndarray
     mean: np.ndarray
+    clear: np.ndarray
     front: np.ndarray
 
 
 def face_statistics(
-    face: np.ndarray, value: np.ndarray, from_front: np.ndarray, n_faces: int, quantile: float = 0.05
+    face: np.ndarray,
+    value: np.ndarray,
+    from_front: np.ndarray,
+    n_faces: int,
+    bound: np.ndarray | None = None,
+    quantile: float = 0.05,
 ) -> FaceStatistics:
-    """Statistics of the pixels that see each face (METHOD 2.4, quantile form).
+    """Statistics of the pixels that see each face (METHOD 2.4, quantile form, in radiance).
+
+    A saturated pixel at exposure e says only L >= f^-1(saturation) / e, and at a long exposure that is next to
+    nothing. The lower quantile is therefore Kaplan and Meier's (1958) estimate from right-censored data: bounds below
+    a value do not count against it. Without saturation it is the observation of rank floor(quantile * count).
 
     Args:
         face: (n,) int, -1 = no face.
-        value: (n, 3) sensor value (LDR) or radiance (HDR); rows with non-finite values are left out.
+        value: (n, 3) radiance; rows with non-finite values are left out.
         from_front: (n,) bool, the camera is on the side of the face normal.
         n_faces: F.
-        quantile: lower quantile; the observation of rank floor(quantile * count), so the minimum below 1 /
-            quantile pixels.
+        bound: (n, 3) bool, `value` is a lower bound; None = nowhere.
+        quantile: lower quantile; the minimum below 1 / quantile pixels.
     """
+    value = np.asarray(value)
     good = (face >= 0) & np.isfinite(value).all(-1)
-    face, value, from_front = face[good], np.asarray(value)[good], from_front[good]
+    bounded = np.zeros(len(face), bool) if bound is None else np.asarray(bound).any(-1)
+    face, value, from_front, bounded = face[good], value[good], from_front[good], bounded[good]
     count = np.bincount(face, minlength=n_faces)
-    divisor = np.maximum(count, 1)
+    clear = np.bincount(face[~bounded], minlength=n_faces)
     brightest = value.max(-1) if len(value) else np.zeros(0)
-    order = np.lexsort((brightest, face))
+    low, hidden = _censored_quantile(face, brightest, bounded, count, quantile)
+    used = np.where(bounded & (clear[face] > 0), 0.0, 1.0)
+    divisor = np.maximum(np.where(clear > 0, clear, count), 1)
+    mean = np.stack([np.bincount(face, value[:, c] * used, n_faces) / divisor for c in range(3)], -1)
+    front = np.bincount(face, from_front.astype(np.float64), n_faces) / np.maximum(count, 1)
+    counts = (count.astype(np.int32), clear.astype(np.int32))
+    return FaceStatistics(counts[0], low, hidden, mean.astype(np.float32), counts[1], front.astype(np.float32))
+
+
+def _censored_quantile(
+    face: np.ndarray, value: np.ndarray, bounded: np.ndarray, count: np.ndarray, quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Kaplan-Meier quantile per face, and whether it lies beyond the last value; the largest value then."""
+    low, hidden = np.zeros(len(count), np.float32), np.zeros(len(count), bool)
+    order = np.lexsort((bounded, value, face))  # at equal values those that are known come first
+    owner, ordered, known = face[order], value[order], ~bounded[order]
     first = np.cumsum(count) - count
-    low = np.zeros(n_faces, np.float32)
+    at_risk = count[owner] - (np.arange(len(owner)) - first[owner])
+    # The last one of a face, if it is known, ends the curve: log 0.
+    with np.errstate(divide="ignore"):
+        step = np.where(known, np.log1p(-1.0 / np.maximum(at_risk, 1)), 0.0)
+    last = at_risk == 1
+    finite = np.where(last & known, 0.0, step)
+    total = np.cumsum(finite)
+    before = np.where(first[owner] > 0, total[np.maximum(first[owner] - 1, 0)], 0.0)
+    survival = np.where(last & known, 0.0, np.exp(total - before))
+    reached = known & (survival < 1.0 - quantile - 1e-9)
+    hit = np.flatnonzero(reached)
+    faces, index = np.unique(owner[hit], return_index=True)
+    low[faces] = ordered[hit[index]]
     seen = count > 0
-    low[seen] = brightest[order][(first + np.floor(quantile * count).astype(np.int64))[seen]]
-    mean = np.stack([np.bincount(face, value[:, c], n_faces) / divisor for c in range(3)], -1)
-    front = np.bincount(face, from_front.astype(np.float64), n_faces) / divisor
-    return FaceStatistics(count.astype(np.int32), low, mean.astype(np.float32), front.astype(np.float32))
+    hidden[seen] = True
+    hidden[faces] = False
+    beyond = np.flatnonzero(hidden)
+    low[beyond] = ordered[first[beyond] + count[beyond] - 1] if len(beyond) else 0
+    return low, hidden
 
 
 def with_thin_objects(
@@ -90,10 +134,14 @@ def with_thin_objects(
         whole, inner = getattr(every, name), getattr(interior, name)
         return np.where(allow.reshape(-1, *[1] * (whole.ndim - 1)), whole, inner)
 
-    return FaceStatistics(**{name: pick(name) for name in ("count", "low", "mean", "front")})
+    return FaceStatistics(**{name: pick(name) for name in FaceStatistics.__dataclass_fields__})
 
 
-def hdr_threshold(statistics: FaceStatistics, ratio: float = 5.0) -> float:
+BRIGHT = 5.0
+"""Radiance of a candidate relative to the median."""
+
+
+def radiance_threshold(statistics: FaceStatistics, ratio: float = BRIGHT) -> float:
     """Radiance above which a face may be an emitter: `ratio` times the median over pixels.
 
     The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may
@@ -117,14 +165,15 @@ def emitter_candidates(
 ) -> np.ndarray:
     """Faces that may shine by themselves: (F,) bool (METHOD 2.4).
 
-    A face counts when its low quantile reaches `threshold` over at least `min_observations` pixels. Faces seen by fewer
+    A face counts when its low quantile reaches `threshold`, or saturation hides how bright it is, over at least
+    `min_observations` pixels. Faces seen by fewer
     pixels are pooled: neighbours (also across a few unseen faces) that all reach the threshold count when together
     they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to
         90 % joins
     them, up to four times their area or `SMALL_AREA`: the gaps between them, and the far side of a lamp.
     """
     solid, unseen = areas > 1e-12, statistics.count == 0
-    bright = ~unseen & (statistics.low >= threshold) & solid
+    bright = ~unseen & ((statistics.low >= threshold) | statistics.bounded) & solid
     if not bright.any():
         return bright
     first, second = adjacency[:, 0], adjacency[:, 1]

@@ -32,6 +32,14 @@ class EmitterGroups:
     def size(self) -> int:
         return len(self.faces)
 
+    def select(self, kept: np.ndarray) -> EmitterGroups:
+        """The groups of a mask (G,), renumbered."""
+        number = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)
+        of_face = number[self.of_face]
+        side = np.where(of_face >= 0, self.side, 0).astype(np.int32)
+        rows = (self.faces[kept], self.area[kept], self.observed[kept], self.count[kept])
+        return EmitterGroups(of_face, side, *rows, self.dropped)
+
 
 def group_emitters(
     candidate: np.ndarray,
@@ -77,14 +85,15 @@ def group_emitters(
     local[ids] = np.arange(len(ids))
     label = components(local[pair], np.ones(len(ids), bool)) if len(ids) else np.zeros(0, np.int64)
     piece_area = np.bincount(label, areas[ids])[label] if len(ids) else np.zeros(0)
-    weight = np.maximum(statistics.count[ids], 1e-3).astype(np.float64)
-    colour = np.where(unseen[:, None], 0.0, statistics.mean[ids]) * weight[:, None]
+    # A face that is always saturated has no colour to compare.
+    weight = statistics.clear[ids].astype(np.float64)
+    colour = statistics.mean[ids] * weight[:, None]
     parent = _merge(
         local[pair],
         normals[ids],
         areas[ids],
         colour,
-        np.where(unseen, 0.0, weight),
+        weight,
         piece_area < small_area,
         np.cos(np.radians(max_angle)),
         max_ratio,

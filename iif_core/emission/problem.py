@@ -7,11 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .gains import object_gains
+from .pruning import WhiteSurface
 from .rows import EmissionRows, block_rows, scale_rows
 
 ANCHOR_WEIGHT = 100.0
 """Weight of what is directly seen of a group relative to everything that its light does elsewhere: a face that is
 looked at says what it emits; light it sends elsewhere also depends on albedos that the prior only guessed."""
+
+
+Halves = list[tuple[np.ndarray, np.ndarray]]
+"""Two independent estimates of (A (n, G, 3), h (n, 3))."""
 
 
 @dataclass(frozen=True)
@@ -69,40 +74,66 @@ class EmissionProblem:
 
 
 def assemble(
-    pixels: PixelRows, halves: list[tuple[np.ndarray, np.ndarray]], n_groups: int, reflecting: bool, sky: Sky | None = None
+    pixels: PixelRows,
+    halves: Halves,
+    n_groups: int,
+    white: Halves | None = None,
+    sky: Sky | None = None,
 ) -> EmissionProblem:
     """Averages over (view, tile, object) with their weights; directly seen emitters and sky as rows of their own.
 
     A row of radiance y weighs 1 / (mean y + floor)^2: noise of photographs and albedos is relative.
 
+    What a pixel on an emitter shows is taken as its emission alone (kept emitters are black): an anchor that outweighs
+    the rest. With `white`, while it is still open which groups shine, it may as well reflect, up to a white surface:
+    y - (A_w E + h_w) <= E_g <= y, the upper end only where y is not saturated.
+
     Args:
         halves: two independent estimates of (A (n, G, 3), h (n, 3)) of the pixels.
-        reflecting: emitters also reflect, and are not trusted more than other rows; otherwise they are black anchors.
+        white: the same of the pixels on emitters (in their order) with a white material.
         sky: mean of the camera rays that leave the mesh, as one more row of the last group.
     """
-    on_emitter = pixels.group >= 0
-    direct = np.zeros((len(pixels.group), n_groups, 3), np.float32)
-    direct[np.flatnonzero(on_emitter), pixels.group[on_emitter]] = 1.0
-    reflects = np.ones(len(pixels.group), np.float32) if reflecting else np.where(on_emitter, 0.0, 1.0).astype(np.float32)
-    first, second = (direct + a * reflects[:, None, None] for a, _ in halves)
-    targets = [pixels.radiance - h * reflects[:, None] for _, h in halves]
-    ones = np.ones((len(pixels.group), 3))
-    owner = np.where(on_emitter, -1, pixels.object_id)
-    keys, block = np.unique(np.stack([owner, pixels.group, pixels.view, pixels.tile], 1), axis=0, return_inverse=True)
-    rows = block_rows(EmissionRows(first, second, *targets, ones, pixels.bound), block.ravel())
-    empty = direct[:, :0]
-    # The same blocks again for y itself, and for the number of the block.
-    seen = block_rows(EmissionRows(empty, empty, pixels.radiance, pixels.radiance, ones, pixels.bound), block.ravel())
-    number = np.repeat(block.ravel().astype(np.float64)[:, None], 3, 1)
-    label = block_rows(EmissionRows(empty, empty, number, number, ones, pixels.bound), block.ravel()).target[:, 0]
-    key = keys[np.round(label).astype(np.int64)] if len(keys) else keys.reshape(0, 4)
-    brightness = seen.target.mean(1, keepdims=True)
-    floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
-    weight = rows.weight / np.maximum(brightness + floor, 1e-12) ** 2
-    out = EmissionProblem(replace(rows, weight=weight), seen.target, key[:, 0].astype(np.int64), key[:, 1] >= 0)
+    own = pixels.group >= 0
+    direct = np.zeros((len(own), n_groups, 3), np.float32)
+    direct[np.flatnonzero(own), pixels.group[own]] = 1.0
+    matrices, targets = [], []
+    for half in range(2):
+        matrix, cached = np.array(halves[half][0]), np.array(halves[half][1])
+        matrix[own], cached[own] = (0.0, 0.0) if white is None else white[half]
+        matrices.append(matrix + direct)
+        targets.append(pixels.radiance - cached)
+    bound = pixels.bound if white is None else pixels.bound | own[:, None]
+    radiance, rows = pixels.radiance, [matrices, targets]
+    owner = np.where(own, -1, pixels.object_id)
+    key = np.stack([owner, pixels.group, pixels.view, pixels.tile], 1)
+    if white is not None:
+        clear = own & ~pixels.bound.any(1)
+        rows = [[np.concatenate([a, -direct[clear]]) for a in matrices], [np.r_[t, -radiance[clear]] for t in targets]]
+        radiance, bound = np.r_[radiance, -radiance[clear]], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
+        key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
+    problem = _blocks(EmissionRows(*rows[0], *rows[1], np.ones(radiance.shape), bound), radiance, key)
     if sky is not None and sky.pixels:
-        out = _with_sky(out, n_groups, sky)
-    return out if reflecting else replace(out, rows=_strengthened(out.rows, out.anchor))
+        problem = _with_sky(problem, n_groups, sky)
+    return problem if white is not None else replace(problem, rows=_strengthened(problem.rows, problem.anchor))
+
+
+def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray) -> EmissionProblem:
+    """Averages of rows with the same key (owner, group, view, tile), weighted for relative noise."""
+    keys, block = np.unique(key, axis=0, return_inverse=True)
+    block, ones, empty = block.ravel(), rows.weight, rows.first[:, :0]
+    out = block_rows(rows, block)
+    # The same blocks again for y itself, and for the number of the block.
+    seen = block_rows(EmissionRows(empty, empty, radiance, radiance, ones, rows.lower_bound), block)
+    number = np.repeat(block.astype(np.float64)[:, None], 3, 1)
+    label = block_rows(EmissionRows(empty, empty, number, number, ones, rows.lower_bound), block).target[:, 0]
+    key = keys[np.round(label).astype(np.int64)] if len(keys) else keys.reshape(0, 4)
+    brightness = np.abs(seen.target).mean(1, keepdims=True)
+    for g in np.unique(key[key[:, 1] >= 0, 1]):  # one weight for all that is seen of a group, or its dark edges count most
+        own = key[:, 1] == g
+        brightness[own] = brightness[own].mean()
+    floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
+    weight = out.weight / np.maximum(brightness + floor, 1e-12) ** 2
+    return EmissionProblem(replace(out, weight=weight), seen.target, key[:, 0].astype(np.int64), key[:, 1] >= 0)
 
 
 def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProblem:
@@ -131,7 +162,12 @@ def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
     group = mean[anchor].max(2).argmax(1)
     weight = rows.weight.copy()
     own = np.zeros(elsewhere.shape)
-    np.add.at(own, group, weight[anchor])
+    # Bounds that are met carry nothing, so where a group is also seen unsaturated only that counts.
+    known = np.where(rows.lower_bound[anchor], 0.0, weight[anchor])
+    np.add.at(own, group, known)
+    bounds = np.zeros(elsewhere.shape)
+    np.add.at(bounds, group, weight[anchor])
+    own = np.where(own > 0, own, bounds)
     factor = np.maximum(1.0, ANCHOR_WEIGHT * elsewhere / np.maximum(own, 1e-300))
     weight[anchor] *= factor[group]
     return replace(rows, weight=weight)
@@ -154,11 +190,16 @@ def initial_radiance(pixels: PixelRows, observed: np.ndarray, is_hdr: bool) -> n
     return out
 
 
-def seen_radiance(pixels: PixelRows, n_groups: int) -> np.ndarray:
-    """(G, 3) mean radiance of the pixels on each group that were not saturated; 0 without any."""
-    out = np.zeros((n_groups, 3))
-    clear = (pixels.group >= 0) & ~pixels.bound.any(1)
-    count = np.bincount(pixels.group[clear], minlength=n_groups)
-    for c in range(3):
-        out[:, c] = np.bincount(pixels.group[clear], pixels.radiance[clear, c], n_groups) / np.maximum(count, 1)
-    return out
+def white_surface(pixels: PixelRows, seen: np.ndarray, white: Halves) -> WhiteSurface:
+    """Means over the pixels of each group of what they would show if they were white.
+
+    Args:
+        seen: (G, 3) radiance seen on each group; white: as in `assemble`.
+    """
+    group = pixels.group[pixels.group >= 0]
+    n_groups = len(seen)
+    count = np.maximum(np.bincount(group, minlength=n_groups), 1)
+    matrix, cached = np.zeros((n_groups, n_groups, 3)), np.zeros((n_groups, 3))
+    np.add.at(matrix, group, 0.5 * (white[0][0] + white[1][0]))
+    np.add.at(cached, group, 0.5 * (white[0][1] + white[1][1]))
+    return WhiteSurface(np.where((count > 0)[:, None], seen, 0.0), matrix / count[:, None, None], cached / count[:, None])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,11 +10,17 @@ import numpy as np
 
 from iif_core import plan
 from iif_core.emission.cache import RadianceSums, RadianceVoxels
-from iif_core.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, hdr_threshold, with_thin_objects
+from iif_core.emission.candidates import (
+    FaceStatistics,
+    emitter_candidates,
+    face_statistics,
+    radiance_threshold,
+    with_thin_objects,
+)
 from iif_core.emission.direct import EmissionSolution, solve_emission
 from iif_core.emission.environment import cosine_directions
 from iif_core.emission.groups import EmitterGroups, group_emitters
-from iif_core.emission.problem import PixelRows, Sky, assemble, initial_radiance, seen_radiance
+from iif_core.emission.problem import PixelRows, Sky, assemble, initial_radiance, white_surface
 from iif_core.emission.pruning import PrunedEmission, prune_groups
 from iif_core.emission.sensor import Sensor
 from iif_core.exposure import calibrate_response
@@ -30,6 +37,8 @@ STATISTICS_PIXELS = 20_000_000
 """Photographs are thinned to about this many pixels for the statistics of faces."""
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels a group enter the solve."""
+WHITE = (1.0, 1.0, 1.0, 1.0, 0.0)
+"""Base material of the brightest surface that only reflects."""
 METAL = 0.9
 """Predicted metalness from which a surface counts as metal in the solve."""
 _SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
@@ -63,18 +72,31 @@ def run(job: Job) -> None:
     sensor = Sensor(response(family), capture.is_hdr, job.settings.emission.saturation)
     photos = _calibrated(_Photographs(job, capture, scene, views, sensor, exposures), notes)
     statistics, threshold = _statistics(photos)
-    groups, candidates = _groups(job, scene, statistics, threshold)
+    adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
+    candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
+    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, min_observations=least)
+    job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
     cache, sky, escape, brightness = _radiance_cache(photos, groups)
     secondary = _secondary_escape(photos)
     environment = plan.environment(job.settings.emission.environment, escape, secondary, brightness)
-    solution, table = _solve(photos, groups, cache, sky, environment["included"])
+    outside = sky if environment["included"] else None
+    pruned = _trial(photos, groups, cache, outside)
+    lit = pruned.kept[: groups.size]
+    candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
+    reasons = [reason for reason, keep in zip(pruned.reason, pruned.kept, strict=True) if not keep]
+    groups = groups.select(lit)
+    if left_out.size:
+        cache = _radiance_cache(photos, groups)[0]
+    solution = _solve(photos, groups, cache, outside)
+    table = _table(groups, left_out, reasons, solution, sky if outside else None)
     _write(job, groups, table, cache)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
+    job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
     for faces, area, reason in groups.dropped[:20]:
         notes.append(f"candidate of {faces} faces, {area:.2g} m^2, left out before the solve: {reason}")
     if not kept and not environment["included"]:
         notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
-    decisions = [environment, exposure_plan, plan.emitters(kept, groups.size - kept + len(groups.dropped), candidates)]
+    decisions = [environment, exposure_plan, plan.emitters(kept, candidates - kept, candidates)]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",
@@ -146,35 +168,23 @@ def _shared_surface(photos: _Photographs) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _statistics(photos: _Photographs) -> tuple[FaceStatistics, float]:
-    """Statistics of the faces, and the threshold in units of the photograph."""
+    """Statistics of the faces, and the radiance from which one may shine."""
     scene, views, least = photos.scene, photos.views, photos.job.settings.emission.min_observations
     total = sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("face", "value", "front", "interior")}
+    parts = []
     for done, view in enumerate(views):
         pixels = photos.pixels(view)
         pixels = pixels.take(np.flatnonzero(pixels.valid)[::stride])
-        parts["face"].append(pixels.face)
-        parts["value"].append(pixels.value.astype(np.float32))
-        parts["front"].append(pixels.from_front)
-        parts["interior"].append(pixels.interior)
+        radiance, bound = photos.radiance(view, pixels.value)
+        parts.append((pixels.face, radiance.astype(np.float32), bound, pixels.from_front, pixels.interior))
         photos.job.progress(done + 1, len(views), "views searched for emitters")
-    face, value, front, inside = (np.concatenate(part) for part in parts.values())
-    every = face_statistics(face, value, front, len(scene.faces))
-    inner = face_statistics(face[inside], value[inside], front[inside], len(scene.faces))
-    threshold = hdr_threshold(every) if photos.sensor.is_hdr else photos.sensor.saturation
-    bright = value.max(1) >= threshold
+    face, radiance, bound, front, inside = (np.concatenate(part) for part in zip(*parts, strict=True))
+    every = face_statistics(face, radiance, front, len(scene.faces), bound)
+    inner = face_statistics(face[inside], radiance[inside], front[inside], len(scene.faces), bound[inside])
+    threshold = radiance_threshold(every)
+    bright = (radiance.max(1) >= threshold) | bound.any(1)
     return with_thin_objects(inner, every, scene.object_id, face, bright, inside, least), float(threshold)
-
-
-def _groups(job: Job, scene: BaseScene, statistics: FaceStatistics, threshold: float) -> tuple[EmitterGroups, int]:
-    """Groups, and the number of candidate groups."""
-    adjacency = face_adjacency(scene.faces)
-    least = job.settings.emission.min_observations
-    candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
-    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, min_observations=least)
-    job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
-    return groups, groups.size + len(groups.dropped)
 
 
 # -------------------------------------------------------------------------------------------------------------- cache
@@ -233,10 +243,10 @@ def _secondary_escape(photos: _Photographs) -> float:
 # -------------------------------------------------------------------------------------------------------------- solve
 
 
-def _choose_rows(photos: _Photographs, groups: EmitterGroups) -> tuple[ViewPixels, np.ndarray, PixelRows]:
-    """A fixed number of pixels, evenly over views, plus enough on every emitter; their materials (n, 5)."""
+def _choose_rows(photos: _Photographs, groups: EmitterGroups, thin: int = 1) -> tuple[ViewPixels, np.ndarray, PixelRows]:
+    """A fixed number of pixels, evenly over views (one in `thin`), plus enough on every emitter; their materials (n, 5)."""
     rng = np.random.default_rng([photos.job.seed, _SEEDS, 1])
-    per_view = -(-photos.job.settings.emission.rows // len(photos.views))
+    per_view = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
     quota = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
     parts: list[tuple[ViewPixels, np.ndarray, PixelRows]] = []
     for view in photos.views:
@@ -259,41 +269,48 @@ def _choose_rows(photos: _Photographs, groups: EmitterGroups) -> tuple[ViewPixel
         number = np.full(len(choice), view.view_id)
         rows = PixelRows(*photos.radiance(view, part.value), part.object_id, number, tile, group[choice])
         parts.append((part, base_maps(photos.job, view)[part.index], rows))
-    pixels, base, rows = zip(*parts, strict=True)
-    return _joined(pixels), np.concatenate(base), _joined(rows)
+    pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
+    joined, group = _joined(pixels), np.concatenate([part.group for part in rows])
+    # Border pixels mix with what is beside the emitter: only for emitters that have no others.
+    inner = np.bincount(group[joined.interior & (group >= 0)], minlength=groups.size) > 0
+    use = (group < 0) | joined.interior | ~np.append(inner, False)[group]
+    everything = _joined(rows)
+    return joined.take(use), np.concatenate(base)[use], PixelRows(**{k: v[use] for k, v in everything.__dict__.items()})
 
 
-def _joined(parts: tuple[Any, ...]) -> Any:
+def _joined(parts: Sequence[Any]) -> Any:
     """Records of arrays, one after another."""
     return type(parts[0])(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in parts[0].__dict__})
 
 
-def _solve(
-    photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky, with_environment: bool
-) -> tuple[EmissionSolution, dict[str, Any]]:
-    """Transport rows of a subset of pixels, twice; pruned non-negative least squares; the table of emitters."""
-    job = photos.job
+def _trial(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None) -> PrunedEmission:
+    """Which groups shine, from half of the rows."""
+    pixels, base, rows = _choose_rows(photos, groups, 2)
+    own = rows.group >= 0
+    halves = _trace(photos, pixels, base, groups, voxels, sky, 0)
+    paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
+    white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1)
+    seen, initial = _initial(photos, groups, rows, sky)
+    n_groups = len(initial)
+    trial = assemble(rows, halves, n_groups, white, sky).with_gains(initial)
+    area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
+    evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
+    share = photos.job.settings.emission.prune
+    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share)
+
+
+def _initial(photos: _Photographs, groups: EmitterGroups, rows: PixelRows, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
+    """Radiance seen on the groups, and with the environment's."""
+    seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
+    return seen, seen if sky is None else np.concatenate([seen, sky.radiance[None]])
+
+
+def _solve(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None) -> EmissionSolution:
+    """Emission of the groups that shine, which are black from here on, and of the environment."""
     pixels, base, rows = _choose_rows(photos, groups)
-    n_groups = groups.size + int(with_environment)
-    initial = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
-    if with_environment:
-        initial = np.concatenate([initial, sky.radiance[None]])
-    halves = _trace(photos, pixels, base, groups, voxels, n_groups, groups.size if with_environment else None)
-    area = np.r_[groups.area, np.zeros(n_groups - groups.size)]
-    protected = np.arange(n_groups) >= groups.size
-    outside = sky if with_environment else None
-    problem = assemble(rows, halves, n_groups, True, outside).with_gains(initial)
-    pruned = prune_groups(problem.rows, initial, area, seen_radiance(rows, n_groups), protected, job.settings.emission.prune)
-    # What remains is treated as black from here on: its pixels show its emission alone.
-    kept = pruned.kept
-    final = assemble(rows, halves, n_groups, False, outside)
-    final = replace(final, rows=final.rows.columns(kept)).with_gains(initial[kept])
-    part = solve_emission(final.rows, initial[kept])
-    radiance, error = np.zeros((n_groups, 3)), np.zeros((n_groups, 3))
-    radiance[kept], error[kept] = part.radiance, part.error
-    number, left = int(kept[: groups.size].sum()), (part.residual, part.condition)
-    job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", number, groups.size, *left)
-    return replace(part, radiance=radiance, error=error), _table(groups, pruned, radiance, error, sky, n_groups)
+    halves = _trace(photos, pixels, base, groups, voxels, sky, 3)
+    initial = _initial(photos, groups, rows, sky)[1]
+    return solve_emission(assemble(rows, halves, len(initial), None, sky).with_gains(initial).rows, initial)
 
 
 def _trace(
@@ -302,8 +319,8 @@ def _trace(
     base: np.ndarray,
     groups: EmitterGroups,
     voxels: RadianceVoxels,
-    n_groups: int,
-    environment_group: int | None,
+    sky: Sky | None,
+    stream: int,
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Two independent estimates of (A, h)."""
     job, settings = photos.job, photos.job.settings.emission
@@ -316,12 +333,12 @@ def _trace(
     # believed.
     metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
     surface = (pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
-    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | _SEEDS) * 2
+    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | _SEEDS) * 8 + 2 * stream
     halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        columns = (groups.of_face, n_groups, side)
-        paths = (samples, settings.max_bounces, seed + half, cache, environment_group)
+        columns = (groups.of_face, groups.size + (sky is not None), side)
+        paths = (samples, settings.max_bounces, seed + half, cache, None if sky is None else groups.size)
         halves.append(transport_matrix(geometry, material, *surface, *columns, *paths))
     job.progress(2, 2, "halves of the transport matrix traced")
     return halves
@@ -331,21 +348,24 @@ def _trace(
 
 
 def _table(
-    groups: EmitterGroups, pruned: PrunedEmission, radiance: np.ndarray, error: np.ndarray, sky: Sky, n_groups: int
+    groups: EmitterGroups, left_out: EmitterGroups, reasons: list[str], solution: EmissionSolution, sky: Sky | None
 ) -> dict[str, Any]:
-    extra = n_groups - groups.size
-    sides = np.array([_side_of(groups, g) for g in range(groups.size)] + [0] * extra, np.int32)
+    """Emitters, the environment, and the groups that turned out to reflect."""
+    outside, out = int(sky is not None), left_out.size
+    sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
+    pixels = [sky.pixels] if sky is not None else []
+    radiance, error = (np.r_[values, np.zeros((out, 3))] for values in (solution.radiance, solution.error))
     return {
-        "emitter_id": np.arange(n_groups, dtype=np.int32),
-        "kind": np.array(["area"] * groups.size + ["environment"] * extra, dtype=str),
-        "faces": np.r_[groups.faces, np.zeros(extra)].astype(np.int32),
-        "area_m2": np.r_[groups.area, np.zeros(extra)].astype(np.float64),
-        "side": sides,
+        "emitter_id": np.arange(groups.size + outside + out, dtype=np.int32),
+        "kind": np.array(["area"] * groups.size + ["environment"] * outside + ["area"] * out, dtype=str),
+        "faces": np.r_[groups.faces, np.zeros(outside), left_out.faces].astype(np.int32),
+        "area_m2": np.r_[groups.area, np.zeros(outside), left_out.area].astype(np.float64),
+        "side": np.array([*sides[0], *[0] * outside, *sides[1]], np.int32),
         **{f"radiance_{c}": radiance[:, i].astype(np.float32) for i, c in enumerate("rgb")},
         **{f"error_{c}": error[:, i].astype(np.float32) for i, c in enumerate("rgb")},
-        "observations": np.r_[groups.count, np.full(extra, sky.pixels)].astype(np.int64),
-        "kept": pruned.kept.astype(bool),
-        "reason": np.array(pruned.reason, dtype=str),
+        "observations": np.r_[groups.count, pixels, left_out.count].astype(np.int64),
+        "kept": np.arange(groups.size + outside + out) < groups.size + outside,
+        "reason": np.array([""] * (groups.size + outside) + reasons, dtype=str),
     }
 
 
@@ -358,7 +378,6 @@ def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: Radian
     units = {"area_m2": "m^2", "radiance_r": "relative", "error_r": "relative"}
     job.writer.table("emitters.parquet", table, units)
     face = np.flatnonzero(groups.of_face >= 0)
-    face = face[table["kept"][groups.of_face[face]]] if len(face) else face
     columns = {
         "face_id": face.astype(np.int32),
         "emitter_id": groups.of_face[face].astype(np.int32),
