@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from iif_core.cells import grid_origin
-from iif_core.emitters import face_geometry
+from iif_core.mesh import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View

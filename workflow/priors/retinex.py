@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.emitters import face_geometry
+from iif_core.mesh import face_geometry
 from iif_core.retinex import retinex_predictions
 from workflow.normal_form import CaptureReader, View
 

@@ -22,9 +22,9 @@ from iif_core.cells import (
     unpack_keys,
     voxel_indices,
 )
-from iif_core.emitters import face_geometry
 from iif_core.errors import InputError
 from iif_core.hashgrid import HashGridOptions
+from iif_core.mesh import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View

@@ -1,17 +1,12 @@
 import numpy as np
 import pytest
 
-from iif_core.emitters import (
-    FaceStatistics,
-    RadianceSums,
-    emitter_candidates,
-    face_adjacency,
-    face_geometry,
-    face_statistics,
-    group_emitters,
-    hdr_threshold,
-)
+from iif_core.emission.cache import RadianceSums
+from iif_core.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, hdr_threshold
+from iif_core.emission.groups import group_emitters
 from iif_core.errors import InputError
+from iif_core.mesh import face_geometry
+from iif_core.segments import face_adjacency
 
 
 def _strip(n, start=(0.0, 0.0, 0.0)):
@@ -54,15 +49,6 @@ def test_quantile_forgives_a_few_dark_pixels_but_not_many():
         stats = face_statistics(np.zeros(40, int), value, np.ones(40, bool), 1)
         got = emitter_candidates(stats, np.zeros((0, 2), int), np.ones(1), 0.99)
         assert got.tolist() == [expected]
-
-
-def test_adjacency():
-    _, faces = _strip(3)
-    pairs = face_adjacency(faces)
-    assert pairs.tolist() == [[0, 1], [0, 3], [2, 3], [2, 5], [4, 5]]
-    assert face_adjacency(np.zeros((0, 3), int)).shape == (0, 2)
-    fan = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])  # three faces on one edge
-    assert face_adjacency(fan).tolist() == [[0, 1], [1, 2]]
 
 
 def test_sphere_adjacency_and_geometry():

@@ -2,8 +2,11 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from iif_core.emission.direct import solve_emission
+from iif_core.emission.gains import object_gains
+from iif_core.emission.pruning import prune_groups
+from iif_core.emission.rows import EmissionRows, block_rows, scale_rows
 from iif_core.errors import InputError
-from iif_core.nnls import EmissionRows, block_rows, object_gains, prune_groups, scale_rows, solve_emission
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 

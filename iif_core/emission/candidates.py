@@ -1,0 +1,220 @@
+"""Which faces may shine by themselves.
+
+A face is a candidate when nearly all of its pixels in all views are far brighter than the room, or saturated whatever
+the exposure. That is generous on purpose: a surface that merely reflects is recognised by the solve that follows
+(`pruning`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+SMALL_AREA = 0.25
+"""Surface (m^2) of a lamp that may be one group whatever its shape."""
+_BRIDGE = 3  # faces by which pools reach over unseen surface
+
+
+@dataclass(frozen=True)
+class FaceStatistics:
+    """What the photographs say about every face.
+
+    Attributes:
+        count: (F,) int32 observations.
+        low: (F,) float32, lower quantile over the observations of the largest channel; 0 where unobserved.
+        bounded: (F,) bool, saturation hides that quantile: `low` is the highest radiance that was reached.
+        mean: (F, 3) float32 mean of the observations that are not saturated, of the bounds where all are; 0 where
+            unobserved.
+        clear: (F,) int32 observations that are not saturated in any channel.
+        front: (F,) float32 in [0, 1]: share of the observations from the side of the face normal.
+    """
+
+    count: np.ndarray
+    low: np.ndarray
+    bounded: np.ndarray
+    mean: np.ndarray
+    clear: np.ndarray
+    front: np.ndarray
+
+
+def face_statistics(
+    face: np.ndarray,
+    value: np.ndarray,
+    from_front: np.ndarray,
+    n_faces: int,
+    bound: np.ndarray | None = None,
+    quantile: float = 0.05,
+) -> FaceStatistics:
+    """Statistics of the pixels that see each face (METHOD 2.4, quantile form, in radiance).
+
+    A saturated pixel at exposure e says only L >= f^-1(saturation) / e, and at a long exposure that is next to
+    nothing. The lower quantile is therefore Kaplan and Meier's (1958) estimate from right-censored data: bounds below
+    a value do not count against it. Without saturation it is the observation of rank floor(quantile * count).
+
+    Args:
+        face: (n,) int, -1 = no face.
+        value: (n, 3) radiance; rows with non-finite values are left out.
+        from_front: (n,) bool, the camera is on the side of the face normal.
+        n_faces: F.
+        bound: (n, 3) bool, `value` is a lower bound; None = nowhere.
+        quantile: lower quantile; the minimum below 1 / quantile pixels.
+    """
+    value = np.asarray(value)
+    good = (face >= 0) & np.isfinite(value).all(-1)
+    bounded = np.zeros(len(face), bool) if bound is None else np.asarray(bound).any(-1)
+    face, value, from_front, bounded = face[good], value[good], from_front[good], bounded[good]
+    count = np.bincount(face, minlength=n_faces)
+    clear = np.bincount(face[~bounded], minlength=n_faces)
+    brightest = value.max(-1) if len(value) else np.zeros(0)
+    low, hidden = _censored_quantile(face, brightest, bounded, count, quantile)
+    used = np.where(bounded & (clear[face] > 0), 0.0, 1.0)
+    divisor = np.maximum(np.where(clear > 0, clear, count), 1)
+    mean = np.stack([np.bincount(face, value[:, c] * used, n_faces) / divisor for c in range(3)], -1)
+    front = np.bincount(face, from_front.astype(np.float64), n_faces) / np.maximum(count, 1)
+    counts = (count.astype(np.int32), clear.astype(np.int32))
+    return FaceStatistics(counts[0], low, hidden, mean.astype(np.float32), counts[1], front.astype(np.float32))
+
+
+def _censored_quantile(
+    face: np.ndarray, value: np.ndarray, bounded: np.ndarray, count: np.ndarray, quantile: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Kaplan-Meier quantile per face, and whether it lies beyond the last value; the largest value then."""
+    low, hidden = np.zeros(len(count), np.float32), np.zeros(len(count), bool)
+    order = np.lexsort((bounded, value, face))  # at equal values those that are known come first
+    owner, ordered, known = face[order], value[order], ~bounded[order]
+    first = np.cumsum(count) - count
+    at_risk = count[owner] - (np.arange(len(owner)) - first[owner])
+    # The last one of a face, if it is known, ends the curve: log 0.
+    with np.errstate(divide="ignore"):
+        step = np.where(known, np.log1p(-1.0 / np.maximum(at_risk, 1)), 0.0)
+    last = at_risk == 1
+    finite = np.where(last & known, 0.0, step)
+    total = np.cumsum(finite)
+    before = np.where(first[owner] > 0, total[np.maximum(first[owner] - 1, 0)], 0.0)
+    survival = np.where(last & known, 0.0, np.exp(total - before))
+    reached = known & (survival < 1.0 - quantile - 1e-9)
+    hit = np.flatnonzero(reached)
+    faces, index = np.unique(owner[hit], return_index=True)
+    low[faces] = ordered[hit[index]]
+    seen = count > 0
+    hidden[seen] = True
+    hidden[faces] = False
+    beyond = np.flatnonzero(hidden)
+    low[beyond] = ordered[first[beyond] + count[beyond] - 1] if len(beyond) else 0
+    return low, hidden
+
+
+def with_thin_objects(
+    interior: FaceStatistics,
+    every: FaceStatistics,
+    object_id: np.ndarray,
+    face: np.ndarray,
+    bright: np.ndarray,
+    inside: np.ndarray,
+    min_observations: int,
+) -> FaceStatistics:
+    """Statistics of interior pixels, and of all pixels for objects too thin to have interior ones.
+
+    Pixels at the border of an object mix with what is beside it, so interior ones count. An object without any (a
+    filament) is judged by all of its pixels, if nine tenths of them are bright: the frame of a window is not.
+
+    Args:
+        interior, every: statistics of the interior pixels and of all.
+        object_id: (F,) of the faces, -1 = none.
+        face, bright, inside: (n,) of all pixels.
+        min_observations: interior pixels from which an object is not thin.
+    """
+    owner, size = object_id[face] + 1, int(object_id.max(initial=-1)) + 2
+    share = np.bincount(owner, bright, size) / np.maximum(np.bincount(owner, minlength=size), 1)
+    thin = np.bincount(owner, inside, size) < min_observations
+    allow = (thin & (share >= 0.9))[object_id + 1] & (object_id >= 0)
+
+    def pick(name: str) -> np.ndarray:
+        whole, inner = getattr(every, name), getattr(interior, name)
+        return np.where(allow.reshape(-1, *[1] * (whole.ndim - 1)), whole, inner)
+
+    return FaceStatistics(**{name: pick(name) for name in FaceStatistics.__dataclass_fields__})
+
+
+BRIGHT = 5.0
+"""Radiance of a candidate relative to the median."""
+
+
+def radiance_threshold(statistics: FaceStatistics, ratio: float = BRIGHT) -> float:
+    """Radiance above which a face may be an emitter: `ratio` times the median over pixels.
+
+    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may
+    fill up to half of the pixels. A white diffuse surface in a room reflects at most a few times the median; lamps
+    and windows exceed it by 10 to 50. Infinite when nothing was seen.
+    """
+    seen = statistics.count > 0
+    if not seen.any():
+        return float("inf")
+    low, weight = statistics.low[seen], statistics.count[seen]
+    order = np.argsort(low, kind="stable")
+    cumulative = np.cumsum(weight[order])
+    median = float(low[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
+    positive = low[low > 0]
+    floor = float(positive.min()) if len(positive) else 0.0
+    return ratio * max(median, floor) if max(median, floor) > 0 else float("inf")
+
+
+def emitter_candidates(
+    statistics: FaceStatistics, adjacency: np.ndarray, areas: np.ndarray, threshold: float, min_observations: int = 8
+) -> np.ndarray:
+    """Faces that may shine by themselves: (F,) bool (METHOD 2.4).
+
+    A face counts when its low quantile reaches `threshold`, or saturation hides how bright it is, over at least
+    `min_observations` pixels. Faces seen by fewer
+    pixels are pooled: neighbours (also across a few unseen faces) that all reach the threshold count when together
+    they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to
+        90 % joins
+    them, up to four times their area or `SMALL_AREA`: the gaps between them, and the far side of a lamp.
+    """
+    solid, unseen = areas > 1e-12, statistics.count == 0
+    bright = ~unseen & ((statistics.low >= threshold) | statistics.bounded) & solid
+    if not bright.any():
+        return bright
+    first, second = adjacency[:, 0], adjacency[:, 1]
+    reached = bright.copy()
+    for _ in range(_BRIDGE):
+        grown = reached.copy()
+        grown[first[reached[second]]] = True
+        grown[second[reached[first]]] = True
+        reached = bright | (grown & unseen)
+    label = components(adjacency, reached)
+    pooled = np.bincount(label, np.where(bright, statistics.count, 0))
+    candidate = bright & (pooled[label] >= min_observations)
+    return candidate | (_enclosed(adjacency, areas, unseen, candidate, label) & solid)
+
+
+def components(adjacency: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Label of the connected component of every face; faces outside `mask` are alone."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(mask)
+    pair = adjacency[mask[adjacency[:, 0]] & mask[adjacency[:, 1]]]
+    graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n, n))
+    return connected_components(graph, directed=False)[1]
+
+
+def _enclosed(
+    adjacency: np.ndarray, areas: np.ndarray, unseen: np.ndarray, candidate: np.ndarray, pool: np.ndarray
+) -> np.ndarray:
+    """Unseen faces in regions that border on candidates (almost) alone and are not much larger than their pools."""
+    region = components(adjacency, unseen)
+    size = int(region.max(initial=-1)) + 1
+    pair = np.concatenate([adjacency, adjacency[:, ::-1]])
+    pair = pair[unseen[pair[:, 0]] & ~unseen[pair[:, 1]]]
+    border = np.bincount(region[pair[:, 0]], minlength=size)
+    pair = pair[candidate[pair[:, 1]]]
+    shining = np.bincount(region[pair[:, 0]], minlength=size)
+    pool_area = np.bincount(pool, np.where(candidate, areas, 0.0))
+    # Each pool counts once for a region, however many edges they share.
+    pair = np.unique(np.stack([region[pair[:, 0]], pool[pair[:, 1]]], 1), axis=0)
+    lit_area = np.bincount(pair[:, 0], pool_area[pair[:, 1]], size)
+    area = np.bincount(region, np.where(unseen, areas, 0.0), size)
+    inside = (shining >= 0.9 * border) & (border > 0) & (area <= np.maximum(4.0 * lit_area, SMALL_AREA))
+    return unseen & inside[region]
