@@ -54,6 +54,7 @@ class Job:
         self.log = logging.getLogger(f"{stage}")
         self.document = json.loads(fp.resolved(scene, quality))
         self._last_progress = self._started = time.monotonic()
+        self._progress_of, self._first_item = "", (0, self._started)
         self._cpu_started = time.process_time()
         self._parts: dict[str, dict[str, float]] = {}
         self._readers: dict[str, StageReader] = {}
@@ -152,11 +153,15 @@ class Job:
     def progress(self, done: int, total: int, what: str) -> None:
         """Say how far the job is, at most every five seconds and at the end."""
         now = time.monotonic()
+        if self._progress_of != what or done <= 1:  # the first item pays for compiling and loading; the estimate starts after it
+            self._progress_of, self._first_item = what, (done, now)
         if done < total and now - self._last_progress < 5:
             return
         self._last_progress = now
         spent = now - self._started
-        left = f", about {spent / done * (total - done):.0f} s left" if 0 < done < total else ""
+        done_first, then = self._first_item
+        since = (now - then) / (done - done_first) if done > done_first else 0.0
+        left = f", about {since * (total - done):.0f} s left" if since and done < total else ""
         self.log.info("%s: %d of %d (%.0f s%s)", what, done, total, spent, left)
 
 

@@ -160,6 +160,14 @@ class Segmentation(Section):
     """`geometry`: weight of the photographs' mean colour of a face beside the bend of the surface (0 = shape alone)."""
 
 
+_DIRECT_ALONE = ("sweeps", "polish", "ridge", "temperature", "anneal", "final_temperature", "seams", "robust", "objective")
+_SGD_ALONE = ("preset", "texture", "iterations", "median_gradient")  # the sizes of the hash grid come with a quality
+
+
+def _default(model: type[BaseModel], name: str) -> Any:
+    return model.model_fields[name].get_default()
+
+
 class Base(Section):
     """Fusing the K predictions of all views into one 3D base texture."""
 
@@ -216,6 +224,14 @@ class Base(Section):
         if self.solver == "sgd" and self.variant != "full":
             raise ValueError(
                 f"`solver: sgd` fits `variant: full` alone, not `{self.variant}`; use `solver: direct` for the others"
+            )
+        idle = _SGD_ALONE if self.solver == "direct" else _DIRECT_ALONE
+        named = [name for name in idle if name in self.model_fields_set and getattr(self, name) != _default(Base, name)]
+        if named:
+            other = "sgd" if self.solver == "direct" else "direct"
+            raise ValueError(
+                f"{', '.join(f'`{name}`' for name in named)}: read by `solver: {other}` alone and without effect on `solver:"
+                f" {self.solver}`; remove it, or set the solver"
             )
         if self.objective == "distribution" and self.variant not in ("full", "image_affine"):
             raise ValueError(f"`objective: distribution` needs a selection; `variant: {self.variant}` makes none")
@@ -420,6 +436,15 @@ class SceneSettings(Section):
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of everything random."""
 
+    @model_validator(mode="after")
+    def _known_predictions(self) -> SceneSettings:
+        made, used = getattr(self.prior, "samples", None), self.base.predictions
+        if made is not None and used is not None and used > made:
+            raise ValueError(
+                f"`base: predictions` is {used}, but `prior: samples` makes {made}; lower the one or raise the other"
+            )
+        return self
+
 
 # ---------------------------------------------------------------------------------------------------------------- loading
 
@@ -610,6 +635,14 @@ def schema_json() -> str:
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
 
+_BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below", "min_length": "at least"}
+
+
+def _bound(rule: Any) -> str:
+    """`at least 1` of pydantic's `Ge(ge=1)`."""
+    return ", ".join(f"{words} {getattr(rule, name)}" for name, words in _BOUNDS.items() if hasattr(rule, name))
+
+
 def reference_markdown() -> str:
     """The settings as a page: key, default, allowed values, meaning (docs/settings.md)."""
     lines = ["# Settings", "", "Made from `workflow/settings.py` by `python -m workflow.settings`; do not edit.", ""]
@@ -628,7 +661,7 @@ def reference_markdown() -> str:
             else:
                 default = "required" if field.is_required() else f"`{field.get_default(call_default_factory=True)}`"
             text = " ".join((field.description or "").split())
-            bounds = ", ".join(str(m) for m in field.metadata)
+            bounds = ", ".join(filter(None, map(_bound, field.metadata)))
             literal = getattr(field.annotation, "__args__", ())
             if literal and all(isinstance(v, str) for v in literal):
                 text += f" One of {', '.join(f'`{v}`' for v in literal)}."

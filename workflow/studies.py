@@ -123,7 +123,10 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
     if name not in names:
         near = difflib.get_close_matches(name, names, 1)
         hint = f" Did you mean {near[0]}?" if near else ""
-        raise InputError(f"{path}: not found.{hint} Known studies: {', '.join(names) or 'none'} (docs/studies.md).")
+        raise InputError(
+            f"{path}: not found.{hint} Known studies: {', '.join(names) or 'none'}; benchmarks"
+            " of kernels: hashgrid, base_cost (docs/studies.md)."
+        )
     if not re.fullmatch(STUDY, name):
         raise InputError(f"{path}: name of a study {name!r}: allowed are lower-case letters, digits and _, a letter first")
     return _load_study(path, root, (root / path).stat().st_mtime_ns)

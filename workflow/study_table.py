@@ -95,6 +95,17 @@ def home(cell: Cell, quality: str, stage: str = "base_scores") -> Path:
     return Path("results") / fp.home(stage, cell.name, quality) / stage
 
 
+def left_out(name: str, quality: str) -> list[str]:
+    """What the table will lack, and why."""
+    study, _, skipped = plan(name, quality)
+    notes = [f"without {scene}: {reason}" for scene, reason in skipped.items()]
+    if any(key.endswith("lpips_vgg") for key in study.show) and not Path("results/weights/lpips_vgg.npz").is_file():
+        notes.append(
+            "without LPIPS (VGG16): its weights are not here; `snakemake --cores 1 results/weights/lpips_vgg.npz` fetches them"
+        )
+    return notes
+
+
 def inputs(name: str, quality: str) -> list[str]:
     """Manifests that the study collects; variants that agree with what studies share have one in common."""
     study, cells, _ = plan(name, quality)

@@ -44,6 +44,9 @@ def test_scene_over_preset_over_default(scene):
         ("- a\n- b\n", ["found list", "key: value"]),
         (GOOD + "capture: {views: 3, views: 5}\n", ["x.yaml, line 3", "`views` stands twice"]),
         ("source: builtin\nprior: {kind: simulated}\n", ["`source`", "'builtin'", "{kind: ...}"]),
+        (GOOD + "base: {iterations: 100}\n", ["base", "`iterations`", "`solver: sgd` alone", "remove it"]),
+        (GOOD + "base: {solver: sgd, sweeps: 3}\n", ["base", "`sweeps`", "`solver: direct` alone"]),
+        (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior: samples` makes"]),
         (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", "found 1", "2 and more"]),
     ],
 )
@@ -77,6 +80,11 @@ def test_shipped_scenes_load_at_every_quality(repository):
 def test_generated_files_are_current(repository):
     assert (repository / "config/scene.schema.json").read_text() == settings.schema_json()
     assert (repository / "docs/settings.md").read_text() == settings.reference_markdown()
+
+
+def test_bounds_are_words():
+    text = settings.reference_markdown()
+    assert "(at least 1, at most 64)" in text and "Ge(" not in text
 
 
 def test_registry_is_ordered_and_its_settings_exist(repository):

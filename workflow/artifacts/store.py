@@ -19,11 +19,12 @@ MANIFEST = "manifest.json"
 class DamagedArtefact(InputError):
     """A file on disk is not what its stage wrote: missing, changed, of another schema, or not finite."""
 
-    def __init__(self, path: Path, stage: str, scene: str, problem: str):
+    def __init__(self, path: Path, stage: str, scene: str, problem: str, unfinished: bool = False):
         self.path, self.stage, self.scene = path, stage, scene
-        super().__init__(
-            f"{path}: {problem}. It was made by rule {stage}; rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
-        )
+        cure = f"It was made by rule {stage}; rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
+        if unfinished:
+            cure = f"Make it with: snakemake --cores 2 {path}"
+        super().__init__(f"{path}: {problem}. {cure}")
 
 
 class StageWriter:
@@ -99,7 +100,7 @@ class StageReader:
         self.directory, self.stage, self.scene = directory, stage, scene
         path = directory / MANIFEST
         if not path.is_file():
-            raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished")
+            raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
         try:
             self.manifest: dict[str, Any] = json.loads(path.read_text())
         except ValueError as error:

@@ -103,6 +103,7 @@ def run(job: Job) -> None:
             "objects_in_separate_parts": _parts_of_objects(unpack_keys(cells.keys)[1], result.part_of_cell),
             "filled_share": float((result.coverage == 0).mean()),
             "seen_once_share": float((result.views == 1).mean()),
+            "uncertainty_calibrated": _calibrated(job),
             **({"reference_loss": _judged(job, problem, result, fit)} if settings.judge else {}),
         },
     )
@@ -114,6 +115,12 @@ def run(job: Job) -> None:
         len(seen),
         ", ".join(f"{name} {value:.4g}" for name, value in last.items()),
     )
+
+
+def _calibrated(job: Job) -> bool:
+    """Whether uncertainty_* are calibrated for this way of solving (docs/base.md); else they rank and no more."""
+    settings = job.settings.base
+    return settings.solver == "direct" and settings.variant == "full" and settings.objective == "least_squares"
 
 
 def _solve(job: Job, problem: BaseProblem) -> tuple[BaseResult, SgdFit | None]:

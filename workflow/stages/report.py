@@ -129,7 +129,7 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         (
             "surface cells",
             f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm,"
-            f" {100 * job.read('base').json('base.json')['seen_once_share']:.0f} % seen in one photograph only",
+            f" {100 * job.read('base').json('base.json')['seen_once_share']:.0f} % in one photograph only",
         ),
         ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
     ]
@@ -265,7 +265,7 @@ def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> li
             out.append(tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
     if job.read("affines").has(file):
         uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
-        note = f"of the albedo, 0 to {UNCERTAINTY_RANGE}"
+        note = f"claimed for the albedo, 0 to {UNCERTAINTY_RANGE}; errors that all predictions share cannot be seen in it"
         out.append(tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
     if job.read("base").has(file):
         base = job.read("base").exr(file)
