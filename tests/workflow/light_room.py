@@ -267,4 +267,7 @@ EMISSION = {
     "environment": "auto",
 }
 SHADING = {"samples": 32, "levels": 10, "max_bounces": 6, "indirect": "cache"}
-AFFINES = {"response": "auto", "iterations": 12, "pixels": 200000, "ridge": 2e-3, "robust_width": 0.1, "scale": "prior"}
+AFFINES = {
+    **{"response": "auto", "solver": "direct", "iterations": 60, "pixels": 200000, "population": True, "ridge": 2e-3},
+    **{"robust_width": 0.1, "scale": "prior", "epochs": 3, "batch": 32768, "rate": None},
+}
