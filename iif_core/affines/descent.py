@@ -88,7 +88,7 @@ class Spectrum:
 def spectrum(h: np.ndarray) -> Spectrum:
     """Of symmetric blocks (O, k, k)."""
     diagonal = np.abs(np.diagonal(h, axis1=1, axis2=2))
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * np.maximum(diagonal.max(1, keepdims=True), 1e-300)))
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * np.maximum(diagonal.max(1, keepdims=True), 1e-100)))
     unit = h * scale[:, :, None] * scale[:, None, :]
     values, vectors = np.linalg.eigh(unit)
     return Spectrum(values, vectors, scale)
@@ -96,11 +96,17 @@ def spectrum(h: np.ndarray) -> Spectrum:
 
 def object_blocks(terms: Terms, free: np.ndarray, pull: Pull) -> Spectrum:
     """Of the object blocks with the pull; fixed numbers have rows of the identity."""
-    keep = free[:, :, None] & free[:, None, :]
-    block = np.where(keep, terms.h[:, :PARAMETERS, :PARAMETERS] + pull.weight, 0.0)
+    some = np.flatnonzero(free.any(1))  # of thousands of objects, most may have nothing to fit
+    own = free[some]
+    keep = own[:, :, None] & own[:, None, :]
+    block = np.where(keep, terms.h[some, :PARAMETERS, :PARAMETERS] + pull.weight[some], 0.0)
     i = np.arange(PARAMETERS)
-    block[:, i, i] += ~free
-    return spectrum(block)
+    block[:, i, i] += ~own
+    found = spectrum(block)
+    values, scale = np.ones((2, len(free), PARAMETERS))
+    vectors = np.tile(np.eye(PARAMETERS), (len(free), 1, 1))
+    values[some], vectors[some], scale[some] = found.values, found.vectors, found.scale
+    return Spectrum(values, vectors, scale)
 
 
 def arrowhead(

@@ -98,7 +98,8 @@ class FitOptions:
     Attributes:
         iterations: most Gauss-Newton steps of each descent; a descent ends when the step would move nothing (see
             `tolerance`).
-        tolerance: converged when the objective is expected to fall by less than this share.
+        tolerance: converged when the objective is expected to fall, or fell in three steps, by less than this share: far
+            below what moves a number by its standard error.
         robust_width: Cauchy width of the residual in sensor units.
         min_pixels: objects with fewer keep the population's gain and nothing else of their own.
         free_response: fit the response parameters too.
@@ -116,7 +117,7 @@ class FitOptions:
     """
 
     iterations: int = 60
-    tolerance: float = 1e-7
+    tolerance: float = 1e-6
     robust_width: float = 0.1
     min_pixels: int = 20
     free_response: bool = True

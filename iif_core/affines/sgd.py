@@ -24,6 +24,7 @@ from iif_core.response import Response
 
 _BETAS = (0.9, 0.999)
 _EPSILON = 1e-8
+_FAR = 1e4  # numbers beyond this come back from nowhere: the clamp has no gradient
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def fit_affines_sgd(problem: FitProblem, response: Response, options: SgdOptions
             affine = affine - rate * opt.decay**epoch * g
             if opt.free_response and tone.size:
                 params = tone.at(params - rate * opt.decay**epoch * g_w).response.params.ravel()
-        if not (np.isfinite(affine).all() and np.isfinite(params).all()):
+        if not (np.abs(affine).max(initial=0) < _FAR and np.isfinite(params).all()):
             reason, converged = f"diverged in epoch {epoch + 1} at step size {rate:g}", False
             affine = np.tile(IDENTITY, (problem.n_objects, 1))
             params = response.params.ravel().astype(np.float64)
