@@ -57,13 +57,19 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
         `FitResult`, always finite. The gauge is that of the given light (`gauge.pin` sets another).
     """
     opt = options or FitOptions()
-    px, tone = prepare(problem, response)
-    texture = texture_of(px, opt)
+    everything, tone = prepare(problem, response)
+    texture_of_all = texture_of(everything, opt)
+    members = np.flatnonzero(texture_of_all.enough)
+    px, texture = everything.only(members), texture_of_all.only(members)
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
     fit = _begin(px, texture, start_params, opt)
-    if not texture.enough.any():
-        return result_of(px, fit, tone, texture, opt, start_params)
-    weigh(px, fit.state.affine, tone, opt)
+    if len(members):
+        weigh(px, fit.state.affine, tone, opt)
+        fit = _descend_all(px, fit, tone, texture, opt, start_params)
+    return result_of(px, fit, tone, texture, opt, start_params, members, everything.counts)
+
+
+def _descend_all(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
     if opt.select:
         fit = _select(px, fit, tone, texture, opt, start_params)
     if opt.population:
@@ -75,7 +81,7 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
             pull = _pull(fit, population, noise, mean, fit.profiled)
             fit = replace(fit, state=state, population=population, pull=pull)
     state, _ = descend(px, fit.state, fit.pull, tone, opt, None, None, start_params)
-    return result_of(px, replace(fit, state=state), tone, texture, opt, start_params)
+    return replace(fit, state=state)
 
 
 def weigh(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> None:
@@ -100,7 +106,7 @@ def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) ->
         population = before()
         noise = np.full(n, (0.05 * opt.robust_width + 0.005) ** 2 if len(px.obj) else 1.0)
         pull = pull_of(population, noise, texture.mean[:, 3], metallic)
-        affine = np.where(texture.enough[:, None], pull.centre, IDENTITY)
+        affine = pull.centre.copy()
         if not opt.select:
             affine[:, 12:] = IDENTITY[12:]
     else:
@@ -156,41 +162,51 @@ def _pull(fit: Fit, population: Population, noise: np.ndarray, roughness: np.nda
     return lean(pull, choice.roughness, deviation, noise, roughness, population.contrast, DISCOUNT)
 
 
-def result_of(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> FitResult:
-    state, n_objects = fit.state, px.n_objects
-    affine = state.affine.copy()
-    if fit.population is not None and texture.enough.any():
-        shared = centre_of(fit.population, texture.mean[:, 3], np.tile(KINDS[0], (n_objects, 1)))
-        shared[:, 12:14] = [0.0, fit.population.level]
-        affine = np.where(texture.enough[:, None], affine, shared)
-    final = tone.at(state.params)
-    covariance, of_response = np.zeros((n_objects, PARAMETERS, PARAMETERS)), np.zeros((tone.size, tone.size))
-    residual = np.zeros(n_objects)
+def result_of(
+    px: Pixels,
+    fit: Fit,
+    tone: Tone,
+    texture: Texture,
+    opt: FitOptions,
+    start_params: np.ndarray,
+    members: np.ndarray,
+    counts: np.ndarray,
+) -> FitResult:
+    """The result of all objects; `members`: the objects of `px`, `counts` (O,): usable pixels of every object."""
+    state, n_objects = fit.state, len(counts)
+    affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, PARAMETERS), bool)
+    if fit.population is not None and len(members):
+        affine[:] = centre_of(fit.population, np.zeros(1), KINDS[:1])
+        affine[:, 12] = 0.0
+    covariance, residual = np.zeros((n_objects, PARAMETERS, PARAMETERS)), np.zeros(n_objects)
+    affine[members], free[members] = state.affine, state.free
+    final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
     if len(px.obj):
         terms = evaluate(px, state.affine, final, opt, True)
         fitted = bool(opt.free_response and tone.size)
         blocks = object_blocks(terms, state.free, fit.pull)
         ridge = opt.response_ridge * len(px.obj)
         system = arrowhead(terms, px, state, fit.pull, ridge, start_params, fitted, blocks, damped=False)
-        covariance, of_response = sandwich(px, terms, system, state.free, fit.pull)
+        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
-        residual = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))
-    facts = {"population": fit.population.facts()} if fit.population is not None else {}
+        residual[members] = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))
+    rank = np.zeros(n_objects, np.int64)
+    rank[members] = texture.rank
     return FitResult(
         affine,
         covariance,
-        state.free,
-        px.counts.astype(np.int64),
+        free,
+        counts.astype(np.int64),
         residual,
-        describe(texture, state.free, affine, px.counts),
+        describe(rank, free, affine, counts),
         final.response,
         1.0,
         list(state.history) or [0.0],
-        state.converged or not state.free.any(),
+        state.converged or not free.any(),
         of_response,
         max(len(state.history) - 1, 0),
         state.reason or "nothing to fit",
-        facts,
+        {"population": fit.population.facts()} if fit.population is not None and len(members) else {},
     )

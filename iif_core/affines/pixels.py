@@ -66,6 +66,22 @@ class Pixels:
             starts=np.searchsorted(index, self.starts),
         )
 
+    def only(self, objects: np.ndarray) -> Pixels:
+        """The pixels of some objects (increasing), which are numbered anew."""
+        counts = np.diff(self.first)[objects]
+        clusters = np.concatenate([np.arange(self.first[o], self.first[o + 1]) for o in objects] or [np.zeros(0, np.int64)])
+        sizes = np.diff(self.starts)[clusters]
+        number = np.full(self.n_objects, -1)
+        number[objects] = np.arange(len(objects))
+        index = np.flatnonzero(number[self.obj] >= 0)
+        part = self.take(index)
+        return replace(
+            part,
+            obj=number[part.obj],
+            starts=np.r_[0, np.cumsum(sizes)].astype(np.int64),
+            first=np.r_[0, np.cumsum(counts)].astype(np.int64),
+        )
+
     def sum_by_object(self, values: np.ndarray) -> np.ndarray:
         return np.bincount(self.obj, values, self.n_objects)
 

@@ -45,6 +45,10 @@ class Texture:
     mean: np.ndarray
     mixed: np.ndarray
 
+    def only(self, objects: np.ndarray) -> Texture:
+        """Of some objects."""
+        return Texture(*(getattr(self, name)[objects] for name in ("enough", "rank", "varied", "mean", "mixed")))
+
     def albedo_numbers(self) -> np.ndarray:
         """(O, 16) bool: gains; biases from one direction of colour on; cross terms from two on (METHOD 8)."""
         free = np.zeros((len(self.enough), PARAMETERS), bool)
@@ -180,7 +184,7 @@ def choose(found: Profile, counts: np.ndarray) -> Choice:
     return Choice(kind, probability, mean, deviation, at, (level, width))
 
 
-def describe(texture: Texture, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:
+def describe(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:
     """One line an object: `full, roughness, metal`; `population (12 pixels)`: what the other objects have in common."""
     out = []
     for o in range(len(pixels)):
@@ -191,13 +195,13 @@ def describe(texture: Texture, free: np.ndarray, affine: np.ndarray, pixels: np.
                 else f"identity ({int(pixels[o])} pixels)"
             )
             continue
-        parts = [("gain", "gain+bias", "full", "full")[int(texture.rank[o])]]
+        parts = [("gain", "gain+bias", "full", "full")[int(rank[o])]]
         if free[o, ROUGHNESS].any():
             parts.append("roughness")
         if free[o, METALLIC].any():
             parts.append("metallic")
         else:
             g, h = affine[o, METALLIC]
-            parts += ["metal"] if h == 1 else ["metallic as predicted"] if g and texture.mean[o, 4] > 0 else []
+            parts += ["metal"] if h == 1 else ["metallic as predicted"] if g else []
         out.append(", ".join(parts))
     return out

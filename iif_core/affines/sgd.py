@@ -83,7 +83,8 @@ def fit_affines_sgd(problem: FitProblem, response: Response, options: SgdOptions
     state = State(affine, free, params, np.zeros(problem.n_objects), 0.0, tuple(history), converged, reason)
     weight = np.einsum("o,ij->oij", 1e-6 * np.maximum(px.counts, 1.0), np.eye(PARAMETERS))
     fit = Fit(state, Pull(affine, weight), None, affine[:, 14:])
-    return result_of(px, fit, tone, texture, reference_options(free_response=opt.free_response), params)
+    options = reference_options(free_response=opt.free_response)
+    return result_of(px, fit, tone, texture, options, params, np.arange(problem.n_objects), px.counts)
 
 
 def _gradient(px: Pixels, rows: np.ndarray, affine: np.ndarray, tone: Tone, n_objects: int) -> tuple[np.ndarray, np.ndarray]:
