@@ -24,8 +24,10 @@ from iif_core.affines.selection import DISCOUNT, KINDS, Choice, Texture, choose,
 from iif_core.affines.tone import Tone
 from iif_core.response import Response
 
-_FEW = 300  # pixels of an object, evenly spread over its clusters, that are enough to choose a valley
+_FEW = 300  # pixels of an object that are enough to choose a valley
+_MANY = 1500  # that are enough to learn what objects have in common
 _SHARP = 0.05  # half the distance of two points of the profile's grid: how far the profile is to be trusted
+_MOST_BIAS = 0.1  # of the sensor value, that noise of the cache may be taken to shift it
 _EARLY = 10  # steps of the descents whose end is only a start
 _RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1, 0.1]
 """Without a population: pull of each number relative to `FitOptions.ridge`. Cross terms are weakly determined (METHOD 7b)."""
@@ -64,37 +66,54 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
     fit = _begin(px, texture, start_params, opt)
     if len(members):
-        weigh(px, fit.state.affine, tone, opt)
-        fit = _descend_all(px, fit, tone, texture, opt, start_params)
+        measured = px.target
+        weigh(px, measured, fit.state.affine, tone, opt)
+        fit = _descend_all(px, measured, fit, tone, texture, opt, start_params)
     return result_of(px, fit, tone, texture, opt, start_params, members, everything.counts)
 
 
-def _descend_all(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
+def _descend_all(
+    px: Pixels, measured: np.ndarray, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
+) -> Fit:
     if opt.select:
         fit = _select(px, fit, tone, texture, opt, start_params)
     if opt.population:
+        index = _some(px, _MANY)
+        some = px.take(index)
         for _ in range(2):
-            state, terms = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
-            noise = row_noise(terms, px, state.free)
+            state, terms = descend(some, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+            weigh(some, measured[index], state.affine, tone.at(state.params), opt)
+            noise = row_noise(terms, some, state.free)
             mean = texture.mean[:, 3]
-            population = learn(fit.population, terms, px, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
+            population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
             pull = _pull(fit, population, noise, mean, fit.profiled)
             fit = replace(fit, state=state, population=population, pull=pull)
+    else:
+        state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+        fit = replace(fit, state=state)
+    weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt)
     state, _ = descend(px, fit.state, fit.pull, tone, opt, None, None, start_params)
     return replace(fit, state=state)
 
 
-def weigh(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> None:
-    """Weights from the distance between the halves, once for the whole fit: fireflies are three robust widths apart."""
+def weigh(px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions) -> None:
+    """Weights and bias that follow from the distance between the halves, at `affine`; they are held during a descent.
+
+    Fireflies are three robust widths apart. The mean of a bent curve over noise is not the curve at the mean: each half's f(e L)
+    is off by f'' var(e L) / 2 = (f'' / f'^2) d^2 on average, d half the distance; `measured` is moved by as much.
+    """
     if px.shading.shape[1] < 2:
         return
+    px.target = measured
     errors = residuals(px, affine, tone, opt)
-    with np.errstate(over="ignore"):
-        apart = 0.5 * np.minimum(np.abs(errors[:, 0] - errors[:, 1]), 1e6)
+    apart = 0.5 * np.minimum(np.abs(errors[:, 0] - errors[:, 1]), 1e6)
     trust = 1.0 / (1.0 + (apart / (3.0 * opt.robust_width)) ** 2)
     px.trust = np.ascontiguousarray(trust, px.trust.dtype)
+    shown = measured + errors.mean(1)
+    bias = tone.bend(shown) * np.minimum(apart, opt.robust_width) ** 2
+    bias = np.where(px.saturated, 0.0, np.clip(bias, -_MOST_BIAS * np.abs(measured), _MOST_BIAS * np.abs(measured)))
     # A one-sided row takes the low side of the noise for a violation; bounds count below their noise only.
-    px.target = np.ascontiguousarray(np.where(px.saturated, px.target - 3.0 * apart, px.target), px.target.dtype)
+    px.target = np.ascontiguousarray(np.where(px.saturated, measured - 3.0 * apart, measured + bias), measured.dtype)
 
 
 def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) -> Fit:
@@ -121,15 +140,16 @@ def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) ->
     return Fit(State(affine, free, params.copy(), np.full(n, 1e-2)), pull, population, metallic)
 
 
-def _few(px: Pixels) -> Pixels:
+def _some(px: Pixels, most: int) -> np.ndarray:
+    """At most so many pixels of each object, evenly spread over its clusters."""
     place = np.arange(len(px.obj)) - px.offsets[px.obj]
-    stride = np.maximum(1, -(-px.counts // _FEW))
-    return px.take(np.flatnonzero(place % stride[px.obj] == 0))
+    stride = np.maximum(1, -(-px.counts // most))
+    return np.flatnonzero(place % stride[px.obj] == 0)
 
 
 def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
     """Kind and valley of every object on a few of its pixels; then all numbers of the chosen kind are free."""
-    few = _few(px)
+    few = px.take(_some(px, _FEW))
     # Bounds alone cannot tell one valley from another.
     measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
     state, terms = descend(few, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)

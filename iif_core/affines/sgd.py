@@ -7,6 +7,7 @@ whatever the gradient.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,8 @@ class SgdOptions:
     Attributes:
         method: `sgd` or `adam`; rate: step size (10; adam 0.01); epochs; batch: pixels; decay: of the rate after each epoch.
         seed: of the order of the pixels; free_response: fit the response too.
+        steps: steps over all epochs, for pixels that are a sample of the photographs' (the published 3 epochs are 4,848 steps);
+            the sample is gone through as often as that needs. None: what the pixels give.
     """
 
     method: str = "sgd"
@@ -43,6 +46,7 @@ class SgdOptions:
     decay: float = 0.2
     seed: int = 0
     free_response: bool = True
+    steps: int | None = None
 
     def __post_init__(self) -> None:
         if self.method not in ("sgd", "adam"):
@@ -63,9 +67,8 @@ def fit_affines_sgd(problem: FitProblem, response: Response, options: SgdOptions
     moments = [np.zeros((problem.n_objects, PARAMETERS + tone.size)) for _ in range(2)]
     step = 0
     for epoch in range(opt.epochs if len(px.obj) else 0):
-        order = rng.permutation(len(px.obj))
-        for begin in range(0, len(order), opt.batch):
-            g, g_w = _gradient(px, np.sort(order[begin : begin + opt.batch]), affine, tone.at(params), own.n_objects)
+        for rows in _batches(rng, len(px.obj), opt):
+            g, g_w = _gradient(px, rows, affine, tone.at(params), own.n_objects)
             step += 1
             if opt.method == "adam":
                 g, g_w = _adam(moments, step, g, g_w)
@@ -85,6 +88,17 @@ def fit_affines_sgd(problem: FitProblem, response: Response, options: SgdOptions
     fit = Fit(state, Pull(affine, weight), None, affine[:, 14:])
     options = reference_options(free_response=opt.free_response)
     return result_of(px, fit, tone, texture, options, params, np.arange(problem.n_objects), px.counts)
+
+
+def _batches(rng: np.random.Generator, n: int, opt: SgdOptions) -> Iterator[np.ndarray]:
+    """Sorted pixels of the steps of one epoch."""
+    left = -(-(opt.steps or 0) // opt.epochs) or -(-n // opt.batch)
+    while left > 0:
+        order = rng.permutation(n)
+        for begin in range(0, n, opt.batch):
+            if left > 0:
+                yield np.sort(order[begin : begin + opt.batch])
+            left -= 1
 
 
 def _gradient(px: Pixels, rows: np.ndarray, affine: np.ndarray, tone: Tone, n_objects: int) -> tuple[np.ndarray, np.ndarray]:

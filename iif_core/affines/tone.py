@@ -49,6 +49,15 @@ class Tone:
         """What a photograph is compared in: HDR radiance through the curve, LDR as it is."""
         return self.gain * np.log1p(np.maximum(y, 0.0) / self.knee) if self.knee else np.asarray(y)
 
+    def bend(self, y: np.ndarray) -> np.ndarray:
+        """f'' / f'^2 where the curve has the value y (n, 3): how noise of x bends the mean of f."""
+        if self.knee:
+            return np.full(y.shape, -1.0 / self.gain)
+        x = np.repeat((np.linspace(0.05, 1.0, 400)[:, None]) ** 4, 3, 1)
+        f, slope, _ = self.response.evaluate(x)
+        second = np.gradient(slope, x[:, 0], axis=0)
+        return np.stack([np.interp(y[:, c], f[:, c], (second / slope**2)[:, c]) for c in range(3)], 1)
+
     def at(self, params: np.ndarray) -> Tone:
         """The same family with other parameters, moved into its range."""
         if not self.size:

@@ -44,7 +44,9 @@ def planted(seed: int, objects: int) -> tuple[FitProblem, np.ndarray]:
     place = np.stack([np.arange(n_cells) % 10, np.arange(n_cells) // 10 % 10, np.zeros(n_cells)], 1)
     light = rng.normal(0, SHARED, (objects * CELLS // 4, 1))[(np.arange(n_cells) // 4)][cell]
     shading = shading_of(rng, n)
-    shown = radiance_of(apply_affines(truth, obj, base), [part * np.exp(light).reshape(-1, *[1] * (part.ndim - 1)) for part in shading])
+    shown = radiance_of(
+        apply_affines(truth, obj, base), [part * np.exp(light).reshape(-1, *[1] * (part.ndim - 1)) for part in shading]
+    )
     value = response("gamma", [1.9])(0.5 * shown) + rng.normal(0, PHOTO, (n, 3))
     halves = []
     for _ in range(2):
@@ -86,14 +88,20 @@ def main() -> None:
     columns: dict[str, list[object]] = {"quantity": [], "intervals": [], "coverage_68": [], "error_over_claimed": []}
     for name, parts in z.items():
         values = np.concatenate(parts)
-        row = (name, len(values), float(np.mean(np.abs(values) <= 1)), float(np.sqrt(np.mean(np.minimum(np.abs(values), 10) ** 2))))
+        row = (
+            name,
+            len(values),
+            float(np.mean(np.abs(values) <= 1)),
+            float(np.sqrt(np.mean(np.minimum(np.abs(values), 10) ** 2))),
+        )
         for column, entry in zip(columns.values(), row, strict=True):
             column.append(entry)
         print(f"{name:16s} {row[1]:5d} intervals, {100 * row[2]:.0f} % contain the truth, error / claimed {row[3]:.2f}")
     if arguments.output:
-        from workflow.artifacts.files import write_parquet
+        import pandas
 
-        write_parquet(arguments.output, columns)
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        pandas.DataFrame(columns).to_parquet(arguments.output)
 
 
 if __name__ == "__main__":
