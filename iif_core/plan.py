@@ -113,10 +113,10 @@ def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
 
 
 def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
-    """Metalness: fitted for objects where it was predicted or where it removes residual; elsewhere the prior's stays.
+    """Metalness: where the photographs' evidence says metal, or metal in parts; dielectric elsewhere.
 
     Args:
-        free: (O,) bool, metalness was fitted; prior_median: (O,) median predicted metalness.
+        free: (O,) bool, not a dielectric; prior_median: (O,) median predicted metalness.
     """
     count = int(np.count_nonzero(free))
     predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
@@ -137,10 +137,23 @@ def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
 def affine_size(models: list[str]) -> Decision:
     """Size of the per-object albedo map, from the colour directions of each object's texture."""
     kinds = [m.split(",")[0].split(" (")[0] for m in models]
-    counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "identity")}
+    counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "population", "identity")}
     value = counts["full"] / len(kinds) if kinds else 0.0
     reason = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number) or "no objects"
     return _decision("affine_size", counts["full"] > 0, "share of objects with the full 3x4 map", value, 0.0, reason)
+
+
+def scale(kind: str, factor: float, relative_error: float) -> Decision:
+    """What fixes the scale of light and albedo, which LDR photographs leave open (METHOD 7a)."""
+    reasons = {
+        "none": "the light as it was found",
+        "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",
+        "mean_albedo": "the given mean albedo",
+        "white_patch": "the given albedo of a patch",
+        "lamp": "the given radiance of a lamp",
+    }
+    reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
+    return _decision("scale", kind != "none", "factor on the light that the fit was given", factor, 1.0, reason)
 
 
 def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -5,80 +7,34 @@ from iif_core.affines import (
     IDENTITY,
     FitOptions,
     FitProblem,
-    _prepare,
-    _terms,
+    Gauge,
     albedo_uncertainty,
     apply_affines,
     fit_affines,
     interpolate_levels,
+    pin,
 )
+from iif_core.affines.descent import Pull
+from iif_core.affines.pixels import evaluate, prepare
 from iif_core.errors import InputError
 from iif_core.response import response
+from tests.unit.planted_fit import LEVELS, problem_of
 
-LEVELS = np.linspace(0.02, 1.0, 10)
 EXACT = FitOptions(
     iterations=60,
     ridge=1e-13,
     robust_width=1e3,
-    roughness_weight=0,
-    metallic_weight=0,
-    multi_start=False,
+    select=False,
+    population=False,
     metallic_prior=2,
     response_ridge=1e-14,
+    tolerance=1e-16,
 )
-
-
-def _shading(rng, n, levels=LEVELS):
-    """Light that looks like a room: diffuse, and lobes that go from a sharp reflection to a blurred one."""
-    diffuse = np.exp(rng.normal(-0.8, 0.7, (n, 1))) * np.exp(rng.normal(0, 0.1, (n, 3)))
-    sharp, middle = (np.exp(rng.normal(-1.0, s, (n, 1, 3))) for s in (1.2, 0.7))
-    blur = levels[None, :, None] ** 0.5
-    s0 = (1 - blur) ** 2 * sharp + 2 * blur * (1 - blur) * middle + blur**2 * 0.4 * diffuse[:, None]
-    s1 = 0.05 * (1 - 0.8 * blur) * sharp + 0.01 * diffuse[:, None]
-    return diffuse, s0, s1
-
-
-def _radiance(material, shading, levels=LEVELS):
-    d, s0, s1 = shading
-    a, m = material[:, :3], material[:, 4:5]
-    f0 = 0.04 * (1 - m) + m * a
-    parts = [interpolate_levels(s, levels, material[:, 3])[0] for s in (s0, s1)]
-    return (1 - m) * a * d + f0 * parts[0] + parts[1]
-
-
-def _planted(rng, n_objects, strength=0.25, roughness=True):
-    t = np.tile(IDENTITY, (n_objects, 1))
-    t[:, :12] += rng.normal(0, 0.05, (n_objects, 12))
-    t[:, [0, 5, 10]] += rng.uniform(-strength, strength, (n_objects, 3))
-    if roughness:
-        t[:, 12], t[:, 13] = rng.uniform(0.8, 1.0, n_objects), rng.uniform(0.02, 0.1, n_objects)
-    return t
-
-
-def _problem(rng, n_objects=6, per_object=400, truth=None, value_of=None, noise=0.0, halves=1, base=None):
-    obj = np.repeat(np.arange(n_objects), per_object)
-    n = len(obj)
-    if base is None:
-        base = np.c_[rng.uniform(0.2, 0.6, (n, 3)), rng.uniform(0.3, 0.7, n), np.zeros(n)]
-    shading = _shading(rng, n)
-    truth = _planted(rng, n_objects) if truth is None else truth
-    radiance = _radiance(apply_affines(truth, obj, base), shading)
-    value = radiance if value_of is None else value_of(radiance)
-    cached = []
-    for _ in range(halves):
-        if noise:
-            # all lobes share their paths: one factor a pixel and channel, of mean 1
-            factor = np.exp(rng.normal(0, noise, (n, 3)) - 0.5 * noise**2)
-            cached.append((shading[0] * factor, shading[1] * factor[:, None], shading[2] * factor[:, None]))
-        else:
-            cached.append(shading)
-    d, s0, s1 = (tuple(np.asarray(c[i], np.float32 if noise else np.float64) for c in cached) for i in range(3))
-    problem = FitProblem(obj, n_objects, base, d, s0, s1, LEVELS, value, np.ones(n), np.zeros((n, 3), bool))
-    return problem, truth
+PLAIN = {"select": False, "population": False}
 
 
 def test_planted_affines_are_recovered_from_clean_hdr():
-    problem, truth = _problem(np.random.default_rng(0))
+    problem, truth = problem_of(np.random.default_rng(0))
     out = fit_affines(problem, response("identity"), EXACT)
     np.testing.assert_allclose(out.affine, truth, atol=1e-6)
     assert np.all(np.diff(out.history) <= 0) and out.residual.max() < 1e-6 and out.light_scale == 1
@@ -86,7 +42,7 @@ def test_planted_affines_are_recovered_from_clean_hdr():
 
 @pytest.mark.parametrize("halves", [1, 2])
 def test_planted_affines_and_gamma_from_clean_ldr(halves):
-    problem, truth = _problem(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x), halves=halves)
+    problem, truth = problem_of(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x), halves=halves)
     out = fit_affines(problem, response("gamma"), EXACT)
     np.testing.assert_allclose(out.response.params, 1.9, atol=1e-6)
     np.testing.assert_allclose(out.affine, truth, atol=1e-5)
@@ -95,7 +51,7 @@ def test_planted_affines_and_gamma_from_clean_ldr(halves):
 
 def test_planted_ggcm_per_channel():
     curve = response("ggcm", [[-0.8, 0.2, 0.0], [-0.7, 0.0, 0.1], [-0.6, -0.2, 0.0]])
-    problem, truth = _problem(np.random.default_rng(2), value_of=lambda x: curve(x))
+    problem, truth = problem_of(np.random.default_rng(2), value_of=lambda x: curve(x))
     out = fit_affines(problem, response("ggcm", [[-0.8, 0, 0]] * 3), EXACT)
     np.testing.assert_allclose(out.response.params, curve.params, atol=1e-3)
     np.testing.assert_allclose(out.affine, truth, atol=1e-3)
@@ -105,21 +61,24 @@ def test_planted_ggcm_per_channel():
 def test_gradient_and_normal_matrix_against_differences(family):
     """Every term at once: robust weights, two halves, saturation, out-of-range values, regularisers, ridge."""
     rng = np.random.default_rng(3)
-    problem, _ = _problem(rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5)
+    problem, _ = problem_of(rng, n_objects=2, per_object=40, noise=0.2, halves=2, value_of=lambda x: np.clip(x, 0, 1) ** 0.5)
     saturated = problem.value > 0.8
     problem = FitProblem(**{**problem.__dict__, "saturated": saturated})
     problem.base[:, 4] = rng.uniform(0.1, 0.9, 80)
     start = response(family)
-    px, tone = _prepare(problem, start)
-    opt = FitOptions(ridge=1e-2)
+    px, tone = prepare(problem, start)
+    opt = FitOptions(roughness_weight=1e-3, metallic_weight=5e-3)
+    pull = Pull(np.tile(IDENTITY, (2, 1)), np.tile(0.3 * np.eye(16), (2, 1, 1)))
     t = np.tile(IDENTITY, (2, 1)) + rng.normal(0, 0.1, (2, 16))
     t[1, 0] += 2.0  # some albedos above 1
     t[1, 13] -= 0.4  # some roughness below the range
     params = start.params.ravel() * 1.07
-    terms = _terms(px, t, tone.at(params), opt, True)
-    assert len(terms.g[0]) == 16 + len(params)
+    terms = evaluate(px, t, tone.at(params), opt, True)
+    gradient = terms.gradient(px.first)
+    gradient[:, :16] += pull.gradient(t)
+    assert gradient.shape == (2, 16 + tone.size)
     for o in range(2):
-        for k in range(16 + len(params)):
+        for k in range(16 + tone.size):
             values = []
             for sign in (1, -1):
                 moved, p = t.copy(), params.copy()
@@ -127,18 +86,18 @@ def test_gradient_and_normal_matrix_against_differences(family):
                     moved[o, k] += sign * 1e-7
                 else:
                     p[k - 16] += sign * 1e-7
-                values.append(_terms(px, moved, tone.at(p), opt, False).cost[o])
-            assert terms.g[o, k] == pytest.approx((values[0] - values[1]) / 2e-7, rel=2e-4, abs=2e-4), (o, k)
+                values.append((evaluate(px, moved, tone.at(p), opt, False).cost + pull.cost(moved))[o])
+            assert gradient[o, k] == pytest.approx((values[0] - values[1]) / 2e-7, rel=2e-4, abs=2e-4), (o, k)
     np.testing.assert_allclose(terms.h, terms.h.transpose(0, 2, 1))
 
 
 def test_noise_in_the_cache_raises_gamma_and_two_halves_cure_it():
     """COMPUTE 6: a plain joint fit overestimates gamma (2.59 for 1.9 there); two independent halves do not."""
     rng = np.random.default_rng(4)
-    problem, truth = _problem(
+    problem, truth = problem_of(
         rng, n_objects=8, per_object=3000, value_of=lambda x: response("gamma", [1.9])(x), noise=0.5, halves=2
     )
-    opt = FitOptions(iterations=25, ridge=1e-6, robust_width=1.0, multi_start=False, metallic_prior=2)
+    opt = FitOptions(iterations=25, ridge=1e-6, robust_width=1.0, metallic_prior=2, **PLAIN)
     mean = {name: (0.5 * (getattr(problem, name)[0] + getattr(problem, name)[1]),) for name in ("diffuse", "s0", "s1")}
     plain = fit_affines(FitProblem(**{**problem.__dict__, **mean}), response("gamma"), opt)
     two = fit_affines(problem, response("gamma"), opt)
@@ -153,9 +112,9 @@ def test_constant_object_gets_gains_and_stays_finite():
     base[200:, :3] *= rng.uniform(0.5, 1.5, (200, 1))  # object 1: one direction of colour
     truth = np.tile(IDENTITY, (2, 1))
     truth[:, [0, 5, 10]] = [[1.5, 0.8, 1.2], [0.7, 1.1, 0.9]]
-    problem, _ = _problem(rng, 2, 200, truth=truth, base=base)
+    problem, _ = problem_of(rng, 2, 200, truth=truth, base=base)
     out = fit_affines(problem, response("identity"), EXACT)
-    assert out.model == ["gain, roughness", "gain+bias, roughness"]
+    assert [m.split(", metallic")[0] for m in out.model] == ["gain, roughness", "gain+bias, roughness"]
     np.testing.assert_allclose(out.affine[:, :12], truth[:, :12], atol=1e-5)
     assert (out.free[0, :12].reshape(3, 4)[:, :3] == np.eye(3, dtype=bool)).all() and not out.free[0, 12]
     assert np.isfinite(out.covariance).all()
@@ -163,7 +122,7 @@ def test_constant_object_gets_gains_and_stays_finite():
 
 def test_tiny_absent_and_broken_objects_keep_the_identity():
     rng = np.random.default_rng(6)
-    problem, truth = _problem(rng, 3, 300)
+    problem, truth = problem_of(rng, 3, 300)
     obj = problem.object_id.copy()
     obj[obj == 2] = np.where(np.arange(300) < 12, 2, -1)
     obj[:3] = 77  # out of range: left out, not an index error
@@ -180,20 +139,20 @@ def test_tiny_absent_and_broken_objects_keep_the_identity():
 
 def test_all_saturated_object_does_not_darken():
     rng = np.random.default_rng(7)
-    problem, _ = _problem(rng, 2, 200, truth=np.tile(IDENTITY, (2, 1)), value_of=lambda x: response("gamma")(x))
+    problem, _ = problem_of(rng, 2, 200, truth=np.tile(IDENTITY, (2, 1)), value_of=lambda x: response("gamma")(x))
     saturated = np.repeat([[False], [True]], 200, 0).repeat(3, 1)
     low = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, 1e-3, problem.value)})
-    out = fit_affines(low, response("gamma"), FitOptions(iterations=10, roughness_weight=0, metallic_weight=0))
+    out = fit_affines(low, response("gamma"), FitOptions(**PLAIN))
     np.testing.assert_allclose(out.affine[1], IDENTITY, atol=1e-3)  # every bound is met: nothing pulls
     assert np.isfinite(out.covariance).all() and out.residual[1] == 0
     raised = response("gamma")(1.3 * response("gamma").inverse(problem.value))
     high = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)})
-    out = fit_affines(high, response("gamma"), FitOptions(iterations=10))
+    out = fit_affines(high, response("gamma"), FitOptions(**PLAIN))
     assert out.affine[1, [0, 5, 10]].min() > 1.15  # bounds that are not met pull upwards
 
 
 def test_saturated_pixels_do_not_bias():
-    problem, truth = _problem(np.random.default_rng(8), value_of=lambda x: response("gamma", [1.9])(x))
+    problem, truth = problem_of(np.random.default_rng(8), value_of=lambda x: response("gamma", [1.9])(x))
     saturated = problem.value > 0.6
     clipped = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.minimum(problem.value, 0.6)})
     out = fit_affines(clipped, response("gamma"), EXACT)
@@ -208,10 +167,10 @@ def test_metal_is_found_where_it_pays_and_only_there():
     truth = np.tile(IDENTITY, (2, 1))
     truth[:, 14] = 0
     truth[:, 15] = [0, 1]  # object 1 is a metal, predicted as 0.1 like everything else
-    problem, _ = _problem(rng, 2, n, truth=truth, base=base)
-    out = fit_affines(problem, response("identity"), FitOptions(iterations=16))
+    problem, _ = problem_of(rng, 2, n, truth=truth, base=base)
+    out = fit_affines(problem, response("identity"), FitOptions())
     fitted = apply_affines(out.affine, problem.object_id, base)
-    assert fitted[n:, 4].min() > 0.9 and "metallic" in out.model[1]
+    assert fitted[n:, 4].min() > 0.9 and out.model[1].endswith("metal")
     assert fitted[:n, 4].max() < 0.12
     np.testing.assert_allclose(fitted[n:, :3], base[n:, :3], atol=0.05)
 
@@ -222,19 +181,19 @@ def test_wrong_roughness_valley_is_left():
     base = np.c_[rng.uniform(0.02, 0.1, (n, 3)), np.full(n, 0.95), np.zeros(n)]
     truth = IDENTITY[None].copy()
     truth[0, 13] = -0.8  # a dark, glossy thing predicted as rough
-    problem, _ = _problem(rng, 1, n, truth=truth, base=base)
-    out = fit_affines(problem, response("identity"), FitOptions(iterations=16))
+    problem, _ = problem_of(rng, 1, n, truth=truth, base=base)
+    out = fit_affines(problem, response("identity"), FitOptions())
     assert abs(apply_affines(out.affine, problem.object_id, base)[:, 3].mean() - 0.15) < 0.03
 
 
 def test_outliers_are_shrugged_off():
     rng = np.random.default_rng(11)
-    problem, truth = _problem(rng, value_of=lambda x: response("gamma")(x))
+    problem, truth = problem_of(rng, value_of=lambda x: response("gamma")(x))
     value = problem.value.copy()
     bad = rng.random(len(value)) < 0.1
     value[bad] = rng.uniform(0, 1, (bad.sum(), 3))
     spoilt = FitProblem(**{**problem.__dict__, "value": value})
-    opt = dict(iterations=30, ridge=1e-6, free_response=False, multi_start=False, roughness_weight=0)
+    opt = dict(iterations=30, ridge=1e-6, free_response=False, **PLAIN)
     robust = fit_affines(spoilt, response("gamma"), FitOptions(robust_width=0.02, **opt))
     plain = fit_affines(spoilt, response("gamma"), FitOptions(robust_width=1e3, **opt))
     error = [np.abs(o.affine[:, :12] - truth[:, :12]).max() for o in (robust, plain)]
@@ -242,9 +201,9 @@ def test_outliers_are_shrugged_off():
 
 
 def test_fireflies_in_one_half_do_not_matter():
-    problem, truth = _problem(np.random.default_rng(12), value_of=lambda x: response("gamma")(x), halves=2)
+    problem, truth = problem_of(np.random.default_rng(12), value_of=lambda x: response("gamma")(x), halves=2)
     problem.diffuse[0][::50] *= 300.0
-    opt = FitOptions(iterations=30, ridge=1e-6, free_response=False, multi_start=False, roughness_weight=0)
+    opt = FitOptions(iterations=30, ridge=1e-6, free_response=False, **PLAIN)
     out = fit_affines(problem, response("gamma"), opt)
     np.testing.assert_allclose(out.affine[:, :12], truth[:, :12], atol=0.02)
 
@@ -255,25 +214,54 @@ def test_values_out_of_range_come_back():
     base = np.c_[rng.uniform(1.5, 2.5, (500, 3)), np.full(500, 0.5), np.zeros(500)]
     truth = np.tile(IDENTITY, (1, 1))
     truth[0, [0, 5, 10]] = 0.2
-    problem, _ = _problem(rng, 1, 500, truth=truth, base=base)
+    problem, _ = problem_of(rng, 1, 500, truth=truth, base=base)
     out = fit_affines(problem, response("identity"), EXACT)
     np.testing.assert_allclose(out.affine, truth, atol=1e-4)
 
 
-def test_scale_pin_keeps_the_mean_albedo():
-    problem, _ = _problem(np.random.default_rng(14))
+def test_scale_pins():
+    """Every gauge divides the albedo numbers by one factor, multiplies the light by it, and gives the level that it names."""
+    problem, truth = problem_of(np.random.default_rng(14))
     free = fit_affines(problem, response("identity"), EXACT)
-    pinned = fit_affines(problem, response("identity"), FitOptions(**{**EXACT.__dict__, "scale": "prior"}))
-    np.testing.assert_allclose(pinned.affine[:, :12] * pinned.light_scale, free.affine[:, :12], rtol=1e-9)
-    fitted = apply_affines(pinned.affine, problem.object_id, problem.base)[:, :3]
-    np.testing.assert_allclose(fitted.mean(), problem.base[:, :3].mean(), rtol=1e-3)
+    patch = problem.object_id == 2
+    true_patch = apply_affines(truth, problem.object_id, problem.base)[patch, :3].mean()
+    dimmer = replace(problem, **{n: tuple(0.8 * x for x in getattr(problem, n)) for n in ("diffuse", "s0", "s1")})
+    dim = fit_affines(dimmer, response("identity"), EXACT)  # light 0.8 of the truth: albedos 1.25 times as bright
+    assert dim.affine[:, :12] == pytest.approx(truth[:, :12] / 0.8, rel=0.2, abs=0.05)
+    for gauge, level, where in (
+        (Gauge("prior"), problem.base[:, :3].mean(), slice(None)),
+        (Gauge("mean_albedo", 0.3), 0.3, slice(None)),
+        (Gauge("white_patch", true_patch, patch), true_patch, patch),
+    ):
+        pinned = pin(problem, free, gauge)
+        np.testing.assert_allclose(pinned.affine[:, :12] * pinned.light_scale, free.affine[:, :12], rtol=1e-9)
+        np.testing.assert_array_equal(pinned.affine[:, 12:], free.affine[:, 12:])
+        fitted = apply_affines(pinned.affine, problem.object_id, problem.base)[where, :3]
+        np.testing.assert_allclose(fitted.mean(), level, rtol=1e-3)
+        assert pinned.facts["scale"]["kind"] == gauge.kind and np.isfinite(pinned.facts["scale"]["relative_error"])
+    for gauge in (Gauge("white_patch", true_patch, patch), Gauge("lamp", factor=1.25)):
+        found = pin(dimmer, dim, gauge)  # what is known of one thing gives the level of all
+        fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
+        assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
+    assert pin(problem, free, Gauge("none")).affine is free.affine
+
+
+def test_scale_refused():
+    for wrong in (
+        {"kind": "other"},
+        {"kind": "mean_albedo"},
+        {"kind": "white_patch", "albedo": 0.9},
+        {"kind": "lamp", "factor": 0},
+    ):
+        with pytest.raises(InputError, match="scale"):
+            Gauge(**wrong)
 
 
 def test_covariance_is_of_the_right_size():
     """Spread of the fitted gain over repeated noise against the reported standard deviation."""
     rng = np.random.default_rng(15)
-    problem, _ = _problem(rng, 1, 400, truth=IDENTITY[None])
-    opt = FitOptions(iterations=8, ridge=1e-9, robust_width=1e3, multi_start=False, roughness_weight=0, metallic_prior=2)
+    problem, _ = problem_of(rng, 1, 400, truth=IDENTITY[None])
+    opt = FitOptions(ridge=1e-9, robust_width=1e3, metallic_prior=2, **PLAIN)
     gains, reported = [], []
     for _ in range(60):
         noisy = problem.value * np.exp(rng.normal(0, 0.05, problem.value.shape))
@@ -296,7 +284,7 @@ def test_uncertainty_and_application_without_objects():
 
 
 def test_nothing_to_fit():
-    problem, _ = _problem(np.random.default_rng(16), 1, 30)
+    problem, _ = problem_of(np.random.default_rng(16), 1, 30)
     empty = FitProblem(**{**problem.__dict__, "object_id": np.full(30, -1)})
     out = fit_affines(empty, response("ggcm"))
     np.testing.assert_array_equal(out.affine[0], IDENTITY)
@@ -313,13 +301,13 @@ def test_interpolation_is_exact_at_levels_and_clamped_outside():
 
 def test_same_bytes_twice():
     rng = np.random.default_rng(18)
-    problem, _ = _problem(rng, noise=0.1, halves=2, value_of=lambda x: response("ggcm")(x))
-    a, b = (fit_affines(problem, response("ggcm"), FitOptions(iterations=4)) for _ in range(2))
+    problem, _ = problem_of(rng, noise=0.1, halves=2, value_of=lambda x: response("ggcm")(x))
+    a, b = (fit_affines(problem, response("ggcm"), FitOptions()) for _ in range(2))
     assert a.affine.tobytes() == b.affine.tobytes() and a.history == b.history
 
 
 def test_refused():
-    problem, _ = _problem(np.random.default_rng(19), 1, 30)
+    problem, _ = problem_of(np.random.default_rng(19), 1, 30)
     for change in (
         {"value": problem.value[:5]},
         {"diffuse": ()},
@@ -328,5 +316,3 @@ def test_refused():
     ):
         with pytest.raises(InputError):
             FitProblem(**{**problem.__dict__, **change})
-    with pytest.raises(InputError, match="scale"):
-        fit_affines(problem, response("identity"), FitOptions(scale="other"))

@@ -285,12 +285,6 @@ SHADING = {
     "indirect": "auto",
 }
 AFFINES = {
-    "model": "objects",
-    "solver": "direct",
-    "response": "auto",
-    "iterations": 12,
-    "pixels": 200000,
-    "ridge": 2e-3,
-    "robust_width": 0.1,
-    "scale": "prior",
+    **{"model": "objects", "solver": "direct", "response": "auto", "iterations": 60, "pixels": 200000, "population": True},
+    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "prior", "epochs": 3, "batch": 32768, "rate": None},
 }

@@ -128,3 +128,35 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, brightne
     assert np.isfinite(radiance).all() and (radiance >= 0).all()
     if brightness == 0:
         assert not table["kept"].any() and "no emitter" in " ".join(_reader(tmp_path, "emission").json("emission.json")["notes"])
+
+
+def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
+    """One factor, stated: the light is multiplied by it and the albedos divided; what is unknown is refused before any work."""
+    from types import SimpleNamespace
+
+    from iif_core.errors import InputError
+
+    folder, room = hdr
+    free = _reader(folder, "affines").table("objects.parquet")
+    table, radiance = _emitters(folder)
+    lamp = int(table["emitter_id"][np.flatnonzero(table["kept"])[0]])
+    job = StubJob("affines", folder, {"capture": {"dynamic_range": "hdr"}, "affines": AFFINES})
+    reader = CaptureReader(job.read("capture"))
+    known = SimpleNamespace(mean_albedo=None, white_patch=None, lamp=None)
+
+    def gauge(**scale):
+        job.settings.affines.scale = SimpleNamespace(**{**known.__dict__, **scale})
+        return affines._gauge(job, reader, list(room.names))
+
+    found = float(radiance[np.flatnonzero(table["emitter_id"] == lamp)[0]].mean())
+    got = gauge(lamp=SimpleNamespace(emitter_id=lamp, radiance=(2 * found,) * 3))(None, None)
+    assert got.kind == "lamp" and got.factor == pytest.approx(2.0)
+    with pytest.raises(InputError, match="no emitter 99"):
+        gauge(lamp=SimpleNamespace(emitter_id=99, radiance=(1, 1, 1)))
+    with pytest.raises(InputError, match="no object 'nowhere'"):
+        gauge(white_patch=SimpleNamespace(object="nowhere", view=None, box=None, albedo=0.9))
+    with pytest.raises(InputError, match="no view 'v999'"):
+        gauge(white_patch=SimpleNamespace(object=None, view="v999", box=(0, 0, 4, 4), albedo=0.9))
+    with pytest.raises(InputError, match="box"):
+        gauge(white_patch=SimpleNamespace(object=None, view="v000", box=(0, 0, 400, 4), albedo=0.9))
+    assert len(free["name"]) == len(room.names)

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from iif_core import plan
-from iif_core.affines import FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines, fit_affines
+from iif_core.affines import (
+    FitOptions,
+    FitProblem,
+    FitResult,
+    Gauge,
+    SgdOptions,
+    albedo_uncertainty,
+    apply_affines,
+    fit_affines,
+    fit_affines_sgd,
+    patches,
+    pin,
+    reference_loss,
+)
+from iif_core.errors import InputError
 from iif_core.response import Response, response_facts, response_from_facts
 from workflow import baselines
 from workflow.artifacts.store import ids_from_disk, split_rgb
@@ -35,21 +50,17 @@ def run(job: Job) -> None:
     if job.settings.affines.model != "objects":
         return baselines.run(job)
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    settings = job.settings.affines
+    names = _names(job, scene.n_objects)
+    find_gauge = _gauge(job, capture, names)  # bad settings stop here, before any work
     emits = read_light(job, len(scene.faces)).emits
     exposures = dict(zip((v.view_id for v in capture.views), capture.exposures(), strict=True))
-    problem = _problem(job, capture, scene, emits, exposures)
+    problem, places = _problem(job, capture, scene, emits, exposures)
     start, prior, calibration = _starting_response(job)
-    options = FitOptions(
-        iterations=settings.iterations,
-        ridge=settings.ridge,
-        robust_width=settings.robust_width,
-        scale="none" if capture.is_hdr else settings.scale,
-        response_prior=prior,
-    )
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
-    fit = fit_affines(problem, start, options)
-    names = _names(job, scene.n_objects)
+    solve = _solver(job, prior)
+    with job.timed("solve"):
+        free = solve(problem, start)
+    fit = pin(problem, free, find_gauge(problem, places))
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
     _write_objects(job, names, fit)
@@ -58,20 +69,107 @@ def run(job: Job) -> None:
     _write_cells(job, fit)
     _write_maps(job, capture, fit)
     decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
+    loss = reference_loss(problem, free.affine, free.response)
+    _write_facts(job, fit, loss.__dict__, decisions)
+
+
+def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[FitProblem, Response], FitResult]:
+    """The solver that the settings name; `prior`: of the response."""
+    settings = job.settings.affines
+    if settings.solver == "direct":
+        options = FitOptions(
+            iterations=settings.iterations,
+            population=settings.population,
+            ridge=settings.ridge,
+            robust_width=settings.robust_width,
+            response_prior=prior,
+            threads=job.threads,
+        )
+        return lambda problem, start: fit_affines(problem, start, options)
+    own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
+    return lambda problem, start: fit_affines_sgd(problem, start, own)
+
+
+def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], decisions: list[plan.Decision]) -> None:
+    spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
+    weight = np.maximum(fit.pixels, 1e-9)
     job.writer.json(
         "affines.json",
         {
-            "light_scale": fit.light_scale,
+            "solver": job.settings.affines.solver,
+            "light_scale": float(fit.light_scale),
+            **fit.facts,
             "history": [float(x) for x in fit.history],
             "converged": bool(fit.converged),
+            "iterations": int(fit.iterations),
+            "stopped": fit.reason,
+            "reference_loss": loss,
             "pixels": int(fit.pixels.sum()),
-            "residual": float(np.sqrt(np.average(fit.residual**2, weights=np.maximum(fit.pixels, 1e-9))))
-            if len(fit.pixels)
-            else 0.0,
-            "response": response_facts(fit.response),
+            "residual": float(np.sqrt(np.average(fit.residual**2, weights=weight))) if len(fit.pixels) else 0.0,
+            "response": {**response_facts(fit.response), "std": spread.tolist(), "covariance": fit.response_covariance.tolist()},
             "plan": decisions,
         },
     )
+
+
+# -------------------------------------------------------------------------------------------------------------- gauge
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where the pixels of the problem are: view id and index into the flattened image, (n,)."""
+
+    view: np.ndarray
+    index: np.ndarray
+
+
+def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitProblem, _Places], Gauge]:
+    """What fixes the scale, checked now; what needs the pixels is found when they are there."""
+    scale = job.settings.affines.scale
+    if isinstance(scale, str):
+        kind = "none" if capture.is_hdr else scale  # seen emitters fix the scale of HDR photographs
+        return lambda problem, places: Gauge(kind)
+    if getattr(scale, "mean_albedo", None) is not None:
+        return lambda problem, places: Gauge("mean_albedo", scale.mean_albedo)
+    if getattr(scale, "lamp", None) is not None:
+        return _lamp_gauge(job, scale.lamp)
+    patch = scale.white_patch
+    if patch.object is not None:
+        if patch.object not in names:
+            near = ", ".join(sorted(names)[:20])
+            raise InputError(
+                f"affines.scale.white_patch.object: no object {patch.object!r}; there are {near} (segmentation/objects.parquet)"
+            )
+        number = names.index(patch.object)
+        return lambda problem, places: Gauge("white_patch", patch.albedo, problem.object_id == number)
+    known = {view.name: view for view in capture.views}
+    if patch.view not in known:
+        raise InputError(f"affines.scale.white_patch.view: no view {patch.view!r}; there are {', '.join(sorted(known)[:20])}")
+    view, (left, top, right, bottom) = known[patch.view], patch.box
+    if not (0 <= left < right <= view.width and 0 <= top < bottom <= view.height):
+        raise InputError(
+            f"affines.scale.white_patch.box: {list(patch.box)}; [left, top, right, bottom] must lie within the"
+            f" {view.width} x {view.height} pixels of view {patch.view}"
+        )
+
+    def inside(problem: FitProblem, places: _Places) -> Gauge:
+        x, y = places.index % view.width, places.index // view.width
+        chosen = (places.view == view.view_id) & (x >= left) & (x < right) & (y >= top) & (y < bottom)
+        return Gauge("white_patch", patch.albedo, chosen)
+
+    return inside
+
+
+def _lamp_gauge(job: Job, lamp: Any) -> Callable[[FitProblem, _Places], Gauge]:
+    table = job.read("emission").table("emitters.parquet")
+    row = np.flatnonzero((table["emitter_id"] == lamp.emitter_id) & table["kept"].astype(bool))
+    if not len(row):
+        kept = table["emitter_id"][table["kept"].astype(bool)].tolist()
+        raise InputError(
+            f"affines.scale.lamp.emitter_id: no emitter {lamp.emitter_id} was kept; there are {kept} (emission/emitters.parquet)"
+        )
+    found = float(np.mean([table[f"radiance_{c}"][row[0]] for c in "rgb"]))
+    return lambda problem, places: Gauge("lamp", factor=float(np.mean(lamp.radiance)) / max(found, 1e-30))
 
 
 # -------------------------------------------------------------------------------------------------------------- input
@@ -120,7 +218,9 @@ def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
     return np.minimum(1.0, limit / np.maximum(counts, 1.0))
 
 
-def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]) -> FitProblem:
+def _problem(
+    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]
+) -> tuple[FitProblem, _Places]:
     """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
@@ -129,7 +229,7 @@ def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarr
     thin = counts < THIN_PIXELS
     share = fair_shares(counts, job.settings.affines.pixels)
     shading, levels = job.read("shading"), job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure")}
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
     for done, view in enumerate(views):
         chosen = _eligible(job, capture, scene, view, emits, thin)
@@ -140,6 +240,9 @@ def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarr
         rows["base"].append(base_maps(job, view)[index])
         rows["value"].append(chosen.value[keep])
         rows["exposure"].append(np.full(len(index), exposures[view.view_id] if not capture.is_hdr else 1.0))
+        rows["view"].append(np.full(len(index), view.view_id, np.int32))
+        rows["index"].append(index.astype(np.int32))
+        rows["cell"].append(ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[index])
         channels = shading.exr(f"maps/{view.name}.exr")
         for half in range(2):
             for number, part in enumerate(_cached(channels, half, len(levels), index)):
@@ -152,8 +255,15 @@ def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarr
     d, s0, s1 = ((halves[0][i], halves[1][i]) for i in range(3))
     # A value at the top of the range is a bound there, whatever is stored above it.
     value = np.minimum(value, SATURATION) if not capture.is_hdr else value
-    return FitProblem(
-        joined["object"].astype(np.int32),
+    object_id, cell = joined["object"].astype(np.int32), joined["cell"].astype(np.int64)
+    # Pixels without a cell of their own are a place of their own.
+    position = (
+        np.where((cell >= 0)[:, None], scene.cell_ijk[np.maximum(cell, 0)], -1)
+        if len(scene.cell_ijk)
+        else np.zeros((len(cell), 3))
+    )
+    problem = FitProblem(
+        object_id,
         scene.n_objects,
         joined["base"],
         d,
@@ -163,7 +273,9 @@ def _problem(job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarr
         value,
         joined["exposure"],
         saturated,
+        patches(object_id, position),
     )
+    return problem, _Places(joined["view"], joined["index"])
 
 
 def _cached(
@@ -273,11 +385,12 @@ def _plan(problem: FitProblem, fit: FitResult, calibration: dict[str, Any], dyna
             medians[o] = np.median(problem.base[own, 4])
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
             gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
-    free_metal = fit.free[:, 15] if len(fit.free) else np.zeros(0, bool)
+    free_metal = np.any(fit.affine[:, 14:] != 0, 1) if len(fit.affine) else np.zeros(0, bool)
     return [
         plan.camera_response(dynamic_range, calibration),
         plan.metallic(free_metal, medians),
         plan.specular(glossy, free_metal),
         plan.affine_size(fit.model),
         plan.second_pass(gains, fit.pixels),
+        plan.scale(**fit.facts["scale"]),
     ]

@@ -1,0 +1,232 @@
+"""One affine correction per object and the camera response, fitted to the photographs over cached shading (METHOD 7b).
+
+Pixel p of object o shows I = f(e L), L = (1 - m) a D + [0.04 (1 - m) + m a] S0(r) + S1(r), with a, r, m corrected by the sixteen
+numbers of the object.
+
+Noise in the cached shading flattens the slope of log I over log L: a plain fit overestimates gamma and shrinks gains. With two
+independent halves 1, 2 of the cache we minimise sum rho(e1 e2) instead of sum rho(e^2): the expectation of the product of two
+residuals with independent noise is the squared noise-free residual, and its Gauss-Newton system is
+H = (J1' W J2 + J2' W J1) / 2, g = (J1' W e2 + J2' W e1) / 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.affines.covariance import sandwich
+from iif_core.affines.descent import Pull, State, arrowhead, descend, object_blocks, response_prior
+from iif_core.affines.pixels import Pixels, evaluate, prepare, residuals
+from iif_core.affines.population import Population, before, centre_of, lean, learn, pull_of
+from iif_core.affines.problem import GAINS, IDENTITY, PARAMETERS, FitOptions, FitProblem, FitResult
+from iif_core.affines.selection import DISCOUNT, KINDS, Choice, Texture, choose, describe, profile, row_noise, texture_of
+from iif_core.affines.tone import Tone
+from iif_core.response import Response
+
+_FEW = 300  # pixels of an object that are enough to choose a valley
+_MANY = 1500  # that are enough to learn what objects have in common
+_SHARP = 0.05  # half the distance of two points of the profile's grid: how far the profile is to be trusted
+_MOST_BIAS = 0.1  # of the sensor value, that noise of the cache may be taken to shift it
+_EARLY = 10  # steps of the descents whose end is only a start
+_RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1, 0.1]
+"""Without a population: pull of each number relative to `FitOptions.ridge`. Cross terms are weakly determined (METHOD 7b)."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where the fit stands between its steps."""
+
+    state: State
+    pull: Pull
+    population: Population | None
+    metallic: np.ndarray
+    profiled: Choice | None = None
+
+
+def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
+    """Sixteen numbers per object and the response, by Gauss-Newton on all pixels at once.
+
+    Which numbers are free follows the texture (METHOD 8): a constant object gets three gains, one with a single direction of
+    colour gains and biases, others the full map. Objects with too few pixels take what the others have in common.
+
+    Args:
+        problem: pixels, base values, cached shading.
+        response: starting response; `identity` means linear radiance (HDR).
+        options: see `FitOptions`.
+
+    Returns:
+        `FitResult`, always finite. The gauge is that of the given light (`gauge.pin` sets another).
+    """
+    opt = options or FitOptions()
+    everything, tone = prepare(problem, response)
+    texture_of_all = texture_of(everything, opt)
+    members = np.flatnonzero(texture_of_all.enough)
+    px, texture = everything.only(members), texture_of_all.only(members)
+    start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
+    fit = _begin(px, texture, start_params, opt)
+    if len(members):
+        measured = px.target
+        weigh(px, measured, fit.state.affine, tone, opt)
+        fit = _descend_all(px, measured, fit, tone, texture, opt, start_params)
+    return result_of(px, fit, tone, texture, opt, start_params, members, everything.counts)
+
+
+def _descend_all(
+    px: Pixels, measured: np.ndarray, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
+) -> Fit:
+    if opt.select:
+        fit = _select(px, fit, tone, texture, opt, start_params)
+    if opt.population:
+        index = _some(px, _MANY)
+        some = px.take(index)
+        for _ in range(2):
+            state, terms = descend(some, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+            weigh(some, measured[index], state.affine, tone.at(state.params), opt)
+            noise = row_noise(terms, some, state.free)
+            mean = texture.mean[:, 3]
+            population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
+            pull = _pull(fit, population, noise, mean, fit.profiled)
+            fit = replace(fit, state=state, population=population, pull=pull)
+    else:
+        state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+        fit = replace(fit, state=state)
+    weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt)
+    state, _ = descend(px, fit.state, fit.pull, tone, opt, None, None, start_params)
+    return replace(fit, state=state)
+
+
+def weigh(px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions) -> None:
+    """Weights and bias that follow from the distance between the halves, at `affine`; they are held during a descent.
+
+    Fireflies are three robust widths apart. The mean of a bent curve over noise is not the curve at the mean: each half's f(e L)
+    is off by f'' var(e L) / 2 = (f'' / f'^2) d^2 on average, d half the distance; `measured` is moved by as much.
+    """
+    if px.shading.shape[1] < 2:
+        return
+    px.target = measured
+    errors = residuals(px, affine, tone, opt)
+    apart = 0.5 * np.minimum(np.abs(errors[:, 0] - errors[:, 1]), 1e6)
+    trust = 1.0 / (1.0 + (apart / (3.0 * opt.robust_width)) ** 2)
+    px.trust = np.ascontiguousarray(trust, px.trust.dtype)
+    shown = measured + errors.mean(1)
+    bias = tone.bend(shown) * np.minimum(apart, opt.robust_width) ** 2
+    bias = np.where(px.saturated, 0.0, np.clip(bias, -_MOST_BIAS * np.abs(measured), _MOST_BIAS * np.abs(measured)))
+    # A one-sided row takes the low side of the noise for a violation; bounds count below their noise only.
+    px.target = np.ascontiguousarray(np.where(px.saturated, measured - 3.0 * apart, measured + bias), measured.dtype)
+
+
+def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) -> Fit:
+    """The identity, or the population nobody was seen of: a rough dielectric."""
+    n = px.n_objects
+    free = texture.albedo_numbers()
+    if opt.select or opt.population:
+        metallic = np.tile(KINDS[0] if opt.select else [1.0, 0.0], (n, 1))
+        population = before()
+        noise = np.full(n, (0.05 * opt.robust_width + 0.005) ** 2 if len(px.obj) else 1.0)
+        pull = pull_of(population, noise, texture.mean[:, 3], metallic)
+        affine = pull.centre.copy()
+        if not opt.select:
+            affine[:, 12:] = IDENTITY[12:]
+    else:
+        metallic, population = np.tile([1.0, 0.0], (n, 1)), None
+        affine = np.tile(IDENTITY, (n, 1))
+        weight = np.einsum("o,i,ij->oij", px.counts.astype(np.float64), opt.ridge * _RIDGE, np.eye(PARAMETERS))
+        pull = Pull(affine.copy(), weight)
+    if not opt.select:
+        metal = texture.enough & (texture.mean[:, 4] > opt.metallic_prior)
+        free[:, 12], free[:, 13] = texture.enough & texture.varied[:, 0], texture.enough
+        free[:, 14], free[:, 15] = metal & texture.varied[:, 1], metal
+    return Fit(State(affine, free, params.copy(), np.full(n, 1e-2)), pull, population, metallic)
+
+
+def _some(px: Pixels, most: int) -> np.ndarray:
+    """At most so many pixels of each object, evenly spread over its clusters."""
+    place = np.arange(len(px.obj)) - px.offsets[px.obj]
+    stride = np.maximum(1, -(-px.counts // most))
+    return np.flatnonzero(place % stride[px.obj] == 0)
+
+
+def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
+    """Kind and valley of every object on a few of its pixels; then all numbers of the chosen kind are free."""
+    few = px.take(_some(px, _FEW))
+    # Bounds alone cannot tell one valley from another.
+    measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
+    state, terms = descend(few, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+    noise = row_noise(terms, few, state.free)
+    pull = pull_of(before(), noise, texture.mean[:, 3], fit.metallic)
+    found = profile(few, state, pull, tone, opt, state.free, measured & texture.mixed)
+    choice = choose(found, measured)
+    metallic = KINDS[choice.kind]
+    affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
+    affine[:, 12:] = np.concatenate([np.zeros((px.n_objects, 1)), choice.roughness[:, None], metallic], 1)
+    affine = np.where(measured[:, None], affine, state.affine)
+    free = state.free.copy()
+    free[:, 13] = measured
+    free[:, 12] = measured & texture.varied[:, 0]
+    state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
+    fit = replace(fit, state=state, metallic=metallic, profiled=choice)
+    if opt.population:
+        population = before(*choice.population)
+        return replace(fit, population=population, pull=_pull(fit, population, noise, texture.mean[:, 3], choice))
+    # as weakly as the ridge says
+    return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
+
+
+def _pull(fit: Fit, population: Population, noise: np.ndarray, roughness: np.ndarray, choice: Choice | None) -> Pull:
+    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope)."""
+    pull = pull_of(population, noise, roughness, fit.metallic, DISCOUNT)
+    if choice is None:
+        return pull
+    deviation = np.clip(choice.deviation, _SHARP, population.spread[3])
+    return lean(pull, choice.roughness, deviation, noise, roughness, population.contrast, DISCOUNT)
+
+
+def result_of(
+    px: Pixels,
+    fit: Fit,
+    tone: Tone,
+    texture: Texture,
+    opt: FitOptions,
+    start_params: np.ndarray,
+    members: np.ndarray,
+    counts: np.ndarray,
+) -> FitResult:
+    """The result of all objects; `members`: the objects of `px`, `counts` (O,): usable pixels of every object."""
+    state, n_objects = fit.state, len(counts)
+    affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, PARAMETERS), bool)
+    if fit.population is not None and len(members):
+        affine[:] = centre_of(fit.population, np.zeros(1), KINDS[:1])
+        affine[:, 12] = 0.0
+    covariance, residual = np.zeros((n_objects, PARAMETERS, PARAMETERS)), np.zeros(n_objects)
+    affine[members], free[members] = state.affine, state.free
+    final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
+    if len(px.obj):
+        terms = evaluate(px, state.affine, final, opt, True)
+        fitted = bool(opt.free_response and tone.size)
+        blocks = object_blocks(terms, state.free, fit.pull)
+        prior = response_prior(opt, len(px.obj), start_params)
+        system = arrowhead(terms, px, state, fit.pull, prior, fitted, blocks, damped=False)
+        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull)
+        errors = residuals(px, state.affine, final, opt).mean(1)
+        errors[px.saturated] = 0.0
+        square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
+        residual[members] = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))
+    rank = np.zeros(n_objects, np.int64)
+    rank[members] = texture.rank
+    return FitResult(
+        affine,
+        covariance,
+        free,
+        counts.astype(np.int64),
+        residual,
+        describe(rank, free, affine, counts),
+        final.response,
+        1.0,
+        list(state.history) or [0.0],
+        state.converged or not free.any(),
+        of_response,
+        max(len(state.history) - 1, 0),
+        state.reason or "nothing to fit",
+        {"population": fit.population.facts()} if fit.population is not None and len(members) else {},
+    )

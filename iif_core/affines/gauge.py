@@ -1,0 +1,94 @@
+"""The open scale: with 8-bit photographs light x albedo is known, not each (METHOD 7a, degeneracy 3).
+
+A fit returns albedos that go with the light that it was given. Multiplying the light by s and dividing every albedo by s leaves
+the diffuse part of all photographs as it is; what fixes s is a convention or a piece of knowledge, and this is the only place
+where it enters. (The specular part of dielectrics does not scale with albedo, so s is not entirely free: far from 1 it shows.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from iif_core.affines.problem import FitProblem, FitResult, apply_affines
+from iif_core.errors import InputError
+
+KINDS = ("none", "prior", "mean_albedo", "white_patch", "lamp")
+_DARKEST = 1e-3
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """What fixes the scale.
+
+    Attributes:
+        kind: `none`: the light as given; `prior`: the mean albedo of the base texture stays; `mean_albedo`: the mean albedo
+            of the fitted pixels is `albedo`; `white_patch`: that of `patch` is; `lamp`: the light is multiplied by `factor`.
+        albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0.
+    """
+
+    kind: str
+    albedo: float = 0.0
+    patch: np.ndarray | None = None
+    factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"scale {self.kind!r}; allowed: {', '.join(KINDS)}")
+        if self.kind in ("mean_albedo", "white_patch") and not 0 < self.albedo <= 1:
+            raise InputError(f"scale {self.kind}: albedo {self.albedo}; it lies above 0 and at most at 1")
+        if self.kind == "white_patch" and (self.patch is None or not np.any(self.patch)):
+            raise InputError("scale white_patch: no fitted pixel shows the patch; choose an object or pixels that the views see")
+        if self.kind == "lamp" and not (np.isfinite(self.factor) and self.factor > 0):
+            raise InputError(f"scale lamp: the light would be multiplied by {self.factor}; name a lamp that was found to shine")
+
+
+def pin(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
+    """The same fit in the gauge: albedo numbers divided by one factor, `light_scale` multiplied by it.
+
+    `facts["scale"]` says how: `kind`, `factor`, and `relative_error`, the standard deviation of the factor that comes from the
+    fitted numbers (not from how true the convention is).
+    """
+    factor, error = _factor(problem, fit, gauge)
+    facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}
+    if factor == 1.0:
+        return replace(fit, facts=facts)
+    # Objects that nobody fitted kept their base: it is in the prior's gauge already.
+    fitted = ~np.array([model.startswith("identity") for model in fit.model], bool)
+    affine, covariance = fit.affine.copy(), fit.covariance.copy()
+    affine[fitted, :12] /= factor
+    covariance[:, :12, :] /= factor
+    covariance[:, :, :12] /= factor
+    return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
+
+
+def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:
+    if gauge.kind == "none":
+        return 1.0, 0.0
+    if gauge.kind == "lamp":
+        return float(gauge.factor), 0.0
+    use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)
+    if gauge.kind == "white_patch":
+        use = use & gauge.patch
+    use &= fit.free.any(1)[np.where(use, problem.object_id, 0)] if len(fit.free) else False
+    if not use.any():
+        if gauge.kind == "white_patch":
+            raise InputError("scale white_patch: the patch has too few pixels to be fitted; choose a larger one")
+        return 1.0, 0.0
+    object_id, base = problem.object_id[use], problem.base[use].astype(np.float64)
+    mean = float(apply_affines(fit.affine, object_id, base)[:, :3].mean())
+    wanted = float(base[:, :3].mean()) if gauge.kind == "prior" else gauge.albedo
+    return max(mean, _DARKEST) / max(wanted, _DARKEST), _mean_error(fit, object_id, base) / max(mean, _DARKEST)
+
+
+def _mean_error(fit: FitResult, object_id: np.ndarray, base: np.ndarray) -> float:
+    """Standard deviation of the mean fitted albedo, objects taken as independent."""
+    n_objects = len(fit.affine)
+    slope = np.zeros((n_objects, 16))
+    one = np.concatenate([base[:, :3], np.ones((len(base), 1))], 1)
+    for i in range(4):
+        summed = np.bincount(object_id, one[:, i], n_objects) / (3 * len(base))
+        slope[:, [i, 4 + i, 8 + i]] = summed[:, None]
+    return float(np.sqrt(max(np.einsum("oi,oij,oj->", slope, fit.covariance, slope), 0.0)))

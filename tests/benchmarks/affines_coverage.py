@@ -1,0 +1,108 @@
+"""How often the claimed 68 % intervals of the material fit contain the truth, over seeds of a planted problem.
+
+    python tests/benchmarks/affines_coverage.py --seeds 20 --output results/studies/affines_coverage.parquet
+
+Objects with drawn affines, roughness and metalness under room-like light, photographed through an unknown gamma. Errors: noise of
+the cached shading, one per surface cell and half, shared by all lobes and by the pixels of the cell; noise of the photograph per
+pixel; and an error of the light that neighbouring cells share, which both halves have. Clusters are the patches of neighbours.
+A row per group of numbers: share of intervals that contain the truth, and the ratio of root-mean-square error to claimed error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from iif_core.affines import IDENTITY, FitOptions, FitProblem, apply_affines, fit_affines, patches
+from iif_core.affines.problem import BIASES, CROSS, GAINS
+from iif_core.response import response
+from tests.unit.planted_fit import LEVELS, radiance_of, shading_of
+
+CELLS, PIXELS = 100, 5  # of an object; pixels of a cell
+CACHE, PHOTO, SHARED = 0.15, 0.01, 0.03
+
+
+def planted(seed: int, objects: int) -> tuple[FitProblem, np.ndarray]:
+    """The problem and the true affines (O, 16)."""
+    rng = np.random.default_rng([0x636F76, seed])
+    n_cells = objects * CELLS
+    cell = np.repeat(np.arange(n_cells), PIXELS)
+    obj = cell // CELLS
+    n = len(cell)
+    base = np.c_[rng.uniform(0.15, 0.6, (n_cells, 3)), rng.uniform(0.45, 0.55, n_cells), rng.uniform(0.4, 0.6, n_cells)][cell]
+    truth = np.tile(IDENTITY, (objects, 1))
+    truth[:, GAINS] = rng.normal(1.2, 0.12, (objects, 3))
+    truth[:, BIASES] = rng.normal(0, 0.03, (objects, 3))
+    truth[:, CROSS] = rng.normal(0, 0.05, (objects, 6))
+    truth[:, 12], truth[:, 13] = 0.0, np.clip(rng.normal(0.5, 0.15, objects), 0.15, 0.9)
+    truth[:, 14], truth[:, 15] = 0.0, rng.random(objects) < 0.1
+    place = np.stack([np.arange(n_cells) % 10, np.arange(n_cells) // 10 % 10, np.zeros(n_cells)], 1)
+    light = rng.normal(0, SHARED, (objects * CELLS // 4, 1))[(np.arange(n_cells) // 4)][cell]
+    shading = shading_of(rng, n)
+    shown = radiance_of(
+        apply_affines(truth, obj, base), [part * np.exp(light).reshape(-1, *[1] * (part.ndim - 1)) for part in shading]
+    )
+    value = response("gamma", [1.9])(0.5 * shown) + rng.normal(0, PHOTO, (n, 3))
+    halves = []
+    for _ in range(2):
+        noise = np.exp(rng.normal(0, CACHE, (n_cells, 3)) - 0.5 * CACHE**2)[cell]
+        halves.append([shading[0] * noise, shading[1] * noise[:, None], shading[2] * noise[:, None]])
+    cached = [tuple(np.asarray(h[i], np.float32) for h in halves) for i in range(3)]
+    saturated = value >= 0.99
+    cluster = patches(obj, place[cell])
+    value = np.minimum(value, 0.99)
+    return FitProblem(obj, objects, base, *cached, LEVELS, value, np.full(n, 0.5), saturated, cluster), truth
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--objects", type=int, default=12)
+    parser.add_argument("--output", type=Path)
+    arguments = parser.parse_args()
+    z: dict[str, list[np.ndarray]] = {name: [] for name in ("gain", "bias", "cross", "albedo", "roughness level", "response")}
+    for seed in range(arguments.seeds):
+        problem, truth = planted(seed, arguments.objects)
+        fit = fit_affines(problem, response("gamma"), FitOptions())
+        spread = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
+        right_kind = fit.affine[:, 15] == truth[:, 15]
+        error = (fit.affine - truth)[right_kind]
+        for name, columns in (("gain", GAINS), ("bias", BIASES), ("cross", CROSS)):
+            z[name].append((error[:, columns] / np.maximum(spread[right_kind][:, columns], 1e-12)).ravel())
+        mean = np.stack([problem.base[problem.object_id == o].mean(0) for o in range(arguments.objects)])[right_kind]
+        covariance = fit.covariance[right_kind]
+        one = np.c_[mean[:, :3], np.ones(len(mean))]
+        for c in range(3):
+            rows = slice(4 * c, 4 * c + 4)
+            deviation = np.sqrt(np.einsum("oi,oij,oj->o", one, covariance[:, rows, rows], one))
+            z["albedo"].append((one * error[:, rows]).sum(1) / np.maximum(deviation, 1e-12))
+        level = np.c_[mean[:, 3], np.ones(len(mean))]
+        deviation = np.sqrt(np.einsum("oi,oij,oj->o", level, covariance[:, 12:14, 12:14], level))
+        z["roughness level"].append((level * error[:, 12:14]).sum(1) / np.maximum(deviation, 1e-12))
+        z["response"].append((fit.response.params.ravel() - 1.9) / np.sqrt(np.diagonal(fit.response_covariance)))
+    columns: dict[str, list[object]] = {"quantity": [], "intervals": [], "coverage_68": [], "error_over_claimed": []}
+    for name, parts in z.items():
+        values = np.concatenate(parts)
+        row = (
+            name,
+            len(values),
+            float(np.mean(np.abs(values) <= 1)),
+            float(np.sqrt(np.mean(np.minimum(np.abs(values), 10) ** 2))),
+        )
+        for column, entry in zip(columns.values(), row, strict=True):
+            column.append(entry)
+        print(f"{name:16s} {row[1]:5d} intervals, {100 * row[2]:.0f} % contain the truth, error / claimed {row[3]:.2f}")
+    if arguments.output:
+        import pandas
+
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        pandas.DataFrame(columns).to_parquet(arguments.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""The solvers on one problem, judged by one loss; patches; the settings of the scale."""
+
+import numpy as np
+import pytest
+
+from iif_core.affines import (
+    IDENTITY,
+    FitOptions,
+    SgdOptions,
+    apply_affines,
+    fit_affines,
+    fit_affines_sgd,
+    patches,
+    reference_loss,
+    reference_options,
+    reference_problem,
+)
+from iif_core.affines.pixels import prepare
+from iif_core.affines.sgd import _gradient
+from iif_core.errors import InputError
+from iif_core.response import response
+from tests.unit.planted_fit import problem_of
+from workflow.settings import Affines
+
+
+@pytest.fixture(scope="module")
+def ldr():
+    rng = np.random.default_rng(20)
+    return problem_of(rng, 4, 500, value_of=lambda x: np.minimum(response("gamma", [1.9])(x), 1), noise=0.1, halves=2)[0]
+
+
+def test_reference_loss_by_hand(ldr):
+    """METHOD 2.8, written out once more with plain arrays."""
+    from iif_core.affines import interpolate_levels
+
+    affine = np.tile(IDENTITY, (4, 1)) * 0.9
+    curve = response("gamma")
+    got = reference_loss(ldr, affine, curve)
+    one = ldr.merged()
+    value = apply_affines(affine, one.object_id, one.base)
+    a, r, m = value[:, :3], value[:, 3], value[:, 4:]
+    s0, s1 = (interpolate_levels(s[0], one.levels, r)[0] for s in (one.s0, one.s1))
+    shown = curve((1 - m) * a * one.diffuse[0] + (0.04 * (1 - m) + m * a) * s0 + s1)
+    bright = one.value >= 0.9
+    error = np.where(bright, np.minimum(shown - 0.9, 0), shown - one.value)
+    assert bright.any() and not bright.all()
+    assert got.data == pytest.approx(np.mean(error**2), rel=1e-6)
+    assert got.roughness == pytest.approx(1e-3 * np.mean(1 - r), rel=1e-6)
+    assert got.metallic == pytest.approx(5e-3 * m.mean(), abs=1e-9)
+    assert got.total == pytest.approx(got.data + got.roughness + got.metallic)
+
+
+@pytest.mark.parametrize("family", ["gamma", "ggcm"])
+def test_gradient_of_the_reference_loss_against_differences(ldr, family):
+    curve = response(family)
+    problem = reference_problem(ldr, curve)
+    px, tone = prepare(problem, curve)
+    rng = np.random.default_rng(1)
+    affine = np.tile(IDENTITY, (4, 1)) + 0.05 * rng.normal(size=(4, 16))
+    affine[:, 15] += 0.3
+    params = curve.params * 1.05
+    g, g_w = _gradient(px, np.arange(len(px.obj)), affine, tone.at(params), 4)
+    for k in range(16 + len(params)):
+        values = []
+        for sign in (1, -1):
+            moved, p = affine.copy(), params.copy()
+            if k < 16:
+                moved[2, k] += sign * 1e-6
+            else:
+                p[k - 16] += sign * 1e-6
+            values.append(reference_loss(ldr, moved, curve.with_params(p)).total)
+        expected = (values[0] - values[1]) / 2e-6
+        assert (g[2, k] if k < 16 else g_w[k - 16]) == pytest.approx(expected, rel=1e-3, abs=2e-6), k
+
+
+def test_twins_are_judged_by_one_loss(ldr):
+    """The direct solver on the reference loss is not above the paper's optimiser; both are below the start."""
+    start = response("gamma")
+    before = reference_loss(ldr, np.tile(IDENTITY, (4, 1)), start).total
+    direct = fit_affines(reference_problem(ldr, start), start, reference_options())
+    found = reference_loss(ldr, direct.affine, direct.response).total
+    for options in (SgdOptions(batch=200, epochs=5), SgdOptions("adam", batch=200, epochs=10, decay=0.7)):
+        fit = fit_affines_sgd(ldr, start, options)
+        after = reference_loss(ldr, fit.affine, fit.response).total
+        assert after == pytest.approx(fit.history[-1]) and after < before
+        assert found <= after
+        assert fit.covariance.shape == (4, 16, 16) and np.isfinite(fit.covariance).all() and len(fit.model) == 4
+    assert direct.converged
+
+
+def test_sgd_is_seeded(ldr):
+    a, b, c = (fit_affines_sgd(ldr, response("gamma"), SgdOptions(batch=300, seed=s)) for s in (0, 0, 1))
+    assert a.affine.tobytes() == b.affine.tobytes() and a.affine.tobytes() != c.affine.tobytes()
+    with pytest.raises(InputError, match="solver"):
+        SgdOptions("lbfgs")
+
+
+def test_patches_are_neighbours():
+    """Equal runs along a curve: a patch spans much less than its object; every object has some."""
+    rng = np.random.default_rng(2)
+    object_id = rng.integers(0, 3, 6000)
+    position = np.c_[rng.uniform(0, 4, (6000, 2)), np.zeros(6000)]
+    number = patches(object_id, position)
+    for o in range(3):
+        own = object_id == o
+        sizes = np.bincount(number[own])
+        assert 12 <= len(sizes) <= 200 and sizes.min() > 0 and np.ptp(sizes) <= 1
+        spans = [np.ptp(position[own & (number == k)], axis=0)[:2].max() for k in range(len(sizes))]
+        assert np.median(spans) < 1.2  # of 4
+    assert patches(np.zeros(0, int), np.zeros((0, 3))).shape == (0,)
+    assert len(np.unique(patches(np.zeros(5, int), np.zeros((5, 3))))) == 5
+
+
+def test_covariance_sees_errors_that_neighbours_share():
+    """One error for every 20 pixels: the claimed deviation grows as the true one does."""
+    rng = np.random.default_rng(3)
+    problem, _ = problem_of(rng, 1, 2000, truth=IDENTITY[None])
+    opt = FitOptions(select=False, population=False, ridge=1e-9, robust_width=1e3, metallic_prior=2)
+    gains, claimed = [], []
+    from dataclasses import replace
+
+    for _ in range(30):
+        shared = np.repeat(rng.normal(0, 0.05, (100, 3)), 20, 0)
+        noisy = replace(problem, value=problem.value * np.exp(shared), cluster=np.repeat(np.arange(100), 20))
+        fit = fit_affines(noisy, response("identity"), opt)
+        gains.append(fit.affine[0, 0])
+        claimed.append(np.sqrt(fit.covariance[0, 0, 0]))
+    assert 0.7 < np.mean(claimed) / np.std(gains) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"white_patch": {"albedo": 0.9}}, "either"),
+        ({"white_patch": {"object": "wall", "view": "v", "box": [0, 0, 2, 2], "albedo": 0.9}}, "either"),
+        ({"white_patch": {"view": "v", "albedo": 0.9}}, "either"),
+        ({"lamp": {"emitter_id": 0, "radiance": [0, 0, 0]}}, "above 0"),
+        ({}, "exactly one"),
+        ({"mean_albedo": 0.4, "lamp": {"emitter_id": 0, "radiance": [1, 1, 1]}}, "exactly one"),
+    ],
+)
+def test_known_scale_is_checked(given, message):
+    from pydantic import ValidationError
+
+    with pytest.raises(ValidationError, match=message):
+        Affines(scale=given)
+    assert Affines(scale={"mean_albedo": 0.4}).scale.mean_albedo == 0.4
+    assert Affines().scale == "prior"
