@@ -199,6 +199,11 @@ def read_light(job: Job, n_faces: int) -> Light:
     return Light(radiance, side, emits, rows[kept & (table["kind"] == "environment")].sum(0, dtype=np.float32))
 
 
+def read_exposures(job: Job) -> np.ndarray:
+    """(views,) exposure of every view of the capture, in order, as stage emission used them. Needs emission upstream."""
+    return np.asarray(job.read("emission").json("emission.json")["exposure"], np.float64)
+
+
 def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:
     """The radiance cache on the device; `with_bounds`: also voxels that were only ever seen saturated."""
     from iif_core.transport import RadianceCache

@@ -165,3 +165,26 @@ def test_thinning_keeps_the_same_patches_in_every_view_and_joining_numbers_them(
     rows = join_rows([*parts, no_rows()])
     assert (np.bincount(rows.patch.astype(int)) == 3).all()
     assert len(patch_rows(*(a[:0] for a in _photograph(rng)), 0).patch) == 0
+
+
+@pytest.mark.parametrize(
+    ("truth", "limit"), [(response("gamma", [1.9]), 0.5), (response_curve("filmic"), 1.0)], ids=["gamma", "filmic"]
+)
+def test_unknown_exposures_give_the_curve_up_to_a_power(truth, limit):
+    """f(x^(1 / p)) with exposures e^p shows the same photographs: the power is reported, the rest is found."""
+    rows, exposure = _rows(np.random.default_rng(3), truth)
+    out = calibrate_response(rows, np.ones(8), ("srgb", "spline"), given=False)
+    assert "power" in out.gauge and np.exp(np.mean(np.log(out.exposure))) == pytest.approx(1.0)
+    power = np.polyfit(np.log(exposure), np.log(out.exposure), 1)[0]
+    np.testing.assert_allclose(np.log(out.exposure), power * np.log(exposure), atol=0.03)
+    known = calibrate_response(rows, exposure, ("spline",))
+    assert known.gauge == "" and (known.exposure == exposure).all()
+    error = 100 * np.sqrt(np.mean((out.response(X**power) - truth(X)) ** 2, 0)).max()
+    assert error < limit
+
+
+def test_unknown_exposures_without_overlap_stay_what_they_were():
+    rows, _ = _rows(np.random.default_rng(4), response("gamma"), n_patches=200)
+    out = calibrate_response(rows.take(rows.patch % 8 == rows.view), np.full(8, 3.0), given=False)
+    np.testing.assert_allclose(out.exposure, 3.0)
+    assert out.response.family == "srgb" and out.reason

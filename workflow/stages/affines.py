@@ -16,6 +16,7 @@ from workflow.base_scene import (
     BaseScene,
     base_maps,
     read_base_scene,
+    read_exposures,
     read_light,
     view_pixels,
 )
@@ -34,7 +35,7 @@ def run(job: Job) -> None:
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     settings = job.settings.affines
     emits = read_light(job, len(scene.faces)).emits
-    exposures = dict(zip((v.view_id for v in capture.views), capture.exposures(), strict=True))
+    exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job), strict=True))
     problem = _problem(job, capture, scene, emits, exposures)
     start, prior, calibration = _starting_response(job)
     options = FitOptions(

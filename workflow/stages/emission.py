@@ -84,6 +84,8 @@ def run(job: Job) -> None:
     exposures, exposure_plan = _exposures(capture, views, notes)
     calibrated = _camera_response(job, capture, scene, views, exposures)
     job.log.info("camera response: %s", calibrated.reason)
+    exposures |= {view.view_id: float(e) for view, e in zip(views, calibrated.exposure, strict=True)}
+    notes.extend([calibrated.gauge] if calibrated.gauge else [])
     light = _Light(calibrated.response, capture.is_hdr, job.settings.emission.saturation)
     statistics, threshold = _statistics(job, capture, scene, views, light)
     groups, candidates = _groups(job, scene, statistics, threshold)
@@ -117,6 +119,7 @@ def run(job: Job) -> None:
             },
             "escape_share": {"primary": misses.share, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
+            "exposure": [exposures[view.view_id] for view in capture.views],
             "response": {**response_facts(light.curve), "calibration": calibration_facts(calibrated)},
             "plan": decisions,
             "notes": notes,
@@ -145,11 +148,11 @@ def _camera_response(
 ) -> CalibratedResponse:
     """The measured curve, the family that is set, or the one that surface under different exposures speaks for."""
     setting = job.settings.affines.response
+    exposure = np.array([exposures[view.view_id] for view in views])
     if not isinstance(setting, str):
-        return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}")
+        return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}", exposure)
     families = candidates(setting, capture.facts["dynamic_range"])
     rows = _shared_surface(capture, scene, views, job) if needs_rows(families) else no_rows()
-    exposure = np.array([exposures[view.view_id] for view in views])
     return calibrate_response(
         rows, exposure, families, job.settings.emission.saturation, given=not capture.facts.get("exposure_estimated", False)
     )
