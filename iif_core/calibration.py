@@ -39,8 +39,9 @@ GAUGE = (
 DARK = 4.0 / 255.0
 _FREEDOM = 4.0
 _ROUNDING = 0.29 / 255.0
+_SIGNIFICANT = 2.0
 _PRIOR = 1.0  # standard deviation of a parameter around its start
-_CHANNEL_PRIOR = 0.1  # and of a channel around the curve of all channels
+_CHANNEL_PRIOR = 0.05  # and of a channel around the curve of all channels
 _BLOCK_ROWS = 50.0  # rows' worth of the common width in the width of a block
 _FIT_ROWS = 8_000
 _ROUNDS = 5
@@ -105,7 +106,7 @@ def calibrate_response(
 ) -> CalibratedResponse:
     """The smallest of `families` that no other beats significantly, fitted.
 
-    Significantly: its score is behind the best one's by more than one standard error of the difference, which the
+    Significantly: its score is behind the best one's by more than two standard errors of the difference, which the
     spread over clusters gives.
 
     Args:
@@ -145,7 +146,7 @@ def calibrate_response(
         table.append(
             {"family": family, "parameters": size, "score": fit.score, "behind": float(scores[best] - fit.score), "error": error}
         )
-    chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= entry["error"])
+    chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
     before = _maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
     return CalibratedResponse(
@@ -384,7 +385,6 @@ def _reached(above: np.ndarray, width: float) -> np.ndarray:
 class _Fit:
     params: np.ndarray
     covariance: np.ndarray
-    worth: float  # independent rows a row is worth
     score: float
     clusters: dict[int, float]
     width: float
@@ -402,10 +402,10 @@ def _maximise(data: _Channel, curve: Response, mean: np.ndarray, deviation: floa
             worth = _curvature(data, curve, weight, noise, mean, deviation, 1.0)[1]
         curve = _improve(data, curve, weight, noise, mean, deviation, worth, 30 if last else 12)
         noise, weight, deviations = _settle(data, curve, noise)
-    covariance, worth = _curvature(data, curve, weight, noise, mean, deviation, worth)
+    covariance, _, price = _curvature(data, curve, weight, noise, mean, deviation, worth)
     score, clusters = _likelihood(data, curve, noise)
     width = float(1.4826 * np.median(np.abs(deviations))) if len(deviations) else 0.0
-    return _Fit(curve.params, covariance, worth, score, clusters, width)
+    return _Fit(curve.params, covariance, score - price, clusters, width)
 
 
 def _settle(data: _Channel, curve: Response, noise: _Noise) -> tuple[_Noise, np.ndarray, np.ndarray]:
@@ -500,14 +500,15 @@ def _curvature(
     mean: np.ndarray,
     deviation: float,
     worth: float,
-) -> tuple[np.ndarray, float]:
-    """Covariance of the parameters, (P, P), and how many independent rows a row is worth (at most 1).
+) -> tuple[np.ndarray, float, float]:
+    """Covariance of the parameters, (P, P); how many independent rows a row is worth (at most 1); and the price of the
+    parameters in log likelihood.
 
     The sandwich H^-1 J H^-1 of scores summed over clusters says how far the likelihood overstates what it knows.
     `_inner` majorises the likelihood; H has the curvature of Student's t itself, which is flatter."""
     theta, size = curve.params, curve.params.size
     if not size:
-        return np.zeros((0, 0)), 1.0
+        return np.zeros((0, 0)), 1.0, 0.0
     hessian = np.zeros((size, size))
     for k, step in enumerate(1e-3 * np.eye(size)):
         up = _inner(data, curve, theta + step, weight, noise.width, mean, np.inf, 1.0)[1]
@@ -531,11 +532,13 @@ def _curvature(
     owner = np.unique(data.cluster, return_inverse=True)[1]
     summed = np.stack([np.bincount(owner, score[:, k]) for k in range(size)], -1)
     spread = summed.T @ summed * len(summed) / max(len(summed) - 1, 1)
-    inverse = (vectors / values) @ vectors.T
-    worth = float(np.clip(size / max(np.trace(inverse @ spread), 1e-12), 1e-4, 1.0))
     prior = np.eye(size) / deviation**2
+    known = np.linalg.inv((vectors * values) @ vectors.T + prior)
+    price = float(np.trace(known @ spread))
+    # Free directions alone: what the prior decides is no sign of rows that err together.
+    worth = float(np.clip(np.trace(known @ (vectors * values) @ vectors.T) / max(price, 1e-12), 1e-4, 1.0))
     adjusted = np.linalg.inv(worth * (vectors * values) @ vectors.T + prior)
-    return adjusted @ (worth**2 * spread + prior) @ adjusted, worth
+    return adjusted @ (worth**2 * spread + prior) @ adjusted, worth, price
 
 
 def _likelihood(data: _Channel, curve: Response, noise: _Noise) -> tuple[float, dict[int, float]]:
@@ -568,7 +571,7 @@ def _fit(family: str, joined: _Channel, channels: Sequence[_Channel], enough: Se
             continue
         own = _maximise(channels[c], start.with_params(common.params), common.params, _CHANNEL_PRIOR)
         params[c], covariance[part, part] = own.params, own.covariance
-        score += own.score - size / own.worth
+        score += own.score
         widths.append(own.width)
         for name, value in own.clusters.items():
             clusters[name] = clusters.get(name, 0.0) + value
