@@ -164,10 +164,10 @@ def calibrate_response(
 
 
 def candidates(setting: str, dynamic_range: str) -> tuple[str, ...]:
-    """Families that a setting allows: `auto` is `identity` for HDR and any of `CANDIDATES` for LDR photographs."""
-    if setting != "auto":
-        return (setting,)
-    return ("identity",) if dynamic_range == "hdr" else CANDIDATES
+    """Families that a setting allows: `identity` for HDR whatever is set; `auto` is any of `CANDIDATES` for LDR."""
+    if dynamic_range == "hdr":
+        return ("identity",)
+    return CANDIDATES if setting == "auto" else (setting,)
 
 
 def needs_rows(families: Sequence[str]) -> bool:

@@ -121,7 +121,7 @@ def test_extremes_are_finite_and_explained(kind):
 
 def test_which_families_a_setting_allows():
     assert candidates("auto", "hdr") == ("identity",) and candidates("auto", "ldr") == CANDIDATES
-    assert candidates("gamma", "ldr") == ("gamma",)
+    assert candidates("gamma", "ldr") == ("gamma",) and candidates("gamma", "hdr") == ("identity",)
     for family in ("identity", "srgb"):
         out = calibrate_response(no_rows(), np.ones(0), (family,))
         assert out.response.family == family and out.reason

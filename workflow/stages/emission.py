@@ -149,7 +149,7 @@ def _camera_response(
     """The measured curve, the family that is set, or the one that surface under different exposures speaks for."""
     setting = job.settings.affines.response
     exposure = np.array([exposures[view.view_id] for view in views])
-    if not isinstance(setting, str):
+    if not isinstance(setting, str) and not capture.is_hdr:
         return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}", exposure)
     families = candidates(setting, capture.facts["dynamic_range"])
     rows = _shared_surface(capture, scene, views, job) if needs_rows(families) else no_rows()
@@ -161,7 +161,8 @@ def _camera_response(
 def _shared_surface(capture: CaptureReader, scene: BaseScene, views: list[View], job: Job) -> PatchRows:
     """Patches of interior surface as the views show them."""
     footprints = [np.median(depth[depth > 0]) / view.fx for view in views if (depth := capture.gbuffer(view)[0]).any()]
-    edge = patch_edge(float(np.median(footprints))) if footprints else 1.0
+    extent = float(np.ptp(scene.vertices, axis=0).max())
+    edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
     origin = grid_origin(scene.vertices[scene.faces.ravel()], edge)
     share = min(1.0, STATISTICS_PIXELS / max(sum(view.width * view.height for view in views), 1))
     parts = [no_rows()]
