@@ -1,8 +1,9 @@
 """Camera response from surface that photographs of different, known exposure share; needs no light and no material.
 
 A patch c is equally bright in every view, up to gloss, so log f^-1(I_vc) = log e_v + s_c + n. Known exposures fix the
-exponent of f that unknown ones leave open (`exposure_gauge`). We maximise the likelihood of the sensor values over the
-parameters of f with the levels s_c eliminated:
+exponent of f. Unknown ones leave it open: f(x^(1 / p)) with exposures e^p and levels p s fits as well for every p, so the
+exponent stays near that of sRGB and the result says so (`CalibratedResponse.gauge`). We maximise the likelihood of the
+sensor values over the parameters of f with the levels s_c eliminated:
 
 * n has Student's t distribution (4 degrees of freedom): gloss and misregistration have heavy tails. Its width is
   estimated for every block (object), so that glossy objects lose their say without a word about materials.
@@ -21,20 +22,26 @@ one view are one cluster; the spread of the clusters' scores gives the covarianc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from iif_core.exposure import estimate_gains
 from iif_core.overlap import PatchRows
 from iif_core.response import START, Response, response
 
 CANDIDATES = ("srgb", "gamma", "ggcm", "spline")
 """What `auto` chooses from, smallest first."""
+GAUGE = (
+    "exposures were found together with the response: any power p of the exposures goes with f(x^(1 / p)) and fits as well;"
+    " the power is the one of a curve near sRGB"
+)
 DARK = 4.0 / 255.0
 _FREEDOM = 4.0
 _ROUNDING = 0.29 / 255.0
+_SIGNIFICANT = 2.0
 _PRIOR = 1.0  # standard deviation of a parameter around its start
-_CHANNEL_PRIOR = 0.1  # and of a channel around the curve of all channels
+_CHANNEL_PRIOR = 0.05  # and of a channel around the curve of all channels
 _BLOCK_ROWS = 50.0  # rows' worth of the common width in the width of a block
 _FIT_ROWS = 8_000
 _ROUNDS = 5
@@ -67,6 +74,8 @@ class CalibratedResponse:
     Attributes:
         response: chosen curve, (3, P); the start where the data say nothing.
         covariance: (3 P, 3 P) of its parameters; the prior's where the data say nothing.
+        exposure: (V,) of the views: the given ones, or those found with the curve.
+        gauge: what cannot be known, in words; empty with given exposures.
         stops: largest difference of exposure within a patch, in stops.
         rows: (patch, view, channel) rows used.
         before, after: robust spread of log radiance within patches with the starting curve and with the chosen one.
@@ -82,6 +91,8 @@ class CalibratedResponse:
     after: float
     candidates: list[dict[str, object]]
     reason: str
+    exposure: np.ndarray
+    gauge: str = ""
 
 
 def calibrate_response(
@@ -95,7 +106,7 @@ def calibrate_response(
 ) -> CalibratedResponse:
     """The smallest of `families` that no other beats significantly, fitted.
 
-    Significantly: its score is behind the best one's by more than one standard error of the difference, which the
+    Significantly: its score is behind the best one's by more than two standard errors of the difference, which the
     spread over clusters gives.
 
     Args:
@@ -103,19 +114,29 @@ def calibrate_response(
         families: candidates, smallest first; one = no choice. Families without parameters are compared as they are.
         saturation: sensor values from here on are bounds.
         min_stops, min_rows: below, the start of the first family comes back.
-        given: exposures are known; estimated ones assumed a response, so they cannot tell it (`exposure_gauge`).
+        given: exposures are known. Otherwise they are found together with each candidate; `exposure` gives their mean.
     """
     if not needs_rows(families):
         start = response(families[0])
-        return given_response(start, "photographs are linear radiance" if start.family == "identity" else "set to srgb")
+        reason = "photographs are linear radiance" if start.family == "identity" else "set to srgb"
+        return given_response(start, reason, exposure)
     exposure = np.asarray(exposure, np.float64)
+    if not given:
+        exposure = _gains(rows, response(families[0]), exposure)
     channels = [_channel(rows, c, exposure, saturation, min_stops) for c in range(3)]
     enough = [c for c in range(3) if len(channels[c].cell) >= min_rows]
     stops = max(channel.stops for channel in channels)
-    if not enough or not given:
-        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, given)
+    if not enough:
+        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, exposure)
     common = _joined([_channel(rows, c, exposure, saturation, min_stops, _FIT_ROWS // len(enough)) for c in enough])
-    fits = [_fit(family, common, channels, enough) for family in families]
+    fits, found = [], []
+    for family in families:
+        fit, views = _fit(family, common, channels, enough), exposure
+        if not given:  # the exposures that go with this curve, and the curve that goes with them
+            views = _gains(rows, fit.response, exposure)
+            fit = _fit(family, common.exposed(views), [channel.exposed(views) for channel in channels], enough)
+        fits.append(fit)
+        found.append(views)
     scores = np.array([fit.score for fit in fits])
     best = int(scores.argmax())
     table: list[dict[str, object]] = []
@@ -125,7 +146,7 @@ def calibrate_response(
         table.append(
             {"family": family, "parameters": size, "score": fit.score, "behind": float(scores[best] - fit.score), "error": error}
         )
-    chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= entry["error"])
+    chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
     before = _maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
     return CalibratedResponse(
@@ -137,14 +158,16 @@ def calibrate_response(
         fits[chosen].width,
         table,
         _because(table, chosen, best, used, stops),
+        found[chosen],
+        "" if given else GAUGE,
     )
 
 
 def candidates(setting: str, dynamic_range: str) -> tuple[str, ...]:
-    """Families that a setting allows: `auto` is `identity` for HDR and any of `CANDIDATES` for LDR photographs."""
-    if setting != "auto":
-        return (setting,)
-    return ("identity",) if dynamic_range == "hdr" else CANDIDATES
+    """Families that a setting allows: `identity` for HDR whatever is set; `auto` is any of `CANDIDATES` for LDR."""
+    if dynamic_range == "hdr":
+        return ("identity",)
+    return CANDIDATES if setting == "auto" else (setting,)
 
 
 def needs_rows(families: Sequence[str]) -> bool:
@@ -152,28 +175,34 @@ def needs_rows(families: Sequence[str]) -> bool:
     return len(families) > 1 or bool(START[families[0]])
 
 
-def given_response(curve: Response, reason: str) -> CalibratedResponse:
+def given_response(curve: Response, reason: str, exposure: np.ndarray) -> CalibratedResponse:
     """A response that is not to be fitted."""
     size = curve.params.size
-    return CalibratedResponse(curve, np.zeros((size, size)), 0.0, 0, 0.0, 0.0, [], reason)
+    return CalibratedResponse(curve, np.zeros((size, size)), 0.0, 0, 0.0, 0.0, [], reason, np.asarray(exposure, np.float64))
 
 
 def calibration_facts(found: CalibratedResponse) -> dict[str, object]:
     """What is known about the choice, as plain values for a JSON file."""
-    names = ("stops", "rows", "before", "after", "candidates", "reason")
+    names = ("stops", "rows", "before", "after", "candidates", "reason", "gauge")
     return {"covariance": found.covariance.tolist(), **{name: getattr(found, name) for name in names}}
 
 
-def _unknown(family: str, stops: float, rows: int, min_stops: float, min_rows: int, given: bool) -> CalibratedResponse:
+def _gains(rows: PatchRows, curve: Response, exposure: np.ndarray) -> np.ndarray:
+    """(V,) exposures that a curve implies where views overlap; their mean is that of `exposure`."""
+    values = curve.inverse(np.where(rows.clipped | ~(rows.value > DARK), np.nan, rows.value))
+    gains = estimate_gains(rows.patch, rows.view, values, len(exposure))
+    positive = exposure[np.isfinite(exposure) & (exposure > 0)]
+    return gains.gain * (np.exp(np.mean(np.log(positive))) if len(positive) else 1.0)
+
+
+def _unknown(family: str, stops: float, rows: int, min_stops: float, min_rows: int, exposure: np.ndarray) -> CalibratedResponse:
     start = response(family)
     start = start.with_params(np.tile(start.params, (3, 1)))
-    if not given:
-        reason = f"exposures are not known, which leaves the exponent of the response open: taken as {family}"
-    elif stops < min_stops:
+    if stops < min_stops:
         reason = f"exposures differ by less than {min_stops:g} stop where photographs overlap: taken as {family}"
     else:
         reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
-    return CalibratedResponse(start, _PRIOR**2 * np.eye(start.params.size), stops, 0, 0.0, 0.0, [], reason)
+    return CalibratedResponse(start, _PRIOR**2 * np.eye(start.params.size), stops, 0, 0.0, 0.0, [], reason, exposure)
 
 
 def _because(table: list[dict[str, object]], chosen: int, best: int, rows: int, stops: float) -> str:
@@ -212,6 +241,12 @@ class _Channel:
         self.part = (self.value - _KNOTS[self.knot]) / (_KNOTS[self.knot + 1] - _KNOTS[self.knot])
         members = np.bincount(self.cell, minlength=self.cells)
         self.share = (1.0 - 1.0 / np.maximum(members, 1))[self.cell]
+
+    def exposed(self, exposure: np.ndarray) -> _Channel:
+        """The same rows under other exposures (V,)."""
+        log_e = np.log(exposure)
+        views = len(exposure) + 1
+        return replace(self, log_e=log_e[self.cluster % views], full_e=log_e[self.full_cluster % views])
 
     @property
     def cells(self) -> int:
@@ -350,7 +385,6 @@ def _reached(above: np.ndarray, width: float) -> np.ndarray:
 class _Fit:
     params: np.ndarray
     covariance: np.ndarray
-    worth: float  # independent rows a row is worth
     score: float
     clusters: dict[int, float]
     width: float
@@ -368,10 +402,10 @@ def _maximise(data: _Channel, curve: Response, mean: np.ndarray, deviation: floa
             worth = _curvature(data, curve, weight, noise, mean, deviation, 1.0)[1]
         curve = _improve(data, curve, weight, noise, mean, deviation, worth, 30 if last else 12)
         noise, weight, deviations = _settle(data, curve, noise)
-    covariance, worth = _curvature(data, curve, weight, noise, mean, deviation, worth)
+    covariance, _, price = _curvature(data, curve, weight, noise, mean, deviation, worth)
     score, clusters = _likelihood(data, curve, noise)
     width = float(1.4826 * np.median(np.abs(deviations))) if len(deviations) else 0.0
-    return _Fit(curve.params, covariance, worth, score, clusters, width)
+    return _Fit(curve.params, covariance, score - price, clusters, width)
 
 
 def _settle(data: _Channel, curve: Response, noise: _Noise) -> tuple[_Noise, np.ndarray, np.ndarray]:
@@ -466,14 +500,15 @@ def _curvature(
     mean: np.ndarray,
     deviation: float,
     worth: float,
-) -> tuple[np.ndarray, float]:
-    """Covariance of the parameters, (P, P), and how many independent rows a row is worth (at most 1).
+) -> tuple[np.ndarray, float, float]:
+    """Covariance of the parameters, (P, P); how many independent rows a row is worth (at most 1); and the price of the
+    parameters in log likelihood.
 
     The sandwich H^-1 J H^-1 of scores summed over clusters says how far the likelihood overstates what it knows.
     `_inner` majorises the likelihood; H has the curvature of Student's t itself, which is flatter."""
     theta, size = curve.params, curve.params.size
     if not size:
-        return np.zeros((0, 0)), 1.0
+        return np.zeros((0, 0)), 1.0, 0.0
     hessian = np.zeros((size, size))
     for k, step in enumerate(1e-3 * np.eye(size)):
         up = _inner(data, curve, theta + step, weight, noise.width, mean, np.inf, 1.0)[1]
@@ -497,11 +532,13 @@ def _curvature(
     owner = np.unique(data.cluster, return_inverse=True)[1]
     summed = np.stack([np.bincount(owner, score[:, k]) for k in range(size)], -1)
     spread = summed.T @ summed * len(summed) / max(len(summed) - 1, 1)
-    inverse = (vectors / values) @ vectors.T
-    worth = float(np.clip(size / max(np.trace(inverse @ spread), 1e-12), 1e-4, 1.0))
     prior = np.eye(size) / deviation**2
+    known = np.linalg.inv((vectors * values) @ vectors.T + prior)
+    price = float(np.trace(known @ spread))
+    # Free directions alone: what the prior decides is no sign of rows that err together.
+    worth = float(np.clip(np.trace(known @ (vectors * values) @ vectors.T) / max(price, 1e-12), 1e-4, 1.0))
     adjusted = np.linalg.inv(worth * (vectors * values) @ vectors.T + prior)
-    return adjusted @ (worth**2 * spread + prior) @ adjusted, worth
+    return adjusted @ (worth**2 * spread + prior) @ adjusted, worth, price
 
 
 def _likelihood(data: _Channel, curve: Response, noise: _Noise) -> tuple[float, dict[int, float]]:
@@ -534,7 +571,7 @@ def _fit(family: str, joined: _Channel, channels: Sequence[_Channel], enough: Se
             continue
         own = _maximise(channels[c], start.with_params(common.params), common.params, _CHANNEL_PRIOR)
         params[c], covariance[part, part] = own.params, own.covariance
-        score += own.score - size / own.worth
+        score += own.score
         widths.append(own.width)
         for name, value in own.clusters.items():
             clusters[name] = clusters.get(name, 0.0) + value

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.cells import pack_keys, voxel_indices
+from iif_core.cells import INDEX_LIMIT, pack_keys, voxel_indices
 from iif_core.errors import InputError
 
 PATCH_FOOTPRINTS = 3.2
@@ -47,11 +47,12 @@ class PatchRows:
         return PatchRows(**{name: array[index] for name, array in self.__dict__.items()})
 
 
-def patch_edge(footprint: float) -> float:
-    """Edge of a patch in metres for a median pixel footprint (distance / focal length in pixels) in metres."""
+def patch_edge(footprint: float, extent: float = 0.0) -> float:
+    """Edge of a patch in metres for a median pixel footprint (distance / focal length in pixels) in metres; at least what
+    the numbers of a scene of `extent` metres hold."""
     if not footprint > 0:
         raise InputError(f"patches: pixel footprint {footprint} m; it must be positive")
-    return PATCH_FOOTPRINTS * footprint
+    return max(PATCH_FOOTPRINTS * footprint, extent / (INDEX_LIMIT - 8))
 
 
 def patch_numbers(points: np.ndarray, object_id: np.ndarray, edge: float, origin: np.ndarray) -> np.ndarray:

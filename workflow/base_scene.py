@@ -224,6 +224,11 @@ def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.
     return out
 
 
+def read_exposures(job: Job) -> np.ndarray:
+    """(views,) exposure of every view of the capture, in order, as stage emission used them. Needs emission upstream."""
+    return np.asarray(job.read("emission").json("emission.json")["exposure"], np.float64)
+
+
 def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:
     """The radiance cache on the device; `with_bounds`: also voxels that were only ever seen saturated."""
     from iif_core.transport import RadianceCache

@@ -11,18 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.brdf import R_MIN
 from iif_core.errors import InputError
 from iif_core.response import Response
 
 PARAMETERS = 16
-ROUGHNESS_MIN = 0.02
+
 IDENTITY = np.r_[np.eye(3, 4).ravel(), 1.0, 0.0, 1.0, 0.0]
 GAINS = np.array([0, 5, 10])
 BIASES = np.array([3, 7, 11])
 CROSS = np.array([1, 2, 4, 6, 8, 9])
 ROUGHNESS = np.array([12, 13])
 METALLIC = np.array([14, 15])
-LOW = np.array([0.0, 0.0, 0.0, ROUGHNESS_MIN, 0.0])
+LOW = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
 SOLVERS = ("direct", "sgd", "adam")
 
 

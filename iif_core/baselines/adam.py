@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..affines import ROUGHNESS_MIN
+from ..brdf import R_MIN
 from .loss import F0, CellFit, CellOptions, bracket, checked_prior, data_loss, losses, part_means, prior_scale
 from .problem import CellProblem
 
-_LOW = np.array([0.0, 0.0, 0.0, ROUGHNESS_MIN, 0.0])
+_LOW = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
 
 
 @dataclass(frozen=True)

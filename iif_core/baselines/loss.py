@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..affines import ROUGHNESS_MIN
+from ..brdf import R_MIN
 from ..errors import InputError
 from .problem import CellProblem
 
@@ -126,7 +126,7 @@ def losses(
     Args:
         value: (C, 5); prior: (C, 3) of each cell's object, needed where `options.prior` is not 0; scale: s, if it is held.
     """
-    r, m = np.clip(value[:, 3], ROUGHNESS_MIN, 1.0), value[:, 4]
+    r, m = np.clip(value[:, 3], R_MIN, 1.0), value[:, 4]
     cost = data_loss(problem.dd, lobes_at(problem, r), value[:, :3], m[:, None]).mean(1)
     means = part_means(problem, value, options)[problem.object_id]
     away = np.abs(r - means[:, 0]) + np.abs(m - means[:, 1])
@@ -171,7 +171,7 @@ def albedo_deviation(problem: CellProblem, value: np.ndarray) -> np.ndarray:
     r, m are taken as known, so it is a lower bound. Cells that nothing was seen of: 1.
     """
     known, metal = problem.known, value[:, 4:5]
-    lobes = lobes_at(problem, np.clip(value[:, 3], ROUGHNESS_MIN, 1.0))
+    lobes = lobes_at(problem, np.clip(value[:, 3], R_MIN, 1.0))
     error = np.maximum(data_loss(problem.dd, lobes, value[:, :3], metal), 0.0)[known].sum(0)
     variance = error / max(float(problem.pixels[known].sum()) - int(known.sum()), 1.0)
     rest = 1.0 - metal

@@ -49,6 +49,16 @@ def test_planted_affines_and_gamma_from_clean_ldr(halves):
     assert np.all(np.diff(out.history) <= 0)
 
 
+def test_calibrated_response_is_a_prior():
+    """A sure prior holds the response, a vague one lets the photographs decide."""
+    problem, _ = problem_of(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x))
+    for precision, expected in ((1e9, 2.1), (1e-9, 1.9)):
+        opt = FitOptions(**{**EXACT.__dict__, "response_ridge": 1e-5, "response_prior": (np.array([2.1]), precision * np.eye(1))})
+        out = fit_affines(problem, response("gamma", [2.0]), opt)
+        np.testing.assert_allclose(out.response.params, expected, atol=1e-4)
+        assert np.all(np.diff(out.history) <= 0)
+
+
 def test_planted_ggcm_per_channel():
     curve = response("ggcm", [[-0.8, 0.2, 0.0], [-0.7, 0.0, 0.1], [-0.6, -0.2, 0.0]])
     problem, truth = problem_of(np.random.default_rng(2), value_of=lambda x: curve(x))

@@ -77,3 +77,24 @@ def test_refused():
         estimate_gains(np.zeros(3, int), np.array([0, 1, 5]), np.ones(3), 3)
     with pytest.raises(InputError):
         estimate_gains(np.zeros(3, int), np.zeros(2, int), np.ones(3), 3)
+
+
+@pytest.mark.parametrize("kind", ["black", "huge", "constant", "one bright pixel"])
+def test_extreme_photographs_stay_finite_and_bounded(kind):
+    cell, view, value, truth = _scene(np.random.default_rng(5), noise=0.02)
+    if kind == "black":
+        value[view == 2] = 0.0
+    elif kind == "huge":
+        value *= 1e6
+    elif kind == "constant":
+        value[:] = 0.5
+    else:
+        value[7] = 1e6
+    out = estimate_gains(cell, view, value, 6)
+    assert np.isfinite(out.gain).all() and np.isfinite(out.error).all() and np.isfinite(out.residual)
+    if kind == "black":
+        assert not out.estimated[2] and out.gain[2] == 1
+        truth[2] = np.nan
+    known = np.isfinite(truth)
+    expected = np.zeros(6) if kind == "constant" else truth - np.nanmean(truth)
+    np.testing.assert_allclose(np.log(out.gain)[known], expected[known], atol=0.02)

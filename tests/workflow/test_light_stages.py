@@ -1,11 +1,13 @@
 """emission, shading and affines on a room whose light and materials are known."""
 
 import logging
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
 
+from iif_core.photography import response_curve
 from workflow.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
@@ -115,6 +117,22 @@ def test_ldr_with_unknown_response(tmp_path, llvm):
     response = _reader(tmp_path, "affines").table("camera_response.parquet")
     samples = response["kind"] == "sample"
     assert samples.sum() == 303 and (np.diff(response["value"][samples][:101]) > 0).all()
+
+
+def test_measured_response_is_used_as_it_is(tmp_path, llvm, monkeypatch):
+    truth = response_curve("filmic").samples(1024)
+    np.save(tmp_path / "crf.npy", truth)
+    monkeypatch.setitem(AFFINES, "response", SimpleNamespace(file=str(tmp_path / "crf.npy")))
+    build(tmp_path, views=3, size=24, samples=16, dynamic_range="ldr", curve="filmic")
+    _run(tmp_path, "ldr", emission={"rows": 2000, "samples": 4}, shading={"samples": 4})
+    table = _reader(tmp_path, "affines").table("camera_response.parquet")
+    assert set(table["kind"]) == {"sample"}
+    x, value = table["x"].reshape(3, -1), table["value"].reshape(3, -1)
+    np.testing.assert_allclose(
+        value, [np.interp(a, np.linspace(0, 1, 1024), c) for a, c in zip(x, truth, strict=True)], atol=1e-6
+    )
+    decision = _reader(tmp_path, "affines").json("affines.json")["plan"][0]
+    assert decision["component"] == "camera_response" and "crf.npy" in decision["reason"]
 
 
 @pytest.mark.parametrize("brightness", [0.0, 1000.0])

@@ -32,6 +32,7 @@ from workflow.base_scene import (
     BaseScene,
     base_maps,
     read_base_scene,
+    read_exposures,
     read_light,
     view_pixels,
 )
@@ -53,7 +54,7 @@ def run(job: Job) -> None:
     names = _names(job, scene.n_objects)
     find_gauge = _gauge(job, capture, names)  # bad settings stop here, before any work
     emits = read_light(job, len(scene.faces)).emits
-    exposures = dict(zip((v.view_id for v in capture.views), capture.exposures(), strict=True))
+    exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job), strict=True))
     problem, places = _problem(job, capture, scene, emits, exposures)
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))

@@ -82,7 +82,9 @@ def run(job: Job) -> None:
     photos = _Photographs(job, capture, scene, views, unknown, exposures)
     calibrated = _camera_response(photos)
     job.log.info("camera response: %s", calibrated.reason)
-    photos = replace(photos, sensor=replace(unknown, curve=calibrated.response))
+    exposures |= {view.view_id: float(e) for view, e in zip(views, calibrated.exposure, strict=True)}
+    notes.extend([calibrated.gauge] if calibrated.gauge else [])
+    photos = replace(photos, sensor=replace(unknown, curve=calibrated.response), exposures=exposures)
     statistics, threshold = _statistics(photos)
     adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
@@ -120,6 +122,7 @@ def run(job: Job) -> None:
             "active_set": active_set,
             "escape_share": {"primary": escape, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
+            "exposure": [exposures[view.view_id] for view in capture.views],
             "response": {**response_facts(calibrated.response), "calibration": calibration_facts(calibrated)},
             "plan": decisions,
             "notes": notes,
@@ -147,11 +150,11 @@ def _camera_response(photos: _Photographs) -> CalibratedResponse:
     """The measured curve, the family that is set, or the one that surface under different exposures speaks for."""
     settings, facts = photos.job.settings, photos.capture.facts
     setting = settings.affines.response
-    if not isinstance(setting, str):
-        return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}")
+    exposure = np.array([photos.exposures[view.view_id] for view in photos.views])
+    if not isinstance(setting, str) and not photos.capture.is_hdr:
+        return given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}", exposure)
     families = candidates(setting, facts["dynamic_range"])
     rows = _shared_surface(photos) if needs_rows(families) else no_rows()
-    exposure = np.array([photos.exposures[view.view_id] for view in photos.views])
     given = not facts.get("exposure_estimated", False)
     return calibrate_response(rows, exposure, families, settings.emission.saturation, given=given)
 
@@ -160,7 +163,8 @@ def _shared_surface(photos: _Photographs) -> PatchRows:
     """Patches of interior surface as the views show them."""
     capture, scene, views = photos.capture, photos.scene, photos.views
     footprints = [np.median(depth[depth > 0]) / view.fx for view in views if (depth := capture.gbuffer(view)[0]).any()]
-    edge = patch_edge(float(np.median(footprints))) if footprints else 1.0
+    extent = float(np.ptp(scene.vertices, axis=0).max())
+    edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
     origin = grid_origin(scene.vertices[scene.faces.ravel()], edge)
     share = min(1.0, STATISTICS_PIXELS / max(sum(view.width * view.height for view in views), 1))
     saturation = photos.job.settings.emission.saturation

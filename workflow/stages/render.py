@@ -7,7 +7,7 @@ import numpy as np
 from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.base_scene import BLACK
+from workflow.base_scene import BLACK, read_exposures
 from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
@@ -22,7 +22,7 @@ def run(job: Job) -> None:
     Sensor value: the re-rendering through the view's exposure and the fitted response, clipped to [0, 1].
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
-    curve, exposures = read_response(job.read("affines")), capture.exposures()
+    curve, exposures = read_response(job.read("affines")), read_exposures(job)
     geometry, material = scene.surface.traceable(scene.light.emits)
     from iif_core.transport import render
 
