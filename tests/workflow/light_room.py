@@ -273,8 +273,8 @@ EMISSION = {
 SHADING = {
     "samples": 32,
     "levels": 10,
-    "cell_edge": 0.03,
-    "noise": 0.08,
+    "cell_edge": 0.05,
+    "noise": 0.15,
     "max_samples": 512,
     "max_bounces": 6,
     "indirect": "auto",
