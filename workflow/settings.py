@@ -570,6 +570,20 @@ def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     return out
 
 
+def require_relighting(document: dict[str, Any], scene: str) -> list[dict[str, Any]]:
+    """The relightings of a dumped settings tree; an error where there are none, or two of one name."""
+    wanted: list[dict[str, Any]] = document["relight"]
+    if not wanted:
+        raise InputError(
+            f"config/scenes/{scene}.yaml: no relighting is configured. Add one, for example"
+            " `relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]` (docs/relighting.md)."
+        )
+    names = [entry["name"] for entry in wanted]
+    if len(set(names)) < len(names):
+        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
+    return wanted
+
+
 def relight_files(document: dict[str, Any]) -> list[Path]:
     """Environment files that the relightings of a dumped settings tree name; a missing one is an error."""
     named = [entry["environment"] for entry in document["relight"]]
