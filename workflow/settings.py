@@ -252,7 +252,7 @@ class Shading(Section):
     """Roughness levels."""
     cell_edge: float = Field(0.03, gt=0)
     """Diffuse light is cached once a piece of surface of this edge (metres), for all views."""
-    noise: float = Field(0.08, gt=0)
+    noise: float = Field(0.1, gt=0)
     """Relative standard error of diffuse light (median of an object) at which no more paths are added."""
     max_samples: int = Field(512, ge=2)
     """Most paths a cell."""
