@@ -283,7 +283,7 @@ class Affines(Section):
 class Render(Section):
     """Re-rendering of the views from the recovered scene."""
 
-    samples: int = Field(32, ge=1)
+    samples: int = Field(16, ge=1)
     """Paths a pixel."""
     max_bounces: int = Field(16, ge=1, le=64)
     """Path length."""
