@@ -158,6 +158,15 @@ def diffuse_of_cells(cells: ShadingCells, trace: Tracer, samples: int, noise: fl
     return DiffuseShading(diffuse.astype(np.float32), 2 * paths, first, last, left)
 
 
+def joined(cell: Array, cell_noise: float, own: Array) -> Array:
+    """(2, n, 3) float32 halves of pixels: their cells' estimate (2, n, 3) of relative error `cell_noise` and their own
+    (2, n, 3), each weighted with the other's variance. One weight for all pixels, so that it depends on no pixel's value."""
+    own_noise = float(np.median(relative_error(own))) if own.shape[1] else 0.0
+    total = own_noise**2 + cell_noise**2
+    weight = own_noise**2 / total if total > 0 else 1.0
+    return (weight * cell + (1 - weight) * own).astype(np.float32)
+
+
 def relative_error(halves: Array) -> Array:
     """(c,) relative standard error of the mean of two estimates (2, c, 3), from how far they are apart; dark ones (below 1 % of
     the median) relative to that 1 %."""

@@ -268,7 +268,7 @@ class Shading(Section):
     """Roughness levels."""
     cell_edge: float = Field(0.03, gt=0)
     """Diffuse light is cached once a piece of surface of this edge (metres), for all views."""
-    noise: float = Field(0.08, gt=0)
+    noise: float = Field(0.1, gt=0)
     """Relative standard error of diffuse light (median of an object) at which no more paths are added."""
     max_samples: int = Field(512, ge=2)
     """Most paths a cell."""
@@ -387,7 +387,7 @@ class Affines(Section):
 class Render(Section):
     """Re-rendering of the views from the recovered scene."""
 
-    samples: int = Field(32, ge=1)
+    samples: int = Field(16, ge=1)
     """Paths a pixel."""
     max_bounces: int = Field(16, ge=1, le=64)
     """Path length."""
@@ -681,6 +681,20 @@ def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
             value = value[part]
         out[key] = value
     return out
+
+
+def require_relighting(document: dict[str, Any], scene: str) -> list[dict[str, Any]]:
+    """The relightings of a dumped settings tree; an error where there are none, or two of one name."""
+    wanted: list[dict[str, Any]] = document["relight"]
+    if not wanted:
+        raise InputError(
+            f"config/scenes/{scene}.yaml: no relighting is configured. Add one, for example"
+            " `relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]` (docs/relighting.md)."
+        )
+    names = [entry["name"] for entry in wanted]
+    if len(set(names)) < len(names):
+        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
+    return wanted
 
 
 def relight_files(document: dict[str, Any]) -> list[Path]:

@@ -68,9 +68,13 @@ class Emitters:
             weight = np.concatenate(
                 [_scaled(weight, 1 - environment_share), _scaled(sky.ravel(), environment_share if weight.any() else 1.0)]
             )
+        first, copies = _coincident(geometry, np.flatnonzero(weight[:faces] > 0), side)
+        weight[first] += weight[copies]
+        weight[copies] = 0
         measure = np.concatenate([geometry.areas, solid_angles(*sky.shape).ravel()])[: len(weight)]
         self.slots, pdf = _slots(weight, measure)
         self.pdf_area = pdf[:faces]
+        self.pdf_area[copies] = self.pdf_area[first]
         self.pdf_sky = pdf[faces:].reshape(sky.shape) if sky.any() else np.zeros(sky.shape, np.float32)
         self.can_be_sampled = len(self.slots) > 0
         self.sky_is_sampled = bool(self.pdf_sky.any())
@@ -148,6 +152,26 @@ def _escape_share(geometry: Geometry, rays: int = 4096) -> float:
     start = np.einsum("ij,ijk->ik", weights, corners) + 1e-3 * normal
     hit, _ = trace(geometry, start, cosine_directions(normal, rng))
     return float((hit < 0).mean())
+
+
+def _coincident(geometry: Geometry, drawn: Array, side: Array) -> tuple[Array, Array]:
+    """(first, copy): faces out of `drawn` with the same corners that radiate to the same side, each copy with the first.
+
+    A ray meets one of them only, so drawing a point on each would count its light twice.
+    """
+    corners = geometry.vertices[geometry.faces[drawn]]
+    order = np.lexsort((corners[..., 2], corners[..., 1], corners[..., 0]), axis=1)
+    key = np.take_along_axis(corners, order[..., None], 1).reshape(-1, 9)
+    turned = np.where(np.isin(order @ np.array([9, 3, 1]), (5, 15, 19)), 1, -1)  # even permutations of 0 1 2
+    key = np.column_stack([key, turned * side[drawn]])
+    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    if len(count) == len(drawn):
+        return drawn[:0], drawn[:0]
+    by_group = np.argsort(group, kind="stable")
+    start = np.repeat(np.cumsum(count) - count, count)
+    is_copy = np.arange(len(drawn)) > start
+    return drawn[by_group[start[is_copy]]], drawn[by_group[is_copy]]
 
 
 def _sky_weight(environment: Array, weight: ArrayLike | None) -> Array:

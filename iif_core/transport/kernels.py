@@ -70,11 +70,16 @@ def to_world(local: tuple[Any, Any, Any], normal: Any) -> Any:
     return mi.Vector3f(tangent * local[0] + bitangent * local[1] + normal * local[2])
 
 
-def evaluate(wi: Any, wo: Any, normal: Any, roughness: Any) -> tuple[Any, Any, Any, Any]:
+def specular_chance(kd: Any, ks: Any, normal: Any, wo: Any) -> Any:
+    """Probability with which a path at this vertex goes on in the GGX lobe."""
+    return brdf.specular_chance(DRJIT, dr.max(kd), dr.max(ks), dr.dot(normal, wo))
+
+
+def evaluate(wi: Any, wo: Any, normal: Any, roughness: Any, chance: Any) -> tuple[Any, Any, Any, Any]:
     """(diffuse, spec, fc, mixture density) of one pair of directions."""
     NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, normal, wi, wo)
     diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, roughness)
-    return diffuse, spec, fc, brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, roughness)
+    return diffuse, spec, fc, brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, roughness, chance)
 
 
 def reflectance(kd: Any, ks: Any, diffuse: Any, spec: Any, fc: Any) -> Any:
@@ -154,7 +159,7 @@ def direct_light(
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
     light = sample_light(world, rng, point, normal, active)
-    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness)
+    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness, specular_chance(kd, ks, normal, wo))
     f = reflectance(kd, ks, diffuse, spec, fc)
     share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
     return light.gain(world, weight * f * share)
@@ -163,8 +168,9 @@ def direct_light(
 def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
-    wi = sample_lobe(choice < 0.5, u1, u2, wo, normal, roughness)
-    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness)
+    chance = specular_chance(kd, ks, normal, wo)
+    wi = sample_lobe(choice < chance, u1, u2, wo, normal, roughness)
+    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness, chance)
     goes_on = active & (dr.dot(normal, wi) > 0) & (pdf > 0)
     return goes_on, wi, dr.select(goes_on, reflectance(kd, ks, diffuse, spec, fc) / pdf, 0), pdf
 

@@ -240,3 +240,15 @@ def test_torch_gradients_are_finite_at_the_edges():
     diffuse, spec, fc = brdf.lobes(TORCH, NoL, one, one, one, torch.zeros(4), r)
     (diffuse + spec + fc).sum().backward()
     assert torch.isfinite(r.grad).all()
+
+
+def test_lobes_are_drawn_by_what_they_reflect():
+    chance = brdf.specular_chance(
+        NUMPY, np.array([0.8, 0.0, 0.8, 0.0]), np.array([0.04, 0.9, 0.04, 0.0]), np.array([1.0, 1.0, 1e-3, 1.0])
+    )
+    assert chance[0] == 0.05 and chance[1] == 0.95 and 0.4 < chance[2] < 0.6 and chance[3] == 0.05
+    steep = brdf.specular_chance(NUMPY, 0.5, 0.04, np.linspace(0, 1, 101))
+    assert (np.diff(steep) <= 0).all() and np.isfinite(steep).all()
+    angles = 0.7, 0.9, 0.5, 0.2
+    both = [brdf.mixture_pdf(NUMPY, *angles, 0.3, c) for c in (0.0, 0.25, 1.0)]
+    assert both[0] == pytest.approx(0.7 / np.pi) and both[1] == pytest.approx(0.75 * both[0] + 0.25 * both[2])

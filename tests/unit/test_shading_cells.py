@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.shading_cells import REPRESENTATIVES, ShadingCellBuilder, diffuse_of_cells, normal_bin, relative_error
+from iif_core.shading_cells import REPRESENTATIVES, ShadingCellBuilder, diffuse_of_cells, joined, normal_bin, relative_error
 
 EDGE = 0.5
 UP, SIDE = np.float32([0, 0, 1]), np.float32([1, 0, 0])
@@ -112,6 +112,19 @@ def test_most_paths_stop_it_and_reruns_are_the_same():
     assert (few.samples == 2).all()
     dark = diffuse_of_cells(cells, lambda p, n, s, seed: np.zeros((len(p), 3)), 16, 0.1, 64, 5)
     assert not dark.diffuse.any() and dark.noise_last == 0 and (dark.samples == 16).all()
+
+
+def test_two_estimates_are_better_than_one():
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(1, 3, (1, 4000, 1)) * np.ones(3)
+    cell = truth * (1 + rng.normal(0, 0.1 * np.sqrt(2), (2, 4000, 1)))
+    own = truth * (1 + rng.normal(0, 0.2 * np.sqrt(2), (2, 4000, 1)))
+    both = joined(cell, 0.1, own)
+    scatter = (both.mean(0) / truth[0] - 1).std()
+    assert scatter == pytest.approx(1 / np.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=0.05)
+    assert abs(np.corrcoef((both / truth - 1)[..., 0])[0, 1]) < 0.07
+    assert not joined(np.zeros((2, 5, 3)), 0.0, np.zeros((2, 5, 3))).any()
+    assert joined(np.zeros((2, 0, 3)), 0.1, np.zeros((2, 0, 3))).shape == (2, 0, 3)
 
 
 def test_normals_of_every_direction_have_a_bin():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -131,7 +131,7 @@ class StubJob:
     def progress(self, done: int, total: int, what: str) -> None:
         pass
 
-    def timed(self, name: str) -> Any:
+    def timed(self, name: str) -> AbstractContextManager[None]:
         return nullcontext()
 
 
@@ -278,8 +278,8 @@ EMISSION = {
 SHADING = {
     "samples": 32,
     "levels": 10,
-    "cell_edge": 0.03,
-    "noise": 0.08,
+    "cell_edge": 0.05,
+    "noise": 0.15,
     "max_samples": 512,
     "max_bounces": 6,
     "indirect": "auto",

@@ -1,7 +1,24 @@
 # Pictures of the recovered scene under other light: `relight:` in config/scenes/<scene>.yaml (docs/relighting.md).
+import json
+
+from workflow.settings import require_relighting
+
+
+def relight_inputs(wildcards):
+    """What stage relight reads; a scene without relightings stops here, before any job."""
+    inputs = upstream("relight")(wildcards)
+    try:
+        require_relighting(
+            json.loads(fingerprints.resolved(wildcards.scene, QUALITY)), wildcards.scene
+        )
+    except InputError as error:
+        stop(error)
+    return inputs
+
+
 rule relight:
     input:
-        upstream("relight"),
+        relight_inputs,
     output:
         manifest="results/{scene}/relight/manifest.json",
     log:

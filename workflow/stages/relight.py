@@ -23,24 +23,17 @@ from workflow.exporters.surface import up_axis
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.recovered import Recovered, read_recovered, read_response
+from workflow.settings import require_relighting
 
 _SEEDS = 0x72656C69  # keeps the random streams of this stage apart from those of others
 MAP_ROWS = 128
 """Environment files are averaged down to this many rows."""
 SHEET_COLUMNS = 6
-EXAMPLE = "relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]"
 
 
 def run(job: Job) -> None:
     """Write <name>/frame_<i>.exr and .png of every relighting, contact_sheet.png and relight.json."""
-    wanted = job.settings.relight
-    if not wanted:
-        raise InputError(
-            f"config/scenes/{job.scene}.yaml: no relighting is configured. Add one, for example `{EXAMPLE}` (docs/relighting.md)."
-        )
-    names = [entry["name"] for entry in wanted]
-    if len(set(names)) < len(names):
-        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
+    wanted = require_relighting({"relight": job.settings.relight}, job.scene)
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve = read_response(job.read("affines"))
     if capture.is_hdr:

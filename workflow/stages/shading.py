@@ -11,11 +11,11 @@ import numpy as np
 from iif_core import plan
 from iif_core.cells import grid_origin
 from iif_core.errors import InputError
-from iif_core.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells
+from iif_core.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells, joined
 from workflow.artifacts.store import split_rgb
-from workflow.base_scene import BaseScene, Light, read_base_scene, read_light, read_radiance_cache, view_pixels
+from workflow.base_scene import BaseScene, Light, ViewPixels, read_base_scene, read_light, read_radiance_cache, view_pixels
 from workflow.job import Job
-from workflow.normal_form import CaptureReader
+from workflow.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
     from iif_core.transport import CellMaterials, Emitters, Geometry, RadianceCache
@@ -135,39 +135,47 @@ def _views(
     cells: ShadingCells,
     diffuse: DiffuseShading,
 ) -> None:
-    """Specular levels of every pixel, with the diffuse light of its cell."""
-    from iif_core.transport import shading_caches
-
-    settings = job.settings.shading
-    per_half = max(1, settings.samples // 2)
+    """Specular levels of every pixel, and the diffuse light of its cell joined with what the same paths say about it."""
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
         pixels = view_pixels(job, capture, scene, view)
         cell = cells.find(pixels.points, pixels.normals, pixels.object_id)
+        own, s0, s1 = _traced(job, world, levels, view, pixels)
+        parts = joined(diffuse.diffuse[:, cell], diffuse.noise_last, own), s0, s1
+        if not all(np.isfinite(part).all() for part in parts):
+            raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
         channels: dict[str, np.ndarray] = {}
         for half in range(2):
-            _, s0, s1 = shading_caches(
-                world.geometry,
-                world.material,
-                world.emitters,
-                pixels.points,
-                pixels.normals,
-                pixels.wo,
-                levels,
-                per_half,
-                settings.max_bounces,
-                _seed(job, view.view_id) * 2 + half,
-                world.cache,
-            )
-            parts = diffuse.diffuse[half, cell], s0, s1
-            if not all(np.isfinite(part).all() for part in parts):
-                raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
-            channels |= _channels(f"half{half}.diffuse", parts[0], pixels.index, view.height, view.width)
+            channels |= _channels(f"half{half}.diffuse", parts[0][half], pixels.index, view.height, view.width)
             for j in range(len(levels)):
-                channels |= _channels(f"half{half}.s0.{j:02d}", s0[:, j], pixels.index, view.height, view.width)
-                channels |= _channels(f"half{half}.s1.{j:02d}", s1[:, j], pixels.index, view.height, view.width)
+                channels |= _channels(f"half{half}.s0.{j:02d}", s0[half, :, j], pixels.index, view.height, view.width)
+                channels |= _channels(f"half{half}.s1.{j:02d}", s1[half, :, j], pixels.index, view.height, view.width)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
     job.progress(len(capture.views), len(capture.views), "views cached")
+
+
+def _traced(job: Job, world: _World, levels: np.ndarray, view: View, pixels: ViewPixels) -> tuple[np.ndarray, ...]:
+    """Diffuse (2, n, 3) and specular (2, n, J, 3) twice of the pixels of a view, two independent halves."""
+    from iif_core.transport import shading_caches
+
+    settings = job.settings.shading
+    halves = [
+        shading_caches(
+            world.geometry,
+            world.material,
+            world.emitters,
+            pixels.points,
+            pixels.normals,
+            pixels.wo,
+            levels,
+            max(1, settings.samples // 2),
+            settings.max_bounces,
+            _seed(job, view.view_id) * 2 + half,
+            world.cache,
+        )
+        for half in range(2)
+    ]
+    return tuple(np.stack(part) for part in zip(*halves, strict=True))
 
 
 def _facts(cells: ShadingCells, diffuse: DiffuseShading) -> dict[str, Any]:
