@@ -25,8 +25,8 @@ from .loss import (
 from .problem import CellProblem
 
 METALNESS = np.linspace(0.0, 1.0, 11)
-STARTS = ((1.0, 0.0), (0.6, 0.0), (0.25, 0.0), (0.4, 1.0))
-"""Means of the parts to start the fixed point from: rough, half glossy, glossy, metal. The best is kept per object."""
+STARTS = ((1.0, 0.0), (1.0, 0.2), (0.85, 0.3), (0.8, 0.0), (0.4, 0.0), (0.85, 0.85), (0.4, 1.0), (0.15, 1.0))
+"""Means of the parts to start the fixed point from, rough to glossy, dielectric to metal. The best is kept per object."""
 _CELLS = 1 << 13
 
 
@@ -34,7 +34,7 @@ def solve_direct(
     problem: CellProblem,
     options: CellOptions | None = None,
     prior: np.ndarray | None = None,
-    rounds: int = 6,
+    rounds: int = 4,
     scales: int = 3,
 ) -> CellFit:
     """Minimise the loss of every cell.

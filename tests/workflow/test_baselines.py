@@ -107,7 +107,7 @@ def test_both_solvers_and_same_bytes_twice(ldr):
         files, loss = direct.manifest["files"], direct.json("affines.json")["history"][-1]
         assert _fit(folder, "ldr", model).manifest["files"] == files
         adam = _fit(folder, "ldr", model, solver="sgd").json("affines.json")
-        assert loss <= adam["history"][-1] * 1.002 and adam["solver"] == "sgd"
+        assert loss <= 1.01 * adam["history"][-1] and adam["solver"] == "sgd"
 
 
 def test_the_camera_of_iris_comes_closer(ldr):
