@@ -85,7 +85,7 @@ def run(job: Job) -> None:
         "names": list(result.curve.names),
         "parameters": np.ravel(result.curve.params).tolist(),
     }
-    facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [], "residual": 0.0, "plan": []}
+    facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [0.0], "residual": 0.0, "plan": []}
     job.writer.json("affines.json", {**facts, "pixels": int(result.pixels.sum()), "response": family, **result.facts})
 
 
