@@ -7,8 +7,6 @@ the levels and that mean misses nothing. Metalness is searched on a grid and at 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from .loss import (
@@ -35,7 +33,7 @@ def solve_direct(
     options: CellOptions | None = None,
     prior: np.ndarray | None = None,
     rounds: int = 4,
-    scales: int = 3,
+    scales: int = 2,
 ) -> CellFit:
     """Minimise the loss of every cell.
 
@@ -52,9 +50,10 @@ def solve_direct(
     problem_pixels = max(float(problem.pixels[problem.known].sum()), 1e-300)
     value, scale = np.zeros((len(problem.pixels), 5)), 1.0
     cost, history = np.full(problem.n_objects, np.inf), []
-    if options.prior:  # the scale starts where the light alone puts the albedo
-        free = replace(options, prior=0.0)
-        scale = prior_scale(problem, _parts(problem, free, target, scale, _search(problem, free, target, scale), rounds), target)
+    if options.prior:  # the scale starts where the light alone puts the albedo of rough dielectrics
+        rough = problem.lobes[:, -1].astype(np.float64)
+        alone = best_albedo(problem.dd, rough, np.zeros((len(rough), 1)), 0.0, 0.0)
+        scale = prior_scale(problem, alone, target)
     for _ in range(scales if options.prior else 1):
         table = _search(problem, options, target, scale)
         candidate = _parts(problem, options, target, scale, table, rounds)
