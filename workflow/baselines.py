@@ -25,14 +25,24 @@ from iif_core.baselines.problem import DARK, CellSums, PixelRows
 from iif_core.baselines.texture import AlbedoSums, BlockLight, blocks_of
 from iif_core.response import Response, response, response_facts, response_from_facts
 from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
-from workflow.base_scene import MATERIAL, UNKNOWN_MATERIAL, BaseScene, base_maps, read_base_scene, read_light, view_pixels
+from workflow.base_scene import (
+    MATERIAL,
+    UNKNOWN_MATERIAL,
+    BaseScene,
+    ViewPixels,
+    base_maps,
+    read_base_scene,
+    read_light,
+    view_pixels,
+)
+from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
 SATURATION = 0.99
 BORDER_WEIGHT = 0.1
-BLOCK = 4
-"""Edge in cells of the blocks that share roughness, metalness and diffuse light: about 1.6 pixel footprints."""
+BLOCK_FOOTPRINTS = 1.6
+"""Edge, in median pixel footprints, of the blocks of cells that share roughness, metalness and diffuse light."""
 CAMERA_PIXELS = 200_000
 """Pixels, of whole blocks, that the camera response is fitted to."""
 RESPONSE_SAMPLES = 101
@@ -70,7 +80,7 @@ def run(job: Job) -> None:
         _write_response(job, result.curve)
     _write_cells(job, result)
     _write_maps(job, capture, scene, result, per_pixel=model == "base")
-    facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [], "residual": 0.0, "plan": []}
+    facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [0.0], "residual": 0.0, "plan": []}
     job.writer.json(
         "affines.json", {**facts, "pixels": int(result.pixels.sum()), "response": response_facts(result.curve), **result.facts}
     )
@@ -116,7 +126,8 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
     """Roughness and metalness of blocks of cells, then the albedo of every cell."""
     levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
     options = FIPT if model == "fipt" else IRIS
-    block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, BLOCK)
+    edge = max(1, round(BLOCK_FOOTPRINTS * _footprint(capture) / scene.cell_edge))
+    block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
     prior = _object_means(job, capture, scene) if model == "iris" else None
     goal = prior[owner, :3] if prior is not None else None
     views = _Pixels(job, capture, scene, block_of, len(owner))
@@ -159,6 +170,16 @@ def _residual(fit: CellFit) -> float:
     return float(np.sqrt(max(fit.history[-1], 0.0))) if fit.history else 0.0
 
 
+def _footprint(capture: CaptureReader) -> float:
+    """Median over the views of the median size of a pixel on the surface, in metres; 0 where nothing is seen."""
+    sizes = []
+    for view in capture.views:
+        depth = capture.gbuffer(view)[0]
+        if (depth > 0).any():
+            sizes.append(float(np.median(depth[depth > 0])) / view.fx)
+    return float(np.median(sizes)) if sizes else 0.0
+
+
 class _Pixels:
     """Valid pixels of surface that does not shine, view by view: rows by block, and the cell of each.
 
@@ -168,6 +189,7 @@ class _Pixels:
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, block_of: np.ndarray, blocks: int):
         self.job, self.capture, self.scene, self.block_of = job, capture, scene, block_of
+        require_denoiser()
         self.emits = read_light(job, len(scene.faces)).emits
         self.levels = len(job.read("shading").table("levels.parquet")["roughness"])
         light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
@@ -191,12 +213,13 @@ class _Pixels:
             pixels = view_pixels(job, capture, self.scene, view)
             cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
             use = pixels.valid & (cell >= 0) & ~self.emits[pixels.face]
+            channels = job.read("shading").exr(f"maps/{view.name}.exr")
+            d = _denoised(channels, view, pixels)[use] if diffuse is None else np.zeros(0)
             pixels, cell = pixels.take(use), cell[use]
             block = self.block_of[cell]
-            channels = job.read("shading").exr(f"maps/{view.name}.exr")
             levels = self.levels if diffuse is not None else 0
             s0, s1 = (_lobes(channels, name, levels, pixels.index) for name in ("s0", "s1"))
-            d = diffuse[block] if diffuse is not None else _mean_of_halves(channels, "diffuse", pixels.index)
+            d = d if diffuse is None else diffuse[block]
             value = np.asarray(pixels.value, np.float32)
             saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
             value = np.minimum(value, SATURATION) if not capture.is_hdr else value
@@ -204,6 +227,15 @@ class _Pixels:
             weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
             yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
             job.progress(done + 1, len(views), "views read")
+
+
+def _denoised(channels: dict[str, np.ndarray], view: View, pixels: ViewPixels) -> np.ndarray:
+    """(n, 3) diffuse light of pixels, denoised as FIPT does; a free albedo would keep all of its noise."""
+    normals = np.zeros((view.height * view.width, 3), np.float32)
+    normals[pixels.index] = pixels.normals
+    shape = (view.height, view.width, 3)
+    both = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
+    return denoise(both, np.ones(shape, np.float32), normals.reshape(shape)).reshape(-1, 3)[pixels.index]
 
 
 def _mean_of_halves(channels: dict[str, np.ndarray], layer: str, index: np.ndarray) -> np.ndarray:

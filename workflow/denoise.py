@@ -1,4 +1,4 @@
-"""Denoising of rendered pictures: photographs of sources that render, and re-renderings. Never of what a fit reads."""
+"""Denoising of rendered pictures: photographs, re-renderings, the light of the baselines. Never of what our fit reads."""
 
 from __future__ import annotations
 

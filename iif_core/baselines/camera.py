@@ -67,6 +67,10 @@ def fit_camera(
     rows = rows.take(np.argsort(rows.cell, kind="stable"))
     if not response.params.size or not len(rows.cell):
         return CameraFit(response, [])
+    # Only the cells that have pixels here: the others would be solved for nothing.
+    present, own = np.unique(rows.cell, return_inverse=True)
+    rows, prior = replace(rows, cell=own), prior[present]
+    sums = CellSums(sums.object_id[present], sums.n_objects, sums.levels)
     begin, history, fit = response.params, [], None
     for step in range(iterations):
         problem = _problem(rows, sums, response)

