@@ -136,7 +136,10 @@ def test_variants_share_what_an_earlier_one_made(folder):
         (LATE.replace("scores: metrics", "scores: report"), ["`scores`", "'report'", "'metrics'"]),
         (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
         (LATE.replace("predictions: 2}", "predictions: 0}"), ["late.yaml, `common`", "`base.predictions`: found 0"]),
-        (LATE.replace("model: fipt", "solver: sgd"), ["late.yaml, variant other", "`solver: sgd` fits `model: fipt`"]),
+        (
+            LATE.replace("model: fipt", "model: fipt, solver: sgd"),
+            ["late.yaml, variant other", "`solver: sgd` does not fit `model: fipt`"],
+        ),
     ],
 )
 def test_mistakes_in_a_study_of_the_result(folder, text, words):
