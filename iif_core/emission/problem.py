@@ -132,8 +132,13 @@ def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray) -> Emissi
         own = key[:, 1] == g
         brightness[own] = brightness[own].mean()
     floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
-    weight = out.weight / np.maximum(brightness + floor, 1e-12) ** 2
-    return EmissionProblem(replace(out, weight=weight), seen.target, key[:, 0].astype(np.int64), key[:, 1] >= 0)
+    scale = np.maximum(brightness + floor, 1e-12)
+    weight = out.weight / scale**2
+    owner = key[:, 0].astype(np.int64)
+    # What an emitter shows itself has next to no noise.
+    noise = np.where(owner >= 0, 1.0, 1e-3) * scale[:, 0]
+    cluster = np.where(owner >= 0, owner * (int(key[:, 2].max(initial=0)) + 1) + key[:, 2], -1)
+    return EmissionProblem(replace(out, weight=weight, cluster=cluster, noise=noise), seen.target, owner, key[:, 1] >= 0)
 
 
 def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProblem:
@@ -149,6 +154,8 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
         np.concatenate([old.target_second, seen]),
         np.concatenate([old.weight, weight]),
         np.concatenate([old.lower_bound, np.full((1, 3), sky.bounded)]),
+        np.r_[old.cluster, -1],
+        np.r_[old.noise, 1e-3 * max(float(seen.mean()), 1e-6)],
     )
     return EmissionProblem(added, np.concatenate([problem.observed, seen]), np.r_[problem.owner, -1], np.r_[problem.anchor, True])
 

@@ -17,7 +17,7 @@ from iif_core.emission.candidates import (
     radiance_threshold,
     with_thin_objects,
 )
-from iif_core.emission.direct import EmissionSolution, solve_emission
+from iif_core.emission.direct import EmissionSolution, solve_families
 from iif_core.emission.environment import cosine_directions
 from iif_core.emission.groups import EmitterGroups, group_emitters
 from iif_core.emission.problem import PixelRows, Sky, assemble, initial_radiance, white_surface
@@ -310,7 +310,12 @@ def _solve(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, 
     pixels, base, rows = _choose_rows(photos, groups)
     halves = _trace(photos, pixels, base, groups, voxels, sky, 3)
     initial = _initial(photos, groups, rows, sky)[1]
-    return solve_emission(assemble(rows, halves, len(initial), None, sky).with_gains(initial).rows, initial)
+    problem = assemble(rows, halves, len(initial), None, sky).with_gains(initial)
+    # Parts of one object shine alike, more or less; the environment is a family of its own.
+    face = np.flatnonzero(groups.of_face >= 0)
+    family = np.full(len(initial), -1)
+    family[groups.of_face[face]] = photos.scene.object_id[face]
+    return solve_families(problem.rows, initial, family)
 
 
 def _trace(
