@@ -19,6 +19,7 @@ include: "workflow/rules/emission.smk"
 include: "workflow/rules/shading.smk"
 include: "workflow/rules/affines.smk"
 include: "workflow/rules/deliver.smk"
+include: "workflow/rules/relight.smk"
 include: "workflow/rules/studies.smk"
 
 

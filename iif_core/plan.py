@@ -19,6 +19,7 @@ EXPOSURE_LOG_RATIO = 0.05
 RESPONSE_EXPLAINED = 0.05
 METALLIC_PRIOR = 0.25
 SPECULAR_ROUGHNESS = 0.85
+CACHE_COVERAGE = 0.3
 SECOND_PASS_GAIN = 0.10
 
 
@@ -67,6 +68,25 @@ def emitters(groups: int, dropped: int, candidates: int) -> Decision:
     else:
         reason = "no face was seen saturated often enough; light comes from cache and environment"
     return _decision("emitters", groups > 0, "emitter groups", groups, 1, reason)
+
+
+def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
+    """Indirect light from photographed radiance, or from paths that go on with the base materials.
+
+    The cache holds what the cameras saw; paths compound the error of the base albedo at every bounce. Against true incident
+    light (14 views of 112^2, LDR) the objects' diffuse shading was off by -0.6 % +- 1.8 % (kitchen) and +5 % +- 4.6 % (Country
+    Kitchen) with the cache, by -25 % +- 8 % and -51 % +- 19 % with paths; thinned to half of its hits the cache still won.
+
+    Args:
+        setting: `cache`, `path` or `auto`.
+        coverage: share of cosine-distributed rays from the surface that meet a voxel, of those that meet no emitter.
+        censored: share of the voxels that were only ever seen saturated.
+    """
+    measure = "share of secondary hits whose radiance was photographed"
+    if setting != "auto":
+        return _decision("radiance_cache", setting == "cache", measure, coverage, CACHE_COVERAGE, f"set to {setting}")
+    reason = f"{coverage:.0%} of secondary hits were photographed ({censored:.1%} of the voxels only saturated)"
+    return _decision("radiance_cache", coverage > CACHE_COVERAGE, measure, coverage, CACHE_COVERAGE, reason)
 
 
 def camera_response(dynamic_range: str, family: str, start_residual: float, fitted_residual: float) -> Decision:

@@ -30,17 +30,47 @@ class Namespace:
     maximum: Callable[[Any, Any], Any]
     minimum: Callable[[Any, Any], Any]
     where: Callable[[Any, Any, Any], Any]
+    acos: Callable[[Any], Any]
+    atan2: Callable[[Any, Any], Any]
     pi: float = math.pi
 
 
 def _numpy() -> Namespace:
-    return Namespace("numpy", np.sqrt, np.exp, np.log, np.abs, np.sin, np.cos, np.floor, np.maximum, np.minimum, np.where)
+    return Namespace(
+        "numpy",
+        np.sqrt,
+        np.exp,
+        np.log,
+        np.abs,
+        np.sin,
+        np.cos,
+        np.floor,
+        np.maximum,
+        np.minimum,
+        np.where,
+        np.arccos,
+        np.arctan2,
+    )
 
 
 def _drjit() -> Namespace:
     import drjit as dr
 
-    return Namespace("drjit", dr.sqrt, dr.exp, dr.log, dr.abs, dr.sin, dr.cos, dr.floor, dr.maximum, dr.minimum, dr.select)
+    return Namespace(
+        "drjit",
+        dr.sqrt,
+        dr.exp,
+        dr.log,
+        dr.abs,
+        dr.sin,
+        dr.cos,
+        dr.floor,
+        dr.maximum,
+        dr.minimum,
+        dr.select,
+        dr.acos,
+        dr.atan2,
+    )
 
 
 def _torch() -> Namespace:
@@ -66,6 +96,8 @@ def _torch() -> Namespace:
         extremum(torch.maximum, lambda tensor, scalar: torch.clamp(tensor, min=scalar)),
         extremum(torch.minimum, lambda tensor, scalar: torch.clamp(tensor, max=scalar)),
         torch.where,
+        torch.acos,
+        torch.atan2,
     )
 
 

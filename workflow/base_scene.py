@@ -9,7 +9,7 @@ import numpy as np
 
 from iif_core.cells import grid_origin
 from iif_core.mesh import face_geometry
-from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
@@ -46,8 +46,13 @@ class BaseScene:
     cell_values: np.ndarray
     object_values: np.ndarray
 
-    def traceable(self, black: np.ndarray | None = None) -> tuple[Geometry, CellMaterials]:
-        """Geometry and materials on the device; faces in `black` (m,) bool reflect nothing."""
+    def traceable(
+        self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> tuple[Geometry, CellMaterials]:
+        """Geometry and materials on the device; faces in `black` (m,) bool reflect nothing.
+
+        extra: vertices (v, 3) and faces (f, 3) of a black thing to add; its faces come last.
+        """
         import mitsuba
 
         mitsuba.set_variant("llvm_ad_rgb")
@@ -58,7 +63,12 @@ class BaseScene:
         material = CellMaterials(
             self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object, self.cell_values, object_values
         )
-        return build_geometry(self.vertices, self.faces, object_id), material
+        if extra is None:
+            return build_geometry(self.vertices, self.faces, object_id), material
+        vertices = np.concatenate([self.vertices, extra[0]])
+        faces = np.concatenate([self.faces, extra[1] + len(self.vertices)])
+        object_id = np.concatenate([object_id, np.full(len(extra[1]), self.n_objects, np.int32)])
+        return build_geometry(vertices, faces, object_id), material
 
 
 def read_base_scene(job: Job) -> BaseScene:
@@ -168,7 +178,7 @@ class Light:
     """What stage emission found, per face.
 
     Attributes:
-        radiance: (m, 3); side: (m,) int8; emits: (m,) bool; environment: (3,).
+        radiance: (m, 3); side: (m,) int8; emits: (m,) bool; environment: (3,), or (H, W, 3) as in `iif_core.environment`.
     """
 
     radiance: np.ndarray
@@ -196,7 +206,22 @@ def read_light(job: Job, n_faces: int) -> Light:
     shines = np.isin(faces["emitter_id"], table["emitter_id"][area])
     ids = faces["face_id"][shines]
     radiance[ids], side[ids], emits[ids] = by_id[faces["emitter_id"][shines]], faces["side"][shines], True
-    return Light(radiance, side, emits, rows[kept & (table["kind"] == "environment")].sum(0, dtype=np.float32))
+    return Light(radiance, side, emits, _environment(reader, table, rows, kept & (table["kind"] == "environment")))
+
+
+def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.ndarray, shines: np.ndarray) -> np.ndarray:
+    """(H, W, 3) where the stage wrote the texels of its environment emitters, else (3,), one radiance everywhere."""
+    name = "environment_texels.parquet"
+    if not reader.has(name):
+        return rows[shines].sum(0, dtype=np.float32)
+    texels = reader.table(name)
+    height, width = (int(texels[c].max(initial=0)) + 1 for c in ("row", "column"))
+    by_id = np.zeros((int(max(emitters["emitter_id"].max(initial=-1), texels["emitter_id"].max(initial=-1))) + 1, 3), np.float32)
+    by_id[emitters["emitter_id"][shines]] = rows[shines]
+    out = np.zeros((height, width, 3), np.float32)
+    lit = texels["emitter_id"] >= 0
+    out[texels["row"][lit], texels["column"][lit]] = by_id[texels["emitter_id"][lit]]
+    return out
 
 
 def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:

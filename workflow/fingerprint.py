@@ -160,6 +160,8 @@ def raw_digest(paths: list[Path]) -> str:
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     """Input files from outside that a stage reads; the source (or prior) module knows them and checks them first."""
     out = [path for path in OPTIONAL_FILES.get(stage, ()) if path.is_file()]
+    if stage == "relight":
+        out.extend(settings_module.relight_files(document))
     for section, key, pattern in PLUGINS.get(stage, ()):
         module = importlib.import_module(pattern.format(document[section][key]))
         if hasattr(module, "raw_inputs"):

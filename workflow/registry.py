@@ -11,7 +11,7 @@ from dataclasses import dataclass
 class Stage:
     """One rule: name, upstream stages, settings that it reads, whether raw input files enter here.
 
-    `on_demand`: no scene needs it; a study asks for it.
+    `on_demand`: no scene needs it; a study or a target of its own asks for it.
     """
 
     name: str
@@ -41,6 +41,13 @@ STAGES: dict[str, Stage] = {
             ("affines", "capture.dynamic_range", "seed"),
         ),
         Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),
+        Stage(
+            "relight",
+            ("capture", "segmentation", "base", "emission", "affines"),
+            ("relight", "seed"),
+            reads_raw=True,
+            on_demand=True,
+        ),
         Stage("metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",)),
         Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(

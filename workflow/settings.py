@@ -247,13 +247,20 @@ class Shading(Section):
     """Cached incident shading: diffuse and split specular."""
 
     samples: int = Field(32, ge=2)
-    """Paths a pixel, over both halves."""
+    """Paths a pixel (specular) and paths a cell to begin with (diffuse), over both halves."""
     levels: int = Field(10, ge=3, le=32)
     """Roughness levels."""
+    cell_edge: float = Field(0.03, gt=0)
+    """Diffuse light is cached once a piece of surface of this edge (metres), for all views."""
+    noise: float = Field(0.08, gt=0)
+    """Relative standard error of diffuse light (median of an object) at which no more paths are added."""
+    max_samples: int = Field(512, ge=2)
+    """Most paths a cell."""
     max_bounces: int = Field(6, ge=1, le=64)
     """Path length where the radiance cache does not answer."""
-    indirect: Literal["cache", "path"] = "cache"
-    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials."""
+    indirect: Literal["auto", "cache", "path"] = "auto"
+    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials; `auto`:
+    `cache` where enough of what the surface sees was photographed."""
 
 
 class Affines(Section):
@@ -307,6 +314,69 @@ class Report(Section):
     """Line under the title (artist, licence)."""
 
 
+class RelightSphere(Section):
+    """A black sphere that shines, put into the room."""
+
+    center: tuple[float, float, float]
+    """Metres, world axes."""
+    radius: float = Field(0.2, gt=0)
+    """Metres."""
+    radiance: tuple[float, float, float] = (53.0, 50.0, 45.0)
+    """In the units of emitters.parquet."""
+    path_to: tuple[float, float, float] | None = None
+    """Where it has moved to in the last frame."""
+
+
+class RelightCamera(Section):
+    """Stills or a flight between views."""
+
+    views: list[str] = Field(default_factory=list)
+    """Names of the views to fly along (one: a still camera); default: the first view."""
+    frames: int = Field(1, ge=1, le=10000)
+    """Pictures."""
+    fov: float | None = Field(None, gt=1, lt=170)
+    """Horizontal field of view in degrees; default: as photographed."""
+    width: int | None = Field(None, ge=8, le=8192)
+    """Pixels; default: of the first view."""
+    height: int | None = Field(None, ge=8, le=8192)
+    """Pixels; default: of the first view."""
+
+
+class Relighting(Section):
+    """One relighting of the recovered scene: `snakemake --cores 2 relight/<scene>` (docs/relighting.md)."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    """Folder of its pictures."""
+    emitters: float = Field(1.0, ge=0)
+    """`on`, `off`, or what their radiance is multiplied by."""
+    environment: Literal["keep", "off"] | tuple[float, float, float] | Path = "keep"
+    """Light from outside: `keep`, `off`, one radiance `[r, g, b]`, or a latitude-longitude EXR (top row = up)."""
+    environment_turn: float = 0.0
+    """Degrees by which an EXR is turned about the up axis."""
+    sphere: RelightSphere | None = None
+    """A lamp that is put in."""
+    camera: RelightCamera = RelightCamera()
+    """Where from."""
+    exposure: float | None = Field(None, gt=0)
+    """What radiance is multiplied by before the camera response; default: by the brightness of the first frame."""
+    samples: int = Field(64, ge=1)
+    """Paths a pixel."""
+    max_bounces: int = Field(8, ge=1, le=64)
+    """Path length."""
+    denoise: bool = True
+    """Denoise the pictures."""
+
+    @field_validator("emitters", mode="before")
+    @classmethod
+    def _switch(cls, value: Any) -> Any:
+        return {"on": 1.0, "off": 0.0}.get(value, value) if isinstance(value, str) else value
+
+    @field_validator("environment", mode="before")
+    @classmethod
+    def _no_environment(cls, value: Any) -> Any:  # YAML reads a bare `off` as false
+        return {False: "off", True: "keep"}[value] if isinstance(value, bool) else value
+
+
 class SceneSettings(Section):
     """Everything about one scene."""
 
@@ -324,6 +394,8 @@ class SceneSettings(Section):
     metrics: Metrics = Metrics()
     export: Export = Export()
     report: Report = Report()
+    relight: list[Relighting] = Field(default_factory=list)
+    """Pictures under other light and from elsewhere, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of everything random."""
 
@@ -401,6 +473,12 @@ _UNIONS: dict[str, dict[str, type[Section]]] = {
 }
 
 
+def _section_in(annotation: Any) -> Any:
+    """The section in `list[Section]` and `Section | None`; other types as they are."""
+    inner = [t for t in getattr(annotation, "__args__", ()) if isinstance(t, type) and issubclass(t, Section)]
+    return inner[0] if inner else annotation
+
+
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
     model: Any = SceneSettings
     parts = [str(p) for p in where]
@@ -411,7 +489,7 @@ def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
             model = model.get(part, model)
         else:
             field = getattr(model, "model_fields", {}).get(part)
-            model = field.annotation if field else model
+            model = _section_in(field.annotation) if field else model
     return model if isinstance(model, type) else None
 
 
@@ -492,6 +570,19 @@ def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
     return out
 
 
+def relight_files(document: dict[str, Any]) -> list[Path]:
+    """Environment files that the relightings of a dumped settings tree name; a missing one is an error."""
+    named = [entry["environment"] for entry in document["relight"]]
+    files = [Path(value) for value in named if isinstance(value, str) and value not in ("keep", "off")]
+    for path in files:
+        if path.suffix.lower() != ".exr" or not path.is_file():
+            raise InputError(
+                f"`relight.environment`: found {str(path)!r}, which is no EXR file here; allowed: keep, off, [r, g, b] or the"
+                " path of a latitude-longitude EXR"
+            )
+    return files
+
+
 def schema_json() -> str:
     """JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
     schema = SceneSettings.model_json_schema()
@@ -504,10 +595,17 @@ def reference_markdown() -> str:
 
     def rows(model: type[Section], prefix: str) -> None:
         lines.extend(["| key | default | meaning |", "|---|---|---|"])
+        nested_rows: list[tuple[str, type[Section]]] = []
         for name, field in model.model_fields.items():
             if name == "kind":
                 continue
-            default = "required" if field.is_required() else f"`{field.get_default()}`"
+            section = _section_in(field.annotation)
+            nested = isinstance(section, type) and issubclass(section, Section)
+            if nested:
+                nested_rows.append((f"{prefix}{name}.", section))
+                default = "none" if field.get_default() is None else "see below"
+            else:
+                default = "required" if field.is_required() else f"`{field.get_default(call_default_factory=True)}`"
             text = " ".join((field.description or "").split())
             bounds = ", ".join(str(m) for m in field.metadata)
             literal = getattr(field.annotation, "__args__", ())
@@ -515,15 +613,18 @@ def reference_markdown() -> str:
                 text += f" One of {', '.join(f'`{v}`' for v in literal)}."
             lines.append(f"| `{prefix}{name}` | {default} | {text}{f' ({bounds})' if bounds else ''} |")
         lines.append("")
+        for inner, section in nested_rows:
+            rows(section, inner)
 
     for name, field in SceneSettings.model_fields.items():
         if name in _UNIONS:
             for kind, model in _UNIONS[name].items():
                 lines.extend([f"## `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
                 rows(model, f"{name}.")
-        elif isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            lines.extend([f"## `{name}`", "", " ".join((field.annotation.__doc__ or "").split()), ""])
-            rows(field.annotation, f"{name}.")
+        elif isinstance(section := _section_in(field.annotation), type) and issubclass(section, Section):
+            many = section is not field.annotation
+            lines.extend([f"## `{name}`" + (" (a list)" if many else ""), "", " ".join((section.__doc__ or "").split()), ""])
+            rows(section, f"{name}[]." if many else f"{name}.")
         else:
             lines.extend([f"## `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
     return "\n".join(lines)

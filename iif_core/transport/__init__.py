@@ -8,10 +8,10 @@ size: one lane owns one point, loops over its samples itself, and draws from its
 
 from .cache import RadianceCache
 from .emitters import Emitters
-from .geometry import Geometry, build_geometry, trace
+from .geometry import Geometry, build_geometry, cosine_directions, trace
 from .materials import CellMaterials, FaceMaterials
 from .matrix import transport_matrix
-from .render import render
+from .render import first_hits, render
 from .shading import shading_caches
 
 __all__ = [
@@ -21,6 +21,8 @@ __all__ = [
     "Geometry",
     "RadianceCache",
     "build_geometry",
+    "cosine_directions",
+    "first_hits",
     "render",
     "shading_caches",
     "trace",

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..cells import CellTable, hash_words, inverse_edge, pack_keys, probe_step
+from ..cells import CellTable, hash_words, inverse_edge, pack_keys, probe_step, voxel_indices
 from ..errors import InputError
 from .arrays import rows_of, table
 
@@ -62,8 +62,13 @@ class RadianceCache:
         if radiance.size and radiance.min() < 0:
             raise InputError(f"cache radiance goes down to {radiance.min()}; radiance is never negative")
         self.count = len(ijk)
+        self.edge, self.origin = edge, np.asarray(origin, np.float32)
         self._rows = VoxelRows(edge, origin, ijk, -1)
         self._radiance = table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
+
+    def covers(self, points: ArrayLike) -> Array:
+        """(n,) bool: the voxel around each point (n, 3) is in the table."""
+        return self._rows.table.lookup(pack_keys(voxel_indices(points, self.edge, self.origin))) >= 0
 
     def radiance(self, point: Any, active: Any) -> tuple[Any, Any]:
         """(found, radiance) at a surface point (device types)."""

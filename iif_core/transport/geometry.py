@@ -136,6 +136,14 @@ def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any) ->
     return Hit(valid, face, object_id, mi.Point3f(dr.fma(direction, t, origin)), normal, t)
 
 
+def cosine_directions(normals: ArrayLike, rng: np.random.Generator) -> Array:
+    """(n, 3) float64 directions around unit normals (n, 3), density cos / pi per steradian; not of unit length."""
+    normals = np.asarray(normals, np.float64)
+    ball = rng.normal(size=normals.shape)
+    # A uniform point on the sphere that touches the surface from above is cosine-distributed.
+    return (1 + 1e-6) * normals + ball / np.linalg.norm(ball, axis=1, keepdims=True)
+
+
 def trace(geometry: Geometry, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20) -> tuple[Array, Array]:
     """(face_id int32 with -1 = miss, t float32 with inf = miss) of the nearest face along origin + t
     direction.

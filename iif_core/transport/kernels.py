@@ -47,8 +47,8 @@ class RadianceCollector:
         """Gain of reaching `face` of the given radiance with path weight `weight` (Color3f)."""
         return dr.select(active, weight * radiance, 0)
 
-    def environment(self, radiance: Any, weight: Any, active: Any) -> Any:
-        """Gain of leaving the scene."""
+    def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        """Gain of leaving the scene through `texel` of the environment."""
         return dr.select(active, weight * radiance, 0)
 
 
@@ -70,11 +70,16 @@ def to_world(local: tuple[Any, Any, Any], normal: Any) -> Any:
     return mi.Vector3f(tangent * local[0] + bitangent * local[1] + normal * local[2])
 
 
-def evaluate(wi: Any, wo: Any, normal: Any, roughness: Any) -> tuple[Any, Any, Any, Any]:
+def specular_chance(kd: Any, ks: Any, normal: Any, wo: Any) -> Any:
+    """Probability with which a path at this vertex goes on in the GGX lobe."""
+    return brdf.specular_chance(DRJIT, dr.max(kd), dr.max(ks), dr.dot(normal, wo))
+
+
+def evaluate(wi: Any, wo: Any, normal: Any, roughness: Any, chance: Any) -> tuple[Any, Any, Any, Any]:
     """(diffuse, spec, fc, mixture density) of one pair of directions."""
     NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, normal, wi, wo)
     diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, roughness)
-    return diffuse, spec, fc, brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, roughness)
+    return diffuse, spec, fc, brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, roughness, chance)
 
 
 def reflectance(kd: Any, ks: Any, diffuse: Any, spec: Any, fc: Any) -> Any:
@@ -91,21 +96,30 @@ def sample_lobe(choose_specular: Any, u1: Any, u2: Any, wo: Any, normal: Any, ro
 
 @dataclass
 class LightSample:
-    """A point drawn on an emitter: `valid` = visible and radiating this way; `pdf` per solid angle at the
-    receiver."""
+    """A point drawn on an emitter, or a direction to the environment (`on_sky`): `valid` = visible and radiating this
+    way; `pdf` per solid angle at the receiver."""
 
     valid: Any
     face: Any
+    on_sky: Any
+    texel: Any
     radiance: Any
     wi: Any
     pdf: Any
+
+    def gain(self, world: World, weight: Any) -> Any:
+        """What the collector makes of it, for a path of the given weight (Color3f)."""
+        if not world.emitters.sky_is_sampled:
+            return world.collector.emitter(self.face, self.radiance, weight, self.valid)
+        gain = world.collector.emitter(self.face, self.radiance, weight, self.valid & ~self.on_sky)
+        return gain + world.collector.environment(self.texel, self.radiance, weight, self.valid & self.on_sky)
 
 
 def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -> LightSample:
     """Next-event estimation from `point`, which already lies off the surface (see `offset_from`)."""
     emitters, geometry = world.emitters, world.geometry
     u0, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
-    face = emitters.sample_face(u0, active)
+    face, on_sky, texel = emitters.sample(u0, active)
     root = dr.sqrt(u1)
     target = geometry.point_on_face(face, 1 - root, root * u2, active)
     light_normal, _ = geometry.normal_and_object(face, active)
@@ -116,10 +130,17 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     cos_front = -dr.dot(light_normal, wi)
     radiance, pdf_area, emits, _ = emitters.surface(face, cos_front, active)
     pdf = pdf_area * distance2 / dr.abs(cos_front)
-    valid = emits & (dr.abs(cos_front) > 1e-7) & (dr.dot(normal, wi) > 0) & (pdf > 0)
+    valid = emits & (dr.abs(cos_front) > 1e-7)
     # Up to 1e-3 of the distance in front of the emitter counts as the emitter (METHOD H23).
-    valid &= ~geometry.occluded(point, wi, distance * (1 - 1e-3), valid)
-    return LightSample(valid, face, radiance, wi, pdf)
+    reach = distance * (1 - 1e-3)
+    if emitters.sky_is_sampled:
+        sky, sky_pdf = emitters.texel(texel, active & on_sky)
+        radiance, pdf = dr.select(on_sky, sky, radiance), dr.select(on_sky, sky_pdf, pdf)
+        wi = dr.select(on_sky, emitters.direction_to(texel, u1, u2), wi)
+        valid, reach = (valid & ~on_sky) | (active & on_sky), dr.select(on_sky, dr.inf, reach)
+    valid &= (dr.dot(normal, wi) > 0) & (pdf > 0)
+    valid &= ~geometry.occluded(point, wi, reach, valid)
+    return LightSample(valid, face, on_sky, texel, radiance, wi, pdf)
 
 
 def direct_light(
@@ -138,17 +159,18 @@ def direct_light(
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
     light = sample_light(world, rng, point, normal, active)
-    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness)
+    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness, specular_chance(kd, ks, normal, wo))
     f = reflectance(kd, ks, diffuse, spec, fc)
     share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
-    return world.collector.emitter(light.face, light.radiance, weight * f * share, light.valid)
+    return light.gain(world, weight * f * share)
 
 
 def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
-    wi = sample_lobe(choice < 0.5, u1, u2, wo, normal, roughness)
-    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness)
+    chance = specular_chance(kd, ks, normal, wo)
+    wi = sample_lobe(choice < chance, u1, u2, wo, normal, roughness)
+    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness, chance)
     goes_on = active & (dr.dot(normal, wi) > 0) & (pdf > 0)
     return goes_on, wi, dr.select(goes_on, reflectance(kd, ks, diffuse, spec, fc) / pdf, 0), pdf
 
@@ -198,7 +220,10 @@ def incoming(
     active = mi.Bool(active)
     while active:
         hit = nearest_hit(world.geometry, origin, direction, active)
-        gain += world.collector.environment(world.emitters.environment_radiance(), throughput, active & ~hit.valid)
+        escapes = active & ~hit.valid
+        texel = world.emitters.texel_along(direction)
+        sky, sky_pdf = world.emitters.texel(texel, escapes)
+        gain += world.collector.environment(texel, sky, throughput * power_weight(pdf, sky_pdf), escapes)
         cos_front = -dr.dot(hit.normal, direction)
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import brdf
+from ..environment import solid_angles
 from ..errors import InputError
 from .arrays import batches, rows_of, to_numpy
 from .cache import RadianceCache
-from .emitters import Emitters
+from .emitters import Emitters, share_of_environment
 from .geometry import Geometry, offset_from
 from .kernels import World, direct_light, incoming, scatter
 from .render import check_counts
@@ -29,18 +30,19 @@ class _ColumnCollector:
     safe and their order is fixed.
     """
 
-    def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, environment_group: int | None):
+    def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, group_of_texel: Any):
         self.rows, self.lane, self.groups = rows, lane, groups
-        self.group_of_face, self.environment_group = group_of_face, environment_group
+        self.group_of_face, self.group_of_texel = group_of_face, group_of_texel
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
         group = dr.gather(mi.Int32, self.group_of_face, face, active)
         return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
 
-    def environment(self, radiance: Any, weight: Any, active: Any) -> Any:
-        if self.environment_group is None:
+    def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        if self.group_of_texel is None:
             return mi.Color3f(0)
-        return self._deposit(mi.UInt32(self.environment_group), weight, active)
+        group = dr.gather(mi.Int32, self.group_of_texel, texel, active)
+        return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
 
     def _deposit(self, group: Any, weight: Any, active: Any) -> Any:
         entry = (self.lane * self.groups + group) * 3
@@ -98,7 +100,7 @@ def transport_matrix(
     max_bounces: int,
     seed: int,
     cache: RadianceCache | None = None,
-    environment_group: int | None = None,
+    environment_columns: ArrayLike | None = None,
     sampling_weight: ArrayLike | None = None,
     chunk: int | None = None,
 ) -> tuple[Array, Array]:
@@ -108,11 +110,13 @@ def transport_matrix(
     points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own
     materials; `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in
     `Emitters`; faces of a group emit its unknown radiance. h is what paths take from `cache` (0 without).
-    Escaping paths are deposited in column environment_group when given. The point's own, directly visible
-    emission is not included. sampling_weight (m,) overrides the default, half by area and half the same for
-    every group. max_bounces counts surface interactions including the point. chunk: lanes on the device at
-    once, a lane being up to 8 samples of a point and a row of A (default: 2^18, fewer when their rows would
-    take more than 256 MiB). Source: METHOD 7a (multi-bounce, or one bounce and the cache); COMPUTE 4.
+    environment_columns (H, W) int32: the column in which paths that escape into a texel of the environment
+    (`iif_core.environment`) are deposited, -1 = dark; texels of a column share its unknown radiance. The point's
+    own, directly visible emission is not included. sampling_weight (m,) overrides the default, half by area and
+    half the same for every group; texels are drawn by solid angle, a map of one texel by directions of the BRDF
+    alone. max_bounces counts surface interactions including the point. chunk: lanes on the device at once, a lane
+    being up to 8 samples of a point and a row of A (default: 2^18, fewer when their rows would take more than 256
+    MiB). Source: METHOD 7a (multi-bounce, or one bounce and the cache), 2.6; COMPUTE 4.
     """
     check_counts(samples, max_bounces)
     points, normals, wo = surface_points(points, normals, wo)
@@ -126,20 +130,25 @@ def transport_matrix(
             f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
             f"({len(geometry.faces)},) in -1 ... {n_groups - 1}"
         )
-    if environment_group is not None and not 0 <= environment_group < n_groups:
-        raise InputError(f"environment_group is {environment_group}; expected 0 ... {n_groups - 1}")
+    columns = None if environment_columns is None else np.ascontiguousarray(environment_columns, np.int32)
+    if columns is not None and (columns.ndim != 2 or not columns.size or columns.min() < -1 or columns.max() >= n_groups):
+        raise InputError(
+            f"environment_columns has shape {columns.shape} and values up to {columns.max(initial=-1)}; expected "
+            f"(height, width) in -1 ... {n_groups - 1}"
+        )
     matrix, cached = np.zeros((count, n_groups, 3), np.float32), np.zeros((count, 3), np.float32)
     if max_bounces == 0 or n_groups == 0 and cache is None:
         return matrix, cached
     if sampling_weight is None:
         sampling_weight = _group_weights(geometry.areas, groups, n_groups)
-    emitters = Emitters(geometry, np.zeros((len(groups), 3)), side, sampling_weight=sampling_weight)
+    emitters = _unit_emitters(geometry, groups, side, sampling_weight, columns)
     group_of_face = mi.Int32(groups)
+    group_of_texel = None if columns is None else mi.Int32(columns.ravel())
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
     width = 3 * n_groups
     for batch in batches(count, samples, width, chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
-        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, environment_group)
+        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, group_of_texel)
         gain = _deposit_paths(
             World(geometry, material, emitters, cache, collector),
             batch.streams(seed),
@@ -157,6 +166,18 @@ def transport_matrix(
         if n_groups:
             matrix[batch.part] = to_numpy(rows).reshape(-1, batch.split, n_groups, 3).sum(axis=1) / samples
     return matrix, cached
+
+
+def _unit_emitters(
+    geometry: Geometry, groups: Array, side: ArrayLike | None, weight: ArrayLike, columns: Array | None
+) -> Emitters:
+    """Emitters that are drawn as if all groups had the same radiance; what they radiate is the unknown."""
+    dark = np.zeros((len(groups), 3))
+    if columns is None or columns.size == 1:
+        return Emitters(geometry, dark, side, sampling_weight=weight)
+    sky = solid_angles(*columns.shape) * (columns >= 0)
+    share = share_of_environment(geometry, geometry.areas[groups >= 0].sum(), sky.sum() / (4 * np.pi))
+    return Emitters(geometry, dark, side, np.zeros((*columns.shape, 3)), weight, sky, share)
 
 
 def _group_weights(areas: Array, groups: Array, n_groups: int) -> Array:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError
-from .arrays import batches, rows_of
+from .arrays import batches, chunks, rows_of, to_numpy, vectors
 from .cache import RadianceCache
 from .emitters import Emitters
-from .geometry import Geometry
+from .geometry import Geometry, nearest_hit
 from .kernels import RadianceCollector, World, incoming, uniform
 
 Array = np.ndarray
@@ -97,3 +97,29 @@ def render(
         dr.eval(total)
         result[batch.part] = batch.collect(total) / samples
     return result
+
+
+def first_hits(
+    geometry: Geometry, material: Any, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20
+) -> tuple[Array, Array, Array]:
+    """(base colour (n, 3), normal (n, 3) towards the viewer, face (n,) int32) of what rays meet first; 0, 0, -1 for a miss.
+
+    The noise-free guides of a denoiser. origins (n, 3) or (3,), directions (n, 3), any length.
+    """
+    directions = np.asarray(directions, np.float32).reshape(-1, 3)
+    origins = np.broadcast_to(np.asarray(origins, np.float32), directions.shape)
+    colour, normal = np.zeros((2, *directions.shape), np.float32)
+    face = np.full(len(directions), -1, np.int32)
+    for part in chunks(len(directions), chunk):
+        way = vectors(mi.Vector3f, directions[part])
+        hit = nearest_hit(geometry, vectors(mi.Point3f, origins[part]), way, mi.Bool(True))
+        base_color, _, _ = material(hit.point, hit.face, hit.object_id, hit.valid)
+        toward = dr.select(dr.dot(hit.normal, way) > 0, -hit.normal, hit.normal)
+        results = (
+            dr.select(hit.valid, base_color, 0),
+            dr.select(hit.valid, toward, 0),
+            dr.select(hit.valid, mi.Int32(hit.face), -1),
+        )
+        dr.eval(results)
+        colour[part], normal[part], face[part] = (to_numpy(result) for result in results)
+    return colour, normal, face

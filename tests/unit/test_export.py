@@ -468,3 +468,21 @@ def test_mitsuba_environment(mi, tmp_path):
     scene = mi.load_file(str(written(tmp_path, mitsuba_files(parts, [view()], np.array([0.5, 1.0, 2.0])))))
     image = np.array(mi.render(scene, spp=4))
     np.testing.assert_allclose(image[0, 0, :3], [0.5, 1.0, 2.0], rtol=1e-4)
+
+
+def test_mitsuba_environment_map_keeps_its_directions(mi, tmp_path):
+    import drjit as dr
+
+    from iif_core.environment import direction_in
+    from iif_core.xp import NUMPY
+
+    sky = np.random.default_rng(0).uniform(0, 1, (16, 32, 3)).astype(np.float32)
+    parts = [part for name, part in parts_of(room()).items() if name.startswith("white")]
+    scene = mi.load_file(str(written(tmp_path, mitsuba_files(parts, [view()], sky))))
+    row, column = np.indices((16, 32))
+    for u in ((0.5, 0.5), (0.2, 0.8)):
+        toward = np.stack(direction_in(NUMPY, row, column, *u, 16, 32), -1).reshape(-1, 3)
+        escaped = dr.zeros(mi.SurfaceInteraction3f, len(toward))
+        escaped.wi = mi.Vector3f(-toward.T.astype(np.float32))
+        seen = scene.environment().eval(escaped).numpy().T.reshape(16, 32, 3)
+        np.testing.assert_allclose(seen, sky, atol=1e-5)

@@ -312,7 +312,7 @@ def test_white_furnace(T, r, m):
         32,
         8,
         1,
-        environment_group=0,
+        environment_columns=[[0]],
     )
     assert not cached.any()
     for channel in range(3):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -129,6 +130,9 @@ class StubJob:
 
     def progress(self, done: int, total: int, what: str) -> None:
         pass
+
+    def timed(self, name: str) -> AbstractContextManager[None]:
+        return nullcontext()
 
 
 def build(
@@ -266,5 +270,13 @@ EMISSION = {
     "prune": 0.01,
     "environment": "auto",
 }
-SHADING = {"samples": 32, "levels": 10, "max_bounces": 6, "indirect": "cache"}
+SHADING = {
+    "samples": 32,
+    "levels": 10,
+    "cell_edge": 0.05,
+    "noise": 0.15,
+    "max_samples": 512,
+    "max_bounces": 6,
+    "indirect": "auto",
+}
 AFFINES = {"response": "auto", "iterations": 12, "pixels": 200000, "ridge": 2e-3, "robust_width": 0.1, "scale": "prior"}

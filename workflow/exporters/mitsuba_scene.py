@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import math
 import re
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from workflow.artifacts.files import write_exr
+from workflow.artifacts.store import split_rgb
 from workflow.exporters.surface import Part
 from workflow.normal_form import View
 
@@ -27,6 +31,15 @@ _NOTE = """
   Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)
 """
 
+# Mitsuba's map has +y up, its left edge towards -z, and runs the other way round: mirrored columns, then this turn.
+_ENVIRONMENT = """\t<emitter type="envmap">
+\t\t<string name="filename" value="environment.exr"/>
+\t\t<transform name="to_world"><matrix value="0 0 -1 0 -1 0 0 0 0 1 0 0 0 0 0 1"/></transform>
+\t</emitter>"""
+
+ENVIRONMENT_ROWS = 256
+"""Texels are repeated up to about this many rows: Mitsuba interpolates, here radiance is constant in a texel."""
+
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
@@ -35,7 +48,7 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
 
     Args:
         views: at least one; each becomes a sensor. Mitsuba's cameras have square pixels: fy is taken to be fx.
-        environment: (3,) constant radiance around the scene, 0 = none.
+        environment: (3,) constant radiance around the scene or (H, W, 3), a map as in `iif_core.environment`; 0 = none.
         max_depth: path length; 1 = emitters only.
     """
     files: dict[str, bytes] = {}
@@ -48,7 +61,10 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
             back = f"meshes/{stem}.back.ply"
             files[back] = ply_bytes(part, back=True)
             body.append(_shape(part, back))
-    if np.any(environment > 0):
+    if environment.ndim == 3 and np.any(environment > 0):
+        files["environment.exr"] = _environment_exr(environment)
+        body.append(_ENVIRONMENT)
+    elif np.any(environment > 0):
         body.append(f'\t<emitter type="constant">\n\t\t{_rgb("radiance", environment)}\n\t</emitter>')
     first = views[0]
     head = [
@@ -62,6 +78,15 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
     ]
     text = "\n".join([*head, *(_sensor(view) for view in views), *body, "</scene>"]) + "\n"
     return {"scene.xml": text.encode(), **files}
+
+
+def _environment_exr(environment: np.ndarray) -> bytes:
+    repeat = max(1, ENVIRONMENT_ROWS // len(environment))
+    image = environment[:, ::-1].repeat(repeat, 0).repeat(repeat, 1)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "environment.exr"
+        write_exr(path, split_rgb(np.ascontiguousarray(image, np.float32)))
+        return path.read_bytes()
 
 
 def ply_bytes(part: Part, back: bool = False) -> bytes:

@@ -18,9 +18,9 @@ from iif_core.emission.candidates import (
     with_thin_objects,
 )
 from iif_core.emission.direct import EmissionSolution, solve_families
-from iif_core.emission.environment import cosine_directions
+from iif_core.emission.environment import Sky, SkySums, cosine_directions
 from iif_core.emission.groups import EmitterGroups, group_emitters
-from iif_core.emission.problem import PixelRows, Sky, assemble, initial_radiance, white_surface
+from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
 from iif_core.emission.pruning import PrunedEmission, prune_groups
 from iif_core.emission.sensor import Sensor
 from iif_core.exposure import calibrate_response
@@ -63,7 +63,7 @@ class _Photographs:
 
 
 def run(job: Job) -> None:
-    """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet and emission.json."""
+    """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet, environment_texels.parquet and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
     family = family_for(job.settings.affines.response, capture.facts["dynamic_range"])
@@ -76,10 +76,10 @@ def run(job: Job) -> None:
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
     groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, min_observations=least)
     job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
-    cache, sky, escape, brightness = _radiance_cache(photos, groups)
+    cache, sums, escape, brightness = _radiance_cache(photos, groups)
     secondary = _secondary_escape(photos)
     environment = plan.environment(job.settings.emission.environment, escape, secondary, brightness)
-    outside = sky if environment["included"] else None
+    outside = sums.groups() if environment["included"] else None
     pruned = _trial(photos, groups, cache, outside)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
@@ -88,8 +88,8 @@ def run(job: Job) -> None:
     if left_out.size:
         cache = _radiance_cache(photos, groups)[0]
     solution = _solve(photos, groups, cache, outside)
-    table = _table(groups, left_out, reasons, solution, sky if outside else None)
-    _write(job, groups, table, cache)
+    table = _table(groups, left_out, reasons, solution, outside)
+    _write(job, groups, table, cache, outside)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
     for faces, area, reason in groups.dropped[:20]:
@@ -190,12 +190,12 @@ def _statistics(photos: _Photographs) -> tuple[FaceStatistics, float]:
 # -------------------------------------------------------------------------------------------------------------- cache
 
 
-def _radiance_cache(photos: _Photographs, groups: EmitterGroups) -> tuple[RadianceVoxels, Sky, float, float | None]:
+def _radiance_cache(photos: _Photographs, groups: EmitterGroups) -> tuple[RadianceVoxels, SkySums, float, float | None]:
     """The cache of interior pixels that are not on an emitter; what the camera rays see that miss the mesh, their share,
     and their brightness relative to the others'."""
     edge = photos.job.settings.emission.cache_edge
-    sums = RadianceSums(edge, cache_origin(photos.scene, edge))
-    missed, bounded, total, mean_hit, hits, sky = 0, 0, 0, 0.0, 0, np.zeros(3)
+    sums, sky = RadianceSums(edge, cache_origin(photos.scene, edge)), SkySums()
+    total, mean_hit, hits = 0, 0.0, 0
     for done, view in enumerate(photos.views):
         pixels = photos.pixels(view)
         radiance, bound = photos.radiance(view, pixels.value)
@@ -204,19 +204,14 @@ def _radiance_cache(photos: _Photographs, groups: EmitterGroups) -> tuple[Radian
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
         hits += int(pixels.valid.sum())
         photo, valid = photos.capture.photo(view)
-        out = valid.ravel().copy()
+        values = photo.reshape(-1, 3)
+        out = valid.ravel() & np.isfinite(values).all(1)
         out[pixels.index] = False
-        values = photo.reshape(-1, 3)[out]
-        values = values[np.isfinite(values).all(1)]
-        outside, outside_bound = photos.radiance(view, values)
-        sky += outside.sum(0)
-        missed += len(values)
-        bounded += int(outside_bound.any(1).sum())
+        sky.add(photos.capture.directions(view).reshape(-1, 3)[out], *photos.radiance(view, values[out]))
         total += int(valid.sum())
         photos.job.progress(done + 1, len(photos.views), "views cached")
-    sky = sky / max(missed, 1)
-    brightness = float(sky.mean() / max(mean_hit / max(hits, 1), 1e-12)) if missed else None
-    return sums.finish(), Sky(missed, sky, 2 * bounded > missed), missed / max(total, 1), brightness
+    brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None
+    return sums.finish(), sky, sky.pixels / max(total, 1), brightness
 
 
 def _secondary_escape(photos: _Photographs) -> float:
@@ -302,7 +297,7 @@ def _trial(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, 
 def _initial(photos: _Photographs, groups: EmitterGroups, rows: PixelRows, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
     """Radiance seen on the groups, and with the environment's."""
     seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
-    return seen, seen if sky is None else np.concatenate([seen, sky.radiance[None]])
+    return seen, seen if sky is None else np.concatenate([seen, sky.radiance])
 
 
 def _solve(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None) -> EmissionSolution:
@@ -311,9 +306,9 @@ def _solve(photos: _Photographs, groups: EmitterGroups, voxels: RadianceVoxels, 
     halves = _trace(photos, pixels, base, groups, voxels, sky, 3)
     initial = _initial(photos, groups, rows, sky)[1]
     problem = assemble(rows, halves, len(initial), None, sky).with_gains(initial)
-    # Parts of one object shine alike, more or less; the environment is a family of its own.
+    # Parts of one object shine alike, more or less; the environment knows no such thing.
     face = np.flatnonzero(groups.of_face >= 0)
-    family = np.full(len(initial), -1)
+    family = -1 - np.arange(len(initial))
     family[groups.of_face[face]] = photos.scene.object_id[face]
     return solve_families(problem.rows, initial, family)
 
@@ -342,8 +337,8 @@ def _trace(
     halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        columns = (groups.of_face, groups.size + (sky is not None), side)
-        paths = (samples, settings.max_bounces, seed + half, cache, None if sky is None else groups.size)
+        columns = (groups.of_face, groups.size + (sky.size if sky else 0), side)
+        paths = (samples, settings.max_bounces, seed + half, cache, sky.columns + groups.size if sky else None)
         halves.append(transport_matrix(geometry, material, *surface, *columns, *paths))
     job.progress(2, 2, "halves of the transport matrix traced")
     return halves
@@ -356,9 +351,9 @@ def _table(
     groups: EmitterGroups, left_out: EmitterGroups, reasons: list[str], solution: EmissionSolution, sky: Sky | None
 ) -> dict[str, Any]:
     """Emitters, the environment, and the groups that turned out to reflect."""
-    outside, out = int(sky is not None), left_out.size
+    outside, out = sky.size if sky else 0, left_out.size
     sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
-    pixels = [sky.pixels] if sky is not None else []
+    pixels = sky.pixels if sky else np.zeros(0)
     radiance, error = (np.r_[values, np.zeros((out, 3))] for values in (solution.radiance, solution.error))
     return {
         "emitter_id": np.arange(groups.size + outside + out, dtype=np.int32),
@@ -379,7 +374,7 @@ def _side_of(groups: EmitterGroups, group: int) -> int:
     return int(sides[0]) if len(sides) and (sides == sides[0]).all() else 0
 
 
-def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: RadianceVoxels) -> None:
+def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: RadianceVoxels, sky: Sky | None) -> None:
     units = {"area_m2": "m^2", "radiance_r": "relative", "error_r": "relative"}
     job.writer.table("emitters.parquet", table, units)
     face = np.flatnonzero(groups.of_face >= 0)
@@ -393,3 +388,8 @@ def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: Radian
     voxels |= {f"radiance_{c}": cache.radiance[:, i] for i, c in enumerate("rgb")}
     voxels |= {"samples": cache.samples, "censored": cache.censored}
     job.writer.table("radiance_cache.parquet", voxels, {"radiance_r": "relative"})
+    if sky:
+        row, column = np.indices(sky.columns.shape).astype(np.int32)
+        ids = (sky.columns + groups.size).astype(np.int32)
+        texels = {"row": row.ravel(), "column": column.ravel(), "emitter_id": ids.ravel()}
+        job.writer.table("environment_texels.parquet", texels)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from iif_core.environment import as_map, solid_angles
 from iif_core.errors import InputError
 from workflow.exporters.glb import glb_bytes
 from workflow.exporters.mitsuba_scene import mitsuba_files
@@ -34,6 +37,7 @@ def run(job: Job) -> None:
     budget = max(len(recovered.surface.faces), min(SPLIT_FACES, job.settings.export.max_faces_glb))
     parts = build_parts(scene, max(VERTEX_SPACING, 2 * recovered.surface.cell_edge), budget)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
+    provenance |= _environment_note(recovered.light.environment)
     job.writer.bytes("scene.glb", glb_bytes(parts, scene.up, provenance))
     for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.light.environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
@@ -77,6 +81,16 @@ def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredSc
         back,
         np.asarray(up, np.float64) if up else up_axis(poses),
     )
+
+
+def _environment_note(environment: np.ndarray) -> dict[str, Any]:
+    """glTF has no light from outside: its mean radiance for `asset.extras`, and where the map is."""
+    if not environment.any():
+        return {}
+    radiance = as_map(environment)
+    mean = np.average(radiance, (0, 1), np.repeat(solid_angles(*radiance.shape[:2])[..., None], 3, -1))
+    note: dict[str, Any] = {"mean_radiance": [round(float(value), 6) for value in mean]}
+    return {"environment": note | ({"map": "mitsuba/environment.exr"} if environment.ndim == 3 else {})}
 
 
 def _emitter_table(job: Job, recovered: Recovered) -> None:

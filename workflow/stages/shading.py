@@ -3,15 +3,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 
+from iif_core import plan
+from iif_core.cells import grid_origin
 from iif_core.errors import InputError
+from iif_core.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells
 from workflow.artifacts.store import split_rgb
-from workflow.base_scene import read_base_scene, read_light, read_radiance_cache, view_pixels
+from workflow.base_scene import BaseScene, Light, read_base_scene, read_light, read_radiance_cache, view_pixels
 from workflow.job import Job
 from workflow.normal_form import CaptureReader
 
+if TYPE_CHECKING:
+    from iif_core.transport import CellMaterials, Emitters, Geometry, RadianceCache
+
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
+COVERAGE_RAYS = 8192
 
 
 def roughness_levels(count: int) -> np.ndarray:
@@ -23,47 +33,157 @@ def roughness_levels(count: int) -> np.ndarray:
     return 0.02 + 0.98 * (np.arange(count) / (count - 1)) ** 1.5
 
 
+@dataclass(frozen=True)
+class _World:
+    """What paths meet, on the device."""
+
+    geometry: Geometry
+    material: CellMaterials
+    emitters: Emitters
+    cache: RadianceCache | None
+
+
 def run(job: Job) -> None:
-    """Write maps/<view>.exr with two independent halves of the cache and levels.parquet; 0 where nothing was hit."""
+    """Write maps/<view>.exr with two independent halves of the cache (0 where nothing was hit), levels.parquet, shading.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    settings = job.settings.shading
-    levels = roughness_levels(settings.levels)
+    levels = roughness_levels(job.settings.shading.levels)
     light = read_light(job, len(scene.faces))
+    cells = _cells(job, capture, scene)
     geometry, material = scene.traceable(light.emits)
+    cache = read_radiance_cache(job)
+    decision = _indirect(job, geometry, cache, light, cells)
+    world = _World(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
+    with job.timed("diffuse"):
+        diffuse = _diffuse(job, world, cells)
+    with job.timed("specular"):
+        _views(job, capture, scene, world, levels, cells, diffuse)
+    job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
+    job.writer.json("shading.json", {"diffuse": _facts(cells, diffuse), "plan": [decision]})
+
+
+def _cells(job: Job, capture: CaptureReader, scene: BaseScene) -> ShadingCells:
+    edge = job.settings.shading.cell_edge
+    builder = ShadingCellBuilder(edge, grid_origin(scene.vertices[scene.faces.ravel()], edge))
+    for view in capture.views:
+        pixels = view_pixels(job, capture, scene, view)
+        builder.add(pixels.points, pixels.normals, pixels.object_id, _seed(job, view.view_id))
+    return builder.finish()
+
+
+def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, cells: ShadingCells) -> plan.Decision:
+    """Whether the radiance cache stands for indirect light: by how much of what the surface sees it knows."""
+    from iif_core.transport import cosine_directions, trace
+
+    rng = np.random.default_rng([job.seed, _SEEDS])
+    share = cells.pixels / cells.pixels.sum()
+    cell = rng.choice(len(cells), COVERAGE_RAYS, p=share)
+    normal = cells.normals[cell, 0]
+    origin, way = cells.points[cell, 0] + 1e-3 * normal, cosine_directions(normal, rng)
+    face, t = trace(geometry, origin, way)
+    hit = (face >= 0) & ~light.emits[np.maximum(face, 0)]
+    covered = cache.covers((origin + t[:, None] * way)[hit]) if hit.any() else np.zeros(0, bool)
+    censored = job.read("emission").table("radiance_cache.parquet")["censored"].astype(bool)
+    return plan.radiance_cache(
+        job.settings.shading.indirect,
+        float(covered.mean()) if covered.size else 0.0,
+        float(censored.mean()) if censored.size else 0.0,
+    )
+
+
+def _diffuse(job: Job, world: _World, cells: ShadingCells) -> DiffuseShading:
     from iif_core.transport import shading_caches
 
-    emitters = light.emitters(geometry)
-    cache = read_radiance_cache(job) if settings.indirect == "cache" else None
+    settings = job.settings.shading
+
+    def trace(points: np.ndarray, normals: np.ndarray, paths: int, seed: int) -> np.ndarray:
+        # Seen head-on: without specular levels the viewer does not matter.
+        return shading_caches(
+            world.geometry,
+            world.material,
+            world.emitters,
+            points,
+            normals,
+            normals,
+            [],
+            paths,
+            settings.max_bounces,
+            seed,
+            world.cache,
+        )[0]
+
+    found = diffuse_of_cells(
+        cells, trace, settings.samples, settings.noise, settings.max_samples, (job.seed << 32 | _SEEDS) << 32 | 0xFFFFFFFF
+    )
+    job.log.info(
+        "diffuse light of %d cells: %.0f paths each, noise %.1f %% at first, %.1f %% at last (%d objects above %.1f %%)",
+        len(cells),
+        found.samples.mean(),
+        100 * found.noise_first,
+        100 * found.noise_last,
+        found.noisy_objects,
+        100 * settings.noise,
+    )
+    return found
+
+
+def _views(
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    world: _World,
+    levels: np.ndarray,
+    cells: ShadingCells,
+    diffuse: DiffuseShading,
+) -> None:
+    """Specular levels of every pixel, with the diffuse light of its cell."""
+    from iif_core.transport import shading_caches
+
+    settings = job.settings.shading
     per_half = max(1, settings.samples // 2)
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
         pixels = view_pixels(job, capture, scene, view)
+        cell = cells.find(pixels.points, pixels.normals, pixels.object_id)
         channels: dict[str, np.ndarray] = {}
         for half in range(2):
-            seed = (((job.seed << 32) | _SEEDS) << 32 | view.view_id) * 2 + half
-            parts = shading_caches(
-                geometry,
-                material,
-                emitters,
+            _, s0, s1 = shading_caches(
+                world.geometry,
+                world.material,
+                world.emitters,
                 pixels.points,
                 pixels.normals,
                 pixels.wo,
                 levels,
                 per_half,
                 settings.max_bounces,
-                seed,
-                cache,
+                _seed(job, view.view_id) * 2 + half,
+                world.cache,
             )
+            parts = diffuse.diffuse[half, cell], s0, s1
             if not all(np.isfinite(part).all() for part in parts):
                 raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
-            diffuse, s0, s1 = parts
-            channels |= _channels(f"half{half}.diffuse", diffuse, pixels.index, view.height, view.width)
+            channels |= _channels(f"half{half}.diffuse", parts[0], pixels.index, view.height, view.width)
             for j in range(len(levels)):
                 channels |= _channels(f"half{half}.s0.{j:02d}", s0[:, j], pixels.index, view.height, view.width)
                 channels |= _channels(f"half{half}.s1.{j:02d}", s1[:, j], pixels.index, view.height, view.width)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
     job.progress(len(capture.views), len(capture.views), "views cached")
-    job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
+
+
+def _facts(cells: ShadingCells, diffuse: DiffuseShading) -> dict[str, Any]:
+    return {
+        "cells": len(cells),
+        "cell_edge_m": cells.edge,
+        "pixels_per_cell": float(cells.pixels.mean()),
+        "paths_per_cell": float(diffuse.samples.mean()),
+        "noise_first": diffuse.noise_first,
+        "noise_last": diffuse.noise_last,
+        "noisy_objects": diffuse.noisy_objects,
+    }
+
+
+def _seed(job: Job, view_id: int) -> int:
+    return ((job.seed << 32) | _SEEDS) << 32 | view_id
 
 
 def _channels(layer: str, values: np.ndarray, index: np.ndarray, height: int, width: int) -> dict[str, np.ndarray]:

@@ -1,0 +1,217 @@
+"""relight: the recovered scene under other light and from elsewhere, with the BRDF and the materials of the re-renderings."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from iif_core.camera import direction_derivatives, pixel_directions
+from iif_core.color import to_uint8
+from iif_core.environment import as_map, resample
+from iif_core.errors import InputError
+from iif_core.relighting import axes_of_map, camera_path, exposure_for, frame_times, sphere_mesh
+from iif_core.response import Response, response
+from workflow.artifacts.files import read_exr
+from workflow.artifacts.store import rgb, split_rgb
+from workflow.base_scene import Light
+from workflow.denoise import denoise, require_denoiser
+from workflow.exporters.surface import up_axis
+from workflow.job import Job
+from workflow.normal_form import CaptureReader, View
+from workflow.recovered import Recovered, read_recovered, read_response
+
+_SEEDS = 0x72656C69  # keeps the random streams of this stage apart from those of others
+MAP_ROWS = 128
+"""Environment files are averaged down to this many rows."""
+SHEET_COLUMNS = 6
+EXAMPLE = "relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]"
+
+
+def run(job: Job) -> None:
+    """Write <name>/frame_<i>.exr and .png of every relighting, contact_sheet.png and relight.json."""
+    wanted = job.settings.relight
+    if not wanted:
+        raise InputError(
+            f"config/scenes/{job.scene}.yaml: no relighting is configured. Add one, for example `{EXAMPLE}` (docs/relighting.md)."
+        )
+    names = [entry["name"] for entry in wanted]
+    if len(set(names)) < len(names):
+        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
+    capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
+    curve = read_response(job.read("affines"))
+    if capture.is_hdr:
+        curve = response("srgb")  # linear radiance has no response of its own; pictures are for screens
+    up = np.asarray(capture.facts.get("up") or up_axis(np.stack([view.world_from_camera for view in capture.views])), np.float64)
+    facts, sheet = [], []
+    for number, entry in enumerate(wanted):
+        made, pictures = _relight(job, capture, scene, curve, up, number, _settings(entry))
+        facts.append(made)
+        shown = np.unique(np.linspace(0, len(pictures) - 1, min(SHEET_COLUMNS, len(pictures))).round().astype(int))
+        sheet.append([pictures[i] for i in shown])
+    job.writer.bytes("contact_sheet.png", _png(_sheet(sheet)))
+    job.writer.json("relight.json", {"relightings": facts, "up": up.tolist()})
+
+
+def _settings(entry: dict) -> SimpleNamespace:
+    inner = {name: SimpleNamespace(**value) if isinstance(value, dict) else value for name, value in entry.items()}
+    return SimpleNamespace(**inner)
+
+
+def _relight(
+    job: Job,
+    capture: CaptureReader,
+    scene: Recovered,
+    curve: Response,
+    up: np.ndarray,
+    number: int,
+    wanted: SimpleNamespace,
+) -> tuple[dict, list[np.ndarray]]:
+    """Render all frames of one relighting; returns facts and the 8-bit pictures."""
+    if wanted.denoise:
+        require_denoiser()
+    camera, times = _Camera.of(capture, wanted), frame_times(wanted.camera.frames)
+    poses = camera_path(camera.poses, times)
+    light = _light(scene, wanted, up)
+    exposure, world, pictures = wanted.exposure, None, []
+    for frame, (pose, time) in enumerate(zip(poses, times, strict=True)):
+        job.progress(frame, len(poses), f"frames of {wanted.name}")
+        if world is None or (wanted.sphere and wanted.sphere.path_to):
+            world = _world(scene, light, wanted, float(time))
+        seed = ((((job.seed << 32) | _SEEDS) << 16 | number) << 32) | frame
+        radiance = _frame(world, camera, pose, wanted, seed)
+        if not np.isfinite(radiance).all():
+            raise InputError(f"relighting {wanted.name}, frame {frame}: radiance is not finite; please report it with the scene")
+        exposure = exposure or exposure_for(radiance)
+        picture = to_uint8(curve(np.clip(exposure * radiance, 0, 1)))
+        job.writer.exr(f"{wanted.name}/frame_{frame:04d}.exr", split_rgb(radiance), "relative")
+        job.writer.bytes(f"{wanted.name}/frame_{frame:04d}.png", _png(picture))
+        pictures.append(picture)
+    job.progress(len(poses), len(poses), f"frames of {wanted.name}")
+    facts = {"name": wanted.name, "frames": len(poses), "exposure": exposure, "poses": poses.reshape(-1, 16).tolist()}
+    if not any(picture.any() for picture in pictures):
+        facts["note"] = "black: no light is on, or none reaches the room"
+        job.log.warning("relighting %s is %s", wanted.name, facts["note"])
+    return facts, pictures
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """Key poses (k, 4, 4) and the intrinsics of all frames."""
+
+    poses: np.ndarray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    @staticmethod
+    def of(capture: CaptureReader, wanted: SimpleNamespace) -> _Camera:
+        by_name: dict[str, View] = {view.name: view for view in capture.views}
+        names = wanted.camera.views or [capture.views[0].name]
+        unknown = [name for name in names if name not in by_name]
+        if unknown:
+            raise InputError(
+                f"`relight.camera.views` of {wanted.name}: found {', '.join(unknown)}; the views are"
+                f" {', '.join(list(by_name)[:8])}{' ...' if len(by_name) > 8 else ''}"
+            )
+        first = by_name[names[0]]
+        width, height = wanted.camera.width or first.width, wanted.camera.height or first.height
+        sx = width / first.width
+        fx, fy = first.fx * sx, first.fy * sx
+        cx, cy = width * first.cx / first.width, height * first.cy / first.height
+        if wanted.camera.fov:
+            fx = fy = 0.5 * width / np.tan(np.radians(wanted.camera.fov) / 2)
+            cx, cy = width / 2, height / 2
+        return _Camera(np.stack([by_name[name].world_from_camera for name in names]), fx, fy, cx, cy, width, height)
+
+
+def _light(scene: Recovered, wanted: SimpleNamespace, up: np.ndarray) -> Light:
+    """The scene's light as it is asked for; an emitter that is off reflects like any other surface."""
+    found, factor = scene.light, np.float32(wanted.emitters)
+    if wanted.environment == "keep":
+        environment = found.environment
+    elif wanted.environment == "off":
+        environment = np.zeros(3, np.float32)
+    elif isinstance(wanted.environment, str):
+        environment = _read_environment(Path(wanted.environment), up, wanted.environment_turn)
+    else:
+        environment = np.asarray(wanted.environment, np.float32)
+    emits = found.emits if factor > 0 else np.zeros_like(found.emits)
+    return Light(found.radiance * factor, found.side, emits, environment)
+
+
+def _read_environment(path: Path, up: np.ndarray, turn: float) -> np.ndarray:
+    """(H, W, 3) map in world axes of a latitude-longitude picture: top row = up, to the right = clockwise from above."""
+    channels = read_exr(path)
+    if not {"R", "G", "B"} <= set(channels):
+        raise InputError(f"{path}: found the channels {', '.join(channels)}; an environment needs R, G and B")
+    image = as_map(np.maximum(rgb(channels).astype(np.float32), 0))[:, ::-1]  # our columns run counter-clockwise
+    rows = min(MAP_ROWS, len(image))
+    points = 2 * -(-len(image) // rows)
+    return resample(image, axes_of_map(up, turn), rows, 2 * rows, points)
+
+
+def _world(scene: Recovered, light: Light, wanted: SimpleNamespace, time: float) -> tuple:
+    """Geometry, materials and emitters on the device, the sphere where it is at `time` in [0, 1]."""
+    if wanted.sphere is None:
+        geometry, material = scene.surface.traceable(light.emits)
+        return geometry, material, light.emitters(geometry)
+    ball = wanted.sphere
+    start = np.asarray(ball.center, np.float64)
+    centre = start if ball.path_to is None else start + time * (np.asarray(ball.path_to, np.float64) - start)
+    mesh = sphere_mesh(centre, ball.radius)
+    geometry, material = scene.surface.traceable(light.emits, mesh)
+    count = len(mesh[1])
+    with_ball = Light(
+        np.concatenate([light.radiance, np.tile(np.float32(ball.radiance), (count, 1))]),
+        np.concatenate([light.side, np.ones(count, np.int8)]),
+        np.concatenate([light.emits, np.ones(count, bool)]),
+        light.environment,
+    )
+    return geometry, material, with_ball.emitters(geometry)
+
+
+def _frame(world: tuple, camera: _Camera, pose: np.ndarray, wanted: SimpleNamespace, seed: int) -> np.ndarray:
+    """(H, W, 3) float32 radiance."""
+    from iif_core.transport import first_hits, render
+
+    geometry, material, emitters = world
+    shape, eye = (camera.height, camera.width, 3), pose[:3, 3]
+    directions = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose).reshape(-1, 3)
+    jitter = direction_derivatives(camera.fx, camera.fy, pose)
+    radiance = render(
+        geometry, material, emitters, eye, directions, wanted.samples, wanted.max_bounces, seed=seed, jitter=jitter
+    ).reshape(shape)
+    if not wanted.denoise:
+        return radiance
+    albedo, normals, _ = first_hits(geometry, material, eye, directions)
+    return denoise(radiance, albedo.reshape(shape), normals.reshape(shape))
+
+
+def _png(picture: np.ndarray) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(picture)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def _sheet(rows: list[list[np.ndarray]], gap: int = 4) -> np.ndarray:
+    """One row a relighting, on white."""
+    height = sum(max(p.shape[0] for p in row) + gap for row in rows) + gap
+    width = max(sum(p.shape[1] + gap for p in row) for row in rows) + gap
+    out = np.full((height, width, 3), 255, np.uint8)
+    y = gap
+    for row in rows:
+        x = gap
+        for picture in row:
+            out[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
+            x += picture.shape[1] + gap
+        y += max(p.shape[0] for p in row) + gap
+    return out
