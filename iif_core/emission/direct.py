@@ -20,8 +20,9 @@ import numpy as np
 from ..errors import InputError
 from .rows import EmissionRows
 
-TRUSTED = 2.0
+TRUSTED = 1.5
 """Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
+_DAMPED = 6  # rounds of re-weighting after which steps are halved
 _CHUNK = 1 << 24  # bytes of float64 rows converted at a time
 
 
@@ -255,6 +256,8 @@ def _solve_channel(
         before = step.answer
         share, shift = _censored(target - mean_a @ before, bound, rows.noise, noise)
         step = _solve_active(rows, c, weight * share, shift, initial, width, variance, cross, ridge, step, family)
+        if rounds > _DAMPED:  # two answers by turns: the one between them
+            step = replace(step, answer=0.5 * (before + step.answer))
         difference = target - mean_a @ step.answer
         used = np.where(bound & (difference <= 0), 0.0, weight)
         residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
@@ -263,7 +266,7 @@ def _solve_channel(
         noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
         # The first round has no residual to weigh the prior and the bounds with.
         change = np.abs(step.answer - before).max(initial=0.0)
-        converged = rounds > 1 and bool(change <= 1e-4 * max(step.answer.max(initial=0.0), 1e-300))
+        converged = rounds > 1 and bool(change <= 1e-3 * max(step.answer.max(initial=0.0), 1e-300))
     difference = target - mean_a @ step.answer
     counted = np.where(bound & (difference < 0), 0.0, weight)
     return _Channel(

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.camera import look_at, pixel_directions
-from iif_core.emission.direct import EmissionSolution, solve_emission
 from iif_core.emission.problem import EmissionProblem, PixelRows, assemble, initial_radiance
 from iif_core.emission.sensor import Sensor
 from iif_core.response import response
@@ -108,7 +107,6 @@ class PlantedScene:
         self.room, self.size = room, size
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
         self.material = FaceMaterials(room.material)
-        lit = np.append(room.truth, np.zeros((1, 3)))
         lit = np.concatenate([room.truth, np.zeros((1, 3))])[room.group].astype(np.float32)
         self.side = np.where(room.group >= 0, 1, 0).astype(np.int8)
         self.emitters = Emitters(self.geometry, lit, self.side)
@@ -154,37 +152,35 @@ class PlantedScene:
         ]
 
     def problem(
-        self, photographs: np.ndarray, halves: list[tuple[np.ndarray, np.ndarray]], dynamic_range: str
+        self, photographs: np.ndarray, halves: list[tuple[np.ndarray, np.ndarray]], kind: str
     ) -> tuple[EmissionProblem, np.ndarray]:
-        """(problem, initial radiance). `hdr`: what emitters show is unknown (their pixels are left out), the rest is
-        linear. `ldr`: 8 bits through sRGB at one exposure at which every emitter is saturated. Emitters are never
-        seen unsaturated in either: all is learned from the light they send."""
-        sensor = Sensor(response("srgb" if dynamic_range == "ldr" else "identity"), dynamic_range == "hdr", 0.99)
-        exposure, value = 1.0, photographs
-        if dynamic_range == "ldr":
-            exposure = float(0.6 / np.quantile(photographs[self.room.group[self.face] < 0], 0.9))
-            value = np.round(255 * sensor.curve(np.clip(exposure * photographs, 0, 1))) / 255
-        radiance, bound = sensor.radiance(value, exposure)
+        """(problem, initial radiance) of linear (`hdr`) or 8-bit photographs through sRGB (`ldr`, `ldr_one`).
+
+        `ldr`: the views have five exposures, two stops apart; in the shortest some emitters are not saturated.
+        `ldr_one`, `hdr_hidden`: no emitter is seen unsaturated, or at all; what is known is the light that they send.
+        """
+        linear = kind.startswith("hdr")
+        sensor = Sensor(response("identity" if linear else "srgb"), linear, 0.99)
         group = self.room.group[self.face]
+        exposure = np.ones(len(group))
+        if not linear:
+            exposure *= 0.6 / np.quantile(photographs[group < 0], 0.9)
+            exposure *= 4.0 ** -(self.view % 5 - 1.0) if kind == "ldr" else 1.0
+        value = photographs
+        if not linear:
+            value = np.round(255 * sensor.curve(np.clip(exposure[:, None] * photographs, 0, 1))) / 255
+        radiance, bound = sensor.radiance(value, exposure[:, None])
         group = np.where(self.room.truth[group].any(1) & (group >= 0), group, -1)
-        own = np.isin(np.arange(len(group)), np.flatnonzero(group >= 0))
-        if dynamic_range == "hdr":
-            bound[own], radiance[own] = True, np.minimum(radiance[own], 1.0)
-        use = self.face >= 0
-        rows = PixelRows(
-            radiance[use], bound[use], self.room.object_id[self.face[use]], self.view[use], self.tile[use], group[use]
-        )
-        halves = [(a[use], h[use]) for a, h in halves]
+        if kind == "hdr_hidden":
+            bound, radiance = bound | (group >= 0)[:, None], np.where((group >= 0)[:, None], 1.0, radiance)
+        rows = PixelRows(radiance, bound, self.room.object_id[self.face], self.view, self.tile, group)
         problem = assemble(rows, halves, GROUPS)
-        return problem, initial_radiance(rows, np.ones((GROUPS, 3)), False)
+        return problem, initial_radiance(rows, np.ones((GROUPS, 3)), linear and kind == "hdr")
 
     def families(self) -> np.ndarray:
         """(32,) object of every group."""
         first = np.unique(self.room.group, return_index=True)
         return self.room.object_id[first[1][first[0] >= 0]]
-
-    def solve(self, problem: EmissionProblem, initial: np.ndarray, **options) -> EmissionSolution:
-        return solve_emission(problem.rows, initial, **options)
 
 
 def relative_errors(room: Room, radiance: np.ndarray) -> np.ndarray:
