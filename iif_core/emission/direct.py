@@ -197,10 +197,8 @@ def _chunks(rows: EmissionRows) -> list[slice]:
     return [slice(start, start + step) for start in range(0, len(rows.target), step)]
 
 
-def _scores(
-    rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool, answer: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """sum_k s_k s_k' over clusters (G, G), and how many times larger its trace is than that of single rows."""
+def _scores(rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool, answer: np.ndarray) -> np.ndarray:
+    """sum_k s_k s_k' over clusters: (G, G)."""
     parts = []
     for part in _chunks(rows):
         w = weight[part, None]
@@ -216,9 +214,7 @@ def _scores(
     number = np.unique(cluster[~alone], return_inverse=True)[1]
     together = np.zeros((int(number.max(initial=-1)) + 1, rows.groups))
     np.add.at(together, number, single[~alone])
-    meat = single[alone].T @ single[alone] + together.T @ together
-    plain = float((single * single).sum())
-    return meat, max(float(np.trace(meat)) / plain, 1.0) if plain > 0 else 1.0
+    return single[alone].T @ single[alone] + together.T @ together
 
 
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -249,31 +245,35 @@ def _solve_channel(
     mean_a = 0.5 * (rows.first[:, :, c] + rows.second[:, :, c])
     target, weight = rows.mean_target[:, c], rows.weight[:, c]
     width = _width(initial, prior_width)
-    step = _Step(initial.copy(), initial.copy(), np.zeros(len(initial)), 1.0, 1.0)
+    answer, condition = initial.copy(), 1.0
     rounds, converged, variance, noise = 0, False, 0.0, 0.0
     while rounds < max_rounds and not converged:
         rounds += 1
-        before = step.answer
+        before = answer
         share, shift = _censored(target - mean_a @ before, bound, rows.noise, noise)
-        step = _solve_active(rows, c, weight * share, shift, initial, width, variance, cross, ridge, step, family)
+        system = _system(rows, c, weight * share, shift, initial, width, variance, cross, ridge)
+        if system is not None:
+            answer, condition = system.solve(initial), system.condition
         if rounds > _DAMPED:  # two answers by turns: the one between them
-            step = replace(step, answer=0.5 * (before + step.answer))
-        difference = target - mean_a @ step.answer
+            answer = 0.5 * (before + answer)
+        difference = target - mean_a @ answer
         used = np.where(bound & (difference <= 0), 0.0, weight)
         residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
         variance = residual if np.isfinite(width).any() else 0.0
         plain = ~bound & (weight > 0)
         noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
         # The first round has no residual to weigh the prior and the bounds with.
-        change = np.abs(step.answer - before).max(initial=0.0)
-        converged = rounds > 1 and bool(change <= 1e-3 * max(step.answer.max(initial=0.0), 1e-300))
-    difference = target - mean_a @ step.answer
+        change = np.abs(answer - before).max(initial=0.0)
+        converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
+    difference = target - mean_a @ answer
     counted = np.where(bound & (difference < 0), 0.0, weight)
+    # A bound that is reached says where the answer stops, not how far off it is.
+    error, share = _uncertainty(rows, c, np.where(bound, 0.0, weight), answer, initial, width, variance, cross, ridge, family)
     return _Channel(
-        step.answer,
-        step.error,
-        step.share,
-        step.condition,
+        answer,
+        error,
+        share,
+        condition,
         int((bound & (difference > 1e-6 * np.abs(target))).sum()),
         rounds,
         converged,
@@ -317,17 +317,33 @@ def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Step:
-    """Answer of one active set; `inflation`: how much more than single rows the clusters of rows vary."""
+class _System:
+    """Normal equations of the groups that the rows know, scaled to unit diagonal of M.
 
-    answer: np.ndarray
-    error: np.ndarray
-    share: np.ndarray
+    Attributes:
+        known: (G,) bool; scale: of the unknowns; matrix, right: lifted H and prior, b; lifted: the part of the prior.
+    """
+
+    known: np.ndarray
+    scale: np.ndarray
+    matrix: np.ndarray
+    lifted: np.ndarray
+    right: np.ndarray
     condition: float
-    inflation: float
+
+    def solve(self, initial: np.ndarray) -> np.ndarray:
+        """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
+        from scipy.linalg import solve_triangular
+        from scipy.optimize import nnls
+
+        lower = np.linalg.cholesky(self.matrix)
+        right = solve_triangular(lower, self.right + self.lifted @ (initial[self.known] * self.scale), lower=True)
+        answer = initial.copy()
+        answer[self.known] = nnls(lower.T, right, maxiter=50 * len(self.scale) + 50)[0] / self.scale
+        return answer
 
 
-def _solve_active(
+def _system(
     rows: EmissionRows,
     c: int,
     weight: np.ndarray,
@@ -337,40 +353,49 @@ def _solve_active(
     variance: float,
     cross: bool,
     ridge: float,
-    last: _Step,
-    family: np.ndarray | None,
-) -> _Step:
-    """Non-negative least squares with the given weights, and targets shifted."""
-    from scipy.linalg import solve_triangular
-    from scipy.optimize import nnls
-
+) -> _System | None:
+    """With the given weights, and targets shifted; None when the rows know nothing."""
     normal = _normal(rows, c, weight, shift, cross)
     diagonal = np.diag(normal.m)
     known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
     if not known.any():
-        return last
+        return None
     scale = np.sqrt(diagonal[known])
     unit, pick = np.outer(scale, scale), np.ix_(known, known)
     scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
     matrix, lifted, condition = _definite(scaled, ridge)
     prior = np.diag(variance / (width[known] * scale) ** 2)
-    matrix, lifted, start = matrix + prior, lifted + prior, initial[known] * scale
-    lower = np.linalg.cholesky(matrix)
-    right = solve_triangular(lower, scaled.b + lifted @ start, lower=True)
-    answer = initial.copy()
-    answer[known] = nnls(lower.T, right, maxiter=50 * len(scale) + 50)[0] / scale
-    inverse = np.linalg.inv(matrix)
-    meat, inflation = _scores(rows, c, weight, shift, cross, answer)
-    covariance = inverse @ (meat[pick] / unit) @ inverse
-    pull = inverse @ lifted  # d answer / d initial
-    spread = np.minimum(width[known], np.maximum(initial[known], 1e-300)) * scale
-    error, share = initial.copy(), np.zeros(len(initial))
-    share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
-    prior_part = pull * spread
+    return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+
+
+def _uncertainty(
+    rows: EmissionRows,
+    c: int,
+    weight: np.ndarray,
+    answer: np.ndarray,
+    initial: np.ndarray,
+    width: np.ndarray,
+    variance: float,
+    cross: bool,
+    ridge: float,
+    family: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(standard error, share of the answer that is not the prior's), both (G,)."""
+    error, share, none = initial.copy(), np.zeros(len(initial)), np.zeros(len(weight))
+    system = _system(rows, c, weight, none, initial, width, variance, cross, ridge)
+    if system is None:
+        return error, share
+    known, scale = system.known, system.scale
+    inverse = np.linalg.inv(system.matrix)
+    meat = _scores(rows, c, weight, none, cross, answer)[np.ix_(known, known)] / np.outer(scale, scale)
+    pull = inverse @ system.lifted  # d answer / d initial
+    prior_part = pull * np.minimum(width[known], np.maximum(initial[known], 1e-300)) * scale
     if family is not None:
         member = family[known][:, None] == np.unique(family)
         size = member.sum(0)
         mean = prior_part @ (member / np.maximum(size, 1))
         prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
-    error[known] = np.sqrt(np.clip(np.diag(covariance), 0, None) + (prior_part**2).sum(1)) / scale
-    return _Step(answer, error, share, condition, inflation)
+    variance_of = np.clip(np.diag(inverse @ meat @ inverse), 0, None) + (prior_part**2).sum(1)
+    share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
+    error[known] = np.sqrt(variance_of) / scale
+    return error, share
