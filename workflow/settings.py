@@ -256,7 +256,13 @@ class Emission(Section):
     prune: float = Field(0.01, ge=0, lt=1)
     """Groups below this share of the total power are dropped."""
     environment: Literal["auto", "on", "off"] = "auto"
-    """Constant environment light for rays that escape; `auto`: when enough of them do."""
+    """Environment light (16 x 32 texels in groups) for rays that escape; `auto`: when enough of them do."""
+    solver: Literal["direct", "sgd"] = "direct"
+    """`direct`: non-negative least squares; `sgd`: the paper's descent on the same rows, to compare with."""
+    preset: Literal["safe", "paper"] = "safe"
+    """`sgd`: `paper` = the published rate and pruning; `safe` = steps scaled by the diagonal, averaged."""
+    iterations: int = Field(10000, ge=1)
+    """`sgd`: batches of 1024 rows."""
 
 
 class Shading(Section):

@@ -1,21 +1,28 @@
 """Emission from photographs: light is linear in emission, so the emitters follow from non-negative least squares.
 
 With materials and geometry fixed, pixel p shows L_p = h_p + sum_g A_pg E_g in each colour channel (METHOD 7a). A
-is traced, so it is noisy, and a plain normal matrix E[A'A] = A'A + noise shrinks the answer (errors in variables):
-50 % noise turns (5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W A2 + A2'
-W A1) / 2. H may then be indefinite; its antisymmetric part (A1' W A2 - A2' W A1) / 2 is nothing but noise of the
-same size, so directions of H below that size are handed to the prior instead of being inverted.
+is traced, so it is noisy, and a plain normal matrix M = E[A'A] = A'A + noise shrinks the answer (errors in
+variables): 50 % noise turns (5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W
+A2 + A2' W A1) / 2.
+
+H may be indefinite. Its eigenvalues relative to M are reliabilities: the share of what a direction of E does in the rows
+that is signal, at most 1. K = (A1' W A2 - A2' W A1) / 2 is nothing but noise, so |K| relative to M is how far such a
+share can be trusted. Directions below that are lifted to it, and what is lifted goes to the prior. Relative to M and not
+to the identity, because neighbouring triangles differ in directions that do little yet are well known.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import InputError
 from .rows import EmissionRows
 
+TRUSTED = 1.5
+"""Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
+_DAMPED = 6  # rounds of re-weighting after which steps are halved
 _CHUNK = 1 << 24  # bytes of float64 rows converted at a time
 
 
@@ -25,14 +32,15 @@ class EmissionSolution:
 
     Attributes:
         radiance: (G, 3) float64 >= 0.
-        error: (G, 3) standard error: sandwich estimate from the residuals, widened by the initial value in as far
-            as the data leave a group to it.
+        error: (G, 3) standard error: H^-1 (sum_k s_k s_k') H^-1 with the scores s_k of the clusters of rows, each the
+            cross of one trace's A with the other's residual, so that tracing noise is in it once and without bias;
+            plus the prior's own width in as far as the data leave a group to it.
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
         condition: largest / smallest eigenvalue of the normal matrix scaled to unit diagonal (worst channel), cut
             at the noise level.
         residual: weighted root mean square of target - A E, relative to that of the target.
         violated: number of lower bounds that the answer does not reach.
-        iterations: rounds of the active set; `converged` says whether it came to rest.
+        iterations: rounds of re-weighting; `converged` says whether the answer came to rest.
     """
 
     radiance: np.ndarray
@@ -51,14 +59,15 @@ def solve_emission(
     cross: bool = True,
     ridge: float = 1e-4,
     max_rounds: int = 20,
-    prior_width: float = 5.0,
+    prior_width: float | np.ndarray = 5.0,
+    family: np.ndarray | None = None,
 ) -> EmissionSolution:
     """Radiance of every emitter group: weighted non-negative least squares with one-sided rows (METHOD 7a).
 
     min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the
     diagonal)
                         + v sum_g (E_g - E0_g)^2 / (prior_width E0_g)^2,  v = residual variance of a row of weight 1.
-    Bounds that are violated join as equalities until the set rests.
+    How sharp the bounds are is told by the noise of the rows (`_censored`); re-weighted until the answer rests.
 
     Args:
         rows: the system (see `block_rows`).
@@ -66,9 +75,11 @@ def solve_emission(
             columns).
         cross: normal matrix from both estimates of A (unbiased); False: from their mean (biased low, always definite).
         ridge: pull towards E0 relative to the diagonal of the normal matrix.
-        max_rounds: of the active set.
-        prior_width: standard deviation of E relative to E0 before looking at what it lights; keeps small groups
-            whose light reaches few pixels from taking any value at all. Infinity switches it off.
+        max_rounds: of the re-weighting.
+        prior_width: number or (G,), standard deviation of E relative to E0 before looking at what it lights; keeps
+            small groups whose light reaches few pixels from taking any value at all. Infinity switches it off.
+        family: (G,) int, groups whose initial values are one number that the data already gave: they miss it in
+            different directions. None = each for itself.
 
     Returns:
         `EmissionSolution`; always finite.
@@ -89,7 +100,7 @@ def solve_emission(
         return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
     square, square_target = 0.0, 0.0
     for c in range(3):
-        channel = _solve_channel(rows, c, initial[:, c], cross, ridge, max_rounds, prior_width)
+        channel = _solve_channel(rows, c, initial[:, c], cross, ridge, max_rounds, prior_width, family)
         radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
         condition = max(condition, channel.condition)
         violated += channel.violated
@@ -99,6 +110,43 @@ def solve_emission(
         square_target += channel.square_target
     residual = float(np.sqrt(square / square_target)) if square_target > 0 else 0.0
     return EmissionSolution(radiance, error, shares.min(1), condition, residual, violated, iterations, converged)
+
+
+FAMILY_WIDTH = 0.5
+"""Standard deviation of the groups of one object around their common radiance, relative to it."""
+
+
+def solve_families(
+    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float = FAMILY_WIDTH
+) -> EmissionSolution:
+    """`solve_emission` in two steps: groups of one object first share one radiance, then deviate from it.
+
+    The triangles of a window light the room almost alike, so what is known well is their sum. Solved alone, noise and
+    wrong albedos make one black and its neighbour twice as bright. The shared radiance becomes the initial value, and the
+    prior width of groups that have company is `width`.
+
+    Args:
+        family: (G,) int, groups with the same number are parts of one object.
+    """
+    number, members = np.unique(family, return_inverse=True)
+    size = np.bincount(members, minlength=len(number))
+    if not len(family) or size.max() == 1:
+        return solve_emission(rows, initial, cross)
+    joint = np.zeros((len(number), 3))
+    np.add.at(joint, members, initial)
+    joint /= size[:, None]
+    shared = replace(rows, first=_summed(rows.first, members, len(number)), second=_summed(rows.second, members, len(number)))
+    start = solve_emission(shared, joint, cross).radiance[members]
+    together = size[members] > 1
+    start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
+    return solve_emission(rows, start, cross, prior_width=np.where(together, width, 5.0), family=family)
+
+
+def _summed(matrix: np.ndarray, members: np.ndarray, count: int) -> np.ndarray:
+    out = np.zeros((len(matrix), count, 3), np.float32)
+    for group, family in enumerate(members):
+        out[:, family] += matrix[:, group]
+    return out
 
 
 @dataclass(frozen=True)
@@ -114,20 +162,26 @@ class _Channel:
     square_target: float
 
 
-def _normal(rows: EmissionRows, c: int, active: np.ndarray, cross: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """H, the noise part K, b and the plain diagonal, summed in float64 over chunks."""
+@dataclass(frozen=True)
+class _Normal:
+    """H, noise part K, M and b of one channel, float64."""
+
+    h: np.ndarray
+    k: np.ndarray
+    m: np.ndarray
+    b: np.ndarray
+
+
+def _normal(rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool) -> _Normal:
+    """Sums over chunks of rows."""
     groups = rows.groups
-    h, k = np.zeros((groups, groups)), np.zeros((groups, groups))
-    b, diagonal = np.zeros(groups), np.zeros(groups)
-    step = max(1, _CHUNK // (8 * groups))
-    for start in range(0, len(rows.target), step):
-        part = slice(start, start + step)
-        w = np.where(active[part], rows.weight[part, c], 0.0)[:, None]
-        a1 = rows.first[part, :, c].astype(np.float64)
-        a2 = rows.second[part, :, c].astype(np.float64)
+    h, k, m, b = np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros(groups)
+    for part in _chunks(rows):
+        w = weight[part, None]
+        a1, a2 = rows.first[part, :, c].astype(np.float64), rows.second[part, :, c].astype(np.float64)
         mean = 0.5 * (a1 + a2)
-        t1, t2 = rows.target[part, c], rows.target_second[part, c]
-        diagonal += (w * mean * mean).sum(0)
+        t1, t2 = (t[part, c] + shift[part] for t in (rows.target, rows.target_second))
+        m += mean.T @ (w * mean)
         if cross:
             b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
             product = a1.T @ (w * a2)
@@ -135,82 +189,213 @@ def _normal(rows: EmissionRows, c: int, active: np.ndarray, cross: bool) -> tupl
             k += 0.5 * (product - product.T)
         else:
             b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
-            h += mean.T @ (w * mean)
-    return h, k, b, diagonal
+    return _Normal(h if cross else m, k, m, b)
 
 
-def _definite(h: np.ndarray, k: np.ndarray, ridge: float, prior: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """H with every eigenvalue lifted above the noise level and the ridge; the lift, prior (diagonal) included; the
-    condition number of H."""
-    values, vectors = np.linalg.eigh(h)
-    noise = float(np.linalg.norm(k, 2)) if k.any() else 0.0
-    floor = max(noise, ridge, 1e-10)
-    lift = np.maximum(floor - values, 0.0) + ridge
-    lifted = (vectors * lift) @ vectors.T + np.diag(prior)
-    return h + lifted, lifted, float(values[-1] / max(values[0], floor))
+def _chunks(rows: EmissionRows) -> list[slice]:
+    step = max(1, _CHUNK // (8 * max(rows.groups, 1)))
+    return [slice(start, start + step) for start in range(0, len(rows.target), step)]
+
+
+def _scores(rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool, answer: np.ndarray) -> np.ndarray:
+    """sum_k s_k s_k' over clusters: (G, G)."""
+    parts = []
+    for part in _chunks(rows):
+        w = weight[part, None]
+        a1, a2 = rows.first[part, :, c].astype(np.float64), rows.second[part, :, c].astype(np.float64)
+        r1, r2 = rows.target[part, c] + shift[part] - a1 @ answer, rows.target_second[part, c] + shift[part] - a2 @ answer
+        if not cross:
+            a1 = a2 = 0.5 * (a1 + a2)
+            r1 = r2 = 0.5 * (r1 + r2)
+        parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
+    single = np.concatenate(parts)
+    cluster = np.full(len(single), -1) if rows.cluster is None else rows.cluster
+    alone = cluster < 0
+    number = np.unique(cluster[~alone], return_inverse=True)[1]
+    together = np.zeros((int(number.max(initial=-1)) + 1, rows.groups))
+    np.add.at(together, number, single[~alone])
+    return single[alone].T @ single[alone] + together.T @ together
+
+
+def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """(H lifted, the lift, condition number), all of unit diagonal; see the head of this module."""
+    values, vectors = np.linalg.eigh(normal.m)
+    values = np.maximum(values, 1e-9 * values[-1])
+    root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
+    share, directions = np.linalg.eigh(inverse @ normal.h @ inverse)
+    noise = float(np.linalg.norm(inverse @ normal.k @ inverse, 2)) if normal.k.any() else 0.0
+    lift = np.where(share < max(TRUSTED * noise, 1e-6), 1.0 - share, 0.0)
+    whole = root @ directions
+    lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
+    spectrum = np.linalg.eigvalsh(normal.h + lifted)
+    return normal.h + lifted, lifted, float(spectrum[-1] / max(spectrum[0] - ridge, 1e-10))
 
 
 def _solve_channel(
-    rows: EmissionRows, c: int, initial: np.ndarray, cross: bool, ridge: float, max_rounds: int, prior_width: float
+    rows: EmissionRows,
+    c: int,
+    initial: np.ndarray,
+    cross: bool,
+    ridge: float,
+    max_rounds: int,
+    prior_width: float | np.ndarray,
+    family: np.ndarray | None,
 ) -> _Channel:
-    from scipy.linalg import solve_triangular
-    from scipy.optimize import nnls
-
     bound = rows.lower_bound[:, c]
     mean_a = 0.5 * (rows.first[:, :, c] + rows.second[:, :, c])
     target, weight = rows.mean_target[:, c], rows.weight[:, c]
-    answer, error, share, condition = initial.copy(), initial.copy(), np.zeros(len(initial)), 1.0
-    joined = bound & (mean_a @ answer < target)
-    seen: list[bytes] = []
-    rounds, converged, variance = 0, False, 0.0
-    largest = float(initial.max(initial=0.0))
-    # Without any initial brightness there is no scale for the prior, and it is left out.
-    width = prior_width * np.maximum(initial, 0.1 * largest) if largest > 0 else np.full(len(initial), np.inf)
+    width = _width(initial, prior_width)
+    answer, condition = initial.copy(), 1.0
+    rounds, converged, variance, noise = 0, False, 0.0, 0.0
     while rounds < max_rounds and not converged:
         rounds += 1
-        active = ~bound | joined
-        h, k, b, diagonal = _normal(rows, c, active, cross)
-        known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
-        if known.any():
-            scale = np.sqrt(diagonal[known])
-            unit = np.outer(scale, scale)
-            scaled_h, scaled_k = h[np.ix_(known, known)] / unit, k[np.ix_(known, known)] / unit
-            matrix, lifted, condition = _definite(scaled_h, scaled_k, ridge, variance / (width[known] * scale) ** 2)
-            start = initial[known] * scale
-            right = b[known] / scale + lifted @ start
-            lower = np.linalg.cholesky(matrix)
-            solved = nnls(lower.T, solve_triangular(lower, right, lower=True), maxiter=50 * len(scale) + 50)[0]
-            answer = initial.copy()
-            answer[known] = solved / scale
-            inverse = np.linalg.inv(matrix)
-            rows_a = mean_a[:, known] / scale
-            meat_w = np.where(active, weight * (target - mean_a @ answer), 0.0)[:, None] * rows_a
-            covariance = inverse @ (meat_w.T @ meat_w) @ inverse
-            prior_part = np.clip(np.diag(inverse @ lifted), 0.0, 1.0)
-            error, share = initial.copy(), np.zeros(len(initial))
-            share[known] = 1.0 - prior_part
-            error[known] = np.sqrt(np.clip(np.diag(covariance), 0, None) + (prior_part * start) ** 2) / scale
+        before = answer
+        share, shift = _censored(target - mean_a @ before, bound, rows.noise, noise)
+        system = _system(rows, c, weight * share, shift, initial, width, variance, cross, ridge)
+        if system is not None:
+            answer, condition = system.solve(initial), system.condition
+        if rounds > _DAMPED:  # two answers by turns: the one between them
+            answer = 0.5 * (before + answer)
         difference = target - mean_a @ answer
-        now = bound & (difference > 0)
-        # The first round has no residual to weigh the prior with.
-        converged = rounds > 1 and bool((now == joined).all())
-        used = np.where(bound & ~now, 0.0, weight)
-        variance = float((used * difference**2).sum() / max(np.count_nonzero(used), 1)) if np.isfinite(prior_width) else 0.0
-        joined = now
-        mark = np.packbits(now).tobytes()
-        if rounds > 1 and mark in seen and not converged:  # a cycle between two sets: both are within a rounding of the optimum
-            break
-        seen.append(mark)
+        used = np.where(bound & (difference <= 0), 0.0, weight)
+        residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
+        variance = residual if np.isfinite(width).any() else 0.0
+        plain = ~bound & (weight > 0)
+        noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
+        # The first round has no residual to weigh the prior and the bounds with.
+        change = np.abs(answer - before).max(initial=0.0)
+        converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
     difference = target - mean_a @ answer
     counted = np.where(bound & (difference < 0), 0.0, weight)
+    # A bound that is reached says where the answer stops, not how far off it is.
+    error, share = _uncertainty(rows, c, np.where(bound, 0.0, weight), answer, initial, width, variance, cross, ridge, family)
     return _Channel(
         answer,
         error,
         share,
         condition,
-        int(joined.sum()),
+        int((bound & (difference > 1e-6 * np.abs(target))).sum()),
         rounds,
         converged,
         float((counted * difference**2).sum()),
         float((np.where(bound, counted, weight) * target**2).sum()),
     )
+
+
+def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
+
+    A pixel with noise sigma is saturated with probability Phi(-z), z = (bound - prediction) / sigma (Tobin 1958). One
+    Newton step on -log Phi(-z), with lambda = phi(z) / Phi(-z) and delta = lambda (lambda - z) in (0, 1), is the row
+    prediction + sigma lambda / delta with weight delta. sigma -> 0: those that are missed count fully, others not at
+    all. A hard bound instead would be pushed up by every pixel that noise alone has saturated.
+    """
+    from scipy.special import log_ndtr
+
+    share, shift = np.ones(len(difference)), np.zeros(len(difference))
+    missed = bound & (difference > 0)
+    share[bound] = missed[bound]
+    if scale is None or noise <= 0:
+        return share, shift
+    sigma = noise * scale[bound]
+    z = np.clip(difference[bound] / sigma, -30.0, 30.0)
+    ratio = np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
+    delta = np.clip(ratio * (ratio - z), 0.0, 1.0)
+    far = np.abs(difference[bound]) >= 29.0 * sigma
+    soft = ~far & (delta > 1e-4)
+    share[bound] = np.where(far, missed[bound], np.where(soft, delta, 0.0))
+    shift[bound] = np.where(soft, sigma * ratio / np.maximum(delta, 1e-4) - difference[bound], 0.0)
+    return share, shift
+
+
+def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
+    """Standard deviation of the prior; without any initial brightness there is no scale for it, and it is left out."""
+    largest = float(initial.max(initial=0.0))
+    if largest <= 0:
+        return np.full(len(initial), np.inf)
+    return relative * np.maximum(initial, 0.1 * largest)
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of the groups that the rows know, scaled to unit diagonal of M.
+
+    Attributes:
+        known: (G,) bool; scale: of the unknowns; matrix, right: lifted H and prior, b; lifted: the part of the prior.
+    """
+
+    known: np.ndarray
+    scale: np.ndarray
+    matrix: np.ndarray
+    lifted: np.ndarray
+    right: np.ndarray
+    condition: float
+
+    def solve(self, initial: np.ndarray) -> np.ndarray:
+        """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
+        from scipy.linalg import solve_triangular
+        from scipy.optimize import nnls
+
+        lower = np.linalg.cholesky(self.matrix)
+        right = solve_triangular(lower, self.right + self.lifted @ (initial[self.known] * self.scale), lower=True)
+        answer = initial.copy()
+        answer[self.known] = nnls(lower.T, right, maxiter=50 * len(self.scale) + 50)[0] / self.scale
+        return answer
+
+
+def _system(
+    rows: EmissionRows,
+    c: int,
+    weight: np.ndarray,
+    shift: np.ndarray,
+    initial: np.ndarray,
+    width: np.ndarray,
+    variance: float,
+    cross: bool,
+    ridge: float,
+) -> _System | None:
+    """With the given weights, and targets shifted; None when the rows know nothing."""
+    normal = _normal(rows, c, weight, shift, cross)
+    diagonal = np.diag(normal.m)
+    known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
+    if not known.any():
+        return None
+    scale = np.sqrt(diagonal[known])
+    unit, pick = np.outer(scale, scale), np.ix_(known, known)
+    scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
+    matrix, lifted, condition = _definite(scaled, ridge)
+    prior = np.diag(variance / (width[known] * scale) ** 2)
+    return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+
+
+def _uncertainty(
+    rows: EmissionRows,
+    c: int,
+    weight: np.ndarray,
+    answer: np.ndarray,
+    initial: np.ndarray,
+    width: np.ndarray,
+    variance: float,
+    cross: bool,
+    ridge: float,
+    family: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """(standard error, share of the answer that is not the prior's), both (G,)."""
+    error, share, none = initial.copy(), np.zeros(len(initial)), np.zeros(len(weight))
+    system = _system(rows, c, weight, none, initial, width, variance, cross, ridge)
+    if system is None:
+        return error, share
+    known, scale = system.known, system.scale
+    inverse = np.linalg.inv(system.matrix)
+    meat = _scores(rows, c, weight, none, cross, answer)[np.ix_(known, known)] / np.outer(scale, scale)
+    pull = inverse @ system.lifted  # d answer / d initial
+    prior_part = pull * np.minimum(width[known], np.maximum(initial[known], 1e-300)) * scale
+    if family is not None:
+        member = family[known][:, None] == np.unique(family)
+        size = member.sum(0)
+        mean = prior_part @ (member / np.maximum(size, 1))
+        prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
+    variance_of = np.clip(np.diag(inverse @ meat @ inverse), 0, None) + (prior_part**2).sum(1)
+    share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
+    error[known] = np.sqrt(variance_of) / scale
+    return error, share

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .environment import Sky
 from .gains import object_gains
 from .pruning import WhiteSurface
 from .rows import EmissionRows, block_rows, scale_rows
@@ -35,15 +36,6 @@ class PixelRows:
     view: np.ndarray
     tile: np.ndarray
     group: np.ndarray
-
-
-@dataclass(frozen=True)
-class Sky:
-    """Camera rays that leave the mesh: their number, mean radiance (3,), and whether most of them are saturated."""
-
-    pixels: int
-    radiance: np.ndarray
-    bounded: bool
 
 
 @dataclass(frozen=True)
@@ -91,7 +83,7 @@ def assemble(
     Args:
         halves: two independent estimates of (A (n, G, 3), h (n, 3)) of the pixels.
         white: the same of the pixels on emitters (in their order) with a white material.
-        sky: mean of the camera rays that leave the mesh, as one more row of the last group.
+        sky: the last groups are its, each with one more row: the mean of the camera rays that see it.
     """
     own = pixels.group >= 0
     direct = np.zeros((len(own), n_groups, 3), np.float32)
@@ -112,7 +104,7 @@ def assemble(
         radiance, bound = np.r_[radiance, -radiance[clear]], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
     problem = _blocks(EmissionRows(*rows[0], *rows[1], np.ones(radiance.shape), bound), radiance, key)
-    if sky is not None and sky.pixels:
+    if sky is not None and sky.pixels.any():
         problem = _with_sky(problem, n_groups, sky)
     return problem if white is not None else replace(problem, rows=_strengthened(problem.rows, problem.anchor))
 
@@ -132,25 +124,34 @@ def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray) -> Emissi
         own = key[:, 1] == g
         brightness[own] = brightness[own].mean()
     floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
-    weight = out.weight / np.maximum(brightness + floor, 1e-12) ** 2
-    return EmissionProblem(replace(out, weight=weight), seen.target, key[:, 0].astype(np.int64), key[:, 1] >= 0)
+    scale = np.maximum(brightness + floor, 1e-12)
+    weight = out.weight / scale**2
+    owner = key[:, 0].astype(np.int64)
+    # What an emitter shows itself has next to no noise.
+    noise = np.where(owner >= 0, 1.0, 1e-3) * scale[:, 0]
+    cluster = np.where(owner >= 0, owner * (int(key[:, 2].max(initial=0)) + 1) + key[:, 2], -1)
+    return EmissionProblem(replace(out, weight=weight, cluster=cluster, noise=noise), seen.target, owner, key[:, 1] >= 0)
 
 
 def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProblem:
-    row = np.zeros((1, n_groups, 3), np.float32)
-    row[0, n_groups - 1] = 1.0
-    seen = sky.radiance[None]
-    weight = np.full((1, 3), sky.pixels / max(float(seen.mean()), 1e-6) ** 2)
-    old = problem.rows
+    known = np.flatnonzero(sky.pixels > 0)
+    count, old, seen = len(known), problem.rows, sky.radiance[known]
+    row = np.zeros((count, n_groups, 3), np.float32)
+    row[np.arange(count), n_groups - sky.size + known] = 1.0
+    level = np.maximum(seen.mean(1), 1e-6)
+    weight = np.repeat((sky.pixels[known] / level**2)[:, None], 3, 1)
     added = EmissionRows(
         np.concatenate([old.first, row]),
         np.concatenate([old.second, row]),
         np.concatenate([old.target, seen]),
         np.concatenate([old.target_second, seen]),
         np.concatenate([old.weight, weight]),
-        np.concatenate([old.lower_bound, np.full((1, 3), sky.bounded)]),
+        np.concatenate([old.lower_bound, np.repeat(sky.bounded[known][:, None], 3, 1)]),
+        np.r_[old.cluster, np.full(count, -1)],
+        np.r_[old.noise, 1e-3 * level],
     )
-    return EmissionProblem(added, np.concatenate([problem.observed, seen]), np.r_[problem.owner, -1], np.r_[problem.anchor, True])
+    owner, anchor = np.r_[problem.owner, np.full(count, -1)], np.r_[problem.anchor, np.ones(count, bool)]
+    return EmissionProblem(added, np.concatenate([problem.observed, seen]), owner, anchor)
 
 
 def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:

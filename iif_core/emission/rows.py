@@ -20,6 +20,10 @@ class EmissionRows:
         weight: (n, 3) >= 0, weight of the squared residual.
         lower_bound: (n, 3) bool: the sensor was saturated, the target is a lower bound and only a prediction below
             it counts.
+        cluster: (n,) int, rows with the same number >= 0 may err together (one object in one view: its albedo is off);
+            -1 or None = alone.
+        noise: (n,) > 0, relative size of the noise of one pixel of a row (radiance, up to a common factor that the
+            residuals tell); how sharp a bound is. None = bounds are exact.
     """
 
     first: np.ndarray
@@ -28,6 +32,8 @@ class EmissionRows:
     target_second: np.ndarray
     weight: np.ndarray
     lower_bound: np.ndarray
+    cluster: np.ndarray | None = None
+    noise: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n, groups = self.first.shape[:2]

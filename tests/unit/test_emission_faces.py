@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from iif_core.emission.cache import RadianceSums
-from iif_core.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, hdr_threshold
+from iif_core.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, radiance_threshold
 from iif_core.emission.groups import group_emitters
 from iif_core.errors import InputError
 from iif_core.mesh import face_geometry
@@ -27,7 +29,8 @@ def _statistics(count, low, mean=None, front=1.0):
     count = np.asarray(count, np.int32)
     low = np.asarray(low, np.float32)
     mean = np.repeat(low[:, None], 3, 1) if mean is None else np.asarray(mean, np.float32)
-    return FaceStatistics(count, low, mean, np.full(len(count), front, np.float32))
+    bounded = np.zeros(len(count), bool)
+    return FaceStatistics(count, low, bounded, mean, count, np.full(len(count), front, np.float32))
 
 
 def test_face_statistics_by_hand():
@@ -49,6 +52,63 @@ def test_quantile_forgives_a_few_dark_pixels_but_not_many():
         stats = face_statistics(np.zeros(40, int), value, np.ones(40, bool), 1)
         got = emitter_candidates(stats, np.zeros((0, 2), int), np.ones(1), 0.99)
         assert got.tolist() == [expected]
+
+
+def test_saturated_pixels_count_for_what_they_say():
+    """Two exposures of a lamp of 5: saturated at 1 in the long one, seen in the short one."""
+    value = np.full((40, 3), 5.0)
+    value[:20] = 1.0
+    bound = np.zeros((40, 3), bool)
+    bound[:20] = True
+    face = np.zeros(40, int)
+    out = face_statistics(face, value, np.ones(40, bool), 1, bound)
+    assert out.low[0] == 5 and not out.bounded[0] and out.clear[0] == 20
+    np.testing.assert_allclose(out.mean[0], 5)
+    plain = face_statistics(face, value, np.ones(40, bool), 1)
+    assert plain.low[0] == 1 and plain.clear[0] == 40
+    out = face_statistics(face, value, np.ones(40, bool), 1, np.ones((40, 3), bool))
+    assert out.bounded[0] and out.low[0] == 5 and out.clear[0] == 0  # never seen: as bright as any bound
+    np.testing.assert_allclose(out.mean[0], 3)  # of the bounds
+
+
+def test_censored_quantile_is_kaplan_and_meier():
+    """Against the estimator written out."""
+    rng = np.random.default_rng(0)
+    face = rng.integers(0, 6, 600)
+    truth, limit = rng.lognormal(0, 1, 600), rng.lognormal(0.5, 1, 600)
+    bound = truth > limit
+    seen = np.minimum(truth, limit).astype(np.float32)
+    out = face_statistics(face, seen[:, None] * np.ones(3), np.ones(600, bool), 7, bound[:, None] & np.ones(3, bool), 0.4)
+    for f in range(6):
+        own = face == f
+        survival = 1.0
+        order = np.argsort(seen[own], kind="stable")
+        for rank, i in enumerate(np.flatnonzero(own)[order]):
+            survival *= 1.0 if bound[i] else 1 - 1 / (own.sum() - rank)
+            if survival < 0.6 - 1e-9:
+                assert out.low[f] == seen[i]
+                break
+        else:
+            assert out.bounded[f]
+    assert out.count[6] == 0 and out.low[6] == 0 and not out.bounded[6]
+
+
+def test_always_saturated_faces_are_candidates():
+    _, faces = _strip(2)
+    stats = replace(_statistics([9] * 4, [0.3] * 4), bounded=np.array([True, True, False, False]))
+    assert emitter_candidates(stats, face_adjacency(faces), np.ones(4), 0.99).tolist() == [True, True, False, False]
+
+
+def test_selected_groups_are_renumbered():
+    vertices, faces = _strip(6)
+    normals, areas = face_geometry(vertices, faces)
+    stats = _statistics([30] * 12, np.repeat(2.0 ** np.arange(6), 2))
+    groups = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas)
+    some = groups.select(np.array([True, False, True, False, False, False]))
+    assert some.size == 2 and set(some.of_face) == {-1, 0, 1} and (some.side[some.of_face < 0] == 0).all()
+    np.testing.assert_array_equal(some.observed, groups.observed[[0, 2]])
+    assert (groups.of_face[some.of_face == 1] == 2).all()
+    assert groups.select(np.zeros(6, bool)).size == 0
 
 
 def test_sphere_adjacency_and_geometry():
@@ -112,7 +172,8 @@ def test_groups_by_plane_colour_and_side():
     flat_normals, flat_areas = face_geometry(flat, faces)
     assert group_emitters(everything, stats, adjacency, flat_normals, flat_areas).size == 2
 
-    back = FaceStatistics(stats.count, stats.low, np.ones((12, 3), np.float32), np.repeat([1.0, 0.0, 0.5], 4).astype("f4"))
+    front = np.repeat([1.0, 0.0, 0.5], 4).astype("f4")
+    back = replace(stats, mean=np.ones((12, 3), np.float32), front=front)
     out = group_emitters(everything, back, adjacency, flat_normals, flat_areas)
     assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
 
@@ -148,17 +209,17 @@ def test_no_candidates():
     candidate = emitter_candidates(stats, face_adjacency(faces), np.ones(4), 0.99)
     assert not candidate.any()
     assert group_emitters(candidate, stats, face_adjacency(faces), np.ones((4, 3)), np.ones(4)).size == 0
-    assert hdr_threshold(stats) == float("inf")
+    assert radiance_threshold(stats) == float("inf")
 
 
-def test_hdr_threshold_ignores_emitters_and_finds_them():
+def test_radiance_threshold_ignores_emitters_and_finds_them():
     rng = np.random.default_rng(0)
     wall = np.exp(rng.normal(np.log(0.3), 0.5, 400))
     lamp = np.full(30, 12.0)
     stats = _statistics(np.r_[np.full(400, 20), np.full(30, 100)], np.r_[wall, lamp])
-    threshold = hdr_threshold(stats)
+    threshold = radiance_threshold(stats)
     assert 1.0 < threshold < 6.0
-    np.testing.assert_allclose(hdr_threshold(_statistics([5, 5], [7, 7])) / 7, 5)
+    np.testing.assert_allclose(radiance_threshold(_statistics([5, 5], [7, 7])) / 7, 5)
 
 
 def test_radiance_voxels_against_a_dictionary():

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from iif_core.emission.direct import solve_emission
+from iif_core.emission.direct import solve_emission, solve_families
 from iif_core.emission.gains import object_gains
-from iif_core.emission.pruning import prune_groups
+from iif_core.emission.pruning import WhiteSurface, prune_groups
 from iif_core.emission.rows import EmissionRows, block_rows, scale_rows
 from iif_core.errors import InputError
 
@@ -177,30 +179,112 @@ def test_right_hand_side_crosses_the_noise_of_one_trace():
     np.testing.assert_allclose(out.radiance, TRUE[:2], rtol=0.03)
 
 
+def _white(seen, matrix=None, cached=0.0):
+    seen = np.asarray(seen, float)[:, None] * np.ones(3)
+    groups = len(seen)
+    matrix = np.zeros((groups, groups)) if matrix is None else np.asarray(matrix, float)
+    return WhiteSurface(seen, matrix[:, :, None] * np.ones(3), np.full((groups, 3), cached))
+
+
+def _pruning(true, seen, matrix, area, noise=0.05, seed=9):
+    rng = np.random.default_rng(seed)
+    groups = len(true)
+    a = rng.random((2000, groups, 3)).astype(np.float32)
+    y = np.einsum("ngc,gc->nc", a, np.asarray(true)[:, None] * np.ones(3)) * (1 + noise * rng.standard_normal((2000, 3)))
+    everywhere, last = np.ones(2000, bool), np.arange(groups) == groups - 1
+    rows = _rows(a, a, y)
+    return prune_groups(rows, np.ones((groups, 3)), np.asarray(area, float), _white(seen, matrix), everywhere, last, cross=False)
+
+
 def test_pruning_keeps_what_shines():
-    rng = np.random.default_rng(9)
-    a = rng.random((2000, 5, 3)).astype(np.float32)
-    true = np.array([8.0, 0.0, 0.02, 0.005, 1.0])[:, None] * np.ones(3)
-    y = np.einsum("ngc,gc->nc", a, true) * (1 + 0.05 * rng.standard_normal((2000, 3)))
-    observed = np.array([8.0, 2.0, 2.0, 0.0, 0.0])[:, None] * np.ones(3)  # group 2 mostly reflects
-    out = prune_groups(
-        _rows(a, a, y), np.ones((5, 3)), np.array([1.0, 1.0, 1.0, 1.0, 0.0]), observed, np.arange(5) == 4, cross=False
-    )
+    """A lamp; a lit wall beside it; a strip brighter than white but without power; nothing; the environment."""
+    matrix = np.zeros((5, 5))
+    matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
+    out = _pruning([8.0, 0.0, 0.02, 0.0, 1.0], [8.0, 2.0, 2.0, 1.0, 0.0], matrix, [1.0, 1.0, 1.0, 1.0, 0.0])
     assert out.kept.tolist() == [True, False, False, False, True]
-    assert (out.solution.radiance[~out.kept] == 0).all() and [bool(r) for r in out.reason] == [
-        False,
-        True,
-        True,
-        True,
-        False,
-    ]
-    assert "reflects" in out.reason[2] and "power" in out.reason[3]
+    assert (out.solution.radiance[~out.kept] == 0).all()
+    assert "white surface" in out.reason[1] and out.excess[1] == pytest.approx(2 / 3.2, rel=0.1)
+    assert "power" in out.reason[2] and out.reason[0] == out.reason[4] == ""
+
+
+def test_dim_surface_whose_light_is_missed_stays():
+    """No brighter than a white surface would be, but the rest of the scene needs its light."""
+    matrix = np.zeros((3, 3))
+    matrix[1, 0] = 0.5
+    out = _pruning([8.0, 3.0, 0.0], [8.0, 3.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    assert out.kept[1] and out.excess[1] < 1
+
+
+def test_false_emitter_goes_before_the_lamp_it_hides():
+    """A shade around a bulb: each makes the other look like a reflector; the less credible one goes."""
+    matrix = np.array([[0.0, 0.9, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    out = _pruning([8.0, 0.0, 0.0], [8.0, 2.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    assert out.kept.tolist() == [True, False, True] and out.excess[0] > 4
 
 
 def test_pruning_with_nothing():
     rows = _rows(np.zeros((4, 0, 3)), np.zeros((4, 0, 3)), np.ones((4, 3)))
     none = np.zeros((0, 3))
-    assert prune_groups(rows, none, np.zeros(0), none, np.zeros(0, bool)).kept.shape == (0,)
+    out = prune_groups(rows, none, np.zeros(0), _white(np.zeros(0)), np.ones(4, bool), np.zeros(0, bool))
+    assert out.kept.shape == (0,)
+
+
+def test_parts_of_one_object_share_what_only_their_sum_tells():
+    """Two panes whose light arrives almost alike, under noise: alone one takes all, as a family both are near the truth."""
+    rng = np.random.default_rng(3)
+    common = rng.random((300, 1, 3))
+    a = np.concatenate([common, common + 1e-3 * rng.standard_normal((300, 1, 3)), rng.random((300, 1, 3))], 1)
+    true = np.array([4.0, 6.0, 3.0])[:, None] * np.ones(3)
+    y = np.einsum("ngc,gc->nc", a, true) + 0.05 * rng.standard_normal((300, 3))
+    rows = _rows(a, a, y)
+    alone = solve_emission(rows, np.ones((3, 3)), prior_width=np.inf, ridge=1e-9).radiance
+    family = solve_families(rows, np.ones((3, 3)), np.array([7, 7, 2])).radiance
+    assert np.abs(alone[:2] / true[:2] - 1).max() > 0.5
+    assert np.abs(family[:2] / 5.0 - 1).max() < 0.1 and np.abs(family[2] / 3 - 1).max() < 0.02
+    single = solve_families(rows, np.ones((3, 3)), np.arange(3)).radiance
+    np.testing.assert_array_equal(single, solve_emission(rows, np.ones((3, 3))).radiance)
+
+
+@pytest.mark.parametrize("soft", [True, False])
+def test_pixels_that_noise_has_saturated_do_not_push(soft):
+    """Noisy pixels around the saturation level: a hard bound is raised by every one that noise lifts above it."""
+    rng = np.random.default_rng(4)
+    n, level = 40_000, 2.0
+    a = rng.uniform(0.5, 1.5, (n, 1, 3))
+    y = 2.0 * a[:, 0] + 0.5 * rng.standard_normal((n, 3))
+    bound = y > level
+    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[np.minimum(y, level)] * 2, np.ones((n, 3)), bound)
+    rows = replace(rows, noise=np.ones(n)) if soft else rows
+    out = solve_emission(rows, np.ones((1, 3)))
+    assert (np.abs(out.radiance / 2 - 1).max() < 0.02) == soft
+
+
+def test_standard_errors_are_those_of_repeated_solves():
+    """Noise of A and of y redrawn: the claimed error is the scatter, and the scatter has the truth in its middle."""
+    rng = np.random.default_rng(11)
+    a, y = _random(1500)
+    found, claimed = [], []
+    for _ in range(60):
+        a1, a2 = (a * (1 + 0.4 * rng.standard_normal(a.shape)) for _ in range(2))
+        noisy = y * (1 + 0.1 * rng.standard_normal(y.shape))
+        out = solve_emission(_rows(a1, a2, noisy), np.ones((3, 3)), ridge=1e-9)
+        found.append(out.radiance)
+        claimed.append(out.error)
+    scatter = np.std(found, 0)
+    np.testing.assert_allclose(np.mean(claimed, 0) / scatter, 1, atol=0.3)
+    inside = np.abs(np.array(found) - TRUE) < np.array(claimed)
+    assert 0.58 < inside.mean() < 0.78
+
+
+def test_rows_that_err_together_count_as_few():
+    rng = np.random.default_rng(12)
+    a, y = _random(900)
+    off = np.repeat(1 + 0.1 * rng.standard_normal((30, 1)), 30, 0)
+    alone = solve_emission(_rows(a, a, y * off), np.ones((3, 3)))
+    rows = replace(_rows(a, a, y * off), cluster=np.repeat(np.arange(30), 30))
+    together = solve_emission(rows, np.ones((3, 3)))
+    np.testing.assert_array_equal(alone.radiance, together.radiance)
+    assert (together.error > 1.5 * alone.error).any()
 
 
 @pytest.mark.parametrize("pinned", [False, True])

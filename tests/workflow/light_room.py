@@ -274,6 +274,9 @@ EMISSION = {
     "samples": 16,
     "prune": 0.01,
     "environment": "auto",
+    "solver": "direct",
+    "preset": "safe",
+    "iterations": 2000,
 }
 SHADING = {
     "samples": 32,

@@ -1,0 +1,49 @@
+"""Planted emission in a room with known materials (tests/benchmarks/emission_planted.py prints the large table)."""
+
+import numpy as np
+import pytest
+
+from iif_core.emission.direct import solve_emission, solve_families
+from iif_core.emission.loss import reference_loss
+from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
+from tests.unit.planted_room import PlantedScene, build_room, relative_errors
+
+
+@pytest.fixture(scope="module")
+def planted(llvm):
+    scene = PlantedScene(build_room(), views=10, size=48)
+    return scene, scene.photographs(0, 128), scene.halves(0, 8)
+
+
+@pytest.mark.parametrize(("kind", "median"), [("hdr", 0.02), ("ldr", 0.06)])
+def test_planted_groups_are_recovered(planted, kind, median):
+    scene, photographs, halves = planted
+    problem, initial = scene.problem(photographs, halves, kind)
+    found = solve_families(problem.rows, initial, scene.families())
+    assert np.median(relative_errors(scene.room, found.radiance)) < median
+    assert found.radiance[~scene.room.truth.any(1)].max() < 1.0  # of up to 20: the distractors
+    assert found.converged and np.isfinite(found.error).all()
+
+
+def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
+    """Single triangles are not told apart by so few paths; the light of each object is."""
+    scene, photographs, _ = planted
+    problem, initial = scene.problem(photographs, scene.halves(1, 32), "ldr_one")
+    found = solve_families(problem.rows, initial, scene.families())
+    for family in np.unique(scene.families())[:3]:
+        own = scene.families() == family
+        assert found.radiance[own].sum() / scene.room.truth[own].sum() == pytest.approx(1, abs=0.15)
+    alone = solve_emission(problem.rows, initial, cross=False)
+    error = [np.median(relative_errors(scene.room, s.radiance)) for s in (found, alone)]
+    assert error[0] < error[1]
+
+
+def test_twins_are_judged_by_one_loss(planted):
+    scene, photographs, halves = planted
+    problem, initial = scene.problem(photographs, halves, "hdr_hidden")
+    direct = solve_families(problem.rows, initial, scene.families())
+    descent = solve_emission_sgd(problem.rows, initial, SgdOptions(steps=600, prune=()))
+    losses = [reference_loss(problem.rows, s.radiance) for s in (direct, descent)]
+    assert losses[0] <= losses[1]
+    assert losses[0] == pytest.approx(reference_loss(problem.rows, scene.room.truth), abs=2e-3)
+    assert descent.radiance.shape == direct.radiance.shape and descent.converged
