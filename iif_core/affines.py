@@ -94,6 +94,8 @@ class FitOptions:
             None: the start, and precision one.
         response_ridge: weight of that prior per pixel. 1e-5 is a residual of 0.05 squared over 250 independent errors:
             those of the shading go together over an object in a view, so pixels are no measure of what is known.
+            RMS of the curve before and after the joint fit, worst channel, in per cent of the range: built-in kitchen 0.47
+            and 0.59, Country Kitchen 0.60 and 0.62; with precision one instead of the calibration's 4.6 and 8.7.
         roughness_weight, metallic_weight: of |r - 1| and |m| in the mean squared error. The paper has 1e-3 and
             5e-3. On the built-in kitchen (draft) roughness L2 is 0.162 with 1e-3, 0.051 with 2e-4 and 0.038 with
             0: the ridge to the prior is the better tie-breaker; metallic L2 is 0.019 with 5e-3, 0.010 with 1e-3,
