@@ -108,6 +108,8 @@ class FitOptions:
             None: the start, and precision one.
         response_ridge: weight of that prior per pixel. 1e-5 is a residual of 0.05 squared over 250 independent errors:
             those of the shading go together over an object in a view, so pixels are no measure of what is known.
+            RMS of the curve before and after the joint fit, worst channel, in per cent of the range: built-in kitchen 0.47
+            and 0.59, Country Kitchen 0.60 and 0.62; with precision one instead of the calibration's 4.6 and 8.7.
         roughness_weight, metallic_weight: of |r - 1| and |m| in the mean squared error, as in the paper's loss (1e-3, 5e-3
             there); 0 here, because the population decides (`population`).
         population: pull each object towards what the well-determined objects of the scene have in common, as strongly as

@@ -184,7 +184,8 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     rows |= {f"error_{c}": np.array([0.1, 0.1]) for c in "rgb"} | {"reason": ["", "below 1 % of the power"]}
     job.writer.table("emitters.parquet", rows)
     job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
-    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": []})
+    exposure = [view.exposure for view, *_ in seen]
+    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "exposure": exposure})
     job.writer.finish()
 
     job = FakeJob("shading", root)
