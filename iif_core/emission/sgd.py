@@ -57,7 +57,7 @@ def solve_emission_sgd(
 
     Returns:
         `EmissionSolution`; `error` and `determined` are 0, there is no covariance; `converged` is False when the descent
-        left the finite numbers, and the radiance is then that of the step before.
+        left the finite numbers (the radiance is then that of the step before) or ended worse than it began.
 
     Raises:
         InputError: `initial` of the wrong shape.
@@ -109,10 +109,17 @@ def solve_emission_sgd(
         radiance = average / (options.steps - options.steps // 2) * kept[:, None]
     blind = np.einsum("nc,ngc->gc", rows.weight, np.abs(rows.first)) <= 0
     radiance = np.where(blind, initial, radiance)
+    square, norm, violated = _misfit(rows, radiance)
+    # Steps that are too long end in 0, clamped, rather than in infinity: worse than where the descent began.
+    finite &= square <= _misfit(rows, np.full((groups, 3), START))[0] * (1 + 1e-6)
+    residual = float(np.sqrt(square / norm)) if norm > 0 else 0.0
+    return EmissionSolution(radiance, zeros, none, 1.0, residual, violated, step, bool(finite))
+
+
+def _misfit(rows: EmissionRows, radiance: np.ndarray) -> tuple[float, float, int]:
+    """Weighted sum of squares, that of the target, and bounds that are not reached."""
     mean = 0.5 * (rows.first + rows.second)
     difference = rows.mean_target - np.einsum("ngc,gc->nc", mean, radiance)
     counted = np.where(rows.lower_bound & (difference < 0), 0.0, rows.weight)
-    norm = float((counted * rows.mean_target**2).sum())
-    residual = float(np.sqrt((counted * difference**2).sum() / norm)) if norm > 0 else 0.0
-    violated = int((rows.lower_bound & (difference > 0)).sum())
-    return EmissionSolution(radiance, zeros, none, 1.0, residual, violated, step, finite)
+    square, norm = float((counted * difference**2).sum()), float((counted * rows.mean_target**2).sum())
+    return square, norm, int((rows.lower_bound & (difference > 0)).sum())

@@ -1,0 +1,163 @@
+"""Emission at the extremes: every answer is finite, bounded and says what it is."""
+
+import numpy as np
+import pytest
+
+from iif_core.emission.candidates import emitter_candidates, face_statistics, radiance_threshold
+from iif_core.emission.direct import solve_emission, solve_families
+from iif_core.emission.groups import group_emitters
+from iif_core.emission.loss import reference_loss
+from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
+from iif_core.emission.pruning import prune_groups
+from iif_core.emission.rows import EmissionRows
+from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.segments import face_adjacency
+
+
+def _rows(a, target, bound=None):
+    bound = np.zeros(target.shape, bool) if bound is None else bound
+    return EmissionRows(*[a.astype(np.float32)] * 2, target, target, np.ones(target.shape), bound)
+
+
+def _matrix(n=300, groups=3, seed=0):
+    return np.random.default_rng(seed).random((n, groups, 3))
+
+
+def _solutions(rows, initial):
+    yield solve_emission(rows, initial)
+    yield solve_families(rows, initial, np.zeros(len(initial), int))
+    for preset in ("safe", "paper"):
+        yield solve_emission_sgd(rows, initial, SgdOptions(preset, 50, 64))
+
+
+CASES = {
+    "black": (_matrix(), np.zeros((300, 3)), None),
+    "all saturated": (_matrix(), np.full((300, 3), 0.5), np.ones((300, 3), bool)),
+    "a million": (_matrix() * [[[1e-6], [1], [1]]], _matrix().sum(1) + 1.0, None),
+    "tiny": (_matrix() * 1e-12, np.full((300, 3), 1e-12), None),
+    "one row": (_matrix(1), np.ones((1, 3)), None),
+    "twins": (np.repeat(_matrix(300, 1), 3, 1), np.ones((300, 3)), None),
+    "no light reaches anything": (np.zeros((300, 3, 3)), np.ones((300, 3)), None),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_solver_stays_finite(case):
+    a, target, bound = CASES[case]
+    rows = _rows(a, target, bound)
+    for found in _solutions(rows, np.ones((3, 3))):
+        assert np.isfinite(found.radiance).all() and (found.radiance >= 0).all() and np.isfinite(found.error).all()
+        assert np.isfinite(reference_loss(rows, found.radiance)) and np.isfinite(found.residual)
+
+
+def test_descent_that_diverges_says_so():
+    a = 1e20 * _matrix()
+    found = solve_emission_sgd(_rows(a, a.sum(1)), np.ones((3, 3)), SgdOptions("paper", 200, 64))
+    assert not found.converged and np.isfinite(found.radiance).all()
+
+
+def test_descent_reaches_the_answer_on_exact_rows_and_prunes_what_is_dark():
+    a = _matrix(2000)
+    truth = np.array([5.0, 0.0, 2.0])[:, None] * np.ones(3)
+    rows = _rows(a, np.einsum("ngc,gc->nc", a, truth))
+    found = solve_emission_sgd(rows, np.ones((3, 3)), SgdOptions(steps=3000, batch=256, prune=((2000, 0.05),)))
+    np.testing.assert_allclose(found.radiance, truth, atol=0.05)
+    assert (found.radiance[1] == 0).all()
+    again = solve_emission_sgd(rows, np.ones((3, 3)), SgdOptions(steps=3000, batch=256, prune=((2000, 0.05),)))
+    np.testing.assert_array_equal(found.radiance, again.radiance)
+
+
+def test_clamped_loss_has_no_gradient_where_the_prediction_is_too_bright():
+    """METHOD H32: the published loss leaves an emitter too bright that `safe` brings down."""
+    a = np.ones((64, 1, 3))
+    rows = _rows(a, np.full((64, 3), 0.5))
+    ceiling = np.full((64, 3), 0.005)  # below where the descent starts
+    stuck = solve_emission_sgd(rows, np.ones((1, 3)), SgdOptions("paper", 50, 64, ()), ceiling)
+    np.testing.assert_array_equal(stuck.radiance, 0.01)
+    free = solve_emission_sgd(rows, np.ones((1, 3)), SgdOptions("safe", 50, 64, ()), ceiling)
+    np.testing.assert_allclose(free.radiance, 0.5, rtol=0.05)
+
+
+def test_reference_loss_does_not_reward_shrinking():
+    """With noise in A the plain loss is smallest below the truth; the crossed one at the truth."""
+    rng = np.random.default_rng(5)
+    a = _matrix(100_000, 1, 5)
+    halves = [(a * (1 + rng.standard_normal(a.shape))).astype(np.float32) for _ in range(2)]
+    y = 4.0 * a[:, 0]
+    rows = EmissionRows(*halves, y, y, np.ones(y.shape), np.zeros(y.shape, bool))
+    at = {e: [reference_loss(rows, np.full((1, 3), e), cross) for cross in (True, False)] for e in (3.0, 4.0)}
+    assert at[4.0][0] < at[3.0][0] and at[4.0][1] > at[3.0][1]
+    assert abs(at[4.0][0]) < 0.02
+
+
+def _strip(n):
+    x = np.arange(n + 1)
+    quads = [(i, i + 1, i + n + 2, i, i + n + 2, i + n + 1) for i in range(n)]
+    return np.array(quads).reshape(-1, 3), np.concatenate([np.stack([x, np.full(n + 1, y), 0 * x], 1) for y in (0.0, 1.0)])
+
+
+@pytest.mark.parametrize("everything", [True, False])
+def test_a_saturated_or_black_view(everything):
+    """All pixels of one view (or of all views) are saturated, another view is black."""
+    faces, _ = _strip(4)
+    face = np.tile(np.repeat(np.arange(8), 10), 3)
+    view = np.repeat(np.arange(3), 80)
+    value = np.where((view == 0) | everything, 1.0, np.where(view == 1, 0.0, 0.3))[:, None] * np.ones(3)
+    bound = ((view == 0) | everything)[:, None] & np.ones(3, bool)
+    stats = face_statistics(face, value, np.ones(240, bool), 8, bound)
+    threshold = radiance_threshold(stats)
+    found = emitter_candidates(stats, face_adjacency(faces), np.ones(8), threshold)
+    assert found.all() == everything and found.any() == everything
+    assert np.isfinite(stats.low).all() and np.isfinite(stats.mean).all()
+    groups = group_emitters(found, stats, face_adjacency(faces), np.tile([0.0, 0, 1], (8, 1)), np.ones(8))
+    assert groups.size == int(everything)
+
+
+def test_coincident_and_flipped_faces():
+    """A lamp modelled twice, once with its faces turned round: two groups of opposite side, sharing what is not told apart."""
+    faces, _ = _strip(2)
+    both = np.concatenate([faces, faces[:, ::-1] + 6])
+    stats = face_statistics(
+        np.repeat(np.arange(8), 10), np.ones((80, 3)) * 9.0, np.repeat([True, False], 40), 8, np.zeros((80, 3), bool)
+    )
+    normals = np.repeat([[0.0, 0, 1], [0, 0, -1]], 4, 0)
+    groups = group_emitters(np.ones(8, bool), stats, face_adjacency(both), normals, np.ones(8))
+    assert groups.size == 2 and set(groups.side) == {1, -1}
+    a = np.repeat(_matrix(300, 1), 2, 1)
+    found = solve_families(_rows(a, 6.0 * a[:, 0]), np.full((2, 3), 9.0), np.array([0, 1]))
+    np.testing.assert_allclose(found.radiance.sum(0), 6.0, rtol=0.02)
+    assert (found.determined < 0.9).all()
+
+
+@pytest.mark.parametrize("objects", [1, 5000])
+def test_one_object_and_five_thousand(objects):
+    rng = np.random.default_rng(7)
+    n, truth = 10_000, np.array([3.0, 8.0])[:, None] * np.ones(3)
+    a = rng.random((n, 2, 3))
+    gain = np.exp(0.2 * rng.standard_normal(objects))
+    owner = np.arange(n) % objects
+    y = gain[owner][:, None] * np.einsum("ngc,gc->nc", a, truth)
+    group = np.where(np.arange(n) < 200, np.arange(n) % 2, -1)
+    y[:200] = truth[group[:200]]
+    pixels = PixelRows(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
+    halves = [(a, np.zeros((n, 3)))] * 2
+    initial = initial_radiance(pixels, np.ones((2, 3)), True)
+    problem = assemble(pixels, halves, 2).with_gains(initial)
+    np.testing.assert_allclose(solve_emission(problem.rows, initial).radiance, truth, rtol=0.02)
+
+
+def test_emitter_that_is_never_seen_is_left_to_its_light():
+    """No pixel of its own: no white surface to compare with, and no reason to drop it while it has power."""
+    a, truth = _matrix(1000, 2), np.array([5.0, 4.0])[:, None] * np.ones(3)
+    y = np.einsum("ngc,gc->nc", a, truth)
+    group = np.where(np.arange(1000) < 50, 0, -1)
+    y[:50] = truth[0]
+    pixels = PixelRows(y, np.zeros((1000, 3), bool), np.zeros(1000, int), np.zeros(1000, int), np.arange(1000) // 4, group)
+    halves = [(a.astype(np.float32), np.zeros((1000, 3), np.float32))] * 2
+    white = [(np.zeros((50, 2, 3), np.float32), np.full((50, 3), 0.1, np.float32))] * 2
+    seen = initial_radiance(pixels, np.full((2, 3), 2.0), True)
+    trial = assemble(pixels, halves, 2, white)
+    evidence = white_surface(pixels, seen, white)
+    out = prune_groups(trial.rows, seen, np.ones(2), evidence, ~trial.anchor, np.zeros(2, bool))
+    assert out.kept.all() and np.isinf(out.excess[1])
+    np.testing.assert_allclose(out.solution.radiance, truth, rtol=0.05)
