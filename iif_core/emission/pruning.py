@@ -83,7 +83,7 @@ def prune_groups(
         protected: (G,) bool, never dropped (environment).
     """
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
-    excess, missed = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool)
+    excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
     solution = solve_emission(rows, initial, cross)
     while True:
         emission = solution.radiance.sum(1)
@@ -98,13 +98,17 @@ def prune_groups(
         elif reflecting.any():
             drop = reflecting & (excess <= 1.1 * excess[reflecting].min())
         elif weak.any():
-            drop = weak
+            drop = weak & (power <= power[weak].min()) if singly else weak
         else:
             break
         trial = _solve_subset(rows, initial, kept & ~drop, cross)
         before, after = (_misfit(rows, s.radiance, elsewhere) for s in (solution, trial))
         if not dark.any() and after > before * (1 + residual_change) + 1e-12:
-            missed |= drop
+            # One weak lamp that is missed must not keep all other weak groups.
+            if drop.sum() > 1 and not reflecting.any():
+                singly = True
+            else:
+                missed |= drop
             continue
         for g in np.flatnonzero(drop):
             reason[g] = _reason(dark[g], bool(reflecting[g]), excess[g], power[g])
