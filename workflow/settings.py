@@ -160,7 +160,7 @@ class Segmentation(Section):
     """`geometry`: weight of the photographs' mean colour of a face beside the bend of the surface (0 = shape alone)."""
 
 
-_DIRECT_ALONE = ("sweeps", "polish", "ridge", "temperature", "anneal", "final_temperature", "seams", "robust", "objective")
+_DIRECT_ALONE = ("sweeps", "ridge", "temperature", "anneal", "final_temperature", "seams", "robust", "objective")
 _SGD_ALONE = ("preset", "texture", "iterations", "median_gradient")  # the sizes of the hash grid come with a quality
 
 

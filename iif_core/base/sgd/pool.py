@@ -102,7 +102,7 @@ def gather(problem: BaseProblem, options: SgdOptions) -> Pool:
         low, high = float(point.min()), float(point.max())
         pad = max(0.01 * (high - low), 1e-6)  # METHOD 2.0: a cube, padded by 1 %
         box = (low - pad, high + pad)
-        coordinates = coordinates(point, box)
+        coordinates = unit_coordinates(point, box)
         tangent = pool["tangent"] / np.float32(box[1] - box[0]) if jitter else None
     return Pool(
         _half_in_range(pool["values"]),
@@ -128,7 +128,7 @@ def _half_in_range(values: NDArray) -> NDArray:
     return values
 
 
-def coordinates(point: NDArray, box: tuple[float, float]) -> NDArray:
+def unit_coordinates(point: NDArray, box: tuple[float, float]) -> NDArray:
     return ((point - np.float32(box[0])) / np.float32(box[1] - box[0])).astype(np.float32)
 
 

@@ -32,7 +32,7 @@ from ..problem import BaseProblem, Dropped, object_means
 from ..selection import selection_weights
 from .numba_engine import NumbaEngine
 from .options import SgdOptions
-from .pool import TERMS, Pool, Step, activated, batches, coordinates, gather, learning_rate_at, of_view, temperature_at
+from .pool import TERMS, Pool, Step, activated, batches, gather, learning_rate_at, of_view, temperature_at, unit_coordinates
 from .torch_engine import TorchEngine
 
 
@@ -258,7 +258,7 @@ def _fit(
             return value[cell], scale[cell]
         point = of_view(problem.point, view).reshape(-1, 3)
         point = np.where(np.isfinite(point), point, np.float32(pool.box[0]))
-        return activated(engine.at(coordinates(point, pool.box)), options)
+        return activated(engine.at(unit_coordinates(point, pool.box)), options)
 
     return SgdFit(
         value=value,
