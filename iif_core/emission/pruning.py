@@ -98,14 +98,16 @@ def prune_groups(
         elif reflecting.any():
             drop = reflecting & (excess <= 1.1 * excess[reflecting].min())
         elif weak.any():
-            drop = weak & (power <= power[weak].min()) if singly else weak
+            drop = weak
         else:
             break
+        if singly and not dark.any():
+            drop &= power <= power[drop].min()
         trial = _solve_subset(rows, initial, kept & ~drop, cross)
         before, after = (_misfit(rows, s.radiance, elsewhere) for s in (solution, trial))
         if not dark.any() and after > before * (1 + residual_change) + 1e-12:
-            # One weak lamp that is missed must not keep all other weak groups.
-            if drop.sum() > 1 and not reflecting.any():
+            # One lamp that is missed must not keep those that were to go with it.
+            if drop.sum() > 1 and not singly:
                 singly = True
             else:
                 missed |= drop
