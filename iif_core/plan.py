@@ -15,6 +15,9 @@ Decision = dict[str, Any]
 ESCAPE_PRIMARY = 1e-3
 ESCAPE_SECONDARY = 2e-3
 ESCAPE_BRIGHTNESS = 0.02
+ESCAPE_OPEN = 0.3
+"""Share of escaping rays from which a mesh is a part of a room. What its holes show is then the rest of the room, near and
+different from everywhere: one radiance, not a map (Red Kitchen, 64 %: re-rendering 18.7 dB against 15.3 dB with a map)."""
 EXPOSURE_LOG_RATIO = 0.05
 RESPONSE_ERRORS = 2.0
 METALLIC_PRIOR = 0.25

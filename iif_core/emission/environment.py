@@ -10,6 +10,7 @@ from ..environment import texel_of
 from ..xp import NUMPY
 
 HEIGHT, WIDTH = 16, 32
+MAX_GROUPS = 12
 MIN_PIXELS = 50
 """Escaping camera pixels from which a texel is known by itself (METHOD 8)."""
 
@@ -55,12 +56,12 @@ class SkySums:
         """(3,) mean radiance of all escaping pixels; 0 without any."""
         return self._sums[:, :3].sum(0) / max(self.pixels, 1)
 
-    def groups(self, max_ratio: float = 1.5, max_groups: int = 12, min_pixels: int = MIN_PIXELS) -> Sky:
+    def groups(self, max_ratio: float = 1.5, max_groups: int = MAX_GROUPS, min_pixels: int = MIN_PIXELS) -> Sky:
         """Texels that share an unknown radiance: those of similar brightness, saturated ones by themselves, and as the
         last group all that too few pixels have seen: nothing tells them apart.
 
         Args:
-            max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice.
+            max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice; 1 = all texels together.
             min_pixels: of a texel that counts as seen.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
@@ -68,7 +69,7 @@ class SkySums:
         seen, hidden = count >= min_pixels, 2 * saturated > count
         level = np.log(np.maximum(mean.sum(1), 1e-12))
         number, step = np.zeros(len(count), np.int64), np.log(max_ratio)
-        while True:
+        while max_groups > 1:
             number[:] = -1
             for part in (seen & ~hidden, seen & hidden):
                 if part.any():

@@ -11,7 +11,7 @@ from iif_core.calibration import calibration_facts
 from iif_core.emission.cache import RadianceVoxels
 from iif_core.emission.candidates import emitter_candidates
 from iif_core.emission.direct import EmissionSolution, solve_families
-from iif_core.emission.environment import Sky
+from iif_core.emission.environment import MAX_GROUPS, Sky
 from iif_core.emission.groups import EmitterGroups, group_emitters
 from iif_core.emission.loss import reference_loss
 from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
@@ -58,7 +58,10 @@ def run(job: Job) -> None:
     cache, sums, escape, brightness = radiance_cache(photos, groups)
     secondary = escaping_share(photos)
     environment = plan.environment(job.settings.emission.environment, escape, secondary, brightness)
-    outside = sums.groups() if environment["included"] else None
+    is_open = secondary > plan.ESCAPE_OPEN
+    outside = sums.groups(max_groups=1 if is_open else MAX_GROUPS) if environment["included"] else None
+    if outside is not None and is_open:
+        notes.append(f"{secondary:.0%} of the rays from the surface leave the mesh: one radiance for all that is outside, no map")
     pruned = _trial(photos, groups, cache, outside)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
