@@ -171,5 +171,9 @@ def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
     order = np.argsort(values, kind="stable")
     cumulative = np.cumsum(weights[order])
     value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
-    reason = "would change the light, but every further pass multiplies the bias of the overall scale: left out" if value > SECOND_PASS_GAIN else "light would hardly change"
+    reason = (
+        "would change the light, but every further pass multiplies the bias of the overall scale: left out"
+        if value > SECOND_PASS_GAIN
+        else "light would hardly change"
+    )
     return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)
