@@ -38,6 +38,7 @@ from workflow.base_scene import (
 from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
+from workflow.recovered import write_response
 
 SATURATION = 0.99
 BORDER_WEIGHT = 0.1
@@ -45,7 +46,6 @@ BLOCK_FOOTPRINTS = 1.6
 """Edge, in median pixel footprints, of the blocks of cells that share roughness, metalness and diffuse light."""
 CAMERA_PIXELS = 200_000
 """Pixels, of whole blocks, that the camera response is fitted to."""
-RESPONSE_SAMPLES = 101
 _SEEDS = 0x626C6E  # keeps the random numbers of this module apart from those of others
 WORDS = {
     "base": "identity",
@@ -77,7 +77,7 @@ def run(job: Job) -> None:
         result = _given(job, capture, scene, model)
     _write_objects(job, scene, result, model)
     if not capture.is_hdr:
-        _write_response(job, result.curve)
+        write_response(job, result.curve)
     _write_cells(job, result)
     _write_maps(job, capture, scene, result, per_pixel=model == "base")
     facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [0.0], "residual": 0.0, "plan": []}
@@ -280,18 +280,6 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
     zeros = np.zeros(len(names))
     columns |= {"covariance_trace": zeros, "residual": zeros, "model": np.array([WORDS[model]] * len(names), dtype=str)}
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
-
-
-def _write_response(job: Job, curve: Response) -> None:
-    """Parameters (x = 0) and samples of f on [0, 1] for each channel."""
-    x = np.linspace(0.0, 1.0, RESPONSE_SAMPLES)
-    rows: list[tuple[str, str, str, float, float]] = []
-    for number, channel in enumerate("RGB"):
-        own = curve.channel(number)
-        rows += [(channel, "parameter", name, 0.0, float(v)) for name, v in zip(own.names, own.params, strict=True)]
-        rows += [(channel, "sample", "", float(at), float(v)) for at, v in zip(x, own(x), strict=True)]
-    names = ("channel", "kind", "name", "x", "value")
-    job.writer.table("camera_response.parquet", {name: list(c) for name, c in zip(names, zip(*rows, strict=True), strict=True)})
 
 
 def _write_cells(job: Job, result: _Result) -> None:

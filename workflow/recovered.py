@@ -92,6 +92,21 @@ def read_affines(reader: StageReader, n_objects: int) -> np.ndarray:
     return out
 
 
+RESPONSE_SAMPLES = 101
+
+
+def write_response(job: Job, curve: Response) -> None:
+    """camera_response.parquet: parameters (x = 0) and samples of f on [0, 1] for each channel."""
+    x = np.linspace(0.0, 1.0, RESPONSE_SAMPLES)
+    rows: list[tuple[str, str, str, float, float]] = []
+    for number, channel in enumerate("RGB"):
+        own = curve.channel(number)
+        rows += [(channel, "parameter", name, 0.0, float(v)) for name, v in zip(own.names, own.params, strict=True)]
+        rows += [(channel, "sample", "", float(at), float(v)) for at, v in zip(x, own(x), strict=True)]
+    names = ("channel", "kind", "name", "x", "value")
+    job.writer.table("camera_response.parquet", {name: list(c) for name, c in zip(names, zip(*rows, strict=True), strict=True)})
+
+
 def read_response(reader: StageReader) -> Response:
     """The camera response that stage affines found, from its samples; identity when it wrote none (HDR)."""
     name = "camera_response.parquet"

@@ -38,9 +38,9 @@ from workflow.base_scene import (
 )
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
+from workflow.recovered import write_response
 
 SATURATION = 0.99
-RESPONSE_SAMPLES = 101
 THIN_PIXELS = 50
 """Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
 _SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
@@ -66,7 +66,7 @@ def run(job: Job) -> None:
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
     _write_objects(job, names, fit)
     if not capture.is_hdr:
-        _write_response(job, fit.response)
+        write_response(job, fit.response)
     _write_cells(job, fit)
     _write_maps(job, capture, fit)
     decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
@@ -319,20 +319,6 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
         "model": np.array(fit.model, dtype=str),
     }
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
-
-
-def _write_response(job: Job, curve: Response) -> None:
-    """Parameters (x = 0) and samples of f on [0, 1] for each channel."""
-    x = np.linspace(0.0, 1.0, RESPONSE_SAMPLES)
-    columns: dict[str, list[Any]] = {name: [] for name in ("channel", "kind", "name", "x", "value")}
-    for number, channel in enumerate("RGB"):
-        own = curve.channel(number)
-        rows = [("parameter", name, 0.0, value) for name, value in zip(own.names, own.params, strict=True)]
-        rows += [("sample", "", at, value) for at, value in zip(x, own(x), strict=True)]
-        for kind, name, at, value in rows:
-            for column, entry in zip(columns, (channel, kind, name, float(at), float(value)), strict=True):
-                columns[column].append(entry)
-    job.writer.table("camera_response.parquet", columns)
 
 
 def _write_cells(job: Job, fit: FitResult) -> None:
