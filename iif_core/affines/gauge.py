@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.affines.problem import FitProblem, FitResult, apply_affines
+from iif_core.affines.problem import FitProblem, FitResult, raw_values
 from iif_core.errors import InputError
 
 KINDS = ("none", "prior", "mean_albedo", "white_patch", "lamp")
@@ -78,7 +78,8 @@ def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, f
             raise InputError("scale white_patch: the patch has too few pixels to be fitted; choose a larger one")
         return 1.0, 0.0
     object_id, base = problem.object_id[use], problem.base[use].astype(np.float64)
-    mean = float(apply_affines(fit.affine, object_id, base)[:, :3].mean())
+    # Not clamped to 1: in the light's own gauge an albedo may be larger.
+    mean = float(np.maximum(raw_values(fit.affine[object_id], base)[:, :3], 0.0).mean())
     wanted = float(base[:, :3].mean()) if gauge.kind == "prior" else gauge.albedo
     return max(mean, _DARKEST) / max(wanted, _DARKEST), _mean_error(fit, object_id, base) / max(mean, _DARKEST)
 

@@ -114,6 +114,7 @@ def sums(
     robust_width,
     roughness_weight,
     metallic_weight,
+    brightest,
     box,
     low,
     high,
@@ -167,7 +168,7 @@ def sums(
                     raw[4] = t[14] * b[4] + t[15]
                     for i in range(5):
                         floor = 0.02 if i == 3 else 0.0
-                        value[i] = min(max(raw[i], floor), 1.0)
+                        value[i] = min(max(raw[i], floor), brightest if i < 3 else 1.0)
                         beyond = raw[i] - value[i]
                         is_free[i] = 1.0 if beyond == 0.0 else 0.0
                         if beyond != 0.0:

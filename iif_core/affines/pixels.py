@@ -205,6 +205,7 @@ def _run(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, want: int)
             opt.robust_width,
             opt.roughness_weight,
             opt.metallic_weight,
+            opt.brightest,
             BOX,
             bounds[0],
             bounds[1],

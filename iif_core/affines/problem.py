@@ -119,6 +119,8 @@ class FitOptions:
             identity with metalness free where it was predicted above `metallic_prior`.
         metallic_prior: see `select`.
         texture_sigma: standard deviation (albedo) above which a direction of the texture is real (2 / 255).
+        brightest: largest albedo in the fit, above 1 because the light is not known that well: a white wall in light that is a
+            little too dim could show what it shows only by a gloss that it does not have. Albedos are published within [0, 1].
         threads: of the compiled loops; the result does not depend on it.
     """
 
@@ -136,6 +138,7 @@ class FitOptions:
     select: bool = True
     metallic_prior: float = 0.25
     texture_sigma: float = 2.0 / 255.0
+    brightest: float = 1.25
     threads: int = 1
 
 

@@ -110,7 +110,8 @@ class Profile:
     """Evidence of every kind at each roughness of `GRID`.
 
     Attributes:
-        cost: (O, 3, R) data term with the albedo fitted, infinite where not tried; affine: (O, 3, R, 16); noise: (O,) variance
+        cost: (O, 3, R) data term with the albedo fitted, infinite where not tried; that of the roughest dielectric is the better
+            one of its own and of none with no lobe; affine: (O, 3, R, 16); noise: (O,) variance
             of a row.
     """
 
@@ -142,8 +143,19 @@ def profile(px: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, f
             affine[:, kind, at] = trial.affine
             noise[:, kind, at] = row_noise(terms, px, albedo)
             current = trial.affine
+            if kind == 0 and step == 0:  # no lobe, or one so wide that it looks like none
+                cost[:, 0, at] = np.minimum(cost[:, 0, at], _without_gloss(px, trial, own_pull, tone, quick))
     best = cost.reshape(n_objects, -1).argmin(1)
     return Profile(cost, affine, noise.reshape(n_objects, -1)[np.arange(n_objects), best])
+
+
+def _without_gloss(px: Pixels, start: State, pull: Pull, tone: Tone, opt: FitOptions) -> np.ndarray:
+    """(O,) cost of a surface that has no specular lobe at all; the albedo numbers that are free in `start` are fitted."""
+    shading = px.shading.copy()
+    shading[:, :, 1:] = 0.0
+    start = replace(start, damping=np.full(px.n_objects, 1e-3))
+    matte, terms = descend(replace(px, shading=shading), start, pull, tone, opt, 2 * _STEPS, False)
+    return terms.data + pull.cost(matte.affine)
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,8 @@ def solve_emission(
 
     min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the
     diagonal)
-                        + v sum_g (E_g - E0_g)^2 / (prior_width E0_g)^2,  v = residual variance of a row of weight 1.
+                        + sum_g v_g (E_g - E0_g)^2 / (prior_width E0_g)^2,
+    v_g = residual variance of a row of weight 1, times the design effect (`_design_effect`) once the answer has come to rest.
     How sharp the bounds are is told by the noise of the rows (`_censored`); re-weighted until the answer rests.
 
     Args:
@@ -112,7 +113,7 @@ def solve_emission(
     return EmissionSolution(radiance, error, shares.min(1), condition, residual, violated, iterations, converged)
 
 
-FAMILY_WIDTH = 0.5
+FAMILY_WIDTH = 0.3
 """Standard deviation of the groups of one object around their common radiance, relative to it."""
 
 
@@ -245,9 +246,15 @@ def _solve_channel(
     mean_a = 0.5 * (rows.first[:, :, c] + rows.second[:, :, c])
     target, weight = rows.mean_target[:, c], rows.weight[:, c]
     width = _width(initial, prior_width)
+    bounded = bool(np.isfinite(width).any())
     answer, condition = initial.copy(), 1.0
-    rounds, converged, variance, noise = 0, False, 0.0, 0.0
-    while rounds < max_rounds and not converged:
+    rounds, converged, weighed, noise = 0, False, not bounded, 0.0
+    variance, effect = np.zeros(len(initial)), np.ones(len(initial))
+    while rounds < max_rounds and not (converged and weighed):
+        if converged and not weighed:
+            weighed, sure = True, np.where(bound, 0.0, weight)
+            effect = _design_effect(rows, c, sure, answer, initial, width, variance, cross, ridge)
+            variance = variance * effect
         rounds += 1
         before = answer
         share, shift = _censored(target - mean_a @ before, bound, rows.noise, noise)
@@ -259,7 +266,7 @@ def _solve_channel(
         difference = target - mean_a @ answer
         used = np.where(bound & (difference <= 0), 0.0, weight)
         residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
-        variance = residual if np.isfinite(width).any() else 0.0
+        variance = effect * residual if bounded else variance
         plain = ~bound & (weight > 0)
         noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
         # The first round has no residual to weigh the prior and the bounds with.
@@ -280,6 +287,32 @@ def _solve_channel(
         float((counted * difference**2).sum()),
         float((np.where(bound, counted, weight) * target**2).sum()),
     )
+
+
+def _design_effect(
+    rows: EmissionRows,
+    c: int,
+    weight: np.ndarray,
+    answer: np.ndarray,
+    initial: np.ndarray,
+    width: np.ndarray,
+    variance: np.ndarray,
+    cross: bool,
+    ridge: float,
+) -> np.ndarray:
+    """(G,) >= 1, how many times less the rows know about a group than if their errors were independent (Kish 1965).
+
+    diag(H^-1 sum_k s_k s_k' H^-1) / diag(v H^-1): tracing noise and errors that the rows of an object share. The prior is weighed
+    against what the rows really know; otherwise neighbouring panes of one window are told apart by nothing but noise.
+    """
+    effect = np.ones(len(answer))
+    system = _system(rows, c, weight, np.zeros(len(weight)), initial, width, variance, cross, ridge)
+    if system is not None:
+        known, inverse = system.known, np.linalg.inv(system.matrix)
+        real = np.diag(inverse @ system.scores(rows, c, weight, cross, answer) @ inverse)
+        claimed = variance[known] * np.diag(inverse)
+        effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
+    return effect
 
 
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -331,6 +364,11 @@ class _System:
     right: np.ndarray
     condition: float
 
+    def scores(self, rows: EmissionRows, c: int, weight: np.ndarray, cross: bool, answer: np.ndarray) -> np.ndarray:
+        """sum_k s_k s_k' at `answer` (G,), of the known groups and in units of `scale`."""
+        meat = _scores(rows, c, weight, np.zeros(len(weight)), cross, answer)
+        return meat[np.ix_(self.known, self.known)] / np.outer(self.scale, self.scale)
+
     def solve(self, initial: np.ndarray) -> np.ndarray:
         """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
         from scipy.linalg import solve_triangular
@@ -350,7 +388,7 @@ def _system(
     shift: np.ndarray,
     initial: np.ndarray,
     width: np.ndarray,
-    variance: float,
+    variance: np.ndarray,
     cross: bool,
     ridge: float,
 ) -> _System | None:
@@ -364,7 +402,7 @@ def _system(
     unit, pick = np.outer(scale, scale), np.ix_(known, known)
     scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
     matrix, lifted, condition = _definite(scaled, ridge)
-    prior = np.diag(variance / (width[known] * scale) ** 2)
+    prior = np.diag(variance[known] / (width[known] * scale) ** 2)
     return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
 
 
@@ -375,7 +413,7 @@ def _uncertainty(
     answer: np.ndarray,
     initial: np.ndarray,
     width: np.ndarray,
-    variance: float,
+    variance: np.ndarray,
     cross: bool,
     ridge: float,
     family: np.ndarray | None,
@@ -387,7 +425,7 @@ def _uncertainty(
         return error, share
     known, scale = system.known, system.scale
     inverse = np.linalg.inv(system.matrix)
-    meat = _scores(rows, c, weight, none, cross, answer)[np.ix_(known, known)] / np.outer(scale, scale)
+    meat = system.scores(rows, c, weight, cross, answer)
     pull = inverse @ system.lifted  # d answer / d initial
     prior_part = pull * np.minimum(width[known], np.maximum(initial[known], 1e-300)) * scale
     if family is not None:

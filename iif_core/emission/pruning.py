@@ -4,7 +4,7 @@ What a white surface would show in a group's place is known from the same transp
 groups. A group that is clearly brighter than that shines, whatever its albedo. Any other may just be a bright surface
 near a lamp, and one with little power something that shines through; such groups stay only if the rest of the scene
 misses their light. The least credible one goes first, because the light of a false emitter makes its neighbours look
-like reflectors.
+like reflectors. A group that is dropped goes on to show what was seen of it: once it is no emitter, the radiance cache holds it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ surface would reflect is only known as well as the other emitters are."""
 RESIDUAL_CHANGE = 0.03
 """Growth of the residual from which a group is missed. METHOD 8 has 0.001; with albedos that are only predicted, one
 more free column always finds something to explain (kitchen: 0.3 to 1 % for a lit wall)."""
+
+
+_ROUNDS = 6  # of re-weighting in a trial, which only says which groups are needed
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,13 @@ def prune_groups(
     """
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
-    solution = solve_emission(rows, initial, cross)
+    solution = solve_emission(rows, initial, cross, max_rounds=_ROUNDS)
     while True:
         emission = solution.radiance.sum(1)
         power = area * emission * ~protected
         power = power / max(power.sum(), 1e-300)
-        excess = np.where(kept, white.excess(solution.radiance), excess)
+        shown = np.where(kept[:, None], solution.radiance, white.seen)
+        excess = np.where(kept, white.excess(shown), excess)
         dark = kept & ~protected & (emission <= 0)
         open_ = kept & ~protected & ~dark & ~missed
         reflecting, weak = open_ & (excess < CERTAIN), open_ & (power < share)
@@ -103,8 +107,9 @@ def prune_groups(
             break
         if singly and not dark.any():
             drop &= power <= power[drop].min()
-        trial = _solve_subset(rows, initial, kept & ~drop, cross)
-        before, after = (_misfit(rows, s.radiance, elsewhere) for s in (solution, trial))
+        trial = _solve_subset(rows, initial, kept & ~drop, white.seen, cross)
+        before = _misfit(rows, shown, elsewhere)
+        after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
         if not dark.any() and after > before * (1 + residual_change) + 1e-12:
             # One lamp that is missed must not keep those that were to go with it.
             if drop.sum() > 1 and not singly:
@@ -134,10 +139,16 @@ def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float
     return float(np.sqrt((counted * difference**2).sum()))
 
 
-def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, cross: bool) -> EmissionSolution:
-    """Solution over all groups, 0 outside `kept`."""
-    part = solve_emission(rows.columns(kept), initial[kept], cross)
+def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray, cross: bool) -> EmissionSolution:
+    """Solution over all groups, 0 outside `kept`: the others light the scene with what they show, as the cache will."""
+    part = solve_emission(_without(rows, kept, shown), initial[kept], cross, max_rounds=_ROUNDS)
     radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
     determined = np.zeros(len(initial))
     radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
     return replace(part, radiance=radiance, error=error, determined=determined)
+
+
+def _without(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
+    """The system of the `kept` groups; the light of the others, `shown` (G, 3), is taken off the targets."""
+    first, second = (np.einsum("ngc,gc->nc", a[:, ~kept], shown[~kept]) for a in (rows.first, rows.second))
+    return replace(rows.columns(kept), target=rows.target - first, target_second=rows.target_second - second)

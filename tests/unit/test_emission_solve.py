@@ -186,11 +186,12 @@ def _white(seen, matrix=None, cached=0.0):
     return WhiteSurface(seen, matrix[:, :, None] * np.ones(3), np.full((groups, 3), cached))
 
 
-def _pruning(true, seen, matrix, area, noise=0.05, seed=9):
+def _pruning(shown, seen, matrix, area, noise=0.05, seed=9):
+    """`shown`: radiance that each group sends out, its own or reflected; `seen`: what the photographs say of it."""
     rng = np.random.default_rng(seed)
-    groups = len(true)
+    groups = len(shown)
     a = rng.random((2000, groups, 3)).astype(np.float32)
-    y = np.einsum("ngc,gc->nc", a, np.asarray(true)[:, None] * np.ones(3)) * (1 + noise * rng.standard_normal((2000, 3)))
+    y = np.einsum("ngc,gc->nc", a, np.asarray(shown)[:, None] * np.ones(3)) * (1 + noise * rng.standard_normal((2000, 3)))
     everywhere, last = np.ones(2000, bool), np.arange(groups) == groups - 1
     rows = _rows(a, a, y)
     return prune_groups(rows, np.ones((groups, 3)), np.asarray(area, float), _white(seen, matrix), everywhere, last, cross=False)
@@ -200,7 +201,7 @@ def test_pruning_keeps_what_shines():
     """A lamp; a lit wall beside it; a strip brighter than white but without power; nothing; the environment."""
     matrix = np.zeros((5, 5))
     matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
-    out = _pruning([8.0, 0.0, 0.02, 0.0, 1.0], [8.0, 2.0, 2.0, 1.0, 0.0], matrix, [1.0, 1.0, 1.0, 1.0, 0.0])
+    out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, [1.0, 1.0, 1e-3, 1.0, 0.0])
     assert out.kept.tolist() == [True, False, False, False, True]
     assert (out.solution.radiance[~out.kept] == 0).all()
     assert "white surface" in out.reason[1] and out.excess[1] == pytest.approx(2 / 3.2, rel=0.1)
@@ -208,17 +209,26 @@ def test_pruning_keeps_what_shines():
 
 
 def test_dim_surface_whose_light_is_missed_stays():
-    """No brighter than a white surface would be, but the rest of the scene needs its light."""
+    """Saturated, and its bound is no brighter than a white surface; but the rest of the scene needs more of its light."""
     matrix = np.zeros((3, 3))
     matrix[1, 0] = 0.5
-    out = _pruning([8.0, 3.0, 0.0], [8.0, 3.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    out = _pruning([8.0, 3.0, 0.0], [8.0, 1.0, 0.0], matrix, [1.0, 1.0, 0.0])
     assert out.kept[1] and out.excess[1] < 1
+
+
+def test_wall_that_is_dropped_keeps_reflecting():
+    """The wall's light is a third of what arrives: without it the residual would grow, but it is known how bright the wall is."""
+    matrix = np.zeros((3, 3))
+    matrix[1, 0] = 0.6
+    out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    assert out.kept.tolist() == [True, False, True]
+    np.testing.assert_allclose(out.solution.radiance[0], 8.0, rtol=0.02)
 
 
 def test_false_emitter_goes_before_the_lamp_it_hides():
     """A shade around a bulb: each makes the other look like a reflector; the less credible one goes."""
     matrix = np.array([[0.0, 0.9, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    out = _pruning([8.0, 0.0, 0.0], [8.0, 2.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    out = _pruning([8.0, 2.0, 0.0], [8.0, 2.0, 0.0], matrix, [1.0, 1.0, 0.0])
     assert out.kept.tolist() == [True, False, True] and out.excess[0] > 4
 
 
@@ -283,8 +293,26 @@ def test_rows_that_err_together_count_as_few():
     alone = solve_emission(_rows(a, a, y * off), np.ones((3, 3)))
     rows = replace(_rows(a, a, y * off), cluster=np.repeat(np.arange(30), 30))
     together = solve_emission(rows, np.ones((3, 3)))
-    np.testing.assert_array_equal(alone.radiance, together.radiance)
+    np.testing.assert_allclose(alone.radiance, together.radiance, rtol=0.03)  # only the prior counts for more
     assert (together.error > 1.5 * alone.error).any()
+
+
+def test_prior_is_weighed_against_what_rows_really_know():
+    """Errors that many rows share, and a prior: the answer is near the mean of both, weighed by their real errors."""
+    rng = np.random.default_rng(13)
+    objects, rows_each, true, start = 8, 400, 4.0, 5.0
+    found, plain = [], []
+    for _ in range(40):
+        off = np.repeat(1 + 0.5 * rng.standard_normal((objects, 1)), rows_each, 0)
+        a = rng.uniform(0.5, 1.5, (objects * rows_each, 1, 3))
+        rows = replace(_rows(a, a, true * a[:, 0] * off), cluster=np.repeat(np.arange(objects), rows_each))
+        found.append(solve_emission(rows, np.full((1, 3), start), prior_width=0.2).radiance[0])
+        plain.append(solve_emission(replace(rows, cluster=None), np.full((1, 3), start), prior_width=0.2).radiance[0])
+    # data: sd 0.5 * 4 / sqrt(8) = 0.7 around 4; prior: 1 around 5. Independent rows would leave the prior no say.
+    share = 1.0 / (1.0 + 0.71**2)
+    assert np.mean(found) == pytest.approx(share * 4 + (1 - share) * 5, abs=0.15)
+    assert np.mean(plain) == pytest.approx(4.0, abs=0.25)
+    assert np.std(found) < 0.85 * np.std(plain)
 
 
 @pytest.mark.parametrize("pinned", [False, True])
