@@ -23,9 +23,9 @@ _SMOOTHING = np.array([0.25, 0.5, 0.25])  # of the population's histogram: neigh
 _PSEUDO = 0.5  # objects' worth of every pair before any was seen
 KINDS = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
 """(g_m, h_m) of a dielectric, a metal, and of metalness as predicted."""
-ROUGHEST_METAL = 0.7
+ROUGHEST_METAL = 0.6
 """A rougher metal and a dielectric of another albedo look alike (METHOD 7b, degeneracy 2), and errors of the light would decide
-between them: rough surface is taken for a dielectric."""
+between them: what could best be a rough metal is taken for a dielectric."""
 _SHARES = np.array([[0.85], [0.1], [0.05]])  # of the three before any object was seen
 DISCOUNT = 10.0
 """The scatter between clusters shows what varies over an object; the errors of light and geometry that it does not show are as
@@ -178,6 +178,7 @@ class Choice:
 def choose(found: Profile, counts: np.ndarray) -> Choice:
     """EM for the population's histogram, then the posterior of each object; `counts` (O,) bool, objects that have a say."""
     cost = found.cost.copy()
+    cost[GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
     cost[:, 1, GRID > ROUGHEST_METAL] = np.inf
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / (DISCOUNT * found.noise[:, None, None])
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
