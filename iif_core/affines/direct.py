@@ -22,6 +22,7 @@ from iif_core.affines.population import Population, before, centre_of, lean, lea
 from iif_core.affines.problem import GAINS, IDENTITY, PARAMETERS, FitOptions, FitProblem, FitResult
 from iif_core.affines.selection import DISCOUNT, KINDS, Choice, Texture, choose, describe, profile, row_noise, texture_of
 from iif_core.affines.tone import Tone
+from iif_core.brdf import R_MIN
 from iif_core.response import Response
 
 _FEW = 300  # pixels of an object that are enough to choose a valley
@@ -34,6 +35,15 @@ _RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1,
 
 
 @dataclass(frozen=True)
+class _Profiled:
+    """The choice, the response at which it was made (P,), and how it moves with it (O, P)."""
+
+    choice: Choice
+    params: np.ndarray
+    sway: np.ndarray
+
+
+@dataclass(frozen=True)
 class Fit:
     """Where the fit stands between its steps."""
 
@@ -41,7 +51,7 @@ class Fit:
     pull: Pull
     population: Population | None
     metallic: np.ndarray
-    profiled: Choice | None = None
+    profiled: _Profiled | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -86,8 +96,8 @@ def _descend_all(
             noise = row_noise(terms, some, state.free)
             mean = texture.mean[:, 3]
             population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
-            pull = _pull(fit, population, noise, mean, fit.profiled)
-            fit = replace(fit, state=state, population=population, pull=pull)
+            fit = replace(fit, state=state, population=population)
+            fit = replace(fit, pull=_pull(fit, noise, mean))
     else:
         state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
         fit = replace(fit, state=state)
@@ -165,21 +175,42 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
     state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
-    fit = replace(fit, state=state, metallic=metallic, profiled=choice)
+    sway = _sway(few, state, pull, tone, opt, noise, choice)
+    fit = replace(fit, state=state, metallic=metallic, profiled=_Profiled(choice, state.params, sway))
     if opt.population:
-        population = before(*choice.population)
-        return replace(fit, population=population, pull=_pull(fit, population, noise, texture.mean[:, 3], choice))
+        fit = replace(fit, population=before(*choice.population))
+        return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
     # as weakly as the ridge says
     return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
 
 
-def _pull(fit: Fit, population: Population, noise: np.ndarray, roughness: np.ndarray, choice: Choice | None) -> Pull:
-    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope)."""
+def _sway(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice) -> np.ndarray:
+    """(O, P): how far the profile's roughness of each object moves with the response, which the profile held.
+
+    - C / (H + V) with the albedo eliminated; V: the prior of the profile, of the histogram's width.
+    """
+    albedo = replace(state, free=state.free & (np.arange(PARAMETERS) < 12))
+    terms = evaluate(few, state.affine, tone.at(state.params), opt, True)
+    inverse = np.where(albedo.free[:, :, None], object_blocks(terms, albedo.free, pull).inverse(), 0.0)
+    h, c = terms.h[:, 13, :PARAMETERS], terms.h[:, :, PARAMETERS:]
+    row = np.einsum("oi,oij->oj", np.where(albedo.free, h, 0.0), np.where(albedo.free[:, None, :], inverse, 0.0))
+    coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
+    curvature = h[:, 13] - (row * h).sum(1)
+    prior = DISCOUNT * noise / max(choice.population[1], _SHARP) ** 2
+    return np.where(state.free[:, 13:14], -coupling / (np.maximum(curvature, 0.0) + prior)[:, None], 0.0)
+
+
+def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
+    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope), had it
+    known the response of today."""
+    assert fit.population is not None
+    population, seen = fit.population, fit.profiled
     pull = pull_of(population, noise, roughness, fit.metallic, DISCOUNT)
-    if choice is None:
+    if seen is None:
         return pull
-    deviation = np.clip(choice.deviation, _SHARP, population.spread[3])
-    return lean(pull, choice.roughness, deviation, noise, roughness, population.contrast, DISCOUNT)
+    deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
+    level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
+    return lean(pull, level, deviation, noise, roughness, population.contrast, DISCOUNT)
 
 
 def result_of(
