@@ -6,19 +6,22 @@ With u_k the gradient of cluster k, H the normal matrix and W the pull, an objec
 
 where S is the spread of the population: the pull is an observation of the population's mean that errs by that much. The
 response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every object by
--(H + W)^-1 C d_k on top of its own move. What is not in it: errors of light and geometry that all clusters of an object share.
+-(H + W)^-1 C d_k on top of its own move; so do the errors of every pull, and that of the response's own prior. What is not in
+it: errors of light and geometry that all clusters of an object share.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from iif_core.affines.descent import Arrowhead, Pull
+from iif_core.affines.descent import Arrowhead, Pull, ResponsePrior
 from iif_core.affines.pixels import Pixels, Terms
 from iif_core.affines.problem import PARAMETERS
 
 
-def sandwich(px: Pixels, terms: Terms, system: Arrowhead, free: np.ndarray, pull: Pull) -> tuple[np.ndarray, np.ndarray]:
+def sandwich(
+    px: Pixels, terms: Terms, system: Arrowhead, free: np.ndarray, pull: Pull, prior: ResponsePrior
+) -> tuple[np.ndarray, np.ndarray]:
     """(O, 16, 16) of the objects and (P, P) of the response.
 
     Args:
@@ -43,14 +46,20 @@ def sandwich(px: Pixels, terms: Terms, system: Arrowhead, free: np.ndarray, pull
     if size and system.schur.any():
         reduced = terms.scores[:, PARAMETERS:] - np.einsum("kip,ki->kp", system.through[owner], own)
         moved = (reduced * swell[owner][:, None]) @ system.schur
-    total = moved.T @ moved
+    fitted = bool(size and system.schur.any())
+    through, schur = system.through, system.schur
+    leaned = np.zeros((px.n_objects, PARAMETERS, PARAMETERS))
+    if pull.scatter is not None:
+        leaned = np.where(free[:, :, None] & free[:, None, :], pull.scatter, 0.0)
+    # what each object's pull moves the response by
+    swayed = schur @ through.transpose(0, 2, 1) @ leaned @ through @ schur
+    total = moved.T @ moved + swayed.sum(0) + (schur @ prior.scatter @ schur if fitted else 0.0)
     out = np.zeros((px.n_objects, PARAMETERS, PARAMETERS))
     for o in np.flatnonzero(clusters):
         part = slice(px.first[o], px.first[o + 1])
-        through = system.through[o]
         d = moved[part]
-        p = alone[part] - d @ through.T
-        out[o] = p.T @ p + through @ (total - d.T @ d) @ through.T
-        if pull.scatter is not None:
-            out[o] += system.inverse[o] @ np.where(np.outer(free[o], free[o]), pull.scatter[o], 0.0) @ system.inverse[o]
+        p = alone[part] - d @ through[o].T
+        both = system.inverse[o] + through[o] @ schur @ through[o].T
+        others = total - d.T @ d - swayed[o]
+        out[o] = p.T @ p + both @ leaned[o] @ both + through[o] @ others @ through[o].T
     return out, total

@@ -111,10 +111,13 @@ def object_blocks(terms: Terms, free: np.ndarray, pull: Pull) -> Spectrum:
 
 @dataclass(frozen=True)
 class ResponsePrior:
-    """Gaussian prior of the response parameters (P,), row by row: mean, and precision (P, P) times the weight of the pixels."""
+    """Gaussian prior of the response parameters (P,), row by row: mean, and precision (P, P) times the weight of the pixels.
+
+    `scatter` (P, P): of its gradient, weight^2 times the precision."""
 
     mean: np.ndarray
     precision: np.ndarray
+    scatter: np.ndarray
 
     def cost(self, params: np.ndarray) -> float:
         """Half the squared distance."""
@@ -129,7 +132,8 @@ class ResponsePrior:
 def response_prior(opt: FitOptions, pixels: int, start_params: np.ndarray) -> ResponsePrior:
     """That of the options, or the start with precision one; weighted by `response_ridge` per pixel."""
     mean, precision = opt.response_prior or (start_params, np.eye(len(start_params)))
-    return ResponsePrior(np.asarray(mean, np.float64), opt.response_ridge * pixels * np.asarray(precision, np.float64))
+    weight, precision = opt.response_ridge * pixels, np.asarray(precision, np.float64)
+    return ResponsePrior(np.asarray(mean, np.float64), weight * precision, weight**2 * precision)
 
 
 def arrowhead(

@@ -36,9 +36,17 @@ _RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1,
 
 @dataclass(frozen=True)
 class _Profiled:
-    """The choice, the response at which it was made (P,), and how it moves with it (O, P)."""
+    """What the profile said about roughness, and how far it is to be believed.
+
+    Attributes:
+        choice: the posterior; error: (O,) standard deviation of its mean, of noise alone (`choice.deviation` is discounted);
+            share: (O,) of it that is the pixels' and not the prior's.
+        params: (P,) the response at which it was made; sway: (O, P) how it moves with the response.
+    """
 
     choice: Choice
+    error: np.ndarray
+    share: np.ndarray
     params: np.ndarray
     sway: np.ndarray
 
@@ -175,8 +183,10 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
     state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
-    sway = _sway(few, state, pull, tone, opt, noise, choice)
-    fit = replace(fit, state=state, metallic=metallic, profiled=_Profiled(choice, state.params, sway))
+    sure = choose(replace(found, noise=found.noise / DISCOUNT), measured)
+    error = np.sqrt(sure.deviation**2 + (sure.roughness - choice.roughness) ** 2)
+    share, sway = _leverage(few, state, pull, tone, opt, noise, choice)
+    fit = replace(fit, state=state, metallic=metallic, profiled=_Profiled(choice, error, share, state.params, sway))
     if opt.population:
         fit = replace(fit, population=before(*choice.population))
         return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
@@ -184,11 +194,11 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
 
 
-def _sway(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice) -> np.ndarray:
-    """(O, P): how far the profile's roughness of each object moves with the response, which the profile held.
-
-    - C / (H + V) with the albedo eliminated; V: the prior of the profile, of the histogram's width.
-    """
+def _leverage(
+    few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice
+) -> tuple[np.ndarray, np.ndarray]:
+    """(O,) share that pixels have in the profile's roughness of each object, H / (H + V), and (O, P) how far it moves with the
+    response, which the profile held, - C / (H + V); the albedo eliminated, V: the prior of the histogram's width."""
     albedo = replace(state, free=state.free & (np.arange(PARAMETERS) < 12))
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True)
     inverse = np.where(albedo.free[:, :, None], object_blocks(terms, albedo.free, pull).inverse(), 0.0)
@@ -197,7 +207,8 @@ def _sway(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, no
     coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
     curvature = h[:, 13] - (row * h).sum(1)
     prior = DISCOUNT * noise / max(choice.population[1], _SHARP) ** 2
-    return np.where(state.free[:, 13:14], -coupling / (np.maximum(curvature, 0.0) + prior)[:, None], 0.0)
+    total = np.maximum(curvature, 0.0) + prior
+    return 1.0 - prior / total, np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
 
 
 def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
@@ -210,7 +221,7 @@ def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
         return pull
     deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
     level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
-    return lean(pull, level, deviation, noise, roughness, population.contrast, DISCOUNT)
+    return lean(pull, level, deviation, seen.error, seen.share, noise, roughness, population.contrast, DISCOUNT)
 
 
 def result_of(
@@ -238,7 +249,7 @@ def result_of(
         blocks = object_blocks(terms, state.free, fit.pull)
         prior = response_prior(opt, len(px.obj), start_params)
         system = arrowhead(terms, px, state, fit.pull, prior, fitted, blocks, damped=False)
-        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull)
+        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull, prior)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
