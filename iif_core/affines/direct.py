@@ -249,7 +249,7 @@ def result_of(
         blocks = object_blocks(terms, state.free, fit.pull)
         prior = response_prior(opt, len(px.obj), start_params)
         system = arrowhead(terms, px, state, fit.pull, prior, fitted, blocks, damped=False)
-        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull, prior)
+        covariance[members], of_response = sandwich(px, state, system, fit.pull, prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
