@@ -6,9 +6,13 @@ With u_k the gradient of cluster k, H the normal matrix, W the pull and B = (H +
 
 where S is the covariance of the pull's centre: the pull is an observation that errs by that much. A cluster has pulled the fit
 towards itself, which makes its gradient too small; v_k has the size that errors in proportion to H_k would have had (Bell and
-McCaffrey 2002, "CR2"). The response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every
-object by -B C d_k on top of its own move; so do the errors of every pull, and that of the response's own prior. What is not in
-it: errors of light and geometry that all clusters of an object share.
+McCaffrey 2002, "CR2"). What the few clusters of an object say about their own scatter is uncertain too: the first term is larger
+by (1 + 1 / (2 nu))^2, so that one standard deviation either way holds Student's t of nu degrees of freedom 68 % of the time;
+nu = (sum_k l_k)^2 / sum_k l_k^2, l_k = trace(H_k B).
+
+The response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every object by -B C d_k on
+top of its own move; so do the errors of every pull, and that of the response's own prior. What is not in it: errors of light and
+geometry that all clusters of an object share.
 """
 
 from __future__ import annotations
@@ -38,8 +42,9 @@ def sandwich(
     free, through, schur = state.free, system.through, system.schur
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     alone, reduced = np.zeros((len(owner), PARAMETERS)), np.zeros((len(owner), len(schur)))
+    lever = np.zeros(len(owner))
     for part, scores, h in _clusters(px, state, tone, opt):
-        alone[part], reduced[part] = _grown(scores, h, system.inverse, system.coupling, free, owner[part])
+        alone[part], reduced[part], lever[part] = _grown(scores, h, system.inverse, system.coupling, free, owner[part])
     moved = reduced @ schur
     leaned = np.zeros((px.n_objects, PARAMETERS, PARAMETERS))
     if pull.scatter is not None:
@@ -54,7 +59,8 @@ def sandwich(
         p = alone[part] - d @ through[o].T
         both = system.inverse[o] + through[o] @ schur @ through[o].T
         others = total - d.T @ d - swayed[o]
-        out[o] = p.T @ p + both @ leaned[o] @ both + through[o] @ others @ through[o].T
+        few = (lever[part] ** 2).sum() / max(lever[part].sum() ** 2, 1e-100)  # 1 / nu
+        out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ leaned[o] @ both + through[o] @ others @ through[o].T
     return out, total
 
 
@@ -74,8 +80,8 @@ def _clusters(px: Pixels, state: State, tone: Tone, opt: FitOptions) -> Iterator
 
 def _grown(
     scores: np.ndarray, h: np.ndarray, inverse: np.ndarray, coupling: np.ndarray, free: np.ndarray, owner: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """B v_k (c, 16) and the cluster's gradient of the reduced response (c, P).
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """B v_k (c, 16), the cluster's gradient of the reduced response (c, P) and its l_k (c,).
 
     B = R R, M = R H_k R: B v_k = R (1 - M)^(-1/2) R u_k. The response's part of the gradient has lost C_k' R g(M) R u_k with
     g(x) = ((1 - x)^(-1/2) - 1) / x.
@@ -94,4 +100,5 @@ def _grown(
 
     lost = np.einsum("kip,ki->kp", h[:, :PARAMETERS, PARAMETERS:], out((grow - 1.0) / lever))
     alone = out(grow)
-    return alone, scores[:, PARAMETERS:] + lost - np.einsum("kip,ki->kp", coupling[owner], alone)
+    reduced = scores[:, PARAMETERS:] + lost - np.einsum("kip,ki->kp", coupling[owner], alone)
+    return alone, reduced, lever.sum(1)

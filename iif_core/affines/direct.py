@@ -20,7 +20,17 @@ from iif_core.affines.descent import Pull, State, arrowhead, descend, object_blo
 from iif_core.affines.pixels import Pixels, evaluate, prepare, residuals
 from iif_core.affines.population import Population, before, centre_of, lean, learn, pull_of
 from iif_core.affines.problem import GAINS, IDENTITY, PARAMETERS, FitOptions, FitProblem, FitResult
-from iif_core.affines.selection import DISCOUNT, KINDS, Choice, Texture, choose, describe, profile, row_noise, texture_of
+from iif_core.affines.selection import (
+    DISCOUNT,
+    KINDS,
+    Choice,
+    Texture,
+    choose,
+    describe,
+    profile,
+    row_noise,
+    texture_of,
+)
 from iif_core.affines.tone import Tone
 from iif_core.brdf import R_MIN
 from iif_core.response import Response
@@ -40,13 +50,13 @@ class _Profiled:
 
     Attributes:
         choice: the posterior; error: (O,) standard deviation of its mean, of noise alone (`choice.deviation` is discounted);
-            share: (O,) of it that is the pixels' and not the prior's.
+            shared: (O,) what a unit of its weight has in common with the gradient of the pixels.
         params: (P,) the response at which it was made; sway: (O, P) how it moves with the response.
     """
 
     choice: Choice
     error: np.ndarray
-    share: np.ndarray
+    shared: np.ndarray
     params: np.ndarray
     sway: np.ndarray
 
@@ -183,10 +193,8 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
     state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
-    sure = choose(replace(found, noise=found.noise / DISCOUNT), measured)
-    error = np.sqrt(sure.deviation**2 + (sure.roughness - choice.roughness) ** 2)
-    share, sway = _leverage(few, state, pull, tone, opt, noise, choice)
-    fit = replace(fit, state=state, metallic=metallic, profiled=_Profiled(choice, error, share, state.params, sway))
+    seen = _believed(few, state, pull, tone, opt, found.noise, choice)
+    fit = replace(fit, state=state, metallic=metallic, profiled=seen)
     if opt.population:
         fit = replace(fit, population=before(*choice.population))
         return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
@@ -194,21 +202,31 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
 
 
-def _leverage(
-    few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice
-) -> tuple[np.ndarray, np.ndarray]:
-    """(O,) share that pixels have in the profile's roughness of each object, H / (H + V), and (O, P) how far it moves with the
-    response, which the profile held, - C / (H + V); the albedo eliminated, V: the prior of the histogram's width."""
-    albedo = replace(state, free=state.free & (np.arange(PARAMETERS) < 12))
+def _believed(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice) -> _Profiled:
+    """With the curvature H of the objective and its coupling C to the response, the albedo eliminated, and the precision V of the
+    profile's prior, the profile's roughness has the error H noise / (H + V)^2 of the pixels, V / (H + V) of the histogram's
+    width, and that of its grid; it moves with the response by - C / (H + V)."""
+    albedo = state.free & (np.arange(PARAMETERS) < 12)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True)
-    inverse = np.where(albedo.free[:, :, None], object_blocks(terms, albedo.free, pull).inverse(), 0.0)
+    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], object_blocks(terms, albedo, pull).inverse(), 0.0)
     h, c = terms.h[:, 13, :PARAMETERS], terms.h[:, :, PARAMETERS:]
-    row = np.einsum("oi,oij->oj", np.where(albedo.free, h, 0.0), np.where(albedo.free[:, None, :], inverse, 0.0))
+    row = np.einsum("oi,oij->oj", h, inverse)
     coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
-    curvature = h[:, 13] - (row * h).sum(1)
-    prior = DISCOUNT * noise / max(choice.population[1], _SHARP) ** 2
-    total = np.maximum(curvature, 0.0) + prior
-    return 1.0 - prior / total, np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
+    width = max(choice.population[1], _SHARP)
+    prior = DISCOUNT * noise / width**2
+    curvature = np.maximum(h[:, 13] - (row * h).sum(1), 0.0)
+    total = curvature + prior
+    share = 1.0 - prior / total
+    owner = np.repeat(np.arange(few.n_objects), np.diff(few.first))
+    own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :PARAMETERS])
+    own -= (np.bincount(owner, own, few.n_objects) / np.maximum(np.diff(few.first), 1))[owner]
+    # the variance of a row that matters here: that of the direction of roughness
+    scatter = np.minimum(np.bincount(owner, own**2, few.n_objects) / np.maximum(curvature, 1e-12 * total), noise)
+    spacing = 2.0 * _SHARP
+    grid = 0.225 * spacing * np.exp(-2.0 * (np.pi * choice.deviation / spacing) ** 2)
+    error = np.sqrt(share * scatter / total + ((1.0 - share) * width) ** 2 + grid**2)
+    sway = np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
+    return _Profiled(choice, error, share * scatter, state.params, sway)
 
 
 def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
@@ -221,7 +239,7 @@ def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
         return pull
     deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
     level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
-    return lean(pull, level, deviation, seen.error, seen.share, noise, roughness, population.contrast, DISCOUNT)
+    return lean(pull, level, deviation, seen.error, seen.shared, noise, roughness, population.contrast, DISCOUNT)
 
 
 def result_of(

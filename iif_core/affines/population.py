@@ -107,7 +107,7 @@ def lean(
     level: np.ndarray,
     deviation: np.ndarray,
     error: np.ndarray,
-    share: np.ndarray,
+    shared: np.ndarray,
     noise: np.ndarray,
     roughness: np.ndarray,
     contrast: float,
@@ -115,8 +115,8 @@ def lean(
 ) -> Pull:
     """The pull with each object's own level of roughness (O,) +- `deviation` (O,) in place of the population's.
 
-    `error` (O,) is the standard deviation of that level, of which the pixels that pull too have made the part `share` (O,):
-    with w the weight, its scatter is w^2 error^2, and 2 w share noise goes together with the scatter of their own gradient.
+    `error` (O,) is the standard deviation of that level: with w the weight, its scatter is w^2 error^2. The pixels that it was
+    made of pull again by themselves: 2 w `shared` (O,) is what both have in common.
     """
     own = np.stack([roughness, np.ones_like(roughness)], 1)
     outer = own[:, :, None] * own[:, None, :]
@@ -124,7 +124,7 @@ def lean(
     strength = size / deviation**2
     weight, scatter = pull.weight.copy(), pull.scatter.copy() if pull.scatter is not None else np.zeros_like(pull.weight)
     weight[:, 12:14, 12:14] = strength[:, None, None] * outer
-    scatter[:, 12:14, 12:14] = (strength**2 * error**2 + 2.0 * strength * share * noise)[:, None, None] * outer
+    scatter[:, 12:14, 12:14] = (strength**2 * error**2 + 2.0 * strength * shared)[:, None, None] * outer
     weight[:, 12, 12] += size / _DEFAULT[4] ** 2
     scatter[:, 12, 12] += size**2 / _DEFAULT[4] ** 2
     centre = pull.centre.copy()
