@@ -217,11 +217,13 @@ def _believed(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions
     curvature = np.maximum(h[:, 13] - (row * h).sum(1), 0.0)
     total = curvature + prior
     share = 1.0 - prior / total
-    owner = np.repeat(np.arange(few.n_objects), np.diff(few.first))
+    clusters = np.diff(few.first)
+    owner = np.repeat(np.arange(few.n_objects), clusters)
     own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :PARAMETERS])
-    own -= (np.bincount(owner, own, few.n_objects) / np.maximum(np.diff(few.first), 1))[owner]
+    own -= (np.bincount(owner, own, few.n_objects) / np.maximum(clusters, 1))[owner]
     # the variance of a row that matters here: that of the direction of roughness
-    scatter = np.minimum(np.bincount(owner, own**2, few.n_objects) / np.maximum(curvature, 1e-12 * total), noise)
+    squares = np.bincount(owner, own**2, few.n_objects) * clusters / np.maximum(clusters - 1, 1)
+    scatter = np.minimum(squares / np.maximum(curvature, 1e-12 * total), noise)
     spacing = 2.0 * _SHARP
     grid = 0.225 * spacing * np.exp(-2.0 * (np.pi * choice.deviation / spacing) ** 2)
     error = np.sqrt(share * scatter / total + ((1.0 - share) * width) ** 2 + grid**2)
