@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.affines.pixels import Pixels, Terms, evaluate
+from iif_core.affines.pixels import Pixels, Terms, evaluate, other_tone, restore, revise
 from iif_core.affines.problem import PARAMETERS, FitOptions
 from iif_core.affines.tone import Tone
 
@@ -213,7 +213,7 @@ def descend(
         if refused >= _PATIENCE:
             return replace(state, converged=True, reason="no step lowers the objective"), terms
         moved = _step(px, state, terms, pull, tone, opt, prior, fitted, blocks)
-        new_total = total_of(moved.cost, moved.state.affine, moved.state.params)
+        new_total = total_of(moved.terms.cost, moved.state.affine, moved.state.params)
         refused = 0 if new_total < total - 1e-15 * abs(total) else refused + 1
         changed = new_total < total
         state = (
@@ -221,7 +221,7 @@ def descend(
         )
         if changed:
             state = replace(state, history=(*state.history, new_total))
-            terms, blocks = evaluate(px, state.affine, tone.at(state.params), opt, True), None
+            terms, blocks = moved.terms, None
             total, taken = new_total, taken + 1
     raise AssertionError("unreachable")
 
@@ -234,8 +234,10 @@ def _decrement(system: Arrowhead) -> float:
 
 @dataclass(frozen=True)
 class _Moved:
+    """Where a step led, and the system there."""
+
     state: State
-    cost: np.ndarray
+    terms: Terms
 
 
 def _step(
@@ -259,23 +261,25 @@ def _step(
         shift = params - state.params
         delta = -np.einsum("oij,oj->oi", system.inverse, system.g) - system.through @ shift
         new_tone = tone.at(params)
-        stay = evaluate(px, state.affine, new_tone, opt, False).cost
-        go = evaluate(px, state.affine + delta, new_tone, opt, False).cost
+        stay = other_tone(terms, px, new_tone, opt)
+        go = evaluate(px, state.affine + delta, new_tone, opt, True)
         away = pull.cost(state.affine + delta) - pull.cost(state.affine)
-        better = go + away < stay
+        better = go.cost + away < stay
         affine = np.where(better[:, None], state.affine + delta, state.affine)
-        cost = np.where(better, go, stay)
+        cost = np.where(better, go.cost, stay)
         gained = float((cost - terms.cost + np.where(better, away, 0.0)).sum())
         gained += prior.cost(params) - prior.cost(state.params)
         if gained < 0:
+            revise(go, px, affine, new_tone, opt, np.flatnonzero(~better))
             damping = _adapt(state.damping, better)
-            return _Moved(
-                replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True))), cost
-            )
+            moved = replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True)))
+            return _Moved(moved, go)
         mu = float(_adapt(mu, False))
     delta = -np.einsum("oij,oj->oi", system.inverse, system.g)
-    go = evaluate(px, state.affine + delta, tone.at(state.params), opt, False).cost
-    better = go + pull.cost(state.affine + delta) < here
+    same = tone.at(state.params)
+    go = evaluate(px, state.affine + delta, same, opt, True)
+    better = go.cost + pull.cost(state.affine + delta) < here
     affine = np.where(better[:, None], state.affine + delta, state.affine)
+    restore(go, terms, px, ~better)
     damping = _adapt(state.damping, better)
-    return _Moved(replace(state, affine=affine, damping=damping, response_damping=mu), np.where(better, go, terms.cost))
+    return _Moved(replace(state, affine=affine, damping=damping, response_damping=mu), go)

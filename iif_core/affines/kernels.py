@@ -62,6 +62,13 @@ def _cubic(y_before, y0, y1, y_after, h_before, h, h_after, t):
 
 
 @_compiled
+def _lobe(s, x, c, j, before, after, span_before, span, span_after, share):
+    """One channel of the lobe whose levels begin at row x of a pixel's shading s."""
+    y_before, y0, y1, y_after = float(s[x + before, c]), float(s[x + j, c]), float(s[x + j + 1, c]), float(s[x + after, c])
+    return _cubic(y_before, y0, y1, y_after, span_before, span, span_after, share)
+
+
+@_compiled
 def _bracket(levels, r):
     last = len(levels) - 2
     j = 0
@@ -124,8 +131,9 @@ def sums(
     h,  # (O, 16 + P, 16 + P)
     g,  # (clusters, 16 + P)
     errors,  # (n, halves, 3)
+    shown,  # (n, halves, 3) e L, with the system
 ):
-    """Objective, system and residuals of the objects low ... high - 1, written into the last six arrays."""
+    """Objective, system and residuals of the objects low ... high - 1, written into the last seven arrays."""
     halves = shading.shape[1]
     n_levels = len(levels)
     per = by_params.shape[2]
@@ -198,29 +206,10 @@ def sums(
                         for half in range(halves):
                             s = shading[p, half]
                             d = float(s[0, c])
-                            s0, ds0 = _cubic(
-                                float(s[1 + before, c]),
-                                float(s[1 + j, c]),
-                                float(s[2 + j, c]),
-                                float(s[1 + after, c]),
-                                span_before,
-                                span,
-                                span_after,
-                                share,
-                            )
-                            x = 1 + n_levels
-                            s1, ds1 = _cubic(
-                                float(s[x + before, c]),
-                                float(s[x + j, c]),
-                                float(s[x + j + 1, c]),
-                                float(s[x + after, c]),
-                                span_before,
-                                span,
-                                span_after,
-                                share,
-                            )
-                            radiance = (1.0 - m) * a * d + ks * s0 + s1
-                            f, df, node, part = _tone(e * radiance, knee, gain, curve[c], ends[c, 0])
+                            s0, ds0 = _lobe(s, 1, c, j, before, after, span_before, span, span_after, share)
+                            s1, ds1 = _lobe(s, 1 + n_levels, c, j, before, after, span_before, span, span_after, share)
+                            x = e * ((1.0 - m) * a * d + ks * s0 + s1)
+                            f, df, node, part = _tone(x, knee, gain, curve[c], ends[c, 0])
                             left = f - target[p, c]
                             idle = saturated[p, c] and left > 0.0
                             if idle:
@@ -229,6 +218,7 @@ def sums(
                             if want == 2:
                                 errors[p, half, c] = left
                             if jacobian:
+                                shown[p, half, c] = x
                                 slope = 0.0 if idle else df * e
                                 da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
                                 dr = slope * (ks * ds0 + ds1) * is_free[3]
@@ -256,9 +246,7 @@ def sums(
                         modulus = abs(product)
                         rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
                         size_o += rho
-                        if product < 0.0:
-                            rho = -rho
-                        data_o += rho
+                        data_o += rho if product >= 0.0 else -rho
                         weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
                 if jacobian:
                     _add_piece(columns, weight, error, last_half, m_pixels, place, weighted, h[o], g[k])
@@ -270,6 +258,24 @@ def sums(
             for i in range(h.shape[1]):
                 for j in range(i):
                     h[o, i, j] = h[o, j, i]
+
+
+@_compiled
+def toned(target, saturated, trust, shown, offsets, knee, gain, curve, ends, robust_width, low, high, data):
+    """The data terms of the objects low ... high - 1 where e L is `shown` (n, halves, 3), written into `data` (O,)."""
+    c2 = robust_width * robust_width
+    last_half = shown.shape[1] - 1
+    for o in range(low, high):
+        data_o = 0.0
+        for p in range(offsets[o], offsets[o + 1]):
+            for c in range(3):
+                one = _tone(shown[p, 0, c], knee, gain, curve[c], ends[c, 0])[0] - target[p, c]
+                two = _tone(shown[p, last_half, c], knee, gain, curve[c], ends[c, 0])[0] - target[p, c]
+                if saturated[p, c]:
+                    one, two = min(one, 0.0), min(two, 0.0)
+                rho = 0.5 * trust[p, c] * c2 * np.log1p(abs(one * two) / c2)
+                data_o += rho if one * two >= 0.0 else -rho
+        data[o] = data_o
 
 
 @_compiled
@@ -378,28 +384,8 @@ def gradient(
             a = value[c]
             ks = 0.04 * (1.0 - m) + m * a
             d = float(s[0, c])
-            x = 1
-            s0, ds0 = _cubic(
-                float(s[x + before, c]),
-                float(s[x + j, c]),
-                float(s[x + j + 1, c]),
-                float(s[x + after, c]),
-                span_before,
-                span,
-                span_after,
-                share,
-            )
-            x = 1 + n_levels
-            s1, ds1 = _cubic(
-                float(s[x + before, c]),
-                float(s[x + j, c]),
-                float(s[x + j + 1, c]),
-                float(s[x + after, c]),
-                span_before,
-                span,
-                span_after,
-                share,
-            )
+            s0, ds0 = _lobe(s, 1, c, j, before, after, span_before, span, span_after, share)
+            s1, ds1 = _lobe(s, 1 + n_levels, c, j, before, after, span_before, span, span_after, share)
             f, df, node, part = _tone(e * ((1.0 - m) * a * d + ks * s0 + s1), knee, gain, curve[c], ends[c, 0])
             error = f - target[p, c]
             if saturated[p, c] and error > 0.0:
