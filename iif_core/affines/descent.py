@@ -17,6 +17,8 @@ from iif_core.affines.tone import Tone
 _NOTHING = 1e-9
 """Residual, in sensor units, that counts as none: a perfect fit has no relative decrease to judge by."""
 _QUIET = 3  # steps that together must lower the objective by more than the tolerance
+_ALONE = 12  # steps of objects alone after one of everything
+_REST = 0.1  # of the tolerance, that an object may be expected to gain and still be left where it is
 _PATIENCE = 6  # refused steps in a row after which no step will be found
 
 
@@ -213,6 +215,8 @@ def descend(
         if refused >= _PATIENCE:
             return replace(state, converged=True, reason="no step lowers the objective"), terms
         moved = _step(px, state, terms, pull, tone, opt, prior, fitted, blocks)
+        if fitted and iterations is None:
+            moved = _settle(px, moved, pull, tone, opt)
         new_total = total_of(moved.terms.cost, moved.state.affine, moved.state.params)
         refused = 0 if new_total < total - 1e-15 * abs(total) else refused + 1
         changed = new_total < total
@@ -238,6 +242,7 @@ class _Moved:
 
     state: State
     terms: Terms
+    better: np.ndarray
 
 
 def _step(
@@ -253,7 +258,6 @@ def _step(
 ) -> _Moved:
     """One step of everything; where it does not pay, one of the objects alone with the response held."""
     system = arrowhead(terms, px, state, pull, prior, fitted, blocks)
-    here = terms.cost + pull.cost(state.affine)
     mu = state.response_damping
     if fitted:
         right = -system.g_w + np.einsum("oip,oi->p", system.through, system.g)
@@ -273,13 +277,47 @@ def _step(
             revise(go, px, affine, new_tone, opt, np.flatnonzero(~better))
             damping = _adapt(state.damping, better)
             moved = replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True)))
-            return _Moved(moved, go)
+            return _Moved(moved, go, better)
         mu = float(_adapt(mu, False))
-    delta = -np.einsum("oij,oj->oi", system.inverse, system.g)
-    same = tone.at(state.params)
-    go = evaluate(px, state.affine + delta, same, opt, True)
-    better = go.cost + pull.cost(state.affine + delta) < here
-    affine = np.where(better[:, None], state.affine + delta, state.affine)
-    restore(go, terms, px, ~better)
-    damping = _adapt(state.damping, better)
-    return _Moved(replace(state, affine=affine, damping=damping, response_damping=mu), go)
+    moved = _alone(px, replace(state, response_damping=mu), terms, pull, tone, opt, np.ones(len(terms.cost), bool))
+    return moved or _Moved(replace(state, response_damping=mu), terms, np.zeros(len(terms.cost), bool))
+
+
+def _alone(px: Pixels, state: State, terms: Terms, pull: Pull, tone: Tone, opt: FitOptions, active: np.ndarray) -> _Moved | None:
+    """A step of the `active` objects (O,) that are expected to gain something by it, with the response held; None: there is none.
+
+    What the others are expected to gain adds up to less than the tolerance: they are not looked at."""
+    free = state.free & active[:, None]
+    keep = free[:, :, None] & free[:, None, :]
+    blocks = object_blocks(terms, free, pull)
+    g = np.where(free, terms.gradient(px.first)[:, :PARAMETERS] + pull.gradient(state.affine), 0.0)
+    expected = 0.5 * np.einsum("oi,oij,oj->o", g, np.where(keep, blocks.inverse(), 0.0), g)
+    here = terms.cost + pull.cost(state.affine)
+    active = active & (expected > _REST * opt.tolerance * (terms.size + pull.cost(state.affine)))
+    if not active.any():
+        return None
+    delta = -np.einsum("oij,oj->oi", np.where(keep, blocks.inverse(state.damping), 0.0), g)
+    go = terms.copy()
+    tried = state.affine + np.where(active[:, None], delta, 0.0)
+    revise(go, px, tried, tone.at(state.params), opt, np.flatnonzero(active))
+    better = active & (go.cost + pull.cost(tried) < here)
+    restore(go, terms, px, active & ~better)
+    damping = np.where(active, _adapt(state.damping, better), state.damping)
+    affine = np.where(better[:, None], tried, state.affine)
+    return _Moved(replace(state, affine=affine, damping=damping), go, better)
+
+
+def _settle(px: Pixels, moved: _Moved, pull: Pull, tone: Tone, opt: FitOptions) -> _Moved:
+    """Further steps of the objects that still gain, a few pixels of all, with the response held."""
+    active = np.ones(px.n_objects, bool)
+    for _ in range(_ALONE):
+        here = moved.terms.cost + pull.cost(moved.state.affine)
+        further = _alone(px, moved.state, moved.terms, pull, tone, opt, active)
+        if further is None:
+            break
+        gained = here - further.terms.cost - pull.cost(further.state.affine)
+        active = further.better & (gained > _REST * opt.tolerance * further.terms.size)
+        moved = further
+        if not active.any():
+            break
+    return moved

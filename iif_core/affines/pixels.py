@@ -103,6 +103,10 @@ class Terms:
     scores: np.ndarray
     shown: np.ndarray
 
+    def copy(self) -> Terms:
+        """With arrays of its own."""
+        return Terms(**{name: value.copy() for name, value in self.__dict__.items()})
+
     def gradient(self, first: np.ndarray) -> np.ndarray:
         """(O, 16 + P)."""
         summed = np.concatenate([np.zeros((1, self.scores.shape[1])), np.cumsum(self.scores, 0)])
