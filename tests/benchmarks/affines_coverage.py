@@ -5,7 +5,7 @@
 Objects with drawn affines, roughness and metalness under room-like light, photographed through an unknown gamma. Errors: noise of
 the cached shading, one per surface cell and half, shared by all lobes and by the pixels of the cell; noise of the photograph per
 pixel and its rounding to 8 bits; and an error of the light that neighbours share, which both halves have. Clusters are the
-patches of neighbours. Families: `room`, which the formulae were looked at with, and `other`, which they were not: larger objects,
+patches of neighbours. Families: `room`, which the formulae were made on, and `other`, which they were tried on: larger objects,
 other sizes of every error, light that errs in squares instead of rows, another curve, a calibration's prior drawn around it, and
 textured roughness. A row per group of numbers: share of intervals that contain the truth, and the ratio of root-mean-square error
 to claimed error.
