@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.affines.pixels import Pixels, Terms, evaluate
+from iif_core.affines.pixels import Pixels, Terms, evaluate, other_tone, restore, revise
 from iif_core.affines.problem import PARAMETERS, FitOptions
 from iif_core.affines.tone import Tone
 
 _NOTHING = 1e-9
 """Residual, in sensor units, that counts as none: a perfect fit has no relative decrease to judge by."""
 _QUIET = 3  # steps that together must lower the objective by more than the tolerance
+_ALONE = 12  # steps of objects alone after one of everything
+_REST = 0.1  # of the tolerance, that an object may be expected to gain and still be left where it is
 _PATIENCE = 6  # refused steps in a row after which no step will be found
 
 
@@ -111,10 +113,13 @@ def object_blocks(terms: Terms, free: np.ndarray, pull: Pull) -> Spectrum:
 
 @dataclass(frozen=True)
 class ResponsePrior:
-    """Gaussian prior of the response parameters (P,), row by row: mean, and precision (P, P) times the weight of the pixels."""
+    """Gaussian prior of the response parameters (P,), row by row: mean, and precision (P, P) times the weight of the pixels.
+
+    `scatter` (P, P): of its gradient, weight^2 times the precision."""
 
     mean: np.ndarray
     precision: np.ndarray
+    scatter: np.ndarray
 
     def cost(self, params: np.ndarray) -> float:
         """Half the squared distance."""
@@ -129,7 +134,8 @@ class ResponsePrior:
 def response_prior(opt: FitOptions, pixels: int, start_params: np.ndarray) -> ResponsePrior:
     """That of the options, or the start with precision one; weighted by `response_ridge` per pixel."""
     mean, precision = opt.response_prior or (start_params, np.eye(len(start_params)))
-    return ResponsePrior(np.asarray(mean, np.float64), opt.response_ridge * pixels * np.asarray(precision, np.float64))
+    weight, precision = opt.response_ridge * pixels, np.asarray(precision, np.float64)
+    return ResponsePrior(np.asarray(mean, np.float64), weight * precision, weight**2 * precision)
 
 
 def arrowhead(
@@ -209,7 +215,9 @@ def descend(
         if refused >= _PATIENCE:
             return replace(state, converged=True, reason="no step lowers the objective"), terms
         moved = _step(px, state, terms, pull, tone, opt, prior, fitted, blocks)
-        new_total = total_of(moved.cost, moved.state.affine, moved.state.params)
+        if fitted and iterations is None:
+            moved = _settle(px, moved, pull, tone, opt)
+        new_total = total_of(moved.terms.cost, moved.state.affine, moved.state.params)
         refused = 0 if new_total < total - 1e-15 * abs(total) else refused + 1
         changed = new_total < total
         state = (
@@ -217,7 +225,7 @@ def descend(
         )
         if changed:
             state = replace(state, history=(*state.history, new_total))
-            terms, blocks = evaluate(px, state.affine, tone.at(state.params), opt, True), None
+            terms, blocks = moved.terms, None
             total, taken = new_total, taken + 1
     raise AssertionError("unreachable")
 
@@ -230,8 +238,11 @@ def _decrement(system: Arrowhead) -> float:
 
 @dataclass(frozen=True)
 class _Moved:
+    """Where a step led, and the system there."""
+
     state: State
-    cost: np.ndarray
+    terms: Terms
+    better: np.ndarray
 
 
 def _step(
@@ -247,7 +258,6 @@ def _step(
 ) -> _Moved:
     """One step of everything; where it does not pay, one of the objects alone with the response held."""
     system = arrowhead(terms, px, state, pull, prior, fitted, blocks)
-    here = terms.cost + pull.cost(state.affine)
     mu = state.response_damping
     if fitted:
         right = -system.g_w + np.einsum("oip,oi->p", system.through, system.g)
@@ -255,23 +265,59 @@ def _step(
         shift = params - state.params
         delta = -np.einsum("oij,oj->oi", system.inverse, system.g) - system.through @ shift
         new_tone = tone.at(params)
-        stay = evaluate(px, state.affine, new_tone, opt, False).cost
-        go = evaluate(px, state.affine + delta, new_tone, opt, False).cost
+        stay = other_tone(terms, px, new_tone, opt)
+        go = evaluate(px, state.affine + delta, new_tone, opt, True)
         away = pull.cost(state.affine + delta) - pull.cost(state.affine)
-        better = go + away < stay
+        better = go.cost + away < stay
         affine = np.where(better[:, None], state.affine + delta, state.affine)
-        cost = np.where(better, go, stay)
+        cost = np.where(better, go.cost, stay)
         gained = float((cost - terms.cost + np.where(better, away, 0.0)).sum())
         gained += prior.cost(params) - prior.cost(state.params)
         if gained < 0:
+            revise(go, px, affine, new_tone, opt, np.flatnonzero(~better))
             damping = _adapt(state.damping, better)
-            return _Moved(
-                replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True))), cost
-            )
+            moved = replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True)))
+            return _Moved(moved, go, better)
         mu = float(_adapt(mu, False))
-    delta = -np.einsum("oij,oj->oi", system.inverse, system.g)
-    go = evaluate(px, state.affine + delta, tone.at(state.params), opt, False).cost
-    better = go + pull.cost(state.affine + delta) < here
-    affine = np.where(better[:, None], state.affine + delta, state.affine)
-    damping = _adapt(state.damping, better)
-    return _Moved(replace(state, affine=affine, damping=damping, response_damping=mu), np.where(better, go, terms.cost))
+    moved = _alone(px, replace(state, response_damping=mu), terms, pull, tone, opt, np.ones(len(terms.cost), bool))
+    return moved or _Moved(replace(state, response_damping=mu), terms, np.zeros(len(terms.cost), bool))
+
+
+def _alone(px: Pixels, state: State, terms: Terms, pull: Pull, tone: Tone, opt: FitOptions, active: np.ndarray) -> _Moved | None:
+    """A step of the `active` objects (O,) that are expected to gain something by it, with the response held; None: there is none.
+
+    What the others are expected to gain adds up to less than the tolerance: they are not looked at."""
+    free = state.free & active[:, None]
+    keep = free[:, :, None] & free[:, None, :]
+    blocks = object_blocks(terms, free, pull)
+    g = np.where(free, terms.gradient(px.first)[:, :PARAMETERS] + pull.gradient(state.affine), 0.0)
+    expected = 0.5 * np.einsum("oi,oij,oj->o", g, np.where(keep, blocks.inverse(), 0.0), g)
+    here = terms.cost + pull.cost(state.affine)
+    active = active & (expected > _REST * opt.tolerance * (terms.size + pull.cost(state.affine)))
+    if not active.any():
+        return None
+    delta = -np.einsum("oij,oj->oi", np.where(keep, blocks.inverse(state.damping), 0.0), g)
+    go = terms.copy()
+    tried = state.affine + np.where(active[:, None], delta, 0.0)
+    revise(go, px, tried, tone.at(state.params), opt, np.flatnonzero(active))
+    better = active & (go.cost + pull.cost(tried) < here)
+    restore(go, terms, px, active & ~better)
+    damping = np.where(active, _adapt(state.damping, better), state.damping)
+    affine = np.where(better[:, None], tried, state.affine)
+    return _Moved(replace(state, affine=affine, damping=damping), go, better)
+
+
+def _settle(px: Pixels, moved: _Moved, pull: Pull, tone: Tone, opt: FitOptions) -> _Moved:
+    """Further steps of the objects that still gain, a few pixels of all, with the response held."""
+    active = np.ones(px.n_objects, bool)
+    for _ in range(_ALONE):
+        here = moved.terms.cost + pull.cost(moved.state.affine)
+        further = _alone(px, moved.state, moved.terms, pull, tone, opt, active)
+        if further is None:
+            break
+        gained = here - further.terms.cost - pull.cost(further.state.affine)
+        active = further.better & (gained > _REST * opt.tolerance * further.terms.size)
+        moved = further
+        if not active.any():
+            break
+    return moved

@@ -20,8 +20,19 @@ from iif_core.affines.descent import Pull, State, arrowhead, descend, object_blo
 from iif_core.affines.pixels import Pixels, evaluate, prepare, residuals
 from iif_core.affines.population import Population, before, centre_of, lean, learn, pull_of
 from iif_core.affines.problem import GAINS, IDENTITY, PARAMETERS, FitOptions, FitProblem, FitResult
-from iif_core.affines.selection import DISCOUNT, KINDS, Choice, Texture, choose, describe, profile, row_noise, texture_of
+from iif_core.affines.selection import (
+    DISCOUNT,
+    KINDS,
+    Choice,
+    Texture,
+    choose,
+    describe,
+    profile,
+    row_noise,
+    texture_of,
+)
 from iif_core.affines.tone import Tone
+from iif_core.brdf import R_MIN
 from iif_core.response import Response
 
 _FEW = 300  # pixels of an object that are enough to choose a valley
@@ -34,6 +45,23 @@ _RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1,
 
 
 @dataclass(frozen=True)
+class _Profiled:
+    """What the profile said about roughness, and how far it is to be believed.
+
+    Attributes:
+        choice: the posterior; error: (O,) standard deviation of its mean, of noise alone (`choice.deviation` is discounted);
+            shared: (O,) what a unit of its weight has in common with the gradient of the pixels.
+        params: (P,) the response at which it was made; sway: (O, P) how it moves with the response.
+    """
+
+    choice: Choice
+    error: np.ndarray
+    shared: np.ndarray
+    params: np.ndarray
+    sway: np.ndarray
+
+
+@dataclass(frozen=True)
 class Fit:
     """Where the fit stands between its steps."""
 
@@ -41,7 +69,7 @@ class Fit:
     pull: Pull
     population: Population | None
     metallic: np.ndarray
-    profiled: Choice | None = None
+    profiled: _Profiled | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -86,8 +114,8 @@ def _descend_all(
             noise = row_noise(terms, some, state.free)
             mean = texture.mean[:, 3]
             population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
-            pull = _pull(fit, population, noise, mean, fit.profiled)
-            fit = replace(fit, state=state, population=population, pull=pull)
+            fit = replace(fit, state=state, population=population)
+            fit = replace(fit, pull=_pull(fit, noise, mean))
     else:
         state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
         fit = replace(fit, state=state)
@@ -165,21 +193,55 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
     state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
-    fit = replace(fit, state=state, metallic=metallic, profiled=choice)
+    seen = _believed(few, state, pull, tone, opt, found.noise, choice)
+    fit = replace(fit, state=state, metallic=metallic, profiled=seen)
     if opt.population:
-        population = before(*choice.population)
-        return replace(fit, population=population, pull=_pull(fit, population, noise, texture.mean[:, 3], choice))
+        fit = replace(fit, population=before(*choice.population))
+        return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
     # as weakly as the ridge says
     return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
 
 
-def _pull(fit: Fit, population: Population, noise: np.ndarray, roughness: np.ndarray, choice: Choice | None) -> Pull:
-    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope)."""
+def _believed(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice) -> _Profiled:
+    """With the curvature H of the objective and its coupling C to the response, the albedo eliminated, and the precision V of the
+    profile's prior, the profile's roughness has the error H noise / (H + V)^2 of the pixels, V / (H + V) of the histogram's
+    width, and that of its grid; it moves with the response by - C / (H + V)."""
+    albedo = state.free & (np.arange(PARAMETERS) < 12)
+    terms = evaluate(few, state.affine, tone.at(state.params), opt, True)
+    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], object_blocks(terms, albedo, pull).inverse(), 0.0)
+    h, c = terms.h[:, 13, :PARAMETERS], terms.h[:, :, PARAMETERS:]
+    row = np.einsum("oi,oij->oj", h, inverse)
+    coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
+    width = max(choice.population[1], _SHARP)
+    prior = DISCOUNT * noise / width**2
+    curvature = np.maximum(h[:, 13] - (row * h).sum(1), 0.0)
+    total = curvature + prior
+    share = 1.0 - prior / total
+    clusters = np.diff(few.first)
+    owner = np.repeat(np.arange(few.n_objects), clusters)
+    own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :PARAMETERS])
+    own -= (np.bincount(owner, own, few.n_objects) / np.maximum(clusters, 1))[owner]
+    # the variance of a row that matters here: that of the direction of roughness
+    squares = np.bincount(owner, own**2, few.n_objects) * clusters / np.maximum(clusters - 1, 1)
+    scatter = np.minimum(squares / np.maximum(curvature, 1e-12 * total), noise)
+    spacing = 2.0 * _SHARP
+    grid = 0.225 * spacing * np.exp(-2.0 * (np.pi * choice.deviation / spacing) ** 2)
+    error = np.sqrt(share * scatter / total + ((1.0 - share) * width) ** 2 + grid**2)
+    sway = np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
+    return _Profiled(choice, error, share * scatter, state.params, sway)
+
+
+def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
+    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope), had it
+    known the response of today."""
+    assert fit.population is not None
+    population, seen = fit.population, fit.profiled
     pull = pull_of(population, noise, roughness, fit.metallic, DISCOUNT)
-    if choice is None:
+    if seen is None:
         return pull
-    deviation = np.clip(choice.deviation, _SHARP, population.spread[3])
-    return lean(pull, choice.roughness, deviation, noise, roughness, population.contrast, DISCOUNT)
+    deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
+    level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
+    return lean(pull, level, deviation, seen.error, seen.shared, noise, roughness, population.contrast, DISCOUNT)
 
 
 def result_of(
@@ -207,7 +269,7 @@ def result_of(
         blocks = object_blocks(terms, state.free, fit.pull)
         prior = response_prior(opt, len(px.obj), start_params)
         system = arrowhead(terms, px, state, fit.pull, prior, fitted, blocks, damped=False)
-        covariance[members], of_response = sandwich(px, terms, system, state.free, fit.pull)
+        covariance[members], of_response = sandwich(px, state, system, fit.pull, prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))

@@ -1,6 +1,6 @@
 """Compiled loops of the fit over the pixels of whole objects; each call is single-threaded and releases the interpreter.
 
-Pixels are sorted by (object, cluster). A cluster is worked through in pieces of `PIECE` pixels: what the Gauss-Newton system
+Pixels are sorted by (object, cluster). An object is worked through in pieces of `PIECE` pixels: what the Gauss-Newton system
 needs of a pixel is laid out column by column, so that the sums over pixels become vector instructions. `reassoc` lets the
 compiler add a piece in lanes; the order is fixed when the code is compiled. An object's sums are made by one thread in one
 order: the bytes do not depend on the number of threads.
@@ -59,6 +59,13 @@ def _cubic(y_before, y0, y1, y_after, h_before, h, h_after, t):
     value = y0 + h * t * (mean + (1.0 - t) * ((1.0 - t) * bend0 - t * bend1))
     slope = mean + (1.0 - t) * (1.0 - 3.0 * t) * bend0 + t * (3.0 * t - 2.0) * bend1
     return value, slope
+
+
+@_compiled
+def _lobe(s, x, c, j, before, after, span_before, span, span_after, share):
+    """One channel of the lobe whose levels begin at row x of a pixel's shading s."""
+    y_before, y0, y1, y_after = float(s[x + before, c]), float(s[x + j, c]), float(s[x + j + 1, c]), float(s[x + after, c])
+    return _cubic(y_before, y0, y1, y_after, span_before, span, span_after, share)
 
 
 @_compiled
@@ -125,8 +132,9 @@ def sums(
     h,  # (O, 16 + P, 16 + P)
     g,  # (clusters, 16 + P)
     errors,  # (n, halves, 3)
+    shown,  # (n, halves, 3) e L, with the system
 ):
-    """Objective, system and residuals of the objects low ... high - 1, written into the last six arrays."""
+    """Objective, system and residuals of the objects low ... high - 1, written into the last seven arrays."""
     halves = shading.shape[1]
     n_levels = len(levels)
     per = by_params.shape[2]
@@ -154,116 +162,105 @@ def sums(
         cost_o = 0.0
         data_o = 0.0
         size_o = 0.0
-        for k in range(first[o], first[o + 1]):
-            begin = starts[k]
-            while begin < starts[k + 1]:
-                stop = min(begin + PIECE, starts[k + 1])
-                m_pixels = stop - begin
-                for q in range(m_pixels):
-                    p = begin + q
-                    b = base[p]
-                    for c in range(3):
-                        raw[c] = t[4 * c] * b[0] + t[4 * c + 1] * b[1] + t[4 * c + 2] * b[2] + t[4 * c + 3]
-                    raw[3] = t[12] * b[3] + t[13]
-                    raw[4] = t[14] * b[4] + t[15]
-                    for i in range(5):
-                        floor = 0.02 if i == 3 else 0.0
-                        value[i] = min(max(raw[i], floor), brightest if i < 3 else 1.0)
-                        beyond = raw[i] - value[i]
-                        is_free[i] = 1.0 if beyond == 0.0 else 0.0
-                        if beyond != 0.0:
-                            cost_o += 0.5 * box * beyond * beyond
-                            if jacobian:
-                                _add_beyond(h[o], g[k], i, b, box, beyond)
-                    r = value[3]
-                    m = value[4]
-                    cost_o += 1.5 * (roughness_weight * (1.0 - r) + metallic_weight * m)
-                    if jacobian:
-                        if is_free[3] > 0.0:
-                            g[k, 12] -= 1.5 * roughness_weight * b[3]
-                            g[k, 13] -= 1.5 * roughness_weight
-                        if is_free[4] > 0.0:
-                            g[k, 14] += 1.5 * metallic_weight * b[4]
-                            g[k, 15] += 1.5 * metallic_weight
-                    j = _bracket(levels, r)
-                    span = levels[j + 1] - levels[j]
-                    share = min(max((r - levels[j]) / span, 0.0), 1.0)
-                    before = max(j - 1, 0)
-                    after = min(j + 2, n_levels - 1)
-                    span_before = levels[j] - levels[before]
-                    span_after = levels[after] - levels[j + 1]
-                    e = exposure[p]
-                    for c in range(3):
-                        a = value[c]
-                        ks = 0.04 * (1.0 - m) + m * a
-                        for half in range(halves):
-                            s = shading[p, half]
-                            d = float(s[0, c])
-                            s0, ds0 = _cubic(
-                                float(s[1 + before, c]),
-                                float(s[1 + j, c]),
-                                float(s[2 + j, c]),
-                                float(s[1 + after, c]),
-                                span_before,
-                                span,
-                                span_after,
-                                share,
-                            )
-                            x = 1 + n_levels
-                            s1, ds1 = _cubic(
-                                float(s[x + before, c]),
-                                float(s[x + j, c]),
-                                float(s[x + j + 1, c]),
-                                float(s[x + after, c]),
-                                span_before,
-                                span,
-                                span_after,
-                                share,
-                            )
-                            radiance = (1.0 - m) * a * d + ks * s0 + s1
-                            f, df, node, part = _tone(e * radiance, knee, gain, curve[c], ends[c, 0])
-                            left = f - target[p, c]
-                            idle = saturated[p, c] and left > 0.0
-                            if idle:
-                                left = 0.0
-                            error[half, c, q] = left
-                            if want == 2:
-                                errors[p, half, c] = left
-                            if jacobian:
-                                slope = 0.0 if idle else df * e
-                                da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
-                                dr = slope * (ks * ds0 + ds1) * is_free[3]
-                                dm = slope * (-a * d + (a - 0.04) * s0) * is_free[4]
-                                columns[half, c, 0, q] = da * b[0]
-                                columns[half, c, 1, q] = da * b[1]
-                                columns[half, c, 2, q] = da * b[2]
-                                columns[half, c, 3, q] = da
-                                columns[half, c, 4, q] = dr * b[3]
-                                columns[half, c, 5, q] = dr
-                                columns[half, c, 6, q] = dm * b[4]
-                                columns[half, c, 7, q] = dm
-                                for i in range(per):
-                                    if idle:
-                                        columns[half, c, 8 + i, q] = 0.0
-                                    elif node == curve.shape[1] - 1:
-                                        columns[half, c, 8 + i, q] = by_params[c, node, i] + part * ends[c, 1 + i]
-                                    else:
-                                        columns[half, c, 8 + i, q] = (1.0 - part) * by_params[c, node, i] + part * by_params[
-                                            c, node + 1, i
-                                        ]
-                        # Odd in the product: were only positive ones damped, loud noise of opposite signs would pay, and the
-                        # response would be bent until it amplifies the noise.
-                        product = error[0, c, q] * error[last_half, c, q]
-                        modulus = abs(product)
-                        rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
-                        size_o += rho
-                        if product < 0.0:
-                            rho = -rho
-                        data_o += rho
-                        weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
+        k = first[o]
+        end = starts[first[o + 1]]
+        begin = starts[k]
+        while begin < end:
+            stop = min(begin + PIECE, end)
+            m_pixels = stop - begin
+            k_begin = k
+            for q in range(m_pixels):
+                p = begin + q
+                while p >= starts[k + 1]:
+                    k += 1
+                b = base[p]
+                for c in range(3):
+                    raw[c] = t[4 * c] * b[0] + t[4 * c + 1] * b[1] + t[4 * c + 2] * b[2] + t[4 * c + 3]
+                raw[3] = t[12] * b[3] + t[13]
+                raw[4] = t[14] * b[4] + t[15]
+                for i in range(5):
+                    floor = 0.02 if i == 3 else 0.0
+                    value[i] = min(max(raw[i], floor), brightest if i < 3 else 1.0)
+                    beyond = raw[i] - value[i]
+                    is_free[i] = 1.0 if beyond == 0.0 else 0.0
+                    if beyond != 0.0:
+                        cost_o += 0.5 * box * beyond * beyond
+                        if jacobian:
+                            _add_beyond(h[o], g[k], i, b, box, beyond)
+                r = value[3]
+                m = value[4]
+                cost_o += 1.5 * (roughness_weight * (1.0 - r) + metallic_weight * m)
                 if jacobian:
-                    _add_piece(columns, weight, error, last_half, m_pixels, place, weighted, h[o], g[k])
-                begin = stop
+                    if is_free[3] > 0.0:
+                        g[k, 12] -= 1.5 * roughness_weight * b[3]
+                        g[k, 13] -= 1.5 * roughness_weight
+                    if is_free[4] > 0.0:
+                        g[k, 14] += 1.5 * metallic_weight * b[4]
+                        g[k, 15] += 1.5 * metallic_weight
+                j = _bracket(levels, r)
+                span = levels[j + 1] - levels[j]
+                share = min(max((r - levels[j]) / span, 0.0), 1.0)
+                before = max(j - 1, 0)
+                after = min(j + 2, n_levels - 1)
+                span_before = levels[j] - levels[before]
+                span_after = levels[after] - levels[j + 1]
+                e = exposure[p]
+                for c in range(3):
+                    a = value[c]
+                    ks = 0.04 * (1.0 - m) + m * a
+                    for half in range(halves):
+                        s = shading[p, half]
+                        d = float(s[0, c])
+                        s0, ds0 = _lobe(s, 1, c, j, before, after, span_before, span, span_after, share)
+                        s1, ds1 = _lobe(s, 1 + n_levels, c, j, before, after, span_before, span, span_after, share)
+                        x = e * ((1.0 - m) * a * d + ks * s0 + s1)
+                        f, df, node, part = _tone(x, knee, gain, curve[c], ends[c, 0])
+                        left = f - target[p, c]
+                        idle = saturated[p, c] and left > 0.0
+                        if idle:
+                            left = 0.0
+                        error[half, c, q] = left
+                        if want == 2:
+                            errors[p, half, c] = left
+                        if jacobian:
+                            shown[p, half, c] = x
+                            slope = 0.0 if idle else df * e
+                            da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
+                            dr = slope * (ks * ds0 + ds1) * is_free[3]
+                            dm = slope * (-a * d + (a - 0.04) * s0) * is_free[4]
+                            columns[half, c, 0, q] = da * b[0]
+                            columns[half, c, 1, q] = da * b[1]
+                            columns[half, c, 2, q] = da * b[2]
+                            columns[half, c, 3, q] = da
+                            columns[half, c, 4, q] = dr * b[3]
+                            columns[half, c, 5, q] = dr
+                            columns[half, c, 6, q] = dm * b[4]
+                            columns[half, c, 7, q] = dm
+                            for i in range(per):
+                                if idle:
+                                    columns[half, c, 8 + i, q] = 0.0
+                                elif node == curve.shape[1] - 1:
+                                    columns[half, c, 8 + i, q] = by_params[c, node, i] + part * ends[c, 1 + i]
+                                else:
+                                    columns[half, c, 8 + i, q] = (1.0 - part) * by_params[c, node, i] + part * by_params[
+                                        c, node + 1, i
+                                    ]
+                    # Odd in the product: were only positive ones damped, loud noise of opposite signs would pay, and the
+                    # response would be bent until it amplifies the noise.
+                    product = error[0, c, q] * error[last_half, c, q]
+                    modulus = abs(product)
+                    rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
+                    size_o += rho
+                    data_o += rho if product >= 0.0 else -rho
+                    weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
+            if jacobian:
+                _add_piece(columns, weight, error, last_half, m_pixels, place, weighted, h[o])
+                low_q = 0
+                for x in range(k_begin, k + 1):
+                    high_q = min(starts[x + 1] - begin, m_pixels)
+                    _add_scores(columns, weight, error, last_half, low_q, high_q, place, g[x])
+                    low_q = high_q
+            begin = stop
         cost[o] = cost_o + data_o
         data[o] = data_o
         size[o] = size_o
@@ -271,6 +268,24 @@ def sums(
             for i in range(h.shape[1]):
                 for j in range(i):
                     h[o, i, j] = h[o, j, i]
+
+
+@_compiled
+def toned(target, saturated, trust, shown, offsets, knee, gain, curve, ends, robust_width, low, high, data):
+    """The data terms of the objects low ... high - 1 where e L is `shown` (n, halves, 3), written into `data` (O,)."""
+    c2 = robust_width * robust_width
+    last_half = shown.shape[1] - 1
+    for o in range(low, high):
+        data_o = 0.0
+        for p in range(offsets[o], offsets[o + 1]):
+            for c in range(3):
+                one = _tone(shown[p, 0, c], knee, gain, curve[c], ends[c, 0])[0] - target[p, c]
+                two = _tone(shown[p, last_half, c], knee, gain, curve[c], ends[c, 0])[0] - target[p, c]
+                if saturated[p, c]:
+                    one, two = min(one, 0.0), min(two, 0.0)
+                rho = 0.5 * trust[p, c] * c2 * np.log1p(abs(one * two) / c2)
+                data_o += rho if one * two >= 0.0 else -rho
+        data[o] = data_o
 
 
 @_compiled
@@ -293,20 +308,30 @@ def _add_beyond(h, g, i, b, box, beyond):
 
 
 @_compiled
-def _add_piece(columns, weight, error, last_half, m, place, weighted, h, g):
-    """Upper triangle of H += (J1' W J2 + J2' W J1) / 2 and g += (J1' W e2 + J2' W e1) / 2."""
-    cols = columns.shape[2]
+def _add_scores(columns, weight, error, last_half, low, high, place, g):
+    """g += (J1' W e2 + J2' W e1) / 2 of the pixels low ... high - 1 of a piece."""
     for c in range(3):
         one = columns[0, c]
         two = columns[last_half, c]
         w = weight[c]
         e1 = error[0, c]
         e2 = error[last_half, c]
-        for i in range(cols):
+        for i in range(columns.shape[2]):
             total = 0.0
-            for q in range(m):
+            for q in range(low, high):
                 total += w[q] * (one[i, q] * e2[q] + two[i, q] * e1[q])
             g[place[c, i]] += 0.5 * total
+
+
+@_compiled
+def _add_piece(columns, weight, error, last_half, m, place, weighted, h):
+    """Upper triangle of H += (J1' W J2 + J2' W J1) / 2."""
+    cols = columns.shape[2]
+    for c in range(3):
+        one = columns[0, c]
+        two = columns[last_half, c]
+        w = weight[c]
+        for i in range(cols):
             for q in range(m):
                 weighted[q] = w[q] * one[i, q]
             if last_half == 0:
@@ -379,28 +404,8 @@ def gradient(
             a = value[c]
             ks = 0.04 * (1.0 - m) + m * a
             d = float(s[0, c])
-            x = 1
-            s0, ds0 = _cubic(
-                float(s[x + before, c]),
-                float(s[x + j, c]),
-                float(s[x + j + 1, c]),
-                float(s[x + after, c]),
-                span_before,
-                span,
-                span_after,
-                share,
-            )
-            x = 1 + n_levels
-            s1, ds1 = _cubic(
-                float(s[x + before, c]),
-                float(s[x + j, c]),
-                float(s[x + j + 1, c]),
-                float(s[x + after, c]),
-                span_before,
-                span,
-                span_after,
-                share,
-            )
+            s0, ds0 = _lobe(s, 1, c, j, before, after, span_before, span, span_after, share)
+            s1, ds1 = _lobe(s, 1 + n_levels, c, j, before, after, span_before, span, span_after, share)
             f, df, node, part = _tone(e * ((1.0 - m) * a * d + ks * s0 + s1), knee, gain, curve[c], ends[c, 0])
             error = f - target[p, c]
             if saturated[p, c] and error > 0.0:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -92,7 +93,7 @@ class Terms:
 
     Attributes:
         cost: (O,); data: (O,) the data term alone; size: (O,) sum of the moduli of its terms.
-        h: (O, 16 + P, 16 + P); scores: (C, 16 + P) gradient of each cluster.
+        h: (O, 16 + P, 16 + P); scores: (C, 16 + P) gradient of each cluster; shown: (n, halves, 3) e L.
     """
 
     cost: np.ndarray
@@ -100,6 +101,11 @@ class Terms:
     size: np.ndarray
     h: np.ndarray
     scores: np.ndarray
+    shown: np.ndarray
+
+    def copy(self) -> Terms:
+        """With arrays of its own."""
+        return Terms(**{name: value.copy() for name, value in self.__dict__.items()})
 
     def gradient(self, first: np.ndarray) -> np.ndarray:
         """(O, 16 + P)."""
@@ -174,13 +180,63 @@ def residuals(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> np
     return _run(px, affine, tone, opt, 2)[1]
 
 
+def revise(terms: Terms, px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, objects: np.ndarray) -> None:
+    """Put the system of some objects (increasing) at `affine` (O, 16) in place of what `terms` has."""
+    breaks = np.flatnonzero(np.diff(objects) > 1) + 1
+    runs = [(int(run[0]), int(run[-1]) + 1) for run in np.split(objects, breaks) if len(run)]
+    for low, high in runs:
+        terms.h[low:high] = 0.0
+        terms.scores[px.first[low] : px.first[high]] = 0.0
+    _fill(terms, np.zeros((0, px.shading.shape[1], 3)), px, affine, tone, opt, 1, runs)
+
+
+def restore(terms: Terms, before: Terms, px: Pixels, objects: np.ndarray) -> None:
+    """Put what `before` has of some objects, (O,) bool, in place of what `terms` has."""
+    if not objects.any():
+        return
+    clusters, pixels = np.repeat(objects, np.diff(px.first)), np.repeat(objects, px.counts)
+    rows = {"cost": objects, "data": objects, "size": objects, "h": objects, "scores": clusters, "shown": pixels}
+    for name, which in rows.items():
+        getattr(terms, name)[which] = getattr(before, name)[which]
+
+
+def other_tone(terms: Terms, px: Pixels, tone: Tone, opt: FitOptions) -> np.ndarray:
+    """(O,) objective of `terms`, which have a system, with another response."""
+    data = np.zeros(px.n_objects)
+    curve, ends, _ = tone.tables()
+    offsets = px.offsets
+
+    def work(part: tuple[int, int]) -> None:
+        given = (px.target, px.saturated, px.trust, terms.shown, offsets, tone.knee, tone.gain, curve, ends)
+        kernels.toned(*given, opt.robust_width, *part, data)
+
+    _in_threads(work, _parts(px, opt.threads), opt.threads)
+    return terms.cost - terms.data + data
+
+
 def _run(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, want: int) -> tuple[Terms, np.ndarray]:
-    n_objects, width = px.n_objects, PARAMETERS + tone.size
+    n_objects, width, halves = px.n_objects, PARAMETERS + tone.size, px.shading.shape[1]
     cost, data, size = (np.zeros(n_objects) for _ in range(3))
-    shape = (n_objects, width, width) if want == 1 else (0, width, width)
-    h = np.zeros(shape)
+    h = np.zeros((n_objects if want == 1 else 0, width, width))
     scores = np.zeros((len(px.starts) - 1 if want == 1 else 0, width))
-    errors = np.zeros((len(px.obj) if want == 2 else 0, px.shading.shape[1], 3))
+    shown = np.zeros((len(px.obj) if want == 1 else 0, halves, 3))
+    errors = np.zeros((len(px.obj) if want == 2 else 0, halves, 3))
+    terms = Terms(cost, data, size, h, scores, shown)
+    _fill(terms, errors, px, affine, tone, opt, want, _parts(px, opt.threads))
+    return terms, errors
+
+
+def _fill(
+    terms: Terms,
+    errors: np.ndarray,
+    px: Pixels,
+    affine: np.ndarray,
+    tone: Tone,
+    opt: FitOptions,
+    want: int,
+    parts: list[tuple[int, int]],
+) -> None:
+    """The kernel over ranges of objects; systems are added to what is there."""
     affine = np.ascontiguousarray(affine, np.float64)
     curve, ends, by_params = tone.tables()
 
@@ -210,22 +266,25 @@ def _run(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, want: int)
             bounds[0],
             bounds[1],
             want,
-            cost,
-            data,
-            size,
-            h,
-            scores,
+            terms.cost,
+            terms.data,
+            terms.size,
+            terms.h,
+            terms.scores,
             errors,
+            terms.shown,
         )
 
-    parts = _parts(px, opt.threads)
-    if len(parts) > 1:
-        with ThreadPoolExecutor(len(parts)) as pool:
+    _in_threads(work, parts, opt.threads)
+
+
+def _in_threads(work: Callable[[tuple[int, int]], None], parts: list[tuple[int, int]], threads: int) -> None:
+    if threads > 1 and len(parts) > 1:
+        with ThreadPoolExecutor(threads) as pool:
             list(pool.map(work, parts))
     else:
         for part in parts:
             work(part)
-    return Terms(cost, data, size, h, scores), errors
 
 
 def _parts(px: Pixels, threads: int) -> list[tuple[int, int]]:

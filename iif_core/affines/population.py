@@ -106,21 +106,30 @@ def lean(
     pull: Pull,
     level: np.ndarray,
     deviation: np.ndarray,
+    error: np.ndarray,
+    shared: np.ndarray,
     noise: np.ndarray,
     roughness: np.ndarray,
     contrast: float,
     discount: float,
 ) -> Pull:
-    """The pull with each object's own level of roughness (O,) +- `deviation` (O,) in place of the population's."""
-    inverse = np.zeros((len(noise), PARAMETERS, PARAMETERS))
+    """The pull with each object's own level of roughness (O,) +- `deviation` (O,) in place of the population's.
+
+    `error` (O,) is the standard deviation of that level: with w the weight, its scatter is w^2 error^2. The pixels that it was
+    made of pull again by themselves: 2 w `shared` (O,) is what both have in common.
+    """
     own = np.stack([roughness, np.ones_like(roughness)], 1)
-    inverse[:, 12:14, 12:14] = own[:, :, None] * own[:, None, :] / deviation[:, None, None] ** 2
-    inverse[:, 12, 12] += 1.0 / _DEFAULT[4] ** 2
-    weight, scatter = _weighted(inverse, noise, discount)
-    centre, keep = pull.centre.copy(), np.ones((PARAMETERS, PARAMETERS), bool)
+    outer = own[:, :, None] * own[:, None, :]
+    size = discount * noise
+    strength = size / deviation**2
+    weight, scatter = pull.weight.copy(), pull.scatter.copy() if pull.scatter is not None else np.zeros_like(pull.weight)
+    weight[:, 12:14, 12:14] = strength[:, None, None] * outer
+    scatter[:, 12:14, 12:14] = (strength**2 * error**2 + 2.0 * strength * shared)[:, None, None] * outer
+    weight[:, 12, 12] += size / _DEFAULT[4] ** 2
+    scatter[:, 12, 12] += size**2 / _DEFAULT[4] ** 2
+    centre = pull.centre.copy()
     centre[:, 13] = level - contrast * roughness
-    keep[12:14, 12:14] = False
-    return Pull(centre, np.where(keep, pull.weight, weight), np.where(keep, pull.scatter, scatter))
+    return Pull(centre, weight, scatter)
 
 
 def learn(
