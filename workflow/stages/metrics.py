@@ -23,6 +23,7 @@ from workflow.scores import (
     perceptual_networks,
     prediction_numbers,
 )
+from workflow.weights import FETCH_VGG
 
 BASELINES = {
     "prior_k0": "the first prediction of each view, as the prior gave it",
@@ -37,16 +38,19 @@ BASELINES = {
 MEAN_METRICS = ("l2", "psnr")
 """What `prior_mean_k` has: the others take most of the stage's time when every prediction is scored with them."""
 
-LEARNED = ("base", "prior_k0")
-"""Variants beside the result whose albedo has LPIPS."""
+LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(metrics.LPIPS_NETWORKS))
+"""Variant -> learned metrics of its albedo."""
 
 
 def run(job: Job) -> None:
     """Score every view; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
     capture = CaptureReader(job.read("capture"))
     rows = ScoreRows()
-    networks = perceptual_networks()
-    networks_of = {quantity: networks for quantity in (*MATERIALS, "rgb")}
+    networks = perceptual_networks(with_vgg=job.settings.metrics.lpips_vgg)
+    networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in (*MATERIALS, "rgb")}
+    if job.settings.metrics.lpips_vgg and capture.has_truth and "vgg" not in networks:
+        job.log.warning("metrics.lpips_vgg: %s; the other scores are computed without", FETCH_VGG)
+        rows.missing.append({"quantity": "albedo", "metric": "lpips_vgg", "reason": FETCH_VGG})
     means = _PredictionMeans(job, capture) if capture.has_truth else None
     exposures = capture.exposures()
 
@@ -126,11 +130,14 @@ def _view_scores(
 
 def _scores(materials: MaterialTruth, variant: str, maps: dict[str, np.ndarray], quantity: str) -> list[metrics.Score]:
     """All scores of the result; of the others FLIP and LPIPS, which take most of the time, only where they are looked at."""
+    learned = LEARNED.get(variant, ()) if quantity == "albedo" else ()
+    visual = ("raw", "scaled")
     if variant == "result":
-        return materials.scores(maps, quantity)
-    learned = tuple(metrics.LPIPS_NETWORKS) if variant in LEARNED and quantity == "albedo" else ()
+        every = [m for m in metrics.METRICS_OF[quantity] if m != "lpips_vgg"]
+        vgg = materials.scores(maps, quantity, ("lpips_vgg",), visual) if "lpips_vgg" in learned else []
+        return materials.scores(maps, quantity, every) + vgg
     only = [m for m in metrics.METRICS_OF[quantity] if m not in metrics.LPIPS_NETWORKS or m in learned]
-    return materials.scores(maps, quantity, only, perceptual=("raw", "scaled"))
+    return materials.scores(maps, quantity, only, visual)
 
 
 def _log_scores(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[metrics.Score]:
