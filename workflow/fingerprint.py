@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 import json
 import sys
+import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,7 @@ def is_infrastructure(module: str) -> bool:
 _CODE = Path("results/.code-digests.json")
 _remembered: dict[str, list[Any]] = {}  # module -> [sha256 of its source, digest of its code, names that it imports]
 _unsaved = False
+_lock = threading.Lock()  # stages read their upstream from several threads
 
 
 @lru_cache(None)
@@ -82,9 +84,10 @@ def _reader_of_code() -> str:
 
 def _save() -> None:
     global _unsaved
-    if _unsaved:
-        write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
-        _unsaved = False
+    with _lock:
+        if _unsaved:
+            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
+            _unsaved = False
 
 
 @lru_cache(None)
@@ -103,8 +106,9 @@ def _facts(module: str) -> tuple[str, tuple[str, ...]]:
     if found is None or found[0] != source:
         tree = ast.parse(path.read_text(), str(path))
         names = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
-        _remembered[module] = found = [source, _digest_of(tree), sorted(names)]
-        _unsaved = True
+        found = [source, _digest_of(tree), sorted(names)]
+        with _lock:
+            _remembered[module], _unsaved = found, True
     return found[1], tuple(found[2])
 
 

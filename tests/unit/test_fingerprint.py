@@ -152,6 +152,14 @@ def test_what_is_remembered_of_the_code_changes_nothing(checkout):
     for damage in ("{", "[]", '{"by": 3}'):
         memory.write_text(damage)
         assert fingerprints(code, run) == first
+    memory.unlink()
+    threads = (
+        "from concurrent.futures import ThreadPoolExecutor as P; from workflow import fingerprint as f;"
+        "stages = ['render', 'affines', 'emission', 'base'] * 4;"
+        "list(P(8).map(lambda s: f.fingerprint(s, 't', 'draft'), stages))"
+    )
+    environment = {"PYTHONPATH": str(code), "PATH": "/usr/bin:/bin"}
+    subprocess.run([sys.executable, "-c", threads], cwd=run, env=environment, check=True)
     before = affines.stat()
     affines.write_text(affines.read_text() + "\nEXTRA = 1\n")
     one = fingerprints(code, run)
