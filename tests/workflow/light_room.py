@@ -16,7 +16,8 @@ from iif_core.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 from iif_core.photography import response_curve
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_to_disk, split_rgb
-from workflow.normal_form import CaptureWriter, View
+from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.registry import STAGES
 
 SIZE = (4.0, 3.0, 2.4)
 LAMP, BULB = 8.0, 20.0
@@ -128,8 +129,11 @@ class Room:
 class StubJob:
     """What a stage needs of a job, over a folder of the test's own."""
 
+    quality, fingerprint = "draft", "0123456789abcdef"
+
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
-        self.stage, self.folder, self.seed, self.threads, self.scene = stage, folder, seed, 2, "room"
+        self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
+        self.document = {"seed": seed}
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in settings.items()})
         self.log = logging.getLogger(stage)
         provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}
@@ -160,6 +164,7 @@ def build(
     sky: float = 0.0,
     bounces: int = 10,
     retouch: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    truth: bool = False,
 ) -> Room:
     """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture.
 
@@ -194,6 +199,11 @@ def build(
         if retouch is not None:
             image = retouch(view.view_id, image)
         form.photo(view.name, image.astype(np.float32), encoded=sensor is not None)
+        if truth:
+            maps, shine = (values[face].reshape(size, size, -1) for values in (room.material, room.emission))
+            hit = (face >= 0).reshape(size, size)
+            maps, shine = maps * hit[..., None], shine * hit[..., None]
+            form.truth(view.name, Truth(maps[..., :3], maps[..., 3], maps[..., 4], shine, radiance.reshape(size, size, 3), hit))
         form.gbuffer(view.name, depth.reshape(size, size), face.reshape(size, size))
         objects = np.where(face >= 0, room.object_id[face], -1).reshape(size, size).astype(np.int32)
         inner = np.ones((size, size), bool)
@@ -212,7 +222,7 @@ def build(
                 np.where((face >= 0)[:, None], spoiled[face], 0),
             )
         )
-    form.finish("test", dynamic_range, True, [])
+    form.finish("test", dynamic_range, truth, [])
     capture_facts = {"object_id": np.arange(len(room.names), dtype=np.int32), "name": np.array(room.names)}
     segmentation.table("objects.parquet", capture_facts)
     faces = {"face_id": np.arange(len(room.faces), dtype=np.int32), "object_id": room.object_id}
@@ -269,6 +279,7 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
             f"maps/{view.name}.exr",
             {
                 "cell.id": ids_to_disk(ids.reshape(size, size)),
+                "coverage": np.ones((size, size), np.float32),
                 **split_rgb(maps[..., :3], "albedo"),
                 "roughness": maps[..., 3],
                 "metallic": maps[..., 4],
@@ -280,7 +291,10 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
         names = [f"prior.000.{name}" for name in ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")]
         prior.exr(f"maps/{view.name}.exr", {name: maps[..., i] for i, name in enumerate(names)})
     prior.finish()
-    base.json("base.json", {"predictions": 1, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
+    n = len(room.names)
+    base.table("selection.parquet", {"segment_id": np.arange(n), "k": np.zeros(n, int), "weight_albedo": np.ones(n)})
+    facts = {"predictions": 1, "plan": [], "seen_once_share": 0.0}
+    base.json("base.json", {**facts, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()
 
 
