@@ -150,7 +150,8 @@ class CellTable:
         keys = np.ascontiguousarray(np.asarray(keys, np.uint64).reshape(-1))
         if len(keys) >= 1 << 28:
             raise InputError(f"{len(keys)} cells; the table holds fewer than 2^28: use a larger cell edge")
-        if len(np.unique(keys)) != len(keys):
+        ordered = np.sort(keys)  # several times as fast as np.unique, which hashes
+        if (ordered[1:] == ordered[:-1]).any():
             raise InputError("CellTable.build: keys repeat; merge the rows of one cell first")
         size = 1 << max(4, int(4 * len(keys) - 1).bit_length() if len(keys) else 4)
         while (table := cls._place(keys, size)) is None:
@@ -171,9 +172,8 @@ class CellTable:
             if probes == MAX_PROBES:
                 return None
             slot = (h[waiting] + np.uint32(probes) * step[waiting]) & np.uint32(size - 1)
-            free = owner[slot] == EMPTY
-            asked, first = np.unique(slot[free], return_index=True)
-            owner[asked] = waiting[free][first]
+            free = np.flatnonzero(owner[slot] == EMPTY)[::-1]
+            owner[slot[free]] = waiting[free]  # of repeated indices the last value stays: that of the lowest row
             waiting = waiting[owner[slot] != waiting]
             probes += 1
         slots = np.zeros((size, 4), np.uint32)

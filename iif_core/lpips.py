@@ -58,33 +58,56 @@ def lpips(prediction: Array, truth: Array, weights: Weights, mask: Array | None 
         InputError: unknown network, fewer than 64 pixels each way, empty mask, shapes that do not match, values that are not
             finite.
     """
-    import torch
+    several = np.ndim(prediction) > np.ndim(truth)
+    distance = Lpips(truth, weights, mask, network)
+    return np.array([distance(image) for image in prediction], np.float64) if several else np.float64(distance(prediction))
 
-    if network not in NETWORKS:
-        raise InputError(f"LPIPS network {network!r}: unknown; allowed: {', '.join(NETWORKS)}")
-    truth = np.asarray(truth)
-    several = np.ndim(prediction) > truth.ndim
-    images = np.asarray(prediction) if several else np.asarray(prediction)[None]
-    if images.shape[1:] != truth.shape or truth.ndim not in (2, 3) or (truth.ndim == 3 and truth.shape[2] != 3):
-        raise InputError(f"LPIPS: prediction {np.shape(prediction)}, truth {truth.shape}; needed (H, W, 3) or (H, W) of both")
-    height, width = truth.shape[:2]
-    if min(height, width) < MIN_SIZE:
-        raise InputError(f"LPIPS of a {width}x{height} image: at least {MIN_SIZE} pixels are needed each way")
-    mask = np.ones((height, width), bool) if mask is None else np.asarray(mask, bool)
-    if mask.shape != (height, width) or not mask.any():
-        raise InputError(f"LPIPS: mask {mask.shape} with {np.count_nonzero(mask)} pixels; needed {(height, width)}, not empty")
-    truth, images = (a if truth.ndim == 3 else np.repeat(a[..., None], 3, -1) for a in (truth, images))
-    truth = np.where(mask[..., None], truth, np.nan_to_num(truth, posinf=1.0))
-    images = np.where(mask[..., None], images, truth)
-    if not (np.isfinite(truth).all() and np.isfinite(images).all()):
-        raise InputError("LPIPS: an image is not finite where the mask counts it")
-    parts = _as_torch(weights, network)
-    with torch.inference_mode():
-        counted = torch.from_numpy(mask[None, None].astype(np.float32))
-        reference = _activations(_input(truth[None]), parts, network)
-        # One image after the other: batches would be no faster on a CPU, only larger.
-        out = [_distance(_activations(_input(image[None]), parts, network), reference, parts, counted) for image in images]
-    return np.array(out, np.float64) if several else np.float64(out[0])
+
+class Lpips:
+    """LPIPS against one truth, which goes through the network once; arguments and errors as of `lpips`."""
+
+    def __init__(self, truth: Array, weights: Weights, mask: Array | None = None, network: str = "alex"):
+        import torch
+
+        if network not in NETWORKS:
+            raise InputError(f"LPIPS network {network!r}: unknown; allowed: {', '.join(NETWORKS)}")
+        truth = np.asarray(truth)
+        if truth.ndim not in (2, 3) or (truth.ndim == 3 and truth.shape[2] != 3):
+            raise InputError(f"LPIPS: truth {truth.shape}; needed (H, W, 3) or (H, W)")
+        height, width = truth.shape[:2]
+        if min(height, width) < MIN_SIZE:
+            raise InputError(f"LPIPS of a {width}x{height} image: at least {MIN_SIZE} pixels are needed each way")
+        mask = np.ones((height, width), bool) if mask is None else np.asarray(mask, bool)
+        if mask.shape != (height, width) or not mask.any():
+            raise InputError(
+                f"LPIPS: mask {mask.shape} with {np.count_nonzero(mask)} pixels; needed {(height, width)}, not empty"
+            )
+        self.network, self.mask, self._shape = network, mask, truth.shape
+        self.parts = _as_torch(weights, network)
+        truth = _three(truth)
+        self.truth = np.where(mask[..., None], truth, np.nan_to_num(truth, posinf=1.0))
+        with torch.inference_mode():
+            self.counted = torch.from_numpy(mask[None, None].astype(np.float32))
+            self.reference = self._activations(self.truth)
+
+    def _activations(self, image: Array) -> list[Any]:
+        if not np.isfinite(image).all():
+            raise InputError("LPIPS: an image is not finite where the mask counts it")
+        return _activations(_input(image[None]), self.parts, self.network)
+
+    def __call__(self, prediction: Array) -> float:
+        import torch
+
+        prediction = np.asarray(prediction)
+        if prediction.shape != self._shape:
+            raise InputError(f"LPIPS: prediction {prediction.shape}, truth {self._shape}; needed (H, W, 3) or (H, W) of both")
+        image = np.where(self.mask[..., None], _three(prediction), self.truth)
+        with torch.inference_mode():
+            return _distance(self._activations(image), self.reference, self.parts, self.counted)
+
+
+def _three(image: Array) -> Array:
+    return image if image.ndim == 3 else np.repeat(image[..., None], 3, -1)
 
 
 def _as_torch(weights: Weights, network: str) -> dict[str, Any]:
@@ -97,15 +120,18 @@ def _as_torch(weights: Weights, network: str) -> dict[str, Any]:
     missing = [name for name in names if name not in weights]
     if missing:
         raise InputError(f"LPIPS weights of {network}: {missing[0]} is missing ({len(missing)} of {len(names)})")
-    return {name: torch.from_numpy(np.asarray(weights[name]).astype(np.float32)) for name in names}
+    parts = {name: torch.from_numpy(np.array(weights[name], np.float32)) for name in names}
+    # Channels last: a quarter faster on a CPU.
+    return {name: p.contiguous(memory_format=torch.channels_last) if p.ndim == 4 else p for name, p in parts.items()}
 
 
 def _input(images: Array) -> Any:
     """(n, H, W, 3) in [0, 1] -> (n, 3, H, W) as the networks were trained on."""
     import torch
 
-    scaled = (np.clip(images, 0, 1) * 2 - 1 - np.array(_SHIFT)) / np.array(_SCALE)
-    return torch.from_numpy(np.ascontiguousarray(scaled.transpose(0, 3, 1, 2), np.float32))
+    scale, shift = np.array(_SCALE), np.array(_SHIFT)
+    scaled = np.clip(images, 0, 1) * (2 / scale) - (1 + shift) / scale
+    return torch.from_numpy(scaled.astype(np.float32)).permute(0, 3, 1, 2)  # in memory the channels stay last
 
 
 def _activations(x: Any, parts: dict[str, Any], network: str) -> list[Any]:

@@ -17,13 +17,16 @@ with `value=None` and the reason, never a NaN. Not quantised to 8 bits (the refe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from .errors import InputError
-from .lpips import Weights, lpips
+from .filters import correlate
+from .flip import Seen, difference
+from .lpips import Lpips, Weights
 
 Array = np.ndarray
 
@@ -53,6 +56,8 @@ METRICS_OF = {
 }
 LPIPS_NETWORKS = {"lpips": "alex", "lpips_vgg": "vgg"}
 """The paper reports LPIPS with VGG16; AlexNet is what its authors recommend, and a twentieth of the work."""
+
+PERCEPTUAL = ("flip", *LPIPS_NETWORKS)
 
 _MIN_MEAN = 1e-4  # H36: a darker prediction is not scaled
 _SCORED_MIN = 1e-6  # emission below this is no emission
@@ -104,7 +109,10 @@ def l2(prediction: Array, truth: Array, mask: Array) -> float:
 
 def psnr(prediction: Array, truth: Array, mask: Array) -> float:
     """10 log10(1 / MSE) in dB, data range 1, at most 100. Example: every pixel 0.1 off -> 20."""
-    error = l2(prediction, truth, mask)
+    return _decibel(l2(prediction, truth, mask))
+
+
+def _decibel(error: float) -> float:
     return PSNR_CAP if error <= 10 ** (-PSNR_CAP / 10) else float(-10 * np.log10(error))
 
 
@@ -119,48 +127,58 @@ def ssim(prediction: Array, truth: Array, mask: Array) -> float:
     Raises:
         InputError: an image smaller than the window.
     """
-    from skimage.metrics import structural_similarity
-
-    if min(mask.shape) < SSIM_WINDOW:
-        raise InputError(f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way")
-    inside = mask if mask.ndim == truth.ndim else mask[..., None]
-    truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
-    filled = np.where(inside, prediction, truth).astype(np.float32)
-    _, similarity = structural_similarity(
-        truth,
-        filled,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
-        data_range=1.0,
-        channel_axis=2 if truth.ndim == 3 else None,
-        full=True,
-    )
-    border = SSIM_WINDOW // 2
-    interior = np.zeros(mask.shape, bool)
-    interior[border:-border, border:-border] = True
-    counted = mask & interior if (mask & interior).any() else mask
-    return float(similarity[counted].mean(dtype=np.float64))
+    truth = np.where(np.isfinite(truth), truth, 0)
+    return _Structure(truth, mask).similarity(np.where(mask if mask.ndim == truth.ndim else mask[..., None], prediction, truth))
 
 
-def has_flip() -> bool:
-    """Whether the optional package `flip-evaluator` is installed."""
-    from importlib.util import find_spec
+class _Structure:
+    """A truth and the moments of its windows."""
 
-    return find_spec("flip_evaluator") is not None
+    def __init__(self, truth: Array, mask: Array):
+        if min(mask.shape) < SSIM_WINDOW:
+            raise InputError(
+                f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way"
+            )
+        x = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+        self.window = np.exp(-x * x / (2 * 1.5**2))
+        self.window /= self.window.sum()
+        self.truth = _planes(truth)
+        self.moments = [(self._mean(t), self._mean(t * t)) for t in self.truth]
+        border = SSIM_WINDOW // 2
+        interior = np.zeros(mask.shape, bool)
+        interior[border:-border, border:-border] = True
+        self.counted = mask & interior if (mask & interior).any() else mask
+
+    def _mean(self, plane: Array) -> Array:
+        return correlate(plane, self.window, self.window, "symmetric")
+
+    def similarity(self, filled: Array) -> float:
+        """`filled`: the prediction, with the truth where the mask does not count."""
+        total = 0.0
+        for p, t, (mean_t, square_t) in zip(_planes(filled), self.truth, self.moments, strict=True):
+            mean_p, square_p, product = self._mean(p), self._mean(p * p), self._mean(p * t)
+            means, product_of_means = mean_p * mean_p + mean_t * mean_t, mean_p * mean_t
+            local = (2 * product_of_means + 0.01**2) * (2 * (product - product_of_means) + 0.03**2)
+            local /= (means + 0.01**2) * (square_p + square_t - means + 0.03**2)
+            total += local[self.counted].mean()
+        return float(total / len(self.truth))
+
+
+def _planes(image: Array) -> Array:
+    """(channels, H, W) float64 of (H, W) or (H, W, channels)."""
+    image = np.asarray(image, np.float64)
+    return image[None] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(image, -1, 0))
 
 
 def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) -> float:
-    """LDR-FLIP (Andersson et al. 2020), mean over the masked pixels, 0 = same; needs `flip-evaluator`.
+    """LDR-FLIP (`iif_core.flip`), mean over the masked pixels, 0 = same.
 
     Pixels that do not count get the truth on both sides. `encoded`: the images are sRGB-encoded, else linear.
     """
-    from flip_evaluator import evaluate
-
-    truth = np.where(np.isfinite(truth), truth, 0).astype(np.float32)
-    filled = np.where(mask[..., None], np.clip(prediction, 0, 1), truth).astype(np.float32)
-    error, _, _ = evaluate(np.clip(truth, 0, 1), filled, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False)
-    return float(np.asarray(error)[..., 0][mask].mean(dtype=np.float64))
+    truth = np.where(np.isfinite(truth), truth, 0)
+    filled = np.where(mask[..., None], prediction, truth)
+    images = (Seen(np.clip(image, 0, 1), encoded) for image in (filled, truth))
+    return float(difference(*images)[mask].mean(dtype=np.float64))
 
 
 def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
@@ -186,11 +204,13 @@ def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1
     0 would erase what was wrongly found there. `limit=None`: not clamped above.
     """
     prediction = np.asarray(prediction, np.float64)
-    mean_prediction = prediction[mask].mean(0)
-    mean_truth = np.asarray(truth, np.float64)[mask].mean(0)
+    return _gained(prediction, prediction[mask].mean(0), np.asarray(truth, np.float64)[mask].mean(0), limit)
+
+
+def _gained(values: Array, mean_prediction: Array, mean_truth: Array, limit: float | None) -> Array:
     known = (mean_prediction >= _MIN_MEAN) & (mean_truth > 0)
     gain = np.where(known, mean_truth / np.maximum(mean_prediction, _MIN_MEAN), 1.0)
-    return np.clip(prediction * gain, 0, limit)
+    return np.clip(values * gain, 0, limit)
 
 
 def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
@@ -204,26 +224,47 @@ def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array
         object_id: (H, W) int; -1 forms one object.
         ridge: added variance; 1e-6 = differences of 0.001 are not stretched.
     """
-    x = np.asarray(prediction, np.float64).reshape(*mask.shape, -1)
+    x = np.array(prediction, np.float64).reshape(*mask.shape, -1)
     y = np.asarray(truth, np.float64).reshape(*mask.shape, -1)
-    out = x.copy()
     if mask.any():
-        objects, o = np.unique(object_id[mask], return_inverse=True)
-        xs, ys, n = x[mask], y[mask], len(objects)
-        count = np.bincount(o, minlength=n)
-        mean_x, mean_y = (_sums(o, v, n) / count[:, None] for v in (xs, ys))
-        dx, dy = xs - mean_x[o], ys - mean_y[o]
-        s_xx = _sums(o, (dx[:, :, None] * dx[:, None, :]).reshape(len(o), -1), n).reshape(n, x.shape[-1], -1)
-        s_xy = _sums(o, (dx[:, :, None] * dy[:, None, :]).reshape(len(o), -1), n).reshape(n, x.shape[-1], -1)
-        s_xx += ridge * count[:, None, None] * np.eye(x.shape[-1])
-        slope = np.linalg.solve(s_xx, s_xy)  # (objects, channels of x, channels of y)
-        out[mask] = np.clip(np.einsum("ni,nij->nj", dx, slope[o]) + mean_y[o], 0, 1)
-    return out.reshape(np.shape(prediction))
+        x[mask] = _Groups(object_id[mask], y[mask]).nearest(x[mask], ridge)
+    return x.reshape(np.shape(prediction))
 
 
-def _sums(group: Array, values: Array, n: int) -> Array:
-    """(n, k) sums of (m, k) values by group."""
-    return np.stack([np.bincount(group, values[:, i], n) for i in range(values.shape[1])], -1)
+class _Groups:
+    """Pixels by object: `group` (n,) int, `truth` (n, channels) float64."""
+
+    def __init__(self, group: Array, truth: Array):
+        self.order = np.argsort(group, kind="stable")
+        ordered = group[self.order]
+        self.starts = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
+        self.count = np.diff(np.r_[self.starts, len(group)])
+        self.mean_y, self.dy = self._centred(truth)
+
+    def _centred(self, values: Array) -> tuple[Array, Array]:
+        """Means (groups, channels), and what is left, (channels, n) in the order of the groups."""
+        ordered = np.ascontiguousarray(values[self.order].T)
+        mean = np.add.reduceat(ordered, self.starts, 1) / self.count
+        return mean.T, ordered - np.repeat(mean, self.count, 1)
+
+    def nearest(self, values: Array, ridge: float = 1e-6) -> Array:
+        """(n, channels) `values` mapped by the affine of their group that is nearest to the truth, in [0, 1]."""
+        _, dx = self._centred(values)
+        n, m = len(dx), len(self.dy)
+        s_xx, s_xy = np.empty((len(self.count), n, n)), np.empty((len(self.count), n, m))
+        for i in range(n):
+            for j in range(i + 1):
+                s_xx[:, i, j] = s_xx[:, j, i] = np.add.reduceat(dx[i] * dx[j], self.starts)
+            for j in range(m):
+                s_xy[:, i, j] = np.add.reduceat(dx[i] * self.dy[j], self.starts)
+        s_xx += ridge * self.count[:, None, None] * np.eye(n)
+        slope = np.linalg.solve(s_xx, s_xy)  # (groups, channels of x, channels of y)
+        mapped = np.repeat(self.mean_y.T, self.count, 1)
+        for i in range(n):
+            mapped += np.repeat(slope[:, i].T, self.count, 1) * dx[i]
+        out = np.empty((len(values), m))
+        out[self.order] = np.clip(mapped, 0, 1).T
+        return out
 
 
 # ----------------------------------------------------------------------------------------------------------- one image
@@ -239,80 +280,165 @@ def score_map(
     encoded: bool = False,
     networks: Mapping[str, Weights] | None = None,
 ) -> list[Score]:
-    """Every score of one map under every protocol that applies to its quantity.
+    """Every score of one map under every protocol that applies to its quantity; see `Target`."""
+    return Target(quantity, truth, mask, object_id, encoded, networks).scores(prediction, metrics)
+
+
+class Target:
+    """A true map and the pixels that count; what the scores need of them is computed once, for any number of predictions.
 
     Args:
         quantity: `albedo`, `roughness`, `metallic`, `emission` or `rgb`.
-        prediction, truth: (H, W, 3), or (H, W) for roughness and metallic.
+        truth: (H, W, 3), or (H, W) for roughness and metallic.
         mask: (H, W) bool, pixels that count.
         object_id: (H, W) int, for `oracle_affine`; without it that protocol is left out.
-        metrics: default: all of the quantity; FLIP only where its package is installed, LPIPS where its network is given.
         encoded: images are sensor values, not linear (matters to FLIP only; LPIPS takes every image as it is).
         networks: `alex` and `vgg` -> weights of LPIPS (`iif_core.lpips`).
 
     Raises:
         InputError: unknown quantity, or shapes that do not match.
     """
-    if quantity not in PROTOCOLS_OF:
-        raise InputError(f"score of {quantity!r}: unknown quantity; allowed: {', '.join(PROTOCOLS_OF)}")
-    if np.shape(prediction) != np.shape(truth) or np.shape(truth)[:2] != np.shape(mask):
-        raise InputError(
-            f"score of {quantity}: prediction {np.shape(prediction)}, truth {np.shape(truth)}, mask {np.shape(mask)};"
-            " they must share height, width and channels"
-        )
-    wanted = tuple(METRICS_OF[quantity] if metrics is None else metrics)
-    wanted = tuple(m for m in wanted if m != "flip" or has_flip())
-    networks = networks or {}
-    wanted = tuple(m for m in wanted if m not in LPIPS_NETWORKS or LPIPS_NETWORKS[m] in networks)
-    protocols = [p for p in PROTOCOLS_OF[quantity] if p != "oracle_affine" or object_id is not None]
-    problem = _problem(prediction, truth, mask)
-    if problem:
-        return [Score(m, protocol, None, problem) for protocol in protocols for m in wanted if m != "iou" or protocol == "raw"]
-    images = {}
-    for protocol in protocols:
-        images[protocol] = np.asarray(prediction, np.float64)
+
+    def __init__(
+        self,
+        quantity: str,
+        truth: Array,
+        mask: Array,
+        object_id: Array | None = None,
+        encoded: bool = False,
+        networks: Mapping[str, Weights] | None = None,
+    ):
+        if quantity not in PROTOCOLS_OF:
+            raise InputError(f"score of {quantity!r}: unknown quantity; allowed: {', '.join(PROTOCOLS_OF)}")
+        self.quantity, self.truth, self.mask, self.encoded = quantity, np.asarray(truth), np.asarray(mask, bool), encoded
+        if self.truth.shape[:2] != self.mask.shape:
+            raise InputError(
+                f"score of {quantity}: truth {self.truth.shape}, mask {self.mask.shape}; they must share height, width"
+            )
+        self.networks = networks or {}
+        self._object_id = None if object_id is None else np.asarray(object_id)
+
+    def scores(
+        self, prediction: Array, metrics: Iterable[str] | None = None, perceptual: Container[str] = PROTOCOLS
+    ) -> list[Score]:
+        """Scores of one prediction, (H, W, 3) or (H, W) as the truth, under every protocol that applies to the quantity.
+
+        Args:
+            metrics: default: all of the quantity; LPIPS only where its network is given.
+            perceptual: protocols under which FLIP and LPIPS, which take most of the time, are computed.
+
+        Raises:
+            InputError: shapes that do not match.
+        """
+        prediction = np.asarray(prediction)
+        if prediction.shape != self.truth.shape:
+            raise InputError(
+                f"score of {self.quantity}: prediction {prediction.shape}, truth {self.truth.shape}, mask {self.mask.shape};"
+                " they must share height, width and channels"
+            )
+        wanted = tuple(METRICS_OF[self.quantity] if metrics is None else metrics)
+        wanted = tuple(m for m in wanted if m not in LPIPS_NETWORKS or LPIPS_NETWORKS[m] in self.networks)
+        plan = [
+            (protocol, metric)
+            for protocol in PROTOCOLS_OF[self.quantity]
+            if protocol != "oracle_affine" or self._object_id is not None
+            for metric in wanted
+            if (metric != "iou" or protocol == "raw")  # a mask has no scale
+            and (metric not in PERCEPTUAL or protocol in perceptual)
+        ]
+        values = self._at(prediction)
+        problem = self._problem(values)
+        if problem:
+            return [Score(metric, protocol, None, problem) for protocol, metric in plan]
+        out, image, at = [], None, ""
+        for protocol, metric in plan:
+            if protocol != at:
+                image, at = _Candidate(self, self._under(protocol, values)), protocol
+            out.append(self._score(metric, protocol, image))
+        return out
+
+    @cached_property
+    def _counted(self) -> Array:
+        """(n, channels) float64 truth of the pixels that count."""
+        return self._at(self.truth)
+
+    def _at(self, image: Array) -> Array:
+        return image[self.mask].astype(np.float64).reshape(-1, image.shape[2] if image.ndim == 3 else 1)
+
+    def _problem(self, values: Array) -> str:
+        if not len(values):
+            return "no pixel counts"
+        for name, image in (("prediction", values), ("truth", self._counted)):
+            bad = image.size - np.count_nonzero(np.isfinite(image))
+            if bad:
+                return f"{name} is not finite in {bad} values"
+        return ""
+
+    def _under(self, protocol: str, values: Array) -> Array:
         if protocol == "scaled":
-            images[protocol] = scaled(prediction, truth, mask, None if quantity == "emission" else 1.0)
-        elif protocol == "oracle_affine":
-            assert object_id is not None
-            images[protocol] = oracle_affine(prediction, truth, mask, object_id)
-    learned = {m: _lpips(m, images, truth, mask, networks) for m in wanted if m in LPIPS_NETWORKS}
-    out = []
-    for protocol, image in images.items():
-        for metric in wanted:
-            if metric in learned:
-                out.append(learned[metric][protocol])
-            elif metric != "iou" or protocol == "raw":  # a mask has no scale
-                out.append(_score(metric, protocol, image, truth, mask, encoded))
-    return out
+            return _gained(values, values.mean(0), self._counted.mean(0), None if self.quantity == "emission" else 1.0)
+        return self._groups.nearest(values) if protocol == "oracle_affine" else values
+
+    @cached_property
+    def _groups(self) -> _Groups:
+        assert self._object_id is not None
+        return _Groups(self._object_id[self.mask], self._counted)
+
+    @cached_property
+    def _everywhere(self) -> Array:
+        """The truth, 0 where it is not finite (such pixels do not count)."""
+        return np.where(np.isfinite(self.truth), self.truth, 0).astype(np.float64)
+
+    @cached_property
+    def _structure(self) -> _Structure:
+        return _Structure(self._everywhere, self.mask)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        return Seen(np.clip(self._everywhere, 0, 1), self.encoded)
+
+    @cached_property
+    def _learned(self) -> dict[str, Lpips]:
+        return {}
+
+    def _distance(self, network: str) -> Lpips:
+        if network not in self._learned:
+            self._learned[network] = Lpips(self.truth, self.networks[network], self.mask, network)
+        return self._learned[network]
+
+    def _score(self, metric: str, protocol: str, image: _Candidate) -> Score:
+        try:
+            if metric == "ssim":
+                value = self._structure.similarity(image.filled)
+            elif metric == "flip":
+                seen = Seen(np.clip(image.filled, 0, 1), self.encoded)
+                value = difference(seen, self._seen)[self.mask].mean(dtype=np.float64)
+            elif metric in LPIPS_NETWORKS:
+                value = self._distance(LPIPS_NETWORKS[metric])(image.filled)
+            elif metric in ("l2", "psnr"):
+                value = image.l2 if metric == "l2" else _decibel(image.l2)
+            else:
+                everything = np.ones(len(image.values), bool)
+                value = {"log_l2": log_l2, "iou": iou}[metric](image.values, self._counted, everything)
+        except InputError as error:
+            return Score(metric, protocol, None, str(error))
+        return Score(metric, protocol, float(value))
 
 
-def _lpips(metric: str, images: dict[str, Array], truth: Array, mask: Array, networks: Mapping[str, Weights]) -> dict[str, Score]:
-    """One score a protocol; the truth goes through the network once."""
-    network = LPIPS_NETWORKS[metric]
-    try:
-        values = lpips(np.stack(list(images.values())), truth, networks[network], mask, network)
-    except InputError as error:
-        return {protocol: Score(metric, protocol, None, str(error)) for protocol in images}
-    return {protocol: Score(metric, protocol, float(value)) for protocol, value in zip(images, values, strict=True)}
+class _Candidate:
+    """A prediction under one protocol: `values` (n, channels) of the pixels that count."""
 
+    def __init__(self, target: Target, values: Array):
+        self.target, self.values = target, values
 
-def _problem(prediction: Array, truth: Array, mask: Array) -> str:
-    if not mask.any():
-        return "no pixel counts"
-    for name, image in (("prediction", prediction), ("truth", truth)):
-        bad = np.count_nonzero(~np.isfinite(image[mask]))
-        if bad:
-            return f"{name} is not finite in {bad} values"
-    return ""
+    @cached_property
+    def l2(self) -> float:
+        difference = self.values - self.target._counted
+        return float(np.mean(difference * difference))
 
-
-_FUNCTIONS = {"l2": l2, "psnr": psnr, "ssim": ssim, "log_l2": log_l2, "iou": iou}
-
-
-def _score(metric: str, protocol: str, image: Array, truth: Array, mask: Array, encoded: bool) -> Score:
-    try:
-        value = flip(image, truth, mask, encoded) if metric == "flip" else _FUNCTIONS[metric](image, truth, mask)
-    except InputError as error:
-        return Score(metric, protocol, None, str(error))
-    return Score(metric, protocol, float(value))
+    @cached_property
+    def filled(self) -> Array:
+        """The whole image, the truth where a pixel does not count."""
+        image = self.target._everywhere.copy()
+        image[self.target.mask] = self.values if image.ndim == 3 else self.values[:, 0]
+        return image

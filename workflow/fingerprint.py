@@ -12,6 +12,8 @@ import hashlib
 import importlib
 import importlib.util
 import json
+import sys
+import threading
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -42,8 +44,7 @@ PLUGINS = {
 }
 # Modules that know (and check) further input files of a stage.
 FILE_MODULES = {"emission": ("workflow.response_file",)}
-# Files that a stage reads if they are there.
-OPTIONAL_FILES = {"base_scores": (Path("results/weights/lpips_vgg.npz"),)}
+VGG = Path("results/weights/lpips_vgg.npz")
 
 
 def module_file(module: str) -> Path | None:
@@ -60,33 +61,76 @@ def is_infrastructure(module: str) -> bool:
     return module in PACKAGES or any(module == name or module.startswith(name + ".") for name in INFRASTRUCTURE)
 
 
+_CODE = Path("results/.code-digests.json")
+_remembered: dict[str, list[Any]] = {}  # module -> [sha256 of its source, digest of its code, names that it imports]
+_unsaved = False
+_lock = threading.Lock()  # stages read their upstream from several threads
+
+
 @lru_cache(None)
-def _tree(module: str) -> ast.Module | None:
+def _recall() -> None:
+    """Take over what an earlier process found with the same Python and the same text of this module."""
+    try:
+        document = json.loads(_CODE.read_text())
+        if document["by"] == _reader_of_code():
+            _remembered.update(document["modules"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+
+
+def _reader_of_code() -> str:
+    return f"{sys.version_info[:3]} {sha256_of(Path(__file__))}"
+
+
+def _save() -> None:
+    global _unsaved
+    with _lock:
+        if _unsaved:
+            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
+            _unsaved = False
+
+
+@lru_cache(None)
+def _facts(module: str) -> tuple[str, tuple[str, ...]]:
+    """Digest of a module's code, and the names within our packages that it imports anywhere in its source.
+
+    Reading all modules takes longer than some stages, so it is remembered by the sha256 of the source.
+    """
+    global _unsaved
     path = module_file(module)
-    return ast.parse(path.read_text(), str(path)) if path else None
+    if path is None:
+        return "", ()
+    _recall()
+    source = sha256_of(path)
+    found = _remembered.get(module)
+    if found is None or found[0] != source:
+        tree = ast.parse(path.read_text(), str(path))
+        names = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
+        found = [source, _digest_of(tree), sorted(names)]
+        with _lock:
+            _remembered[module], _unsaved = found, True
+    return found[1], tuple(found[2])
+
+
+def _imported(tree: ast.Module, package: str) -> set[str]:
+    out: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            out.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
+            out.update([base or "", *(f"{base}.{alias.name}" for alias in node.names)])
+    return {name for name in out if name.split(".")[0] in PACKAGES}
 
 
 @lru_cache(None)
 def direct_imports(module: str) -> frozenset[str]:
     """Our modules that `module` imports anywhere in its source (also inside functions)."""
-    tree = _tree(module)
-    if tree is None:
-        return frozenset()
-    path = module_file(module)
-    package = module if path and path.name == "__init__.py" else module.rpartition(".")[0]
     found: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
-            names = [base or ""] + [f"{base}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            if name.split(".")[0] in PACKAGES and module_file(name):
-                parts = name.split(".")
-                found.update(".".join(parts[: i + 1]) for i in range(len(parts)))
+    for name in _facts(module)[1]:
+        if module_file(name):
+            parts = name.split(".")
+            found.update(".".join(parts[: i + 1]) for i in range(len(parts)))
     return frozenset(name for name in found if module_file(name))
 
 
@@ -103,11 +147,7 @@ def import_closure(*modules: str) -> list[str]:
     return sorted(seen)
 
 
-@lru_cache(None)
-def _module_digest(module: str) -> str:
-    tree = _tree(module)
-    if tree is None:
-        return ""
+def _digest_of(tree: ast.Module) -> str:
     for node in ast.walk(tree):  # docstrings and comments do not change results
         body = getattr(node, "body", None)
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body:
@@ -132,7 +172,8 @@ def code_digest(stage: str, settings: dict[str, Any]) -> str:
 
 def modules_digest(modules: list[str]) -> str:
     """Digest of the code of some modules."""
-    parts = [f"{module}:{_module_digest(module)}" for module in modules]
+    parts = [f"{module}:{_facts(module)[0]}" for module in modules]
+    _save()
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
@@ -161,7 +202,8 @@ def raw_digest(paths: list[Path]) -> str:
 
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     """Input files from outside that a stage reads; the source (or prior) module knows them and checks them first."""
-    out = [path for path in OPTIONAL_FILES.get(stage, ()) if path.is_file()]
+    wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
+    out = [VGG] if wants_vgg and VGG.is_file() else []
     if stage == "relight":
         out.extend(settings_module.relight_files(document))
     for section, key, pattern in PLUGINS.get(stage, ()):

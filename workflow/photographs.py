@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, 
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.response_file import read_response_file
+
+if TYPE_CHECKING:
+    from iif_core.transport import CellMaterials, Geometry
 
 TILE = 8
 """Pixels of one object in one tile of this edge are averaged into one row (COMPUTE 4)."""
@@ -46,6 +50,11 @@ class Photographs:
 
     def pixels(self, view: View) -> ViewPixels:
         return view_pixels(self.job, self.capture, self.scene, view)
+
+    @cached_property
+    def world(self) -> tuple[Geometry, CellMaterials]:
+        """Geometry and materials on the device, made once."""
+        return self.scene.traceable()
 
     def radiance(self, view: View, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self.sensor.radiance(value, self.exposures[view.view_id])
@@ -147,7 +156,7 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
 
 def escaping_share(photos: Photographs) -> float:
     """Share of cosine-distributed directions from visible surface that leave the mesh (METHOD 8, epsilon_2)."""
-    geometry, _ = photos.scene.traceable()
+    geometry, _ = photos.world
     from iif_core.transport import trace
 
     rng = np.random.default_rng([photos.job.seed, SEEDS])

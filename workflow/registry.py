@@ -32,7 +32,7 @@ STAGES: dict[str, Stage] = {
         Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
         Stage("segmentation", ("capture",), ("segmentation",)),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
-        Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics",), reads_raw=True, on_demand=True),
+        Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics.views",), reads_raw=True, on_demand=True),
         Stage(
             "emission",
             ("capture", "segmentation", "base"),
@@ -53,7 +53,9 @@ STAGES: dict[str, Stage] = {
             reads_raw=True,
             on_demand=True,
         ),
-        Stage("metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",)),
+        Stage(
+            "metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",), reads_raw=True
+        ),
         Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(
             "report",

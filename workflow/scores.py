@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,7 +65,7 @@ class MaterialTruth:
     """What the material maps of a view are compared with."""
 
     truth: Truth
-    targets: dict[str, np.ndarray]  # quantity -> (H, W, 3) or (H, W)
+    targets: dict[str, metrics.Target]  # by quantity
     masks: dict[str, np.ndarray]  # quantity, or emission -> (H, W) bool
     object_id: np.ndarray  # (H, W) int32
 
@@ -73,21 +73,30 @@ class MaterialTruth:
         self,
         maps: dict[str, np.ndarray],
         quantity: str,
-        networks: Mapping[str, Weights] | None = None,
         only: Iterable[str] | None = None,
+        perceptual: Container[str] = metrics.PROTOCOLS,
     ) -> list[metrics.Score]:
-        """Every score of one quantity (or the `only` ones) under every protocol."""
-        target, mask = self.targets[quantity], self.masks[quantity]
-        return metrics.score_map(quantity, maps[quantity], target, mask, self.object_id, only, networks=networks)
+        """Every score of one quantity (or the `only` ones) under every protocol; FLIP and LPIPS under `perceptual`."""
+        return self.targets[quantity].scores(maps[quantity], only, perceptual)
 
 
-def material_truth(capture: CaptureReader, segmentation: StageReader, view: View) -> MaterialTruth:
-    """Targets, masks and objects of a view of a capture that has truth."""
+def material_truth(
+    capture: CaptureReader,
+    segmentation: StageReader,
+    view: View,
+    networks: Mapping[str, Mapping[str, Weights]] | None = None,
+) -> MaterialTruth:
+    """Targets, masks and objects of a view of a capture that has truth; `networks`: quantity -> what LPIPS is scored with."""
     truth = capture.truth(view)
     _, face_id = capture.gbuffer(view)
     masks = metrics.material_masks(truth.valid, face_id >= 0, truth.emission, truth.roughness)
-    targets = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
-    return MaterialTruth(truth, targets, masks, ids_from_disk(segmentation.exr(f"maps/{view.name}.exr")["object.id"]))
+    object_id = ids_from_disk(segmentation.exr(f"maps/{view.name}.exr")["object.id"])
+    maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
+    targets = {
+        quantity: metrics.Target(quantity, image, masks[quantity], object_id, networks=(networks or {}).get(quantity))
+        for quantity, image in maps.items()
+    }
+    return MaterialTruth(truth, targets, masks, object_id)
 
 
 def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
@@ -109,7 +118,8 @@ def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarra
     import torch
 
     torch.set_num_threads(1)  # a convolution's last bits depend on how many threads share it
-    return lpips_weights(with_vgg)
+    weights = lpips_weights(with_vgg)
+    return {name: {part: np.asarray(array, np.float32) for part, array in parts.items()} for name, parts in weights.items()}
 
 
 _CHANNELS_OF = {"albedo": CHANNELS[:3], "roughness": CHANNELS[3:4], "metallic": CHANNELS[4:]}
@@ -127,7 +137,7 @@ def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageRea
         truth = material_truth(capture, segmentation, view)
         for quantity, summed in sums.items():
             mask = truth.masks[quantity] & (cell >= 0)
-            target = truth.targets[quantity][mask].reshape(np.count_nonzero(mask), -1)
+            target = truth.targets[quantity].truth[mask].reshape(np.count_nonzero(mask), -1)
             summed[:, 0] += np.bincount(cell[mask], minlength=n)
             for c in range(target.shape[1]):
                 summed[:, 1 + c] += np.bincount(cell[mask], target[:, c], n)

@@ -406,6 +406,9 @@ class Metrics(Section):
 
     views: Literal["all"] = "all"
     """Views that are scored."""
+    lpips_vgg: bool = False
+    """Score albedo (of the result, the base and the first prediction; as it is and scaled) also with LPIPS on VGG16, as the
+    paper does. Needs its weights: `snakemake --cores 1 results/weights/lpips_vgg.npz`. Triples the time of the stage."""
 
 
 class Export(Section):

@@ -98,3 +98,24 @@ def test_bad_input_is_named():
         cells.grid_origin(np.zeros((0, 3)), 1)
     assert cells.CellTable.build([]).lookup([1, 2]).tolist() == [-1, -1]
     assert cells.voxel_indices(np.zeros((0, 3)), 1, (0, 0, 0)).shape == (0, 3)
+
+
+def test_lowest_row_gets_a_slot_that_several_ask_for():
+    """The table does not depend on how NumPy orders writes to one place: the same keys, slot by slot, in plain Python."""
+    keys = np.random.default_rng(5).choice(1 << 40, 300, replace=False).astype(np.uint64)
+    table = cells.CellTable.build(keys)
+    low, high = (keys & np.uint64(0xFFFFFFFF)).astype(np.uint32), (keys >> np.uint64(32)).astype(np.uint32)
+    h = cells.hash_words(low, high)
+    step, size = cells.probe_step(h), len(table.slots)
+    owner, waiting = {}, list(range(len(keys)))
+    for probe in range(table.probes):
+        asked = {}
+        for row in waiting:
+            slot = int((int(h[row]) + probe * int(step[row])) % size)
+            if slot not in owner:
+                asked.setdefault(slot, row)
+        owner |= asked
+        waiting = [row for row in waiting if row not in owner.values()]
+    assert not waiting
+    found = {int(slot): int(table.slots[slot, 2]) for slot in np.flatnonzero(table.slots[:, 2] != cells.EMPTY)}
+    assert found == owner

@@ -1,6 +1,7 @@
 """Fingerprints: they change when, and only when, a result may."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -124,3 +125,44 @@ def test_raw_digest_follows_content_not_time(tmp_path, monkeypatch):
     assert fp.raw_digest([photo]) == first
     photo.write_bytes(b"two")
     assert fp.raw_digest([photo]) != first
+
+
+def test_weights_of_vgg_count_where_they_are_read(checkout):
+    code, run = checkout
+    weights = run / "results/weights/lpips_vgg.npz"
+    weights.parent.mkdir(parents=True)
+
+    def with_and_without():
+        weights.write_bytes(b"weights")
+        present = fingerprints(code, run)
+        weights.unlink()
+        return changed(present, fingerprints(code, run))
+
+    assert with_and_without() == below("base_scores")
+    (run / "config/scenes/t.yaml").write_text(SCENE + "metrics: {lpips_vgg: true}\n")
+    assert with_and_without() == below("base_scores") | below("metrics")
+
+
+def test_what_is_remembered_of_the_code_changes_nothing(checkout):
+    """Without, with, and with a damaged memory: the same; an edit that keeps size and time stamp is seen."""
+    code, run = checkout
+    memory, affines = run / "results/.code-digests.json", code / "workflow/stages/affines.py"
+    first = fingerprints(code, run)
+    assert memory.is_file() and fingerprints(code, run) == first
+    for damage in ("{", "[]", '{"by": 3}'):
+        memory.write_text(damage)
+        assert fingerprints(code, run) == first
+    memory.unlink()
+    threads = (
+        "from concurrent.futures import ThreadPoolExecutor as P; from workflow import fingerprint as f;"
+        "stages = ['render', 'affines', 'emission', 'base'] * 4;"
+        "list(P(8).map(lambda s: f.fingerprint(s, 't', 'draft'), stages))"
+    )
+    environment = {"PYTHONPATH": str(code), "PATH": "/usr/bin:/bin"}
+    subprocess.run([sys.executable, "-c", threads], cwd=run, env=environment, check=True)
+    before = affines.stat()
+    affines.write_text(affines.read_text() + "\nEXTRA = 1\n")
+    one = fingerprints(code, run)
+    affines.write_text(affines.read_text().replace("EXTRA = 1", "EXTRA = 2"))
+    os.utime(affines, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert changed(first, one) == changed(one, fingerprints(code, run)) == below("affines")

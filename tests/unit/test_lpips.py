@@ -128,8 +128,9 @@ def test_empty_mask_unknown_network_and_lost_weights(alex):
         lpips(a, a, alex, network="vgg")
 
 
-def test_vgg_layers_by_shape():
-    """Random weights of VGG16's shapes: the network is wired as published (13 convolutions, heads of the last of each block)."""
+@pytest.fixture(scope="module")
+def vgg():
+    """Random weights of VGG16's shapes."""
     rng = np.random.default_rng(0)
     sizes = [3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512]
     weights = {}
@@ -138,8 +139,40 @@ def test_vgg_layers_by_shape():
         weights[f"conv{i}.bias"] = np.zeros(m, np.float32)
     for i, n in enumerate([64, 128, 256, 512, 512]):
         weights[f"head{i}"] = np.full(n, 1 / 5, np.float32)
-    value = lpips(image(1), image(2), weights, network="vgg")
-    assert 0.01 < value < 2 and lpips(image(1), image(1), weights, network="vgg") == 0
+    return weights
+
+
+def test_vgg_layers_by_shape(vgg):
+    """The network is wired as published (13 convolutions, heads of the last of each block)."""
+    value = lpips(image(1), image(2), vgg, network="vgg")
+    assert 0.01 < value < 2 and lpips(image(1), image(1), vgg, network="vgg") == 0
+
+
+def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
+    """VGG: albedo of result, base and first prediction, raw and scaled; the result alone has AlexNet everywhere."""
+    from workflow.scores import MATERIALS, MaterialTruth
+    from workflow.stages.metrics import _scores
+
+    truth, mask, objects = image(1), np.ones(image(1).shape[:2], bool), np.zeros(image(1).shape[:2], int)
+    maps = {"albedo": image(2), "roughness": image(2)[..., 0], "metallic": image(2)[..., 1]}
+    images = {"albedo": truth, "roughness": truth[..., 0], "metallic": truth[..., 1]}
+    networks = {"albedo": {"alex": alex, "vgg": vgg}, "roughness": {"alex": alex}, "metallic": {"alex": alex}}
+    targets = {q: metrics.Target(q, images[q], mask, objects, networks=networks[q]) for q in MATERIALS}
+    materials = MaterialTruth(None, targets, {}, objects)
+
+    def found(variant, metric):
+        scores = {q: _scores(materials, variant, maps, q) for q in MATERIALS}
+        return {(q, s.protocol): s.value for q, of in scores.items() for s in of if s.metric == metric}
+
+    visual = {("albedo", "raw"), ("albedo", "scaled")}
+    for variant in ("result", "base", "prior_k0"):
+        values = found(variant, "lpips_vgg")
+        assert set(values) == visual and values["albedo", "raw"] == lpips(maps["albedo"], truth, vgg, network="vgg")
+    assert not found("texel_mean", "lpips_vgg") and not found("texel_mean", "lpips")
+    assert set(found("base", "lpips")) == set(found("object_mean", "flip")) == visual
+    everything = {(q, p) for q in MATERIALS for p in metrics.PROTOCOLS_OF[q]}
+    assert set(found("result", "lpips")) == everything == set(found("prior_k0", "l2"))
+    assert set(found("result", "flip")) == {("albedo", p) for p in metrics.PROTOCOLS}
 
 
 def test_score_map_has_lpips_where_the_network_is_given(alex):

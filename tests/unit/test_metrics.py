@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iif_core import flip
 from iif_core import metrics as m
 from iif_core.errors import InputError
 
@@ -179,11 +180,55 @@ def test_wrong_input_is_refused():
         m.score_map("albedo", image(), image(channels=1), ALL)
 
 
-@pytest.mark.skipif(not m.has_flip(), reason="flip-evaluator is not installed")
 def test_flip_of_equal_images_is_zero():
     truth = image(11)
     assert m.flip(truth, truth, ALL) == 0.0
     assert m.flip(1 - truth, truth, ALL) > 0.2
+
+
+@pytest.mark.parametrize("encoded", [False, True])
+def test_flip_is_the_published_one(encoded):
+    """Against the authors' program, pixel by pixel; a black, a smooth and a noisy pair."""
+    evaluate = pytest.importorskip("flip_evaluator").evaluate
+    rng = np.random.default_rng(12)
+    ramp = np.stack(np.meshgrid(np.linspace(0, 1, 70), np.linspace(0, 1, 50)), -1)
+    smooth = np.concatenate([ramp, 1 - ramp[..., :1]], -1).astype(np.float32)
+    noisy = np.clip(smooth + 0.3 * rng.normal(size=smooth.shape) * (rng.random((50, 70, 1)) < 0.2), 0, 1).astype(np.float32)
+    for truth, prediction in ((smooth, noisy), (noisy, smooth[::-1]), (np.zeros_like(smooth), smooth)):
+        theirs = np.asarray(evaluate(truth, prediction, "LDR", inputsRGB=encoded, applyMagma=False, computeMeanError=False)[0])
+        ours = flip.difference(flip.Seen(prediction, encoded), flip.Seen(truth, encoded))
+        np.testing.assert_allclose(ours, theirs[..., 0], atol=1e-3)
+        assert m.flip(prediction, truth, np.ones((50, 70), bool), encoded) == pytest.approx(theirs.mean(), abs=3e-5)
+
+
+def test_ssim_of_colours_is_the_common_one():
+    from skimage.metrics import structural_similarity
+
+    truth, prediction = image(13), 0.6 * image(13) + 0.4 * image(14)
+    theirs = structural_similarity(
+        truth, prediction, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
+    )
+    assert m.ssim(prediction, truth, ALL) == pytest.approx(theirs, abs=1e-12)
+
+
+def test_one_target_scores_many_predictions():
+    """What is kept of the truth does not depend on what was scored before; the functions say the same."""
+    truth, mask, objects = image(15), ALL.copy(), np.arange(24 * 32).reshape(24, 32) // 200
+    mask[4:9, :20] = False
+    target = m.Target("albedo", truth, mask, objects)
+    for seed in (16, 17):
+        prediction = image(seed)
+        scores = values(target.scores(prediction))
+        assert scores == values(m.score_map("albedo", prediction, truth, mask, objects))
+        for protocol, seen in (
+            ("raw", prediction),
+            ("scaled", m.scaled(prediction, truth, mask)),
+            ("oracle_affine", m.oracle_affine(prediction, truth, mask, objects)),
+        ):
+            for name in ("l2", "psnr", "ssim", "flip"):
+                assert scores[protocol, name] == pytest.approx(getattr(m, name)(seen, truth, mask), rel=1e-9), (protocol, name)
+    some = values(target.scores(image(18), ("l2", "flip"), perceptual=("raw",)))
+    assert set(some) == {("raw", "l2"), ("raw", "flip"), ("scaled", "l2"), ("oracle_affine", "l2")}
 
 
 def test_scaled_gain_is_ratio_of_sums_not_least_squares():

@@ -46,7 +46,7 @@ class FakeJob:
             render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
             export=SimpleNamespace(max_faces_glb=100_000),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
-            metrics=SimpleNamespace(views="all"),
+            metrics=SimpleNamespace(views="all", lpips_vgg=False),
         )
         self.document = {"seed": 3}
         self.log = logging.getLogger("test")
@@ -300,6 +300,22 @@ def test_variants_and_gain(toy):
     assert min(scores) > 0.99
 
 
+def test_absent_weights_of_vgg_are_said(toy, tmp_path, monkeypatch, caplog):
+    """Asked for and not there: the same scores without it, and one line that tells what to do."""
+    monkeypatch.chdir(tmp_path)  # no results/weights here
+    job = FakeJob("metrics", tmp_path, "toy")
+    job.readers = {stage: StageReader(toy / "results/toy" / stage, stage, "toy") for stage in job.stage.upstream}
+    job.settings.metrics.lpips_vgg = True
+    metrics.run(job)
+    job.writer.finish()
+    found, without = (read_parquet(root / "results/toy/metrics/variants.parquet") for root in (tmp_path, toy))
+    for name, column in without.items():
+        np.testing.assert_array_equal(found[name], column)
+    missing = json.loads((tmp_path / "results/toy/metrics/summary.json").read_text())["not_scored"]
+    assert sum(entry["metric"] == "lpips_vgg" for entry in missing) == 1
+    assert "snakemake --cores 1 results/weights/lpips_vgg.npz" in caplog.text
+
+
 def test_object_mean_is_the_mean_of_the_predictions(toy):
     job = FakeJob("metrics", toy / "again")
     job.root = toy
@@ -312,7 +328,7 @@ def test_object_mean_is_the_mean_of_the_predictions(toy):
         for k in range(K):
             total += rgb(channels, f"prior.{k:03d}.albedo")[box].astype(np.float64).sum(0)
         count += K * box.sum()
-    np.testing.assert_allclose(means.sums["object_mean"][1, :3] / means.sums["object_mean"][1, 5], total / count, rtol=1e-5)
+    np.testing.assert_allclose(means.means["object_mean"][1, :3], total / count, rtol=1e-5)
 
 
 def test_maps_hold_everything(toy):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,8 @@ from iif_core.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 from iif_core.photography import response_curve
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_to_disk, split_rgb
-from workflow.normal_form import CaptureWriter, View
+from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.registry import STAGES
 
 SIZE = (4.0, 3.0, 2.4)
 LAMP, BULB = 8.0, 20.0
@@ -58,13 +60,18 @@ def _ball(centre, radius):
 
 
 class Room:
-    """Geometry, true materials per face and true emission per face."""
+    """Geometry, true materials per face and true emission per face.
 
-    def __init__(self, seed: int = 0):
+    `parts`: name -> (vertices, faces); `looks`: name -> (albedo, roughness, metallic); `lights`: name -> radiance, on the side
+    of the normal. Each default is replaced or, where the part is None, taken away.
+    """
+
+    def __init__(
+        self, seed: int = 0, parts: dict | None = None, looks: dict | None = None, lights: dict | None = None, n: int = 14
+    ):
         x, y, z = SIZE
         rng = np.random.default_rng(seed)
-        n = 14
-        parts = {
+        usual = {
             "floor": _quad((0, 0, 0), (x, 0, 0), (0, y, 0), n),
             "ceiling": _quad((0, 0, z), (0, y, 0), (x, 0, 0), n),
             "wall_a": _quad((0, 0, 0), (0, y, 0), (0, 0, z), n),
@@ -77,10 +84,12 @@ class Room:
             "lamp": _quad((1.6, 1.2, z - 0.05), (0, 0.6, 0), (0.8, 0, 0), 2),
             "bulb": _ball((1.9, 2.3, 1.4), 0.12),
         }
+        parts = {name: part for name, part in {**usual, **(parts or {})}.items() if part is not None}
         self.names = list(parts)
         self.vertices, self.faces = _join(list(parts.values()))
         self.object_id = np.repeat(np.arange(len(parts)), [len(f) for _, f in parts.values()]).astype(np.int32)
         looks = {
+            **dict.fromkeys(parts, ((0.5, 0.5, 0.5), 0.8, 0)),
             "floor": ((0.45, 0.3, 0.2), 0.5, 0),
             "ceiling": ((0.75, 0.75, 0.72), 0.9, 0),
             "wall_a": ((0.6, 0.62, 0.55), 0.8, 0),
@@ -92,14 +101,16 @@ class Room:
             "glossy": ((0.1, 0.2, 0.4), 0.2, 0),
             "lamp": ((0, 0, 0), 1, 0),
             "bulb": ((0, 0, 0), 1, 0),
+            **(looks or {}),
         }
         colour = np.array([looks[name][0] for name in self.names])[self.object_id]
         texture = rng.uniform(0.6, 1.25, (len(self.faces), 1)) * rng.uniform(0.95, 1.05, (len(self.faces), 3))
         rest = np.array([looks[name][1:] for name in self.names])[self.object_id]
         self.material = np.concatenate([np.clip(colour * texture, 0, 1), rest], 1).astype(np.float32)
         self.emission = np.zeros((len(self.faces), 3), np.float32)
-        self.emission[self.object_id == self.names.index("lamp")] = LAMP * np.array([1, 0.95, 0.85])
-        self.emission[self.object_id == self.names.index("bulb")] = BULB * np.array([1, 0.8, 0.6])
+        lamps = {"lamp": LAMP * np.array([1, 0.95, 0.85]), "bulb": BULB * np.array([1, 0.8, 0.6])}
+        for name, radiance in (lamps if lights is None else lights).items():
+            self.emission[self.object_id == self.names.index(name)] = radiance
         self.side = np.where(self.emission.any(1), 1, 0).astype(np.int8)
 
     def views(self, count: int, size: int, exposures: np.ndarray) -> list[View]:
@@ -118,8 +129,11 @@ class Room:
 class StubJob:
     """What a stage needs of a job, over a folder of the test's own."""
 
+    quality, fingerprint = "draft", "0123456789abcdef"
+
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
-        self.stage, self.folder, self.seed, self.threads, self.scene = stage, folder, seed, 2, "room"
+        self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
+        self.document = {"seed": seed}
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in settings.items()})
         self.log = logging.getLogger(stage)
         provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}
@@ -146,18 +160,26 @@ def build(
     curve: str | None = None,
     exposures: np.ndarray | None = None,
     brightness: float = 1.0,
+    room: Room | None = None,
+    sky: float = 0.0,
+    bounces: int = 10,
+    retouch: Callable[[int, np.ndarray], np.ndarray] | None = None,
+    truth: bool = False,
 ) -> Room:
-    """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture."""
+    """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture.
+
+    `sky`: radiance of what is outside the mesh; `retouch(view, image)`: the photograph as it is stored.
+    """
     from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
 
-    room = Room(seed)
+    room = room or Room(seed)
     room.emission *= brightness
     rng = np.random.default_rng(seed + 1)
     exposures = np.ones(views) if exposures is None else exposures
     cameras = room.views(views, size, exposures)
     geometry = build_geometry(room.vertices, room.faces, room.object_id)
     material = FaceMaterials(room.material)
-    emitters = Emitters(geometry, room.emission, room.side)
+    emitters = Emitters(geometry, room.emission, room.side, **({"environment": np.full(3, sky)} if sky else {}))
     sensor = response_curve(curve) if curve else None
     capture = StubJob("capture", folder, {}).writer
     segmentation = StubJob("segmentation", folder, {}).writer
@@ -169,12 +191,19 @@ def build(
         directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(-1, 3)
         origin = view.world_from_camera[:3, 3]
         face, depth = trace(geometry, origin, directions)
-        radiance = render(geometry, material, emitters, origin, directions, samples, 10, 1000 + view.view_id)
+        radiance = render(geometry, material, emitters, origin, directions, samples, bounces, 1000 + view.view_id)
         depth = np.where(face >= 0, depth, 0)
         image = radiance.reshape(size, size, 3)
         if sensor is not None:
             image = np.round(255 * sensor(np.clip(view.exposure * image, 0, 1))) / 255
+        if retouch is not None:
+            image = retouch(view.view_id, image)
         form.photo(view.name, image.astype(np.float32), encoded=sensor is not None)
+        if truth:
+            maps, shine = (values[face].reshape(size, size, -1) for values in (room.material, room.emission))
+            hit = (face >= 0).reshape(size, size)
+            maps, shine = maps * hit[..., None], shine * hit[..., None]
+            form.truth(view.name, Truth(maps[..., :3], maps[..., 3], maps[..., 4], shine, radiance.reshape(size, size, 3), hit))
         form.gbuffer(view.name, depth.reshape(size, size), face.reshape(size, size))
         objects = np.where(face >= 0, room.object_id[face], -1).reshape(size, size).astype(np.int32)
         inner = np.ones((size, size), bool)
@@ -193,7 +222,7 @@ def build(
                 np.where((face >= 0)[:, None], spoiled[face], 0),
             )
         )
-    form.finish("test", dynamic_range, True, [])
+    form.finish("test", dynamic_range, truth, [])
     capture_facts = {"object_id": np.arange(len(room.names), dtype=np.int32), "name": np.array(room.names)}
     segmentation.table("objects.parquet", capture_facts)
     faces = {"face_id": np.arange(len(room.faces), dtype=np.int32), "object_id": room.object_id}
@@ -250,6 +279,7 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
             f"maps/{view.name}.exr",
             {
                 "cell.id": ids_to_disk(ids.reshape(size, size)),
+                "coverage": np.ones((size, size), np.float32),
                 **split_rgb(maps[..., :3], "albedo"),
                 "roughness": maps[..., 3],
                 "metallic": maps[..., 4],
@@ -261,7 +291,10 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
         names = [f"prior.000.{name}" for name in ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")]
         prior.exr(f"maps/{view.name}.exr", {name: maps[..., i] for i, name in enumerate(names)})
     prior.finish()
-    base.json("base.json", {"predictions": 1, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
+    n = len(room.names)
+    base.table("selection.parquet", {"segment_id": np.arange(n), "k": np.zeros(n, int), "weight_albedo": np.ones(n)})
+    facts = {"predictions": 1, "plan": [], "seen_once_share": 0.0}
+    base.json("base.json", {**facts, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()
 
 

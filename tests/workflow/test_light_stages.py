@@ -145,6 +145,8 @@ def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, brightne
     table, radiance = _emitters(tmp_path)
     assert np.isfinite(radiance).all() and (radiance >= 0).all()
     if brightness == 0:
+        decisions = {d["component"]: d for d in _reader(tmp_path, "affines").json("affines.json")["plan"]}
+        assert "fitted for 0 of 11 objects" in decisions["metallic"]["reason"] and not decisions["metallic"]["included"]
         assert not table["kept"].any() and "no emitter" in " ".join(_reader(tmp_path, "emission").json("emission.json")["notes"])
 
 

@@ -153,6 +153,10 @@ class StageReader:
         """Columns of a table as numpy arrays; fixed-size lists are (n, k)."""
         return io.read_parquet(self.path(name))
 
+    def rows(self, name: str) -> int:
+        """Number of rows of a table, from the manifest: the file is not opened."""
+        return int(self.manifest["files"][name]["shape"][0])
+
     def json(self, name: str) -> Any:
         """A small document."""
         return json.loads(self.path(name).read_text())

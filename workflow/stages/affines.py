@@ -372,11 +372,11 @@ def _plan(problem: FitProblem, fit: FitResult, calibration: dict[str, Any], dyna
             medians[o] = np.median(problem.base[own, 4])
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
             gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
-    free_metal = np.any(fit.affine[:, 14:] != 0, 1) if len(fit.affine) else np.zeros(0, bool)
+    metal = np.any(fit.affine[:, 14:] != 0, 1)  # of an object that keeps its prediction too, which is not fitted
     return [
         plan.camera_response(dynamic_range, calibration),
-        plan.metallic(free_metal, medians),
-        plan.specular(glossy, free_metal),
+        plan.metallic(metal & fit.free.any(1), medians),
+        plan.specular(glossy, metal),
         plan.affine_size(fit.model),
         plan.second_pass(gains, fit.pixels),
         plan.scale(**fit.facts["scale"]),

@@ -21,6 +21,8 @@ def run(job: Job) -> None:
     if not capture.has_truth:
         raise InputError(f"scene {job.scene}: no ground truth to score against; a study needs a source with truth")
     networks = scoring.perceptual_networks(with_vgg=True)
+    # VGG takes most of the time, and the paper prints it for albedo alone.
+    networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in scoring.MATERIALS}
     rows = scoring.ScoreRows()
     is_raw = job.read("base").json("base.json")["variant"] == "raw"
 
@@ -30,10 +32,9 @@ def run(job: Job) -> None:
         if not job.read("base").has(file):
             return []
         channels = job.read("base").exr(file)
-        maps, truth = scoring.material_maps(channels), scoring.material_truth(capture, job.read("segmentation"), view)
-        # VGG takes most of the time, and the paper prints it for albedo alone.
-        networks_of = {"albedo": networks}
-        return [(q, truth.scores(maps, q, networks_of.get(q, {"alex": networks["alex"]}))) for q in scoring.MATERIALS]
+        maps = scoring.material_maps(channels)
+        truth = scoring.material_truth(capture, job.read("segmentation"), view, networks_of)
+        return [(q, truth.scores(maps, q)) for q in scoring.MATERIALS]
 
     with ThreadPoolExecutor(job.threads) as pool:
         # map keeps the order of the views, so the table does not depend on the number of threads

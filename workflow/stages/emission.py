@@ -157,7 +157,7 @@ def _trace(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Two independent estimates of (A, h)."""
     job, settings = photos.job, photos.job.settings.emission
-    geometry, material = photos.scene.traceable()
+    geometry, material = photos.world
     from iif_core.transport import RadianceCache, transport_matrix
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)

