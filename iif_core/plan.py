@@ -147,16 +147,16 @@ def affine_size(models: list[str]) -> Decision:
 
 
 def scale(kind: str, factor: float, relative_error: float) -> Decision:
-    """What fixes the scale of light and albedo, which LDR photographs leave open (METHOD 7a)."""
+    """What fixes the scale between light and albedo (METHOD 7a, iif_core.affines.gauge)."""
     reasons = {
-        "none": "the light as it was found",
+        "found": "the light as it was found, by how much of it is indirect",
         "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",
         "mean_albedo": "the given mean albedo",
         "white_patch": "the given albedo of a patch",
         "lamp": "the given radiance of a lamp",
     }
     reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
-    return _decision("scale", kind != "none", "factor on the light that the fit was given", factor, 1.0, reason)
+    return _decision("scale", kind != "found", "factor on the light that the fit was given", factor, 1.0, reason)
 
 
 def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:

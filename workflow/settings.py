@@ -375,11 +375,11 @@ class Affines(Section):
     """`sgd`, `adam`: pixels of a step."""
     rate: float | None = Field(None, gt=0)
     """`sgd`, `adam`: step size; default 10 and 0.01."""
-    scale: Literal["prior", "none"] | KnownScale = "prior"
-    """LDR leaves one factor between light and albedo open. `prior` keeps the prior's mean albedo; `none` the light as stage
-    emission found it (always so for HDR, unless a known scale is given); or what is known: {white_patch: {object: NAME, albedo:
-    0.9}}, {white_patch: {view: NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id: 0, radiance: [5, 5, 4]}}
-    or {mean_albedo: 0.4}."""
+    scale: Literal["found", "prior"] | KnownScale = "found"
+    """What fixes the factor between light and albedo. `found`: the light as stage emission found it, by how much of it is
+    indirect (always so for HDR, unless a known scale is given); `prior`: the prior's mean albedo; or what is known: {white_patch:
+    {object: NAME, albedo: 0.9}}, {white_patch: {view: NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id:
+    0, radiance: [5, 5, 4]}} or {mean_albedo: 0.4}."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Affines:

@@ -1,8 +1,11 @@
-"""The open scale: with 8-bit photographs light x albedo is known, not each (METHOD 7a, degeneracy 3).
+"""The scale between light and albedo (METHOD 7a, degeneracy 3).
 
 A fit returns albedos that go with the light that it was given. Multiplying the light by s and dividing every albedo by s leaves
-the diffuse part of all photographs as it is; what fixes s is a convention or a piece of knowledge, and this is the only place
-where it enters. (The specular part of dielectrics does not scale with albedo, so s is not entirely free: far from 1 it shows.)
+the light of the first bounce as it is, so from direct light alone only the product is known. Indirect light tells them apart:
+what surfaces send to each other was photographed, in the same units as everything else, and is a part of what a pixel reflects.
+In pixels with much of it and pixels with little, albedo x (direct + photographed indirect light) fits for one direct light only.
+Stage emission solves for that light (its radiance cache), so its scale is the default; this is the only place where another
+one - a convention, or something that is known - enters.
 """
 
 from __future__ import annotations
@@ -15,7 +18,7 @@ import numpy as np
 from iif_core.affines.problem import FitProblem, FitResult, raw_values
 from iif_core.errors import InputError
 
-KINDS = ("none", "prior", "mean_albedo", "white_patch", "lamp")
+KINDS = ("found", "prior", "mean_albedo", "white_patch", "lamp")
 _DARKEST = 1e-3
 
 
@@ -24,15 +27,17 @@ class Gauge:
     """What fixes the scale.
 
     Attributes:
-        kind: `none`: the light as given; `prior`: the mean albedo of the base texture stays; `mean_albedo`: the mean albedo
+        kind: `found`: the light as given; `prior`: the mean albedo of the base texture stays; `mean_albedo`: the mean albedo
             of the fitted pixels is `albedo`; `white_patch`: that of `patch` is; `lamp`: the light is multiplied by `factor`.
-        albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0.
+        albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0;
+            error: of the found light's overall brightness, relative.
     """
 
     kind: str
     albedo: float = 0.0
     patch: np.ndarray | None = None
     factor: float = 1.0
+    error: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -65,8 +70,8 @@ def pin(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
 
 
 def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:
-    if gauge.kind == "none":
-        return 1.0, 0.0
+    if gauge.kind == "found":
+        return 1.0, float(gauge.error)
     if gauge.kind == "lamp":
         return float(gauge.factor), 0.0
     use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)

@@ -253,7 +253,7 @@ def test_scale_pins():
         found = pin(dimmer, dim, gauge)  # what is known of one thing gives the level of all
         fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
         assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
-    assert pin(problem, free, Gauge("none")).affine is free.affine
+    assert pin(problem, free, Gauge("found")).affine is free.affine
 
 
 def test_scale_refused():

@@ -145,4 +145,4 @@ def test_known_scale_is_checked(given, message):
     with pytest.raises(ValidationError, match=message):
         Affines(scale=given)
     assert Affines(scale={"mean_albedo": 0.4}).scale.mean_albedo == 0.4
-    assert Affines().scale == "prior"
+    assert Affines().scale == "found"

@@ -315,6 +315,21 @@ def test_prior_is_weighed_against_what_rows_really_know():
     assert np.std(found) < 0.85 * np.std(plain)
 
 
+@pytest.mark.parametrize("level", [0.6, 1.0, 1.5])
+def test_indirect_light_tells_light_from_albedo(level):
+    """All albedos off by one factor and no emitter seen: the share of photographed indirect light tells light from albedo."""
+    rng = np.random.default_rng(14)
+    n, owner = 4000, np.repeat(np.arange(8), 500)
+    a = (rng.random((n, 3)) ** 2)[:, :, None] * np.ones(3)  # many pixels see little of the emitters
+    h = rng.uniform(2, 20, (n, 3))
+    y = level * (np.einsum("ngc,gc->nc", a, TRUE) + h) * (1 + 0.1 * rng.standard_normal((n, 3)))
+    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, 1 / y**2, np.zeros(y.shape, bool))
+    gain = object_gains(rows, y, owner, np.ones((3, 3)), True)
+    light = solve_emission(scale_rows(rows, y, gain[owner]), np.ones((3, 3))).radiance
+    assert np.median(gain) == pytest.approx(level, rel=0.06)
+    np.testing.assert_allclose(light.sum(0), TRUE.sum(0), rtol=0.12)
+
+
 @pytest.mark.parametrize("pinned", [False, True])
 def test_light_and_object_gains_together(pinned):
     """Objects that face the lights differently, with albedos off by up to 2: solved plainly the light is wrong."""

@@ -128,8 +128,8 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
     """What fixes the scale, checked now; what needs the pixels is found when they are there."""
     scale = job.settings.affines.scale
     if isinstance(scale, str):
-        kind = "none" if capture.is_hdr else scale  # seen emitters fix the scale of HDR photographs
-        return lambda problem, places: Gauge(kind)
+        gauge = Gauge("found", error=_light_error(job)) if capture.is_hdr or scale == "found" else Gauge(scale)
+        return lambda problem, places: gauge
     if getattr(scale, "mean_albedo", None) is not None:
         return lambda problem, places: Gauge("mean_albedo", scale.mean_albedo)
     if getattr(scale, "lamp", None) is not None:
@@ -159,6 +159,15 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
         return Gauge("white_patch", patch.albedo, chosen)
 
     return inside
+
+
+def _light_error(job: Job) -> float:
+    """Standard error of the power of all light that was found, relative to it; 0 without any."""
+    table = job.read("emission").table("emitters.parquet")
+    kept = table["kept"].astype(bool)
+    area = np.where(table["kind"][kept] == "area", table["area_m2"][kept], 1.0)
+    power, error = (sum(area * table[f"{name}_{c}"][kept] for c in "rgb") for name in ("radiance", "error"))
+    return float(np.sqrt((error**2).sum()) / power.sum()) if kept.any() and power.sum() > 0 else 0.0
 
 
 def _lamp_gauge(job: Job, lamp: Any) -> Callable[[FitProblem, _Places], Gauge]:

@@ -312,7 +312,7 @@ def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
 def _emitter_note(capture: CaptureReader, recovered: Recovered) -> str:
     text = "Radiance in the units of the photographs' exposure."
     if not capture.is_hdr:
-        text += " LDR photographs leave one factor between light and albedo open; the prior's mean albedo decides it."
+        text += " With LDR photographs the factor between light and albedo is `affines.scale`."
     if recovered.light_scale != 1:
         text += f" Light was multiplied by {recovered.light_scale:.3g} for that."
     return text
