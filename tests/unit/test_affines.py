@@ -185,6 +185,47 @@ def test_metal_is_found_where_it_pays_and_only_there():
     np.testing.assert_allclose(fitted[n:, :3], base[n:, :3], atol=0.05)
 
 
+def _lambertian(rng, n, albedo, dim=1.0):
+    """(problem, base) of one object without any lobe; the cached light is `dim` times the true one; HDR, noisy as photographs are."""
+    base = np.c_[rng.uniform(0.6, 0.7, (n, 3)), np.full(n, 0.5), np.zeros(n)]
+    problem, _ = problem_of(rng, 1, n, truth=IDENTITY[None], base=base)
+    value = albedo * problem.diffuse[0] * np.exp(rng.normal(0, 0.03, (n, 3)))
+    dimmer = {name: tuple(dim * x for x in getattr(problem, name)) for name in ("diffuse", "s0", "s1")}
+    return replace(problem, value=value, **dimmer), base
+
+
+@pytest.mark.parametrize("dim", [1.0, 0.9])
+def test_white_wall_in_light_that_is_too_dim_gets_no_gloss(dim):
+    """It shows more than an albedo of 1 explains: only a lobe could add it, were the albedo bounded there in the fit."""
+    problem, base = _lambertian(np.random.default_rng(17), 800, 0.98, dim)
+    out = fit_affines(problem, response("identity"), FitOptions())
+    fitted = apply_affines(out.affine, problem.object_id, base)
+    assert fitted[:, 3].mean() > 0.8 and fitted[:, :3].max() <= 1.0
+    if dim < 1:
+        glossy = fit_affines(problem, response("identity"), FitOptions(brightest=1.0))
+        assert apply_affines(glossy.affine, problem.object_id, base)[:, 3].mean() < fitted[:, 3].mean() - 0.04
+        assert glossy.residual[0] > 1.2 * out.residual[0]
+
+
+def test_what_has_no_lobe_is_rough():
+    problem, base = _lambertian(np.random.default_rng(18), 800, 0.3)
+    out = fit_affines(problem, response("identity"), FitOptions())
+    fitted = apply_affines(out.affine, problem.object_id, base)
+    assert fitted[:, 3].mean() > 0.85 and (fitted[:, 4] == 0).all()
+
+
+def test_rough_metal_is_taken_for_a_dielectric():
+    """Degenerate (METHOD 7b); a smooth one is told."""
+    rng = np.random.default_rng(19)
+    base = np.c_[rng.uniform(0.4, 0.6, (1000, 3)), np.full(1000, 0.5), np.full(1000, 0.5)]
+    for roughness, metal in ((0.9, 0.0), (0.3, 1.0)):
+        truth = IDENTITY[None].copy()
+        truth[0, 12:] = [0, roughness, 0, 1]
+        problem, _ = problem_of(rng, 1, 1000, truth=truth, base=base)
+        out = fit_affines(problem, response("identity"), FitOptions())
+        assert (apply_affines(out.affine, problem.object_id, base)[:, 4] == metal).all()
+
+
 def test_wrong_roughness_valley_is_left():
     rng = np.random.default_rng(10)
     n = 600

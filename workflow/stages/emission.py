@@ -74,8 +74,9 @@ def run(job: Job) -> None:
     _write(job, groups, table, cache, outside)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
-    for faces, area, reason in groups.dropped[:20]:
-        notes.append(f"candidate of {faces} faces, {area:.2g} m^2, left out before the solve: {reason}")
+    for why in sorted({reason for _, _, reason in groups.dropped}):
+        areas = [area for _, area, reason in groups.dropped if reason == why]
+        notes.append(f"{len(areas)} candidates (the largest {max(areas):.2g} m^2) left out before the solve: {why}")
     if not kept and not environment["included"]:
         notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
     decisions = [environment, exposure_plan, plan.emitters(kept, candidates - kept, candidates)]
