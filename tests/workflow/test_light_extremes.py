@@ -186,7 +186,7 @@ def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
     assert (ratio > 0.5).all() and (ratio < 2).all()
     for name in ("floor", "ceiling", "wall_a", "wall_c"):
         assert _fitted(found, room, name)[0][:, :3].min() > 0.9
-    assert "taken as srgb" in _said(found) and "a convention" in _said(found)
+    assert "taken as srgb" in _said(found) and "as it was found" in _said(found)
 
 
 def test_environment_alone_through_a_hole(tmp_path, llvm):
