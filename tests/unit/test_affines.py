@@ -186,7 +186,7 @@ def test_metal_is_found_where_it_pays_and_only_there():
 
 
 def _lambertian(rng, n, albedo, dim=1.0):
-    """(problem, base) of one object without any lobe; the cached light is `dim` times the true one; HDR, noisy as photographs are."""
+    """(problem, base) of one object without any lobe; the cached light is `dim` times the true one; HDR, with noise."""
     base = np.c_[rng.uniform(0.6, 0.7, (n, 3)), np.full(n, 0.5), np.zeros(n)]
     problem, _ = problem_of(rng, 1, n, truth=IDENTITY[None], base=base)
     value = albedo * problem.diffuse[0] * np.exp(rng.normal(0, 0.03, (n, 3)))
