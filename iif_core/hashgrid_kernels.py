@@ -29,6 +29,8 @@ _TOP = np.float32(1 - 1e-6)
 _kernel = {"nogil": True, "cache": True, "error_model": "numpy"}
 _exact = {**_kernel, "fastmath": {"contract", "nsz"}}
 _sums = {**_kernel, "fastmath": {"contract", "nsz", "reassoc"}}
+# What other loops call is inlined: see iif_core.base.kernels.
+_inlined = {"forceinline": True}
 
 
 @njit(**_kernel)
@@ -227,7 +229,7 @@ def adam(parameters, first, second, gradient, live, beta1, beta2, rate, root, ep
             p[j] -= rate * mean / (np.sqrt(square) * root + eps)
 
 
-@njit(**_exact)
+@njit(**_exact, **_inlined)
 def _product(w, x, y):
     """y += w x for w (J, I), x (I, BLOCK), y (J, BLOCK); J and I are multiples of TILE = 4."""
     for j in range(0, w.shape[0], 4):
@@ -246,7 +248,7 @@ def _product(w, x, y):
                 y3[s] += w30 * a + w31 * b + w32 * c + w33 * d
 
 
-@njit(**_sums)
+@njit(**_sums, **_inlined)
 def _outer(d, x, g, h):
     """g += d x^T and h += row sums of d, for d (J, BLOCK), x (I, BLOCK), g (J, I), h (J,)."""
     zero = np.float32(0)
@@ -303,7 +305,7 @@ def _outer(d, x, g, h):
             g[j + 3, i + 3] += g33
 
 
-@njit(**_exact)
+@njit(**_exact, **_inlined)
 def _layer(w, bias, x, y, rectified):
     """y = w x + bias, rectified or not."""
     for j in range(y.shape[0]):
@@ -316,7 +318,7 @@ def _layer(w, bias, x, y, rectified):
                 row[s] = max(row[s], np.float32(0))
 
 
-@njit(**_exact)
+@njit(**_exact, **_inlined)
 def _backed(w_transposed, d, hidden, out):
     """out = (w^T d) where hidden > 0, else 0: through a layer and the rectifier before it."""
     out[:] = 0

@@ -16,10 +16,11 @@ import numpy as np
 PIECE = 64
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
-_inline = numba.njit(nogil=True, cache=True, fastmath=_MATHS, inline="always")
+# What other loops call is inlined: see iif_core.base.kernels.
+_inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
 
 
-@_compiled
+@_inlined
 def _inner(left, right, h_left, h_right):
     if left * right <= 0.0:
         return 0.0
@@ -28,7 +29,7 @@ def _inner(left, right, h_left, h_right):
     return (w_left + w_right) * left * right / (w_left * right + w_right * left)
 
 
-@_compiled
+@_inlined
 def _end(mean, beyond, h, h_beyond):
     slope = ((2.0 * h + h_beyond) * mean - h * beyond) / (h + h_beyond)
     if slope * mean <= 0.0:
@@ -38,7 +39,7 @@ def _end(mean, beyond, h, h_beyond):
     return slope
 
 
-@_compiled
+@_inlined
 def _cubic(y_before, y0, y1, y_after, h_before, h, h_after, t):
     """Value and slope; an absent neighbour has distance 0."""
     mean = (y1 - y0) / h
@@ -61,23 +62,28 @@ def _cubic(y_before, y0, y1, y_after, h_before, h, h_after, t):
     return value, slope
 
 
-@_compiled
+@_inlined
 def _lobe(s, x, c, j, before, after, span_before, span, span_after, share):
     """One channel of the lobe whose levels begin at row x of a pixel's shading s."""
     y_before, y0, y1, y_after = float(s[x + before, c]), float(s[x + j, c]), float(s[x + j + 1, c]), float(s[x + after, c])
     return _cubic(y_before, y0, y1, y_after, span_before, span, span_after, share)
 
 
-@_compiled
+@_inlined
 def _bracket(levels, r):
+    """Where r lies among the levels: node below, its neighbours, the three spans and the share of its own."""
     last = len(levels) - 2
     j = 0
     while j < last and r >= levels[j + 1]:
         j += 1
-    return j
+    before = max(j - 1, 0)
+    after = min(j + 2, last + 1)
+    span = levels[j + 1] - levels[j]
+    share = min(max((r - levels[j]) / span, 0.0), 1.0)
+    return j, before, after, levels[j] - levels[before], span, levels[after] - levels[j + 1], share
 
 
-@_compiled
+@_inlined
 def _tone(x, knee, gain, curve, end):
     """f, df/dx, node and share of the table."""
     if knee > 0.0:
@@ -197,13 +203,7 @@ def sums(
                     if is_free[4] > 0.0:
                         g[k, 14] += 1.5 * metallic_weight * b[4]
                         g[k, 15] += 1.5 * metallic_weight
-                j = _bracket(levels, r)
-                span = levels[j + 1] - levels[j]
-                share = min(max((r - levels[j]) / span, 0.0), 1.0)
-                before = max(j - 1, 0)
-                after = min(j + 2, n_levels - 1)
-                span_before = levels[j] - levels[before]
-                span_after = levels[after] - levels[j + 1]
+                j, before, after, span_before, span, span_after, share = _bracket(levels, r)
                 e = exposure[p]
                 for c in range(3):
                     a = value[c]
@@ -288,7 +288,7 @@ def toned(target, saturated, trust, shown, offsets, knee, gain, curve, ends, rob
         data[o] = data_o
 
 
-@_compiled
+@_inlined
 def _add_beyond(h, g, i, b, box, beyond):
     """Squared distance to the allowed range: gives clamped values a way back (METHOD H13)."""
     if i < 3:
@@ -307,7 +307,7 @@ def _add_beyond(h, g, i, b, box, beyond):
     h[at + 1, at + 1] += box
 
 
-@_compiled
+@_inlined
 def _add_scores(columns, weight, error, last_half, low, high, place, g):
     """g += (J1' W e2 + J2' W e1) / 2 of the pixels low ... high - 1 of a piece."""
     for c in range(3):
@@ -323,7 +323,7 @@ def _add_scores(columns, weight, error, last_half, low, high, place, g):
             g[place[c, i]] += 0.5 * total
 
 
-@_compiled
+@_inlined
 def _add_piece(columns, weight, error, last_half, m, place, weighted, h):
     """Upper triangle of H += (J1' W J2 + J2' W J1) / 2."""
     cols = columns.shape[2]
@@ -389,13 +389,7 @@ def gradient(
             is_free[i] = 1.0 if raw == value[i] else 0.0
         r = value[3]
         m = value[4]
-        j = _bracket(levels, r)
-        span = levels[j + 1] - levels[j]
-        share = min(max((r - levels[j]) / span, 0.0), 1.0)
-        before = max(j - 1, 0)
-        after = min(j + 2, n_levels - 1)
-        span_before = levels[j] - levels[before]
-        span_after = levels[after] - levels[j + 1]
+        j, before, after, span_before, span, span_after, share = _bracket(levels, r)
         e = exposure[p]
         s = shading[p, 0]
         slope_r = -roughness_weight

@@ -23,6 +23,10 @@ PIECE = 256
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}  # no assumption about NaN or infinity
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
 _exact = numba.njit(nogil=True, cache=True)
+# Loops that other loops call are inlined. Where a copy in the caller and one of its own exist, the linker takes the one
+# or the other according to the state of the compiler's cache, and their sums may differ in the last bits.
+_inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
+_inlined_exact = numba.njit(nogil=True, cache=True, forceinline=True)
 
 GRAM = 14
 """Sums that `gram` makes: aa ab ac bb bc cc a b c (albedo), rr r, mm m, 1."""
@@ -286,7 +290,7 @@ def square(target: NDArray, weight: NDArray, start: NDArray) -> NDArray:
     return out
 
 
-@_compiled
+@_inlined
 def _correct(values, k, first, m, t, bits, v, out, add):
     """out (5, m) = or += T_k v_k of the pixels first ... first + m - 1."""
     for c in range(5):
@@ -371,7 +375,7 @@ def sorting_network(n: int) -> NDArray:
     return np.array(pairs, np.int64).reshape(-1, 2)
 
 
-@_exact
+@_inlined_exact
 def _sort_planes(planes, network, m):
     for x in range(len(network)):
         low, high = planes[network[x, 0]], planes[network[x, 1]]

@@ -21,7 +21,9 @@ from ..kernels import sorting_network
 
 TILE = 64
 _kernel = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-_sums = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"})
+# What other loops call is inlined: see iif_core.base.kernels.
+_inlined = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
+_sums = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, forceinline=True)
 
 LOCATION = np.array([0, 1, 2, 6, 8])
 """Raw outputs that hold the location of each channel (METHOD 2.3.5); roughness is mapped to [0.02, 1]."""
@@ -129,7 +131,7 @@ def _exp_of(x, m):
     return exp
 
 
-@_kernel
+@_inlined
 def _exp_float(x, m):
     bits = np.empty(TILE, np.int32)
     power = bits.view(np.float32)
@@ -145,7 +147,7 @@ def _exp_float(x, m):
         x[i] *= power[i]
 
 
-@_kernel
+@_inlined
 def _correct(v, affine, which, m, u):
     """u (5, j, m) = T_j v_j, before the clamp."""
     for j in range(len(which)):
@@ -159,12 +161,12 @@ def _correct(v, affine, which, m, u):
             u[4, j, i] = t[14] * v[4, j, i] + t[15]
 
 
-@_kernel
+@_inlined
 def _clamp(x, low):
     return min(max(x, low), np.float32(1))
 
 
-@_kernel
+@_inlined
 def _select(planes, network, length, m):
     for x in range(length):
         low, high = planes[network[x, 0]], planes[network[x, 1]]
@@ -220,7 +222,7 @@ def _labels(u, mu, share, which, log_alpha, temperature, m, e, votes, error):
     return loss / 3
 
 
-@_kernel
+@_inlined
 def _texture(raw, floor, smooth, m, mu, b, d_mu, d_b):
     """Location and scale (5, m) from raw outputs (m, 10), and their slopes with respect to the raw outputs."""
     x = np.empty(TILE, raw.dtype)
@@ -370,7 +372,7 @@ def _tile(
     return data, label
 
 
-@_kernel
+@_inlined
 def _regulariser(t, weight, gradient):
     """Identity regulariser of one correction (CROSS layout, METHOD 2.3.7); adds weight x its gradient."""
     one, two, four = np.float32(1), np.float32(2), np.float32(4)
