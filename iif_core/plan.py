@@ -149,7 +149,7 @@ def affine_size(models: list[str]) -> Decision:
 def scale(kind: str, factor: float, relative_error: float) -> Decision:
     """What fixes the scale between light and albedo (METHOD 7a, iif_core.affines.gauge)."""
     reasons = {
-        "found": "the light as it was found, by how much of it is indirect",
+        "found": "the light as it was found, by how much of it is indirect, weighed against the mean albedo of the base texture",
         "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",
         "mean_albedo": "the given mean albedo",
         "white_patch": "the given albedo of a patch",

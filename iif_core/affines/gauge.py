@@ -4,8 +4,9 @@ A fit returns albedos that go with the light that it was given. Multiplying the 
 the light of the first bounce as it is, so from direct light alone only the product is known. Indirect light tells them apart:
 what surfaces send to each other was photographed, in the same units as everything else, and is a part of what a pixel reflects.
 In pixels with much of it and pixels with little, albedo x (direct + photographed indirect light) fits for one direct light only.
-Stage emission solves for that light (its radiance cache), so its scale is the default; this is the only place where another
-one - a convention, or something that is known - enters.
+Stage emission solves for that light (its radiance cache) and says how sure its level is. By default it is weighed against the
+other witness, the mean albedo of the base texture, by their variances; this is the only place where another scale - a
+convention, or something that is known - enters.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.affines.problem import FitProblem, FitResult, raw_values
+from iif_core.emission.gains import LEVEL_OF_PRIOR
 from iif_core.errors import InputError
 
 KINDS = ("found", "prior", "mean_albedo", "white_patch", "lamp")
@@ -27,10 +29,11 @@ class Gauge:
     """What fixes the scale.
 
     Attributes:
-        kind: `found`: the light as given; `prior`: the mean albedo of the base texture stays; `mean_albedo`: the mean albedo
-            of the fitted pixels is `albedo`; `white_patch`: that of `patch` is; `lamp`: the light is multiplied by `factor`.
+        kind: `found`: the light as given, leaning on `prior` where its level is not sure; `prior`: the mean albedo of the base
+            texture stays; `mean_albedo`: the mean albedo of the fitted pixels is `albedo`; `white_patch`: that of `patch` is;
+            `lamp`: the light is multiplied by `factor`.
         albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0;
-            error: of the found light's overall brightness, relative.
+            error: standard error of the logarithm of the level of the found light; infinite: not known.
     """
 
     kind: str
@@ -69,9 +72,18 @@ def pin(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
 
 
+def _weighed(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, float]:
+    """log factor = log of the prior's x e^2 / (e^2 + p^2), e and p the standard errors of found level and prior's level."""
+    if error <= 0:
+        return 1.0, 0.0
+    share = 1.0 / (1.0 + (LEVEL_OF_PRIOR / error) ** 2) if np.isfinite(error) else 1.0
+    factor, _ = _factor(problem, fit, Gauge("prior"))
+    return factor**share, LEVEL_OF_PRIOR * float(np.sqrt(share))
+
+
 def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:
     if gauge.kind == "found":
-        return 1.0, float(gauge.error)
+        return _weighed(problem, fit, gauge.error)
     if gauge.kind == "lamp":
         return float(gauge.factor), 0.0
     use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)

@@ -52,6 +52,10 @@ class EmissionSolution:
     iterations: int
     converged: bool
 
+    def with_level_error(self, level_error: float) -> EmissionSolution:
+        """The same answer, the error of the level that all share added to every group's own."""
+        return replace(self, error=np.hypot(self.error, level_error * self.radiance))
+
 
 def solve_emission(
     rows: EmissionRows,
@@ -101,7 +105,8 @@ def solve_emission(
         return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
     square, square_target = 0.0, 0.0
     for c in range(3):
-        channel = _solve_channel(rows, c, initial[:, c], cross, ridge, max_rounds, prior_width, family)
+        width = _width(initial[:, c], prior_width)
+        channel = _ChannelRows.of(rows, c, initial[:, c], width, cross, ridge).solve(max_rounds, family)
         radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
         condition = max(condition, channel.condition)
         violated += channel.violated
@@ -150,74 +155,6 @@ def _summed(matrix: np.ndarray, members: np.ndarray, count: int) -> np.ndarray:
     return out
 
 
-@dataclass(frozen=True)
-class _Channel:
-    radiance: np.ndarray
-    error: np.ndarray
-    share: np.ndarray
-    condition: float
-    violated: int
-    rounds: int
-    converged: bool
-    square: float
-    square_target: float
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """H, noise part K, M and b of one channel, float64."""
-
-    h: np.ndarray
-    k: np.ndarray
-    m: np.ndarray
-    b: np.ndarray
-
-
-def _normal(rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool) -> _Normal:
-    """Sums over chunks of rows."""
-    groups = rows.groups
-    h, k, m, b = np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros(groups)
-    for part in _chunks(rows):
-        w = weight[part, None]
-        a1, a2 = rows.first[part, :, c].astype(np.float64), rows.second[part, :, c].astype(np.float64)
-        mean = 0.5 * (a1 + a2)
-        t1, t2 = (t[part, c] + shift[part] for t in (rows.target, rows.target_second))
-        m += mean.T @ (w * mean)
-        if cross:
-            b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
-            product = a1.T @ (w * a2)
-            h += 0.5 * (product + product.T)
-            k += 0.5 * (product - product.T)
-        else:
-            b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
-    return _Normal(h if cross else m, k, m, b)
-
-
-def _chunks(rows: EmissionRows) -> list[slice]:
-    step = max(1, _CHUNK // (8 * max(rows.groups, 1)))
-    return [slice(start, start + step) for start in range(0, len(rows.target), step)]
-
-
-def _scores(rows: EmissionRows, c: int, weight: np.ndarray, shift: np.ndarray, cross: bool, answer: np.ndarray) -> np.ndarray:
-    """sum_k s_k s_k' over clusters: (G, G)."""
-    parts = []
-    for part in _chunks(rows):
-        w = weight[part, None]
-        a1, a2 = rows.first[part, :, c].astype(np.float64), rows.second[part, :, c].astype(np.float64)
-        r1, r2 = rows.target[part, c] + shift[part] - a1 @ answer, rows.target_second[part, c] + shift[part] - a2 @ answer
-        if not cross:
-            a1 = a2 = 0.5 * (a1 + a2)
-            r1 = r2 = 0.5 * (r1 + r2)
-        parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
-    single = np.concatenate(parts)
-    cluster = np.full(len(single), -1) if rows.cluster is None else rows.cluster
-    alone = cluster < 0
-    number = np.unique(cluster[~alone], return_inverse=True)[1]
-    together = np.zeros((int(number.max(initial=-1)) + 1, rows.groups))
-    np.add.at(together, number, single[~alone])
-    return single[alone].T @ single[alone] + together.T @ together
-
-
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
     """(H lifted, the lift, condition number), all of unit diagonal; see the head of this module."""
     values, vectors = np.linalg.eigh(normal.m)
@@ -230,89 +167,6 @@ def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, fl
     lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
     spectrum = np.linalg.eigvalsh(normal.h + lifted)
     return normal.h + lifted, lifted, float(spectrum[-1] / max(spectrum[0] - ridge, 1e-10))
-
-
-def _solve_channel(
-    rows: EmissionRows,
-    c: int,
-    initial: np.ndarray,
-    cross: bool,
-    ridge: float,
-    max_rounds: int,
-    prior_width: float | np.ndarray,
-    family: np.ndarray | None,
-) -> _Channel:
-    bound = rows.lower_bound[:, c]
-    mean_a = 0.5 * (rows.first[:, :, c] + rows.second[:, :, c])
-    target, weight = rows.mean_target[:, c], rows.weight[:, c]
-    width = _width(initial, prior_width)
-    bounded = bool(np.isfinite(width).any())
-    answer, condition = initial.copy(), 1.0
-    rounds, converged, weighed, noise = 0, False, not bounded, 0.0
-    variance, effect = np.zeros(len(initial)), np.ones(len(initial))
-    while rounds < max_rounds and not (converged and weighed):
-        if converged and not weighed:
-            weighed, sure = True, np.where(bound, 0.0, weight)
-            effect = _design_effect(rows, c, sure, answer, initial, width, variance, cross, ridge)
-            variance = variance * effect
-        rounds += 1
-        before = answer
-        share, shift = _censored(target - mean_a @ before, bound, rows.noise, noise)
-        system = _system(rows, c, weight * share, shift, initial, width, variance, cross, ridge)
-        if system is not None:
-            answer, condition = system.solve(initial), system.condition
-        if rounds > _DAMPED:  # two answers by turns: the one between them
-            answer = 0.5 * (before + answer)
-        difference = target - mean_a @ answer
-        used = np.where(bound & (difference <= 0), 0.0, weight)
-        residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
-        variance = effect * residual if bounded else variance
-        plain = ~bound & (weight > 0)
-        noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
-        # The first round has no residual to weigh the prior and the bounds with.
-        change = np.abs(answer - before).max(initial=0.0)
-        converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
-    difference = target - mean_a @ answer
-    counted = np.where(bound & (difference < 0), 0.0, weight)
-    # A bound that is reached says where the answer stops, not how far off it is.
-    error, share = _uncertainty(rows, c, np.where(bound, 0.0, weight), answer, initial, width, variance, cross, ridge, family)
-    return _Channel(
-        answer,
-        error,
-        share,
-        condition,
-        int((bound & (difference > 1e-6 * np.abs(target))).sum()),
-        rounds,
-        converged,
-        float((counted * difference**2).sum()),
-        float((np.where(bound, counted, weight) * target**2).sum()),
-    )
-
-
-def _design_effect(
-    rows: EmissionRows,
-    c: int,
-    weight: np.ndarray,
-    answer: np.ndarray,
-    initial: np.ndarray,
-    width: np.ndarray,
-    variance: np.ndarray,
-    cross: bool,
-    ridge: float,
-) -> np.ndarray:
-    """(G,) >= 1, how many times less the rows know about a group than if their errors were independent (Kish 1965).
-
-    diag(H^-1 sum_k s_k s_k' H^-1) / diag(v H^-1): tracing noise and errors that the rows of an object share. The prior is weighed
-    against what the rows really know; otherwise neighbouring panes of one window are told apart by nothing but noise.
-    """
-    effect = np.ones(len(answer))
-    system = _system(rows, c, weight, np.zeros(len(weight)), initial, width, variance, cross, ridge)
-    if system is not None:
-        known, inverse = system.known, np.linalg.inv(system.matrix)
-        real = np.diag(inverse @ system.scores(rows, c, weight, cross, answer) @ inverse)
-        claimed = variance[known] * np.diag(inverse)
-        effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
-    return effect
 
 
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -350,6 +204,29 @@ def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class _Channel:
+    radiance: np.ndarray
+    error: np.ndarray
+    share: np.ndarray
+    condition: float
+    violated: int
+    rounds: int
+    converged: bool
+    square: float
+    square_target: float
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """H, noise part K, M and b of one channel, float64."""
+
+    h: np.ndarray
+    k: np.ndarray
+    m: np.ndarray
+    b: np.ndarray
+
+
+@dataclass(frozen=True)
 class _System:
     """Normal equations of the groups that the rows know, scaled to unit diagonal of M.
 
@@ -364,11 +241,6 @@ class _System:
     right: np.ndarray
     condition: float
 
-    def scores(self, rows: EmissionRows, c: int, weight: np.ndarray, cross: bool, answer: np.ndarray) -> np.ndarray:
-        """sum_k s_k s_k' at `answer` (G,), of the known groups and in units of `scale`."""
-        meat = _scores(rows, c, weight, np.zeros(len(weight)), cross, answer)
-        return meat[np.ix_(self.known, self.known)] / np.outer(self.scale, self.scale)
-
     def solve(self, initial: np.ndarray) -> np.ndarray:
         """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
         from scipy.linalg import solve_triangular
@@ -381,59 +253,181 @@ class _System:
         return answer
 
 
-def _system(
-    rows: EmissionRows,
-    c: int,
-    weight: np.ndarray,
-    shift: np.ndarray,
-    initial: np.ndarray,
-    width: np.ndarray,
-    variance: np.ndarray,
-    cross: bool,
-    ridge: float,
-) -> _System | None:
-    """With the given weights, and targets shifted; None when the rows know nothing."""
-    normal = _normal(rows, c, weight, shift, cross)
-    diagonal = np.diag(normal.m)
-    known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
-    if not known.any():
-        return None
-    scale = np.sqrt(diagonal[known])
-    unit, pick = np.outer(scale, scale), np.ix_(known, known)
-    scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
-    matrix, lifted, condition = _definite(scaled, ridge)
-    prior = np.diag(variance[known] / (width[known] * scale) ** 2)
-    return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+@dataclass(frozen=True)
+class _ChannelRows:
+    """The rows of one colour channel and what is known of its answer beforehand.
 
+    Attributes:
+        first, second: (n, G) float32 views; target, target_second, weight: (n,); bound: (n,) bool.
+        cluster: (n,) int; noise: (n,) or None.
+        initial, width: (G,) mean and standard deviation of the prior; cross, ridge: as in `solve_emission`.
+    """
 
-def _uncertainty(
-    rows: EmissionRows,
-    c: int,
-    weight: np.ndarray,
-    answer: np.ndarray,
-    initial: np.ndarray,
-    width: np.ndarray,
-    variance: np.ndarray,
-    cross: bool,
-    ridge: float,
-    family: np.ndarray | None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """(standard error, share of the answer that is not the prior's), both (G,)."""
-    error, share, none = initial.copy(), np.zeros(len(initial)), np.zeros(len(weight))
-    system = _system(rows, c, weight, none, initial, width, variance, cross, ridge)
-    if system is None:
+    first: np.ndarray
+    second: np.ndarray
+    target: np.ndarray
+    target_second: np.ndarray
+    weight: np.ndarray
+    bound: np.ndarray
+    cluster: np.ndarray
+    noise: np.ndarray | None
+    initial: np.ndarray
+    width: np.ndarray
+    cross: bool
+    ridge: float
+
+    @classmethod
+    def of(cls, rows: EmissionRows, c: int, initial: np.ndarray, width: np.ndarray, cross: bool, ridge: float) -> _ChannelRows:
+        """Channel c."""
+        data = (rows.first[:, :, c], rows.second[:, :, c], rows.target[:, c], rows.target_second[:, c], rows.weight[:, c])
+        cluster = np.full(len(rows.target), -1) if rows.cluster is None else rows.cluster
+        return cls(*data, rows.lower_bound[:, c], cluster, rows.noise, initial, width, cross, ridge)
+
+    @property
+    def mean_target(self) -> np.ndarray:
+        return 0.5 * (self.target + self.target_second)
+
+    @property
+    def sure(self) -> np.ndarray:
+        """Weights without the bounds: one that is reached says where the answer stops, not how far off it is."""
+        return np.where(self.bound, 0.0, self.weight)
+
+    def chunks(self) -> list[slice]:
+        """Rows that are converted to float64 at a time."""
+        step = max(1, _CHUNK // (8 * max(self.first.shape[1], 1)))
+        return [slice(start, start + step) for start in range(0, len(self.target), step)]
+
+    def normal(self, weight: np.ndarray, shift: np.ndarray) -> _Normal:
+        """Sums over the rows, targets shifted."""
+        groups = self.first.shape[1]
+        h, k, m, b = np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros(groups)
+        for part in self.chunks():
+            w = weight[part, None]
+            a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
+            mean = 0.5 * (a1 + a2)
+            t1, t2 = (t[part] + shift[part] for t in (self.target, self.target_second))
+            m += mean.T @ (w * mean)
+            if self.cross:
+                b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
+                product = a1.T @ (w * a2)
+                h += 0.5 * (product + product.T)
+                k += 0.5 * (product - product.T)
+            else:
+                b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
+        return _Normal(h if self.cross else m, k, m, b)
+
+    def scores(self, answer: np.ndarray) -> np.ndarray:
+        """sum_k s_k s_k' over clusters of rows that are no bounds: (G, G)."""
+        parts, weight = [], self.sure
+        for part in self.chunks():
+            w = weight[part, None]
+            a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
+            r1, r2 = self.target[part] - a1 @ answer, self.target_second[part] - a2 @ answer
+            if not self.cross:
+                a1 = a2 = 0.5 * (a1 + a2)
+                r1 = r2 = 0.5 * (r1 + r2)
+            parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
+        single = np.concatenate(parts)
+        alone = self.cluster < 0
+        number = np.unique(self.cluster[~alone], return_inverse=True)[1]
+        together = np.zeros((int(number.max(initial=-1)) + 1, single.shape[1]))
+        np.add.at(together, number, single[~alone])
+        return single[alone].T @ single[alone] + together.T @ together
+
+    def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> _System | None:
+        """With the given weights and shifts, `variance` (G,) of a row of weight 1 to weigh the prior with; None when the rows
+        know nothing."""
+        normal = self.normal(weight, shift)
+        diagonal = np.diag(normal.m)
+        known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
+        if not known.any():
+            return None
+        scale = np.sqrt(diagonal[known])
+        unit, pick = np.outer(scale, scale), np.ix_(known, known)
+        scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
+        matrix, lifted, condition = _definite(scaled, self.ridge)
+        prior = np.diag(variance[known] / (self.width[known] * scale) ** 2)
+        return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+
+    def solve(self, max_rounds: int, family: np.ndarray | None) -> _Channel:
+        """Re-weighted until the answer rests; then the prior is weighed against what the rows really know."""
+        bound, weight, target = self.bound, self.weight, self.mean_target
+        mean_a = 0.5 * (self.first + self.second)
+        bounded = bool(np.isfinite(self.width).any())
+        answer, condition = self.initial.copy(), 1.0
+        rounds, converged, weighed, noise = 0, False, not bounded, 0.0
+        variance, effect = np.zeros(len(answer)), np.ones(len(answer))
+        while rounds < max_rounds and not (converged and weighed):
+            if converged and not weighed:
+                weighed, effect = True, self._design_effect(answer, variance)
+                variance = variance * effect
+            rounds += 1
+            before = answer
+            share, shift = _censored(target - mean_a @ before, bound, self.noise, noise)
+            system = self.system(weight * share, shift, variance)
+            if system is not None:
+                answer, condition = system.solve(self.initial), system.condition
+            if rounds > _DAMPED:  # two answers by turns: the one between them
+                answer = 0.5 * (before + answer)
+            difference = target - mean_a @ answer
+            used = np.where(bound & (difference <= 0), 0.0, weight)
+            residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
+            variance = effect * residual if bounded else variance
+            plain = ~bound & (weight > 0)
+            noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
+            # The first round has no residual to weigh the prior and the bounds with.
+            change = np.abs(answer - before).max(initial=0.0)
+            converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
+        difference = target - mean_a @ answer
+        counted = np.where(bound & (difference < 0), 0.0, weight)
+        error, share = self._uncertainty(answer, variance, family)
+        return _Channel(
+            answer,
+            error,
+            share,
+            condition,
+            int((bound & (difference > 1e-6 * np.abs(target))).sum()),
+            rounds,
+            converged,
+            float((counted * difference**2).sum()),
+            float((np.where(bound, counted, weight) * target**2).sum()),
+        )
+
+    def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """(G,) >= 1, how many times less the rows know about a group than if their errors were independent (Kish 1965).
+
+        diag(H^-1 sum_k s_k s_k' H^-1) / diag(v H^-1): tracing noise and errors that the rows of an object share. The prior is
+        weighed against what the rows really know; otherwise neighbouring panes of one window are told apart by nothing but noise.
+        """
+        effect = np.ones(len(answer))
+        system = self.system(self.sure, np.zeros(len(self.target)), variance)
+        if system is not None:
+            known, inverse = system.known, np.linalg.inv(system.matrix)
+            real = np.diag(inverse @ self._meat(system, answer) @ inverse)
+            claimed = variance[known] * np.diag(inverse)
+            effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
+        return effect
+
+    def _meat(self, system: _System, answer: np.ndarray) -> np.ndarray:
+        """`scores` of the known groups in units of the system's scale."""
+        return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
+
+    def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """(standard error, share of the answer that is not the prior's), both (G,)."""
+        error, share = self.initial.copy(), np.zeros(len(answer))
+        system = self.system(self.sure, np.zeros(len(self.target)), variance)
+        if system is None:
+            return error, share
+        known, scale, initial = system.known, system.scale, self.initial[system.known]
+        inverse = np.linalg.inv(system.matrix)
+        pull = inverse @ system.lifted  # d answer / d initial
+        prior_part = pull * np.minimum(self.width[known], np.maximum(initial, 1e-300)) * scale
+        if family is not None:
+            member = family[known][:, None] == np.unique(family)
+            size = member.sum(0)
+            mean = prior_part @ (member / np.maximum(size, 1))
+            prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
+        data_part = np.clip(np.diag(inverse @ self._meat(system, answer) @ inverse), 0, None)
+        share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
+        error[known] = np.sqrt(data_part + (prior_part**2).sum(1)) / scale
         return error, share
-    known, scale = system.known, system.scale
-    inverse = np.linalg.inv(system.matrix)
-    meat = system.scores(rows, c, weight, cross, answer)
-    pull = inverse @ system.lifted  # d answer / d initial
-    prior_part = pull * np.minimum(width[known], np.maximum(initial[known], 1e-300)) * scale
-    if family is not None:
-        member = family[known][:, None] == np.unique(family)
-        size = member.sum(0)
-        mean = prior_part @ (member / np.maximum(size, 1))
-        prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
-    variance_of = np.clip(np.diag(inverse @ meat @ inverse), 0, None) + (prior_part**2).sum(1)
-    share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
-    error[known] = np.sqrt(variance_of) / scale
-    return error, share

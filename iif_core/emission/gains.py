@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from .direct import solve_emission
 from .rows import EmissionRows, scale_rows
 
-_AHEAD = 4
+LEVEL_OF_PRIOR = 0.35
+"""Standard deviation of the logarithm of the level that the mean albedo of the base texture gives the light: it is off by
+factors of 1.22, 1.36 and 1.41 on the three scenes with truth (docs/affines.md)."""
+_LEVELS = np.linspace(-2.0, 2.0, 161)
+"""Logarithms of the level of all light that are tried."""
+_BOUNDS = (0.1, 10.0)
+
+
+@dataclass(frozen=True)
+class ObjectGains:
+    """Result of `object_gains`.
+
+    Attributes:
+        gain: (n_objects, 3) > 0.
+        level_error: standard error of the logarithm of the level of all light (the same factor on every emitter); infinite
+            where nothing tells it.
+    """
+
+    gain: np.ndarray
+    level_error: float
 
 
 def object_gains(
@@ -19,14 +40,18 @@ def object_gains(
     cross: bool = True,
     rounds: int = 15,
     shrink: float = 0.05,
-) -> np.ndarray:
-    """Albedo gain of each object and channel that goes with the light: (n_objects, 3).
+) -> ObjectGains:
+    """Albedo gain of each object and channel that goes with the light.
 
     The base texture is off by a factor per object, and light solved with wrong albedos comes out wrong where an object
     faces one emitter more than another. y = g_o (A E + h) is solved by turns for E (non-negative least squares)
-    and for g (a ratio per object, pulled to what all have in common). Where neither an emitter is seen unsaturated nor
-    photographed light (h) shares in what is reflected, only the product g E is known: the mean of log g over the rows
-    stays 0 then, as the prior has it.
+    and for g (a ratio per object, pulled to what all have in common). By turns alone the level of E would creep, a few per cent a
+    turn, so with each g goes the level s that is best for it: y = g_o (s A E + h), g eliminated. Where neither an emitter is seen
+    unsaturated nor photographed light (h) shares in what is reflected, only the product g E is known: the mean of log g over the
+    rows stays 0 then, as the prior has it.
+
+    The level is found from how unlike the shares of h are. What that is worth is told by the jackknife over objects (Tukey 1958):
+    errors of geometry, cache and texture are shared within an object, not between objects.
 
     Args:
         rows, observed, initial, cross: as in `scale_rows` and `solve_emission`.
@@ -39,38 +64,112 @@ def object_gains(
     gain = np.ones((count, 3))
     known = owner >= 0
     if not known.any() or rows.groups == 0:
-        return gain
-    index, own = np.flatnonzero(known), owner[known]
-    weight = np.where(rows.lower_bound[known], 0.0, rows.weight[known])
-    y, a1, a2 = observed[known], rows.first[known], rows.second[known]
-    h1, h2 = y - rows.target[known], y - rows.target_second[known]
-    share = np.stack([np.bincount(own, weight[:, c] * y[:, c] ** 2, count) for c in range(3)], 1)
-    moved = np.zeros(3)
-    for turn in range(rounds):
-        of_row = np.ones(observed.shape)
-        of_row[index] = gain[own]
+        return ObjectGains(gain, float("inf"))
+    # Every row that is no object's is an anchor, its gain is 1: an object of its own at the end.
+    column = np.where(known, owner, count)
+    weight = np.where(rows.lower_bound, 0.0, rows.weight)
+    cached = [observed - rows.target, observed - rows.target_second]
+    share = _by_object(weight * observed**2, column, count + 1)[:count]
+    profile = None
+    for _ in range(rounds):
+        of_row = np.concatenate([gain, np.ones((1, 3))])[column]
         radiance = solve_emission(scale_rows(rows, observed, of_row), initial, cross, max_rounds=5).radiance
-        p1 = np.einsum("ngc,gc->nc", a1, radiance) + h1
-        p2 = np.einsum("ngc,gc->nc", a2, radiance) + h2
-        new = np.ones_like(gain)
-        for c in range(3):
-            square = p1[:, c] * p2[:, c] if cross else (0.5 * (p1[:, c] + p2[:, c])) ** 2
-            top = np.bincount(own, weight[:, c] * y[:, c] * 0.5 * (p1[:, c] + p2[:, c]), count)
-            bottom = np.bincount(own, weight[:, c] * square, count)
-            floor = 1e-9 * max(float(bottom.max()), 1e-300)
-            pull = shrink * np.maximum(bottom, 0.0) + floor
-            common = float(np.clip((top.sum() + floor) / max(bottom.sum() + floor, 1e-300), 0.1, 10.0)) if pinned else 1.0
-            new[:, c] = np.clip((top + pull * common) / np.maximum(bottom + pull, 1e-300), 0.1, 10.0)
+        emitted = [np.einsum("ngc,gc->nc", a, radiance) for a in (rows.first, rows.second)]
+        profile = _Profile.of(observed, emitted, cached, weight, column, count + 1, cross, shrink, pinned)
+        new = profile.gain(profile.level() if pinned else np.zeros(3))
         if not pinned:
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
         done = np.abs(np.log(new / gain)).max() < 1e-3
-        if pinned:
-            # The level that all objects share settles by a fixed part a turn: now and then to where that leads (Aitken 1926).
-            before, moved = moved, (share * np.log(new / gain)).sum(0) / np.maximum(share.sum(0), 1e-300)
-            rate = np.clip(np.divide(moved, before, out=np.zeros(3), where=before != 0), 0.0, 0.95)
-            if turn % _AHEAD == _AHEAD - 1:
-                new = np.clip(new * np.exp(moved * rate / (1.0 - rate)), 0.1, 10.0)
         gain = new
         if done:
             break
-    return gain
+    return ObjectGains(gain, profile.level_error() if pinned and profile is not None else float("inf"))
+
+
+def _by_object(values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
+    return np.stack([np.bincount(owner, values[:, c], count) for c in range(3)], 1)
+
+
+@dataclass(frozen=True)
+class _Profile:
+    """sum w (y - g_o (s d + h))^2 as quadratic forms of (1, s), each (O + 1, 3); the last object's gain is 1."""
+
+    yy: np.ndarray
+    yd: np.ndarray
+    yh: np.ndarray
+    dd: np.ndarray
+    dh: np.ndarray
+    hh: np.ndarray
+    shrink: float
+    pinned: bool
+
+    @classmethod
+    def of(
+        cls,
+        y: np.ndarray,
+        emitted: list[np.ndarray],
+        cached: list[np.ndarray],
+        weight: np.ndarray,
+        owner: np.ndarray,
+        count: int,
+        cross: bool,
+        shrink: float,
+        pinned: bool,
+    ) -> _Profile:
+        """With `cross`, products of the two traces, which share no noise."""
+        (d1, d2), (h1, h2) = emitted, cached
+        d, h = 0.5 * (d1 + d2), 0.5 * (h1 + h2)
+        if not cross:
+            d1 = d2 = d
+            h1 = h2 = h
+        products = (y * y, y * d, y * h, d1 * d2, 0.5 * (d1 * h2 + d2 * h1), h1 * h2)
+        return cls(*[_by_object(weight * p, owner, count) for p in products], shrink, pinned)
+
+    def _solve(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(cost, gain) of all but the last object, at log s (..., 1 or 3): (..., O, 3)."""
+        s = np.exp(level)[..., None, :]
+        top = (s * self.yd + self.yh)[..., :-1, :]
+        bottom = np.maximum((s * s * self.dd + 2 * s * self.dh + self.hh)[..., :-1, :], 0.0)
+        floor = 1e-9 * np.maximum(bottom.max((-2, -1), keepdims=True), 1e-300)
+        pull = self.shrink * bottom + floor
+        total, below = top.sum(-2, keepdims=True), bottom.sum(-2, keepdims=True)
+        common = np.clip((total + floor) / (below + floor), *_BOUNDS) if self.pinned else 1.0
+        gain = np.clip((top + pull * common) / (bottom + pull), *_BOUNDS)
+        cost = self.yy[:-1] - 2 * gain * top + gain**2 * bottom + pull * (gain - common) ** 2
+        return cost, gain
+
+    def _costs(self) -> np.ndarray:
+        """(levels, O + 1, 3)."""
+        s = np.exp(_LEVELS)[:, None, None]
+        anchors = self.yy[-1:] - 2 * (s * self.yd + self.yh)[:, -1:] + (s * s * self.dd + 2 * s * self.dh + self.hh)[:, -1:]
+        return np.concatenate([self._solve(_LEVELS[:, None])[0], anchors], 1)
+
+    def gain(self, level: np.ndarray) -> np.ndarray:
+        """(O, 3) at log s (3,)."""
+        return self._solve(level)[1]
+
+    def level(self) -> np.ndarray:
+        """(3,) log s of least cost."""
+        return _lowest(self._costs().sum(1))
+
+    def level_error(self) -> float:
+        """Standard error of one log s of all channels, objects (and all anchors) left out in turn."""
+        costs = self._costs().sum(2)
+        there = self.yy[:-1].sum(1) > 0
+        whole, n = costs.sum(1), int(there.sum())
+        if n < 2:
+            return float("inf")
+        without = _lowest(whole[:, None] - costs[:, :-1][:, there])
+        if np.abs(without).max() >= _LEVELS[-1]:
+            return float("inf")
+        return float(np.sqrt((n - 1) / n * ((without - _lowest(whole[:, None])) ** 2).sum()))
+
+
+def _lowest(costs: np.ndarray) -> np.ndarray:
+    """Where each column of (levels, n) is least: a parabola through the smallest value and its neighbours."""
+    at = np.clip(costs.argmin(0), 1, len(_LEVELS) - 2)
+    column = np.arange(costs.shape[1])
+    before, here, after = (costs[at + i, column] for i in (-1, 0, 1))
+    bend = before - 2 * here + after
+    part = np.divide(before - after, 2 * bend, out=np.zeros(len(at)), where=bend > 0)
+    return _LEVELS[at] + np.clip(part, -1.0, 1.0) * (_LEVELS[1] - _LEVELS[0])

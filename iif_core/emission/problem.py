@@ -47,22 +47,25 @@ class EmissionProblem:
         observed: (m, 3) radiance.
         owner: (m,) object that reflects, -1 = an emitter's own pixels.
         anchor: (m,) bool, an emitter or the sky, seen directly.
+        level_error: standard error of the logarithm of the level of all light, infinite where nothing tells it
+            (`with_gains`).
     """
 
     rows: EmissionRows
     observed: np.ndarray
     owner: np.ndarray
     anchor: np.ndarray
+    level_error: float = float("inf")
 
     def with_gains(self, initial: np.ndarray) -> EmissionProblem:
         """Rows scaled by the albedo gains of the objects that go with the light."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
         pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
-        gain = object_gains(self.rows, self.observed, self.owner, initial, pinned)
+        found = object_gains(self.rows, self.observed, self.owner, initial, pinned)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0
-        of_row[known] = gain[self.owner[known]]
-        return replace(self, rows=scale_rows(self.rows, self.observed, of_row))
+        of_row[known] = found.gain[self.owner[known]]
+        return replace(self, rows=scale_rows(self.rows, self.observed, of_row), level_error=found.level_error)
 
 
 def assemble(

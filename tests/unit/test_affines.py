@@ -16,6 +16,7 @@ from iif_core.affines import (
 )
 from iif_core.affines.descent import Pull
 from iif_core.affines.pixels import evaluate, prepare
+from iif_core.emission.gains import LEVEL_OF_PRIOR
 from iif_core.errors import InputError
 from iif_core.response import response
 from tests.unit.planted_fit import LEVELS, problem_of
@@ -295,6 +296,21 @@ def test_scale_pins():
         fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
         assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
     assert pin(problem, free, Gauge("found")).affine is free.affine
+
+
+def test_a_level_that_is_not_sure_leans_on_the_prior():
+    problem, _ = problem_of(np.random.default_rng(14))
+    free = fit_affines(problem, response("identity"), EXACT)
+    prior = pin(problem, free, Gauge("prior")).light_scale
+    assert abs(np.log(prior)) > 0.02
+    for error, share, left in (
+        (LEVEL_OF_PRIOR, 0.5, LEVEL_OF_PRIOR / np.sqrt(2)),
+        (np.inf, 1.0, LEVEL_OF_PRIOR),
+        (1e-6, 0.0, 1e-6),
+    ):
+        pinned = pin(problem, free, Gauge("found", error=error))
+        assert np.log(pinned.light_scale) == pytest.approx(share * np.log(prior), abs=1e-9)
+        assert pinned.facts["scale"]["relative_error"] == pytest.approx(left, rel=1e-6)
 
 
 def test_scale_refused():

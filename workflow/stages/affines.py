@@ -162,12 +162,9 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
 
 
 def _light_error(job: Job) -> float:
-    """Standard error of the power of all light that was found, relative to it; 0 without any."""
-    table = job.read("emission").table("emitters.parquet")
-    kept = table["kept"].astype(bool)
-    area = np.where(table["kind"][kept] == "area", table["area_m2"][kept], 1.0)
-    power, error = (sum(area * table[f"{name}_{c}"][kept] for c in "rgb") for name in ("radiance", "error"))
-    return float(np.sqrt((error**2).sum()) / power.sum()) if kept.any() and power.sum() > 0 else 0.0
+    """Standard error of the logarithm of the level of the light; infinite where the photographs do not tell it."""
+    error = job.read("emission").json("emission.json")["level_error"]
+    return float("inf") if error is None else float(error)
 
 
 def _lamp_gauge(job: Job, lamp: Any) -> Callable[[FitProblem, _Places], Gauge]:

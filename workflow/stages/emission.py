@@ -12,6 +12,7 @@ from iif_core.emission.cache import RadianceVoxels
 from iif_core.emission.candidates import emitter_candidates
 from iif_core.emission.direct import EmissionSolution, solve_families
 from iif_core.emission.environment import MAX_GROUPS, Sky
+from iif_core.emission.gains import LEVEL_OF_PRIOR
 from iif_core.emission.groups import EmitterGroups, group_emitters
 from iif_core.emission.loss import reference_loss
 from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
@@ -69,7 +70,7 @@ def run(job: Job) -> None:
     groups = groups.select(lit)
     if left_out.size:
         cache = radiance_cache(photos, groups)[0]
-    solution, loss = _solve(photos, groups, cache, outside)
+    solution, loss, level_error = _solve(photos, groups, cache, outside)
     table = _table(groups, left_out, reasons, solution, outside)
     _write(job, groups, table, cache, outside)
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
@@ -90,6 +91,7 @@ def run(job: Job) -> None:
             "residual": solution.residual,
             "solver": job.settings.emission.solver,
             "reference_loss": loss,
+            "level_error": level_error if np.isfinite(level_error) else None,
             "active_set": active_set,
             "escape_share": {"primary": escape, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
@@ -126,8 +128,10 @@ def _initial(photos: Photographs, groups: EmitterGroups, rows: PixelRows, sky: S
     return seen, seen if sky is None else np.concatenate([seen, sky.radiance])
 
 
-def _solve(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None) -> tuple[EmissionSolution, float]:
-    """Emission of the groups that shine, which are black from here on, and of the environment; its loss."""
+def _solve(
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None
+) -> tuple[EmissionSolution, float, float]:
+    """Emission of the groups that shine, which are black from here on, and of the environment; its loss; error of its level."""
     pixels, base, rows = choose_rows(photos, groups)
     halves = _trace(photos, pixels, base, groups, voxels, sky, 3)
     initial = _initial(photos, groups, rows, sky)[1]
@@ -144,7 +148,8 @@ def _solve(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, s
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
         solution = solve_families(problem.rows, initial, family)
-    return solution, reference_loss(problem.rows, solution.radiance)
+    solution = solution.with_level_error(min(problem.level_error, LEVEL_OF_PRIOR))
+    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error
 
 
 def _trace(
