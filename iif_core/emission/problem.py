@@ -58,14 +58,15 @@ class EmissionProblem:
     level_error: float = float("inf")
 
     def with_gains(self, initial: np.ndarray) -> EmissionProblem:
-        """Rows scaled by the albedo gains of the objects that go with the light."""
+        """Rows scaled by the albedo gains of the objects that go with the light, weighed relative to what they should show."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
         pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
         found = object_gains(self.rows, self.observed, self.owner, initial, pinned)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0
         of_row[known] = found.gain[self.owner[known]]
-        return replace(self, rows=scale_rows(self.rows, self.observed, of_row), level_error=found.level_error)
+        rows = replace(self.rows, weight=found.weight)
+        return replace(self, rows=scale_rows(rows, self.observed, of_row), level_error=found.level_error)
 
 
 def assemble(

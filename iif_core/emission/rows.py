@@ -23,7 +23,7 @@ class EmissionRows:
         cluster: (n,) int, rows with the same number >= 0 may err together (one object in one view: its albedo is off);
             -1 or None = alone.
         noise: (n,) > 0, relative size of the noise of one pixel of a row (radiance, up to a common factor that the
-            residuals tell); how sharp a bound is. None = bounds are exact.
+            residuals tell): how sharp a bound is, and what the weights are relative to. None = bounds are exact.
     """
 
     first: np.ndarray

@@ -84,7 +84,7 @@ def test_killed_job_resumes_to_the_same_result(finished, tmp_path):
     workflow = type(finished)(finished.repository, tmp_path / "run")
     workflow.write("tiny", (finished.folder / "config/scenes/tiny.yaml").read_text())
     process = subprocess.Popen(workflow.command("scenes/tiny"), stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 600
     victim = None
     while victim is None and time.monotonic() < deadline:
         out = subprocess.run(["pgrep", "-f", "--", "-m workflow (shading|affines|base) tiny"], capture_output=True, text=True)
