@@ -62,7 +62,7 @@ def object_gains(
 
     The level is found from how unlike the shares of h are. What that is worth is told by the jackknife over objects (Tukey 1958):
     errors of geometry, cache and texture are shared within an object, not between objects. What all share is added
-    (`SHARED_ERROR`), unless an emitter is seen unsaturated.
+    (`SHARED_ERROR`), in as far as the level is not that of emitters that are seen unsaturated.
 
     Args:
         rows, observed, initial, cross: as in `scale_rows` and `solve_emission`.
@@ -176,7 +176,7 @@ class _Profile:
         return _lowest(self._costs().sum(1))
 
     def level_error(self) -> float:
-        """Standard error of one log s of all channels, objects (and all anchors) left out in turn."""
+        """Standard error of one log s of all channels, objects left out in turn; see `SHARED_ERROR`."""
         costs = self._costs().sum(2)
         there = self.yy[:-1].sum(1) > 0
         whole, n = costs.sum(1), int(there.sum())
@@ -185,8 +185,11 @@ class _Profile:
         without = _lowest(whole[:, None] - costs[:, :-1][:, there])
         if np.abs(without).max() >= _LEVELS[-1]:
             return float("inf")
-        shared = 0.0 if self.yy[-1].any() else SHARED_ERROR
-        return float(np.hypot(shared, np.sqrt((n - 1) / n * ((without - _lowest(whole[:, None])) ** 2).sum())))
+        at = np.clip(whole.argmin(), 1, len(_LEVELS) - 2)
+        bend = [max(float(c[at - 1] - 2 * c[at] + c[at + 1]), 0.0) for c in (costs[:, :-1].sum(1), costs[:, -1])]
+        of_objects = bend[0] / max(sum(bend), 1e-300)  # how much of the level is theirs, and not the anchors'
+        own = np.sqrt((n - 1) / n * ((without - _lowest(whole[:, None])) ** 2).sum())
+        return float(np.hypot(SHARED_ERROR * of_objects, own))
 
 
 def _lowest(costs: np.ndarray) -> np.ndarray:
