@@ -95,7 +95,6 @@ def test_a_batch_is_what_its_samples_are_alone(made, kind):
     assert together.min() >= 0 and together.max() <= 1
     assert together.std(0).mean() > 0.01  # seeds differ
     np.testing.assert_allclose(sampled(kind, made[kind], batch=1), together, atol=1e-5)
-    np.testing.assert_allclose(sampled(kind, made[kind], batch=3), together, atol=1e-5)
     alone = sampled(kind, made[kind], samples=1, seed=2)  # sample k has seed + k
     np.testing.assert_allclose(alone[0], together[2], atol=1e-5)
 
@@ -103,10 +102,10 @@ def test_a_batch_is_what_its_samples_are_alone(made, kind):
 def test_bytes_do_not_depend_on_threads(made):
     before, found = torch.get_num_threads(), []
     try:
-        for threads in (1, 2, 3):
+        for threads in (1, 3):
             diffusion.loaded.cache_clear()
             torch.set_num_threads(threads)
-            found.append(sampled("rgbx", made["rgbx"]).tobytes())
+            found.append(sampled("rgbx", made["rgbx"], samples=3, steps=1).tobytes())
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
@@ -116,12 +115,13 @@ def test_bytes_do_not_depend_on_threads(made):
 
 @pytest.mark.parametrize("kind", MODULES)
 def test_a_photograph_is_encoded_once(made, kind, monkeypatch):
-    keys = namespace(kind, made[kind])
+    few = {"samples": 2, "steps": 1}
+    keys = namespace(kind, made[kind], **few)
     model = diffusion.loaded(MODULES[kind].RECIPE, json.dumps(vars(keys.prior), sort_keys=True))
     shapes, encode = [], model.vae.encode
     monkeypatch.setattr(model.vae, "encode", lambda x: (shapes.append(tuple(x.shape)), encode(x))[1])
     for view in range(2):
-        sampled(kind, made[kind], view)
+        sampled(kind, made[kind], view, **few)
     assert shapes == [(1, 3, 64, 64)] * 2
 
 
@@ -182,9 +182,9 @@ def test_marigold_is_the_pipeline_of_diffusers(made):
 
 
 def test_marigold_says_what_its_channels_are(made):
-    keys = namespace("marigold", made["marigold"])
-    raw = diffusion.predicted(marigold.RECIPE, keys.prior, photograph.seen(Capture().views[0], Capture(), False), 64, 3, 0)
-    found = sampled("marigold", made["marigold"])
+    keys = namespace("marigold", made["marigold"], samples=2, steps=1)
+    raw = diffusion.predicted(marigold.RECIPE, keys.prior, photograph.seen(Capture().views[0], Capture(), False), 64, 1, 0)
+    found = sampled("marigold", made["marigold"], samples=2, steps=1)
     np.testing.assert_allclose(found[..., :3], linear_from_srgb(raw[:, 0]), atol=1e-6)
     np.testing.assert_array_equal(found[..., 3:], raw[:, 1, ..., :2])
     turned = json.loads(json.dumps(tiny_diffusion.TARGETS))
@@ -232,12 +232,13 @@ def test_resizing_and_padding():
 
 
 def test_bfloat16_is_float32_roughly_and_the_half_files_are_read(made, copied):
-    exact = sampled("rgbx", made["rgbx"])
-    rough = sampled("rgbx", made["rgbx"], precision="bfloat16")
+    few = {"samples": 2, "steps": 2}
+    exact = sampled("rgbx", made["rgbx"], **few)
+    rough = sampled("rgbx", made["rgbx"], precision="bfloat16", **few)
     assert 0 < abs(rough - exact).mean() < 0.05
     for path in copied["rgbx"].rglob("*.safetensors"):
         path.rename(path.with_suffix(".fp16.safetensors"))
-    np.testing.assert_array_equal(sampled("rgbx", copied["rgbx"]), exact)
+    np.testing.assert_array_equal(sampled("rgbx", copied["rgbx"], **few), exact)
 
 
 # ------------------------------------------------------------------------------------------------------------- photographs
@@ -301,6 +302,7 @@ def run(made, tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(stage, "CaptureReader", lambda _: Capture(views))
             patch.setattr(rgbx, "predict", counted)
+            keys = {"samples": 2, "steps": 1} | keys
             job = Job(tmp_path / folder, namespace("rgbx", made["rgbx"], **keys).prior, fingerprint=fingerprint)
             if fail is not None:
                 with pytest.raises(KeyboardInterrupt):
@@ -350,7 +352,7 @@ def test_failed_samples_are_dropped_and_recorded(run, monkeypatch):
 
     monkeypatch.setattr(diffusion.Model, "_decode", spoilt)
     diffusion.loaded.cache_clear()
-    reader, _ = run(views=2, batch=4)
+    reader, _ = run(views=2, batch=4, samples=4)
     diffusion.loaded.cache_clear()
     table = reader.table("predictions.parquet")
     assert table["used"].tolist() == [True, False, True, False] * 2
