@@ -183,7 +183,8 @@ def _check_classes(folder: Path, index: dict[str, Any], recipe: Recipe) -> None:
     for component, needed in COMPONENTS.items():
         entry = index.get(component)
         name = entry[1] if isinstance(entry, list) and len(entry) == 2 else entry
-        if name not in (needed, f"{needed}Fast"):
+        made_anew = component == "scheduler" and recipe.scheduler  # DDIM, from whichever one's settings
+        if name not in (needed, f"{needed}Fast") and not made_anew:
             raise InputError(f"{path}: `{component}` is {name}, needed {needed}; only this kind of it is read here")
         if not (folder / component).is_dir():
             raise InputError(f"{folder / component}: not found; the checkpoint is incomplete, download it again")
@@ -193,7 +194,6 @@ def _check_channels(folder: Path, targets: int, unet: dict[str, Any]) -> None:
     _require(folder / "unet/config.json", "in_channels", (1 + targets) * LATENT)
     _require(folder / "unet/config.json", "out_channels", targets * LATENT)
     _require(folder / "vae/config.json", "latent_channels", LATENT)
-    _require(folder / "scheduler/scheduler_config.json", "_class_name", COMPONENTS["scheduler"])
     _require(folder / "scheduler/scheduler_config.json", "prediction_type", "v_prediction")
     stored = unet.get("conv_in.weight", {}).get("shape", [0, 0])[1]
     if stored != (1 + targets) * LATENT:
