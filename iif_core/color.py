@@ -67,6 +67,17 @@ def display_exposure(radiance: ArrayLike, valid: Array | None = None, quantile: 
     return target / level if level > 1e-12 else 1.0
 
 
+def key_exposure(radiance: ArrayLike, valid: Array | None = None, key: float = 0.18) -> float:
+    """Factor that brings the log-average of luminance, exp(mean(ln Y)), to `key` (Reinhard et al. 2002); 1 without light.
+
+    Luminance below 1e-6 of its mean counts as that, so that black pixels do not decide. Arguments as of `display_exposure`.
+    """
+    y = luminance(radiance).astype(np.float64)
+    y = y[np.isfinite(y) if valid is None else np.isfinite(y) & valid]
+    level = float(y.mean()) if y.size else 0.0
+    return float(key / np.exp(np.log(np.maximum(y, 1e-6 * level)).mean())) if level > 1e-12 else 1.0
+
+
 def tone_map(radiance: ArrayLike, exposure: float = 1.0) -> Array:
     """Picture of linear radiance: sRGB(clip(exposure L, 0, 1)); NaN becomes 0. Shape kept, values in [0, 1]."""
     exposed = np.nan_to_num(_floating(radiance) * exposure, nan=0.0, posinf=1.0, neginf=0.0)

@@ -1,4 +1,4 @@
-"""Separable filters of images, compiled."""
+"""Separable filters of images, compiled, and holes filled."""
 
 from __future__ import annotations
 
@@ -42,3 +42,14 @@ def _correlate(padded, vertical, horizontal):
             for j in range(width):
                 target[j] += weight * row[j + k]
     return out
+
+
+def fill_from_neighbours(maps: np.ndarray) -> tuple[np.ndarray, int]:
+    """(H, W, C) with every pixel that is not finite replaced by the nearest one that is, and how many there were."""
+    from scipy.ndimage import distance_transform_edt
+
+    lost = ~np.isfinite(maps).all(-1)
+    if not lost.any():
+        return maps, 0
+    rows, columns = distance_transform_edt(lost, return_distances=False, return_indices=True)
+    return maps[rows, columns], int(lost.sum())

@@ -140,7 +140,48 @@ class RetinexPrior(PriorBase):
     """Mean albedo that each hypothesis is scaled to."""
 
 
-Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior, Field(discriminator="kind")]
+class DiffusionPrior(PriorBase):
+    accept_license: bool = False
+    """`true` says that you read the licence of the weights and may use them for this."""
+    tile: int = Field(1024, ge=64, le=4096, multiple_of=64)
+    """Larger pictures are sampled in tiles of this edge (pixels that the model sees), which overlap by a quarter."""
+    batch: int | None = Field(None, ge=1)
+    """Samples at once; default: 4 on a GPU, on a CPU one a thread."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto`: the GPU if torch sees one."""
+    precision: Literal["auto", "float32", "float16", "bfloat16"] = "auto"
+    """Of the U-Net; `auto`: float16 on a GPU, float32 on a CPU. The rest is float32."""
+
+
+class RgbxPrior(DiffusionPrior):
+    """RGB-X, a diffusion model whose weights you bring (docs/priors.md). Non-commercial research only."""
+
+    kind: Literal["rgbx"]
+    checkpoint: str = "zheng95z/rgb-to-x"
+    """Folder in diffusers' layout, or the name of a repository in the local cache of Hugging Face. Nothing is downloaded."""
+    revision: str | None = Field("b38b3fd73a14ea62f3953fc54bc4ac67b067bae0", pattern=r"^[0-9a-f]{7,40}$")
+    """Commit of the checkpoint that is meant, or its first digits; where a folder tells none, it is not compared."""
+    steps: int = Field(50, ge=1, le=1000)
+    """Denoising steps."""
+    longest_side: int = Field(1024, ge=64, le=8192)
+    """Photographs are scaled to this size, in pixels, for the model; the maps are scaled back."""
+
+
+class MarigoldPrior(DiffusionPrior):
+    """Marigold-IID appearance, a diffusion model whose weights you bring (docs/priors.md)."""
+
+    kind: Literal["marigold"]
+    checkpoint: str = "prs-eth/marigold-iid-appearance-v1-1"
+    """Folder in diffusers' layout, or the name of a repository in the local cache of Hugging Face. Nothing is downloaded."""
+    revision: str | None = Field("e7280a0a0fc5a0df0b36050882b3d8b77da22fd9", pattern=r"^[0-9a-f]{7,40}$")
+    """Commit of the checkpoint that is meant, or its first digits; where a folder tells none, it is not compared."""
+    steps: int | None = Field(None, ge=1, le=1000)
+    """Denoising steps; default: what the checkpoint recommends (4)."""
+    longest_side: int | None = Field(None, ge=64, le=8192)
+    """Photographs are scaled to this size, in pixels, for the model; default: what the checkpoint recommends (768)."""
+
+
+Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior | RgbxPrior | MarigoldPrior, Field(discriminator="kind")]
 
 # ----------------------------------------------------------------------------------------------------------------- stages
 
@@ -591,7 +632,13 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
 
 _UNIONS: dict[str, dict[str, type[Section]]] = {
     "source": {"builtin": BuiltinSource, "mitsuba": MitsubaSource, "folder": FolderSource},
-    "prior": {"simulated": SimulatedPrior, "files": FilesPrior, "retinex": RetinexPrior},
+    "prior": {
+        "simulated": SimulatedPrior,
+        "files": FilesPrior,
+        "retinex": RetinexPrior,
+        "rgbx": RgbxPrior,
+        "marigold": MarigoldPrior,
+    },
 }
 
 

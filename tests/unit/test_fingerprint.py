@@ -97,7 +97,8 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         print(json.dumps(sorted(m for m in sys.modules if m.split(".")[0] in ("iif_core", "workflow"))))
         """
     )
-    plugins = {"capture": ("source", ("builtin", "mitsuba", "folder")), "prior": ("prior", ("simulated", "files", "retinex"))}
+    priors = ("simulated", "files", "retinex", "rgbx", "marigold")
+    plugins = {"capture": ("source", ("builtin", "mitsuba", "folder")), "prior": ("prior", priors)}
     for stage in STAGES:
         section, kinds = plugins.get(stage, (None, (None,)))
         for kind in kinds:

@@ -8,10 +8,10 @@ import pytest
 
 from iif_core.color import linear_from_srgb
 from iif_core.errors import InputError
+from iif_core.filters import fill_from_neighbours
 from workflow.artifacts.files import write_exr
 from workflow.normal_form import View
 from workflow.priors import files, retinex, simulated
-from workflow.stages.prior import fill_from_neighbours
 
 HEIGHT, WIDTH = 12, 16
 

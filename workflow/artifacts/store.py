@@ -69,6 +69,25 @@ class StageWriter:
         io.write_atomically(self.directory / name, write)
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
+    def note(self, name: str, document: Any) -> None:
+        """Write a small document for this job alone, should it be killed and started again; `finish` removes it."""
+        io.write_json(self.directory / name, document)
+
+    def noted(self, name: str) -> Any | None:
+        """What an earlier run of this job noted; None if it did not, or not readably."""
+        try:
+            return json.loads((self.directory / name).read_text())
+        except (OSError, ValueError):
+            return None
+
+    def keep(self, name: str, facts: dict[str, Any]) -> bool:
+        """Take over a file of an earlier run that recorded `facts` of it, unless it is gone or has changed."""
+        path = self.directory / name
+        if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
+            return False
+        self.files[name] = facts
+        return True
+
     def _record(self, name: str, **facts: Any) -> None:
         path = self.directory / name
         self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}

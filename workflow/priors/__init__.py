@@ -6,5 +6,6 @@ Each has
 
 albedo R G B linear, perceptual roughness, metallic, in [0, 1]; NaN where there is no value. `settings` is what stage
 prior sees (`settings.prior`, `settings.source`), `capture` the normal form. A prior that reads files from outside also
-has `raw_inputs(document) -> list[Path]`, called while Snakemake plans; it names what is missing.
+has `raw_inputs(document) -> list[Path]`, called while Snakemake plans; it names what is missing. One that is a model of its own
+has `describe(settings) -> dict`, which is kept as model.json.
 """

@@ -1,3 +1,12 @@
+import json
+
+
+def diffusion_prior(wildcards):
+    """Whether the scene's prior is a network of gigabytes rather than a formula."""
+    document = json.loads(fingerprints.resolved(wildcards.scene, QUALITY))
+    return document["prior"]["kind"] in ("rgbx", "marigold")
+
+
 rule prior:
     input:
         upstream("prior"),
@@ -9,8 +18,10 @@ rule prior:
         "results/{scene}/benchmarks/prior.jsonl"
     threads: 2
     resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
+        mem_mb=lambda wildcards, attempt: attempt
+        * (12000 if diffusion_prior(wildcards) else 3000),
+        runtime=lambda wildcards, attempt: attempt
+        * (720 if diffusion_prior(wildcards) else 120),
     params:
         job=job("prior"),
         python=sys.executable,

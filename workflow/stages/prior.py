@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import importlib
+from types import ModuleType
 
 import numpy as np
 
 from iif_core.base.problem import prediction_faults
 from iif_core.errors import InputError
+from iif_core.filters import fill_from_neighbours
 from workflow.artifacts.store import split_rgb
 from workflow.job import Job
-from workflow.normal_form import CaptureReader
+from workflow.normal_form import CaptureReader, View
+
+Row = tuple[int, int, bool, str]
+"""view_id, k, whether the prediction is used, why not (or what was done to it)."""
 
 
 def run(job: Job) -> None:
-    """Write maps/<view>.exr with the usable predictions of each view (but test views), and predictions.parquet.
+    """Write maps/<view>.exr with the usable predictions of each view (but test views), and predictions.parquet; of a prior that
+    is a model of its own also model.json.
+
+    A job that was killed goes on after the last view that it finished, as long as settings, inputs and code are the same.
 
     Raises:
         InputError: not a single prediction can be used.
@@ -23,22 +31,50 @@ def run(job: Job) -> None:
     prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
     views = [view for view in capture if view.split != "test"]
     seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
-    rows: list[tuple[int, int, bool, str]] = []
+    rows: list[Row] = []
     for done, view in enumerate(views):
         job.progress(done, len(views), "views predicted")
-        maps = prior.predict(view, job.settings, capture, seed)
-        expected = (job.settings.prior.samples, view.height, view.width, 5)
-        if maps.shape != expected:
-            raise InputError(f"view {view.name}: the prior made {maps.shape}, needed {expected}; please report it")
-        channels: dict[str, np.ndarray] = {}
-        for k, fault in enumerate(prediction_faults(maps)):
-            if not fault:
-                filled, count = fill_from_neighbours(maps[k])
-                channels |= _channels(k, filled)
-                note = f"{count} pixels without a finite value, filled from their neighbours" if count else ""
-            rows.append((view.view_id, k, not fault, fault or note))
-        if channels:
-            job.writer.exr(f"maps/{view.name}.exr", channels)
+        kept = _kept(job, view)
+        rows += _predicted(job, prior, capture, view, seed) if kept is None else kept
+    _write_table(job, rows)
+    if hasattr(prior, "describe"):
+        job.writer.json("model.json", prior.describe(job.settings))
+    job.progress(len(views), len(views), "views predicted")
+
+
+def _predicted(job: Job, prior: ModuleType, capture: CaptureReader, view: View, seed: int) -> list[Row]:
+    maps = prior.predict(view, job.settings, capture, seed)
+    expected = (job.settings.prior.samples, view.height, view.width, 5)
+    if maps.shape != expected:
+        raise InputError(f"view {view.name}: the prior made {maps.shape}, needed {expected}; please report it")
+    rows: list[Row] = []
+    channels: dict[str, np.ndarray] = {}
+    for k, fault in enumerate(prediction_faults(maps)):
+        note = ""
+        if not fault:
+            filled, count = fill_from_neighbours(maps[k])
+            channels |= _channels(k, filled)
+            note = f"{count} pixels without a finite value, filled from their neighbours" if count else ""
+        rows.append((view.view_id, k, not fault, fault or note))
+    name = f"maps/{view.name}.exr"
+    if channels:
+        job.writer.exr(name, channels)
+    done = {"by": job.fingerprint, "rows": rows, "file": job.writer.files[name] if channels else None}
+    job.writer.note(f"unfinished/{view.name}.json", done)
+    return rows
+
+
+def _kept(job: Job, view: View) -> list[Row] | None:
+    """Rows of a view that an interrupted run of this very job has finished."""
+    done = job.writer.noted(f"unfinished/{view.name}.json")
+    if done is None or done.get("by") != job.fingerprint:
+        return None
+    if done["file"] is not None and not job.writer.keep(f"maps/{view.name}.exr", done["file"]):
+        return None
+    return [tuple(row) for row in done["rows"]]
+
+
+def _write_table(job: Job, rows: list[Row]) -> None:
     columns = [list(column) for column in zip(*rows, strict=True)] if rows else [[], [], [], []]
     view_id, k, used, reason = columns
     if not any(used):
@@ -55,18 +91,6 @@ def run(job: Job) -> None:
             "reason": np.array(reason, object),
         },
     )
-    job.progress(len(views), len(views), "views predicted")
-
-
-def fill_from_neighbours(maps: np.ndarray) -> tuple[np.ndarray, int]:
-    """(H, W, 5) with every pixel that is not finite replaced by the nearest one that is, and how many there were."""
-    from scipy.ndimage import distance_transform_edt
-
-    lost = ~np.isfinite(maps).all(-1)
-    if not lost.any():
-        return maps, 0
-    rows, columns = distance_transform_edt(lost, return_distances=False, return_indices=True)
-    return maps[rows, columns], int(lost.sum())
 
 
 def _channels(k: int, maps: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,0 +1,266 @@
+"""A diffusion checkpoint on disk, checked before any job starts: packages, folder, revision, classes, channels, licence.
+
+Snakemake reads this while it plans, so nothing heavy is imported, and nothing is ever downloaded: the licences of these models
+are for people to read.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from iif_core.errors import InputError
+
+PACKAGES = ("diffusers", "transformers", "safetensors", "torch")
+COMPONENTS = {
+    "tokenizer": "CLIPTokenizer",
+    "text_encoder": "CLIPTextModel",
+    "unet": "UNet2DConditionModel",
+    "vae": "AutoencoderKL",
+    "scheduler": "DDIMScheduler",
+}
+LATENT = 4
+"""Channels of the latent space of Stable Diffusion 1 and 2, on which both models are built."""
+_STEM = {"text_encoder": "model", "unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model"}
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What the checkpoint of a prior must be, and how it is asked.
+
+    Attributes:
+        kind: of the prior; repository: where its authors publish it; licence: in words.
+        pipeline: class in model_index.json.
+        targets: of the document model_index.json, how many latent images the U-Net predicts at once (raises InputError).
+        prompts: one pass of the U-Net each; fill_prompts: padded to the length that the text encoder was trained with.
+        condition_first: whether the U-Net reads the photograph's channels before the noisy ones.
+        scheduler: what replaces the checkpoint's own settings of the scheduler.
+    """
+
+    kind: str
+    repository: str
+    licence: str
+    pipeline: str
+    targets: Callable[[dict[str, Any]], int]
+    prompts: tuple[str, ...]
+    fill_prompts: bool
+    condition_first: bool
+    scheduler: tuple[tuple[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checked folder. revision: 40 hexadecimal digits, None where nothing tells; weights: file of each component."""
+
+    folder: Path
+    revision: str | None
+    index: dict[str, Any]
+    weights: dict[str, Path]
+    files: tuple[Path, ...]
+
+    def variant(self, component: str) -> str | None:
+        """Which of the published precisions the weights of a component are in; None = float32."""
+        return "fp16" if self.weights[component].name.endswith(".fp16.safetensors") else None
+
+
+def check(prior: dict[str, Any], recipe: Recipe) -> Checkpoint:
+    """The checkpoint that `prior` (the settings' section, as plain values) names.
+
+    Raises:
+        InputError: a package, the folder or a file of it missing; another model or revision; licence not accepted.
+    """
+    require_packages(recipe.kind)
+    _require_device(prior["device"])
+    folder, revision = _locate(prior["checkpoint"], prior["revision"], recipe)
+    index = _json(folder / "model_index.json")
+    _check_classes(folder, index, recipe)
+    weights = {component: _weights(folder / component, stem) for component, stem in _STEM.items()}
+    headers = {component: _header(path) for component, path in weights.items()}
+    try:
+        targets = recipe.targets(index)
+    except InputError as error:
+        raise InputError(f"{folder / 'model_index.json'}: {error}") from None
+    _check_channels(folder, targets, headers["unet"])
+    if not prior["accept_license"]:
+        raise InputError(
+            f"`prior.accept_license`: found false. {recipe.repository} comes under {recipe.licence}; {_terms(folder)}"
+            " and, if you may use it, set `prior: {accept_license: true}`"
+        )
+    files = [folder / "model_index.json", *weights.values()]
+    for component in COMPONENTS:
+        files += [path for path in (folder / component).iterdir() if path.suffix in (".json", ".txt")]
+    return Checkpoint(folder, revision, index, weights, tuple(sorted(files)))
+
+
+def require_packages(kind: str) -> None:
+    """Refuse while planning what would fail with an ImportError in the job."""
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"`prior: {{kind: {kind}}}` needs {', '.join(missing)}, which this Python lacks; run `bash envs/setup.sh`"
+        )
+
+
+def _require_device(device: str) -> None:
+    torch = importlib.metadata.version("torch")
+    if device == "cuda" and "+cpu" in torch:
+        raise InputError(
+            f"`prior.device`: found cuda, but torch is the CPU build {torch}; envs/README.md says how to install a CUDA build,"
+            " or set `prior: {device: auto}`"
+        )
+
+
+# ----------------------------------------------------------------------------------------------------------------- where
+
+
+def _locate(checkpoint: str, revision: str | None, recipe: Recipe) -> tuple[Path, str | None]:
+    folder = Path(checkpoint).expanduser()
+    if folder.is_dir():
+        found = _revision_of(folder)
+        if revision and found and not found.startswith(revision):
+            raise InputError(
+                f"{folder}: revision {found}, needed {revision} (`prior.revision`); download that one, or set"
+                f" `prior: {{revision: {found}}}` if this one is meant"
+            )
+        return folder, found
+    if _REPOSITORY.fullmatch(checkpoint) is None:
+        raise InputError(f"{folder}: not found; `prior.checkpoint` is a folder in diffusers' layout. {_get_it(recipe)}")
+    return _in_cache(checkpoint, revision, recipe)
+
+
+def _in_cache(repository: str, revision: str | None, recipe: Recipe) -> tuple[Path, str]:
+    """Snapshot of a repository in the local cache of huggingface_hub, as `hf download` leaves it."""
+    from huggingface_hub.constants import HF_HUB_CACHE
+
+    snapshots = Path(HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}" / "snapshots"
+    present = sorted(path.name for path in snapshots.iterdir()) if snapshots.is_dir() else []
+    if revision is None and present:
+        raise InputError(f"`prior.revision`: missing; of {repository} the cache holds {', '.join(present)}. Name the one to use")
+    found = [name for name in present if name.startswith(revision or "")]
+    if len(found) != 1:
+        holds = f"the cache {snapshots.parents[1]} holds {', '.join(present) if present else 'nothing of it'}"
+        wanted = f" at revision {revision}" if revision else ""
+        raise InputError(
+            f"`prior.checkpoint`: {repository}{wanted} is not here ({holds}). {_get_it(recipe, repository, revision)}"
+        )
+    return snapshots / found[0], found[0]
+
+
+def _revision_of(folder: Path) -> str | None:
+    """What the downloader left beside a folder (`hf download --local-dir`), or the name of a snapshot in the cache."""
+    note = folder / ".cache/huggingface/download/model_index.json.metadata"
+    first = note.read_text().split("\n", 1)[0].strip() if note.is_file() else folder.resolve().name
+    return first if re.fullmatch(r"[0-9a-f]{40}", first) else None
+
+
+def _get_it(recipe: Recipe, repository: str | None = None, revision: str | None = None) -> str:
+    which = f"{repository or recipe.repository}{f' --revision {revision}' if revision else ''}"
+    return (
+        f"It comes under {recipe.licence}: if you may use it, `.venv/bin/hf download {which}` puts it into the cache,"
+        f" with `--local-dir <folder>` into a folder (docs/priors.md)"
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------------ what
+
+
+def _check_classes(folder: Path, index: dict[str, Any], recipe: Recipe) -> None:
+    path, found = folder / "model_index.json", index.get("_class_name")
+    if found != recipe.pipeline:
+        raise InputError(
+            f"{path}: `_class_name` is {found}, but `prior: {{kind: {recipe.kind}}}` needs {recipe.pipeline}: this is another"
+            f" model. {recipe.repository} is the one that is meant"
+        )
+    for component, needed in COMPONENTS.items():
+        entry = index.get(component)
+        name = entry[1] if isinstance(entry, list) and len(entry) == 2 else entry
+        made_anew = component == "scheduler" and recipe.scheduler  # DDIM, from whichever one's settings
+        if name not in (needed, f"{needed}Fast") and not made_anew:
+            raise InputError(f"{path}: `{component}` is {name}, needed {needed}; only this kind of it is read here")
+        if not (folder / component).is_dir():
+            raise InputError(f"{folder / component}: not found; the checkpoint is incomplete, download it again")
+
+
+def _check_channels(folder: Path, targets: int, unet: dict[str, Any]) -> None:
+    _require(folder / "unet/config.json", "in_channels", (1 + targets) * LATENT)
+    _require(folder / "unet/config.json", "out_channels", targets * LATENT)
+    _require(folder / "vae/config.json", "latent_channels", LATENT)
+    _require(folder / "scheduler/scheduler_config.json", "prediction_type", "v_prediction")
+    stored = unet.get("conv_in.weight", {}).get("shape", [0, 0])[1]
+    if stored != (1 + targets) * LATENT:
+        raise InputError(
+            f"{folder / 'unet'}: the weights read {stored} channels, its config.json says {(1 + targets) * LATENT}:"
+            " files of two models; download it again"
+        )
+
+
+def _require(path: Path, key: str, needed: Any) -> None:
+    found = _json(path).get(key)
+    if found != needed:
+        raise InputError(f"{path}: `{key}` is {found}, needed {needed}: this is another model")
+
+
+def _weights(folder: Path, stem: str) -> Path:
+    names = (f"{stem}.safetensors", f"{stem}.fp16.safetensors")
+    for name in names:
+        if (folder / name).is_file():
+            return folder / name
+    pickled = next(folder.glob("*.bin"), None)
+    why = f" ({pickled.name} is a pickle, which can run code when it is read: not opened)" if pickled else ""
+    raise InputError(f"{folder}: no {' or '.join(names)}{why}; download the checkpoint with its safetensors files")
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Names, types and shapes of the tensors in a safetensors file, of which the size must be what they say."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = file.read(8)
+        length = struct.unpack("<Q", start)[0] if len(start) == 8 else math.inf
+        if length > size - 8:
+            pointer = start.startswith(b"version ")
+            why = (
+                "a pointer of git-lfs: run `git lfs pull` there"
+                if pointer
+                else "cut short, or not safetensors: download it again"
+            )
+            raise InputError(f"{path}: {size} bytes, {why}")
+        try:
+            header = json.loads(file.read(length))
+            header.pop("__metadata__", None)
+            needed = 8 + length + max(entry["data_offsets"][1] for entry in header.values())
+        except (ValueError, KeyError, TypeError, AttributeError):
+            raise InputError(f"{path}: not a safetensors file; download it again") from None
+    if size != needed:
+        raise InputError(f"{path}: {size} bytes, its header says {needed}: cut short, download it again")
+    return header
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        document = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise InputError(f"{path}: not found; `prior.checkpoint` needs a folder in diffusers' layout (docs/priors.md)") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: not readable as JSON ({error}); download the checkpoint again") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path}: holds {type(document).__name__}, needed `key: value` pairs; download the checkpoint again")
+    return document
+
+
+def _terms(folder: Path) -> str:
+    """Where in a checkpoint its terms stand."""
+    named = sorted(path.name for path in folder.iterdir() if path.name.lower().startswith(("license", "licence")))
+    if named:
+        return f"read {folder / named[0]}"
+    card = folder / "README.md"
+    said = re.search(r"^license(?:_name)?:\s*(\S+)", card.read_text(errors="replace"), re.MULTILINE) if card.is_file() else None
+    return f"its model card says `{said[1]}`: read the terms" if said else "read the terms where you got it"

@@ -1,0 +1,312 @@
+"""Sampling from a latent diffusion model that is conditioned on a photograph: what the priors rgbx and marigold share.
+
+The photograph is encoded once; K latents, each from noise of its own seed, are denoised beside it by DDIM (METHOD 2.1) and
+decoded. Every size is possible: pictures are padded by reflection to what the networks can halve, and beyond one tile the U-Net
+sees overlapping tiles whose answers are blended at every step, so that tiles agree while the picture forms.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.functional import interpolate
+
+from iif_core.errors import InputError
+from workflow.priors.checkpoint import PACKAGES, Checkpoint, Recipe, check
+
+PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+OVERLAP = 0.25
+"""Of a tile, shared with the next one; the share that AutoencoderKL takes for its own tiles."""
+
+
+# --------------------------------------------------------------------------------------------------------------- pictures
+
+
+def working_size(width: int, height: int, longest: int) -> tuple[int, int]:
+    """(width, height) of a picture whose longer side becomes `longest`, aspect kept to half a pixel."""
+    factor = longest / max(width, height)
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(n, height, width, c) of (n, H, W, c): bilinear, low-pass filtered where it shrinks; NaN spreads to its neighbours."""
+    if maps.shape[1:3] == (height, width):
+        return maps
+    planes = torch.from_numpy(np.ascontiguousarray(maps.transpose(0, 3, 1, 2)))
+    out = interpolate(planes, (height, width), mode="bilinear", align_corners=False, antialias=True)
+    return out.numpy().transpose(0, 2, 3, 1)
+
+
+def padded(image: np.ndarray, multiple: int) -> np.ndarray:
+    """(H', W', 3) with sides that are multiples of `multiple`: (H, W, 3) continued at bottom and right by reflection."""
+    extra = [(0, -size % multiple) for size in image.shape[:2]]
+    return np.pad(image, (*extra, (0, 0)), mode="symmetric")
+
+
+def tile_starts(length: int, tile: int) -> list[int]:
+    """First elements of the fewest equally spread tiles that cover `length` and share at least OVERLAP of a tile."""
+    if length <= tile:
+        return [0]
+    count = 1 + math.ceil((length - tile) / (tile - int(tile * OVERLAP)))
+    return [round(i * (length - tile) / (count - 1)) for i in range(count)]
+
+
+def tile_weight(height: int, width: int, tile: int) -> torch.Tensor:
+    """(height, width) weight of a tile's answer: 1 inside, falling to its borders over OVERLAP of a tile; positive."""
+
+    def ramp(size: int) -> torch.Tensor:
+        i = torch.arange(size, dtype=torch.float32)
+        return (torch.minimum(i + 0.5, size - i - 0.5) / max(1.0, tile * OVERLAP)).clamp(max=1.0)
+
+    return ramp(height)[:, None] * ramp(width)
+
+
+def blended(apply: Callable[[slice, slice], torch.Tensor], height: int, width: int, tile: int) -> torch.Tensor:
+    """(..., height, width) from `apply(rows, columns)` on overlapping tiles: the weighted mean where they overlap."""
+    rows, columns = tile_starts(height, tile), tile_starts(width, tile)
+    if len(rows) == len(columns) == 1:
+        return apply(slice(0, height), slice(0, width))
+    total = weights = None
+    for y in rows:
+        for x in columns:
+            place = slice(y, min(y + tile, height)), slice(x, min(x + tile, width))
+            answer = apply(*place)
+            weight = tile_weight(answer.shape[-2], answer.shape[-1], tile).to(answer.device, answer.dtype)
+            if total is None:
+                total = answer.new_zeros((*answer.shape[:-2], height, width))
+                weights = answer.new_zeros((height, width))
+            total[(..., *place)] += answer * weight
+            weights[place] += weight
+    return total / weights
+
+
+# ------------------------------------------------------------------------------------------------------------------ model
+
+
+class Model:
+    """A loaded checkpoint.
+
+    The U-Net works in the chosen precision; the VAE always in float32, whose range a decoder in half precision exceeds
+    (METHOD H51), and so does the scheduler.
+
+    Attributes:
+        multiple: pixels that both sides of a picture must be a multiple of.
+    """
+
+    def __init__(self, recipe: Recipe, prior: SimpleNamespace):
+        """`prior`: the settings' section; its checkpoint is checked again."""
+        self.recipe, self.checkpoint = recipe, check(vars(prior), recipe)
+        self.device = _device(prior.device)
+        self.dtype = _precision(prior.precision, self.device)
+        self.workers = 1 if self.device.type == "cuda" else torch.get_num_threads()
+        self.batch = prior.batch or (1 if self.device.type == "cpu" else 4)
+        with _quiet():
+            import diffusers
+
+            self.unet = _network(self.checkpoint, "unet", diffusers.UNet2DConditionModel).to(self.device, self.dtype)
+            self.vae = _network(self.checkpoint, "vae", diffusers.AutoencoderKL).to(self.device)
+            stored = diffusers.DDIMScheduler.load_config(self.checkpoint.folder / "scheduler")
+            self.scheduler = diffusers.DDIMScheduler.from_config(stored, **dict(recipe.scheduler))
+            self.text = [text.to(self.device, self.dtype) for text in _embeddings(self.checkpoint, recipe)]
+        self.reduction = 2 ** (len(self.vae.config.block_out_channels) - 1)
+        self.multiple = self.reduction * 2 ** (len(self.unet.config.block_out_channels) - 1)
+        self.tile = max(prior.tile // self.multiple, 1) * self.multiple
+        self.vae.enable_slicing()
+        self.vae.enable_tiling()  # of pictures larger than a tile
+        self.vae.tile_sample_min_size, self.vae.tile_latent_min_size = self.tile, self.tile // self.reduction
+
+    def encode(self, image: np.ndarray) -> torch.Tensor:
+        """(1, 4, h, w) latent of a picture (H, W, 3) in [0, 1] with sides that are multiples of `multiple`: the mode of the
+        VAE's posterior times its scaling factor."""
+        with _exact(self.device):
+            planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(self.device, torch.float32)
+            return self.vae.encode(planes * 2 - 1).latent_dist.mode() * self.vae.config.scaling_factor
+
+    def sample(self, condition: torch.Tensor, seeds: list[int], steps: int) -> np.ndarray:
+        """(K, prompts * targets, H, W, 3) float32 in [0, 1]: decoded samples, one a seed, whatever else is in their batch;
+        NaN where numbers overflowed."""
+        self.scheduler.set_timesteps(steps, device=self.device)
+        batches = [seeds[i : i + self.batch] for i in range(0, len(seeds), self.batch)]
+
+        def one(batch: list[int]) -> np.ndarray:
+            with torch.inference_mode():
+                return np.concatenate([self._decode(self._denoise(condition, text, batch)) for text in self.text], 1)
+
+        with _exact(self.device), ThreadPoolExecutor(self.workers) as pool:
+            return np.concatenate(list(pool.map(one, batches)))
+
+    def _denoise(self, condition: torch.Tensor, text: torch.Tensor, seeds: list[int]) -> torch.Tensor:
+        count, (height, width) = len(seeds), condition.shape[-2:]
+        latent = _noise(seeds, self.unet.config.out_channels, height, width).to(self.device)
+        latent = latent * self.scheduler.init_noise_sigma
+        image, text = condition.expand(count, -1, -1, -1), text.expand(count, -1, -1)
+        for step in self.scheduler.timesteps:
+            noisy = self.scheduler.scale_model_input(latent, step)
+            both = torch.cat([image, noisy] if self.recipe.condition_first else [noisy, image], 1).to(self.dtype)
+
+            def velocity(rows: slice, columns: slice, both: torch.Tensor = both, step: torch.Tensor = step) -> torch.Tensor:
+                return self.unet(both[..., rows, columns], step, encoder_hidden_states=text).sample.float()
+
+            answer = blended(velocity, height, width, self.tile // self.reduction)
+            latent = self.scheduler.step(answer, step, latent, eta=0.0).prev_sample
+        return latent
+
+    def _decode(self, latent: torch.Tensor) -> np.ndarray:
+        count, channels, height, width = latent.shape
+        parts = latent.reshape(-1, self.vae.config.latent_channels, height, width) / self.vae.config.scaling_factor
+        pixels = self.vae.decode(parts).sample / 2 + 0.5
+        pixels = torch.where(pixels.isfinite(), pixels.clamp(0, 1), torch.nan)
+        shape = (count, -1, 3, height * self.reduction, width * self.reduction)
+        return pixels.reshape(shape).permute(0, 1, 3, 4, 2).float().cpu().numpy()
+
+
+def _noise(seeds: list[int], channels: int, height: int, width: int) -> torch.Tensor:
+    """(K, channels, height, width) float32, each from a generator of its own on the CPU: the same on every device."""
+    draws = [torch.randn(1, channels, height, width, generator=torch.Generator("cpu").manual_seed(seed)) for seed in seeds]
+    return torch.cat(draws)
+
+
+def predicted(recipe: Recipe, prior: SimpleNamespace, photo: np.ndarray, longest: int, steps: int, seed: int) -> np.ndarray:
+    """(K, prompts * targets, H, W, 3) in [0, 1] of a photograph (H, W, 3) in [0, 1] that the model sees `longest` pixels large.
+
+    Sample k is drawn with seed + k, the same noise for all photographs of a size and all maps.
+
+    Raises:
+        InputError: the checkpoint cannot be used, or the GPU's memory is not enough.
+    """
+    model = loaded(recipe, json.dumps(vars(prior), sort_keys=True))
+    height, width = photo.shape[:2]
+    wide, high = working_size(width, height, longest)
+    try:
+        condition = model.encode(padded(resized(photo[None], wide, high)[0], model.multiple))
+        maps = model.sample(condition, [seed + k for k in range(prior.samples)], steps)[:, :, :high, :wide]
+    except torch.OutOfMemoryError:
+        raise InputError(
+            f"the GPU's memory does not hold {model.batch} samples of {wide}x{high} at once: lower `prior.batch`,"
+            " then `prior.tile`, then `prior.longest_side`"
+        ) from None
+    flat = np.clip(resized(maps.reshape(-1, high, wide, 3), width, height), 0, 1)  # its weights round to 1 + 1e-7; NaN stays
+    return flat.reshape(*maps.shape[:2], height, width, 3)
+
+
+def described(recipe: Recipe, prior: SimpleNamespace) -> dict[str, Any]:
+    """What made the predictions: model, revision, licence, device and precision."""
+    model = loaded(recipe, json.dumps(vars(prior), sort_keys=True))
+    gpu = model.device.type == "cuda"
+    return {
+        "checkpoint": prior.checkpoint,
+        "published_as": recipe.repository,
+        "revision": model.checkpoint.revision,
+        "licence": recipe.licence,
+        "device": torch.cuda.get_device_name(model.device) if gpu else "cpu",
+        "precision": {"unet": str(model.dtype).removeprefix("torch."), "vae": "float32"},
+        "batch": model.batch,
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+    }
+
+
+@lru_cache(1)
+def loaded(recipe: Recipe, prior: str) -> Model:
+    """The model of a prior's settings (as JSON), kept from view to view."""
+    return Model(recipe, SimpleNamespace(**json.loads(prior)))
+
+
+# ---------------------------------------------------------------------------------------------------------------- loading
+
+
+def _network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> torch.nn.Module:
+    """A network with every one of its weights from the checkpoint; from_pretrained alone would draw missing ones at random."""
+    folder = checkpoint.folder / component
+    try:
+        network, info = kind.from_pretrained(
+            folder,
+            variant=checkpoint.variant(component),
+            use_safetensors=True,
+            local_files_only=True,
+            output_loading_info=True,
+            **more,
+        )
+    except Exception as error:  # the libraries raise what they meet, of a dozen types
+        first = str(error).strip().split("\n", 1)[0]
+        raise InputError(f"{folder}: not loaded as {kind.__name__} ({type(error).__name__}: {first})") from error
+    lost = [*info["missing_keys"], *(str(entry[0]) for entry in info["mismatched_keys"])]
+    if lost:
+        raise InputError(
+            f"{folder}: {len(lost)} weights missing or of another shape, such as {sorted(lost)[0]}; config.json and weights do"
+            " not belong together, download the checkpoint again"
+        )
+    return network.eval().requires_grad_(False)
+
+
+def _embeddings(checkpoint: Checkpoint, recipe: Recipe) -> list[torch.Tensor]:
+    """(1, tokens, channels) of each prompt; the text encoder is not kept."""
+    from transformers import CLIPTextModel, CLIPTokenizer
+
+    encoder = _network(checkpoint, "text_encoder", CLIPTextModel, dtype=torch.float32)
+    try:
+        tokenizer = CLIPTokenizer.from_pretrained(checkpoint.folder / "tokenizer", local_files_only=True)
+    except Exception as error:  # as in _network
+        raise InputError(f"{checkpoint.folder / 'tokenizer'}: not loaded as CLIPTokenizer ({error})") from error
+    padding, longest = "max_length" if recipe.fill_prompts else "do_not_pad", encoder.config.max_position_embeddings
+    out = []
+    for prompt in recipe.prompts:
+        tokens = tokenizer(prompt, padding=padding, max_length=longest, truncation=True, return_tensors="pt")
+        with torch.inference_mode():
+            out.append(encoder(tokens.input_ids)[0])
+    return out
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("`prior.device`: found cuda, but torch sees no CUDA device here; set `prior: {device: auto}`")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def _precision(name: str, device: torch.device) -> torch.dtype:
+    if name == "auto":
+        return torch.float16 if device.type == "cuda" else torch.float32
+    if name == "float16" and device.type == "cpu":
+        raise InputError("`prior.precision`: found float16, which is for GPUs, and the device is a CPU; set `precision: auto`")
+    return PRECISIONS[name]
+
+
+@contextmanager
+def _exact(device: torch.device) -> Iterator[None]:
+    """No gradients, no choice of kernels by timing. On a CPU one thread a batch: how many threads share a convolution
+    decides its last bits, so batches are what runs side by side."""
+    threads = torch.get_num_threads()
+    if device.type == "cpu":
+        torch.set_num_threads(1)
+    try:
+        with torch.inference_mode(), torch.backends.cudnn.flags(True, False, deterministic=True, allow_tf32=False):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Progress bars and advice of the libraries stay out of the log; errors do not."""
+    import diffusers.utils.logging as diffusers_log
+    import transformers.utils.logging as transformers_log
+
+    logs = (diffusers_log, transformers_log)
+    levels = [log.get_verbosity() for log in logs]
+    for log in logs:
+        log.set_verbosity_error()
+        log.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.set_verbosity(level)
