@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.errors import InputError
 from iif_core.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
 from iif_core.mask_votes import joined, label_faces, view_votes
 from iif_core.segments import fill_within
@@ -45,14 +46,17 @@ def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None
     own = settings.segmentation
     files = MaskFiles.of_capture(settings, surface.capture)
     options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
-    kept = {}
+    if "piece" not in surface.kept:
+        surface.kept |= {"piece": pieces(surface, own), "labels": {}}
+    kept = surface.kept["labels"]
 
     def load(view: View) -> np.ndarray:
         if view.name not in kept:
-            kept[view.name] = files.labels(view)
-        return kept[view.name]
+            labels = files.labels(view)
+            kept[view.name] = labels.astype(np.uint16) if labels.max(initial=0) < 2**16 else labels
+        return kept[view.name].astype(np.int32)
 
-    return cluster_views(surface, surface.views(fold), load, options, pieces(surface, own))
+    return cluster_views(surface, surface.views(fold), load, options, surface.kept["piece"])
 
 
 def perturbs(surface: Surface) -> bool:
@@ -70,6 +74,11 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
         camera = (view.fx, view.fy, view.cx, view.cy)
         seen.append(masks_at(points, load(view), capture.gbuffer(view)[0], camera, view.world_from_camera, edge))
     masks = gather_masks(seen, len(points), options.min_points)
+    if not len(masks.view):
+        raise InputError(
+            f"`segmentation: {{kind: masks}}`: no mask of any view covers {options.min_points} surface points"
+            f" ({1000 * edge:.3g} mm apart); check that the files hold ids above 0, or lower `segmentation.min_points`"
+        )
     cluster = cluster_masks(masks, options)
 
     count, known = int(cluster.max(initial=-1)) + 1, cluster >= 0

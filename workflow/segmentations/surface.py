@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -41,10 +42,11 @@ class Stability:
 
 
 class Surface:
-    """Mesh and photographs of a scene; what is costly is kept."""
+    """Mesh and photographs of a scene; what is costly is kept, `kept` is for the kinds."""
 
     def __init__(self, capture: CaptureReader):
         self.capture = capture
+        self.kept: dict[str, Any] = {}
         self.vertices, self.faces = capture.mesh()
 
     @cached_property
