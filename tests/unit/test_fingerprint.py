@@ -97,7 +97,11 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         print(json.dumps(sorted(m for m in sys.modules if m.split(".")[0] in ("iif_core", "workflow"))))
         """
     )
-    plugins = {"capture": ("source", ("builtin", "mitsuba", "folder")), "prior": ("prior", ("simulated", "files", "retinex"))}
+    plugins = {
+        "capture": ("source", ("builtin", "mitsuba", "folder")),
+        "prior": ("prior", ("simulated", "files", "retinex")),
+        "segmentation": ("segmentation", ("given", "masks", "geometry")),
+    }
     for stage in STAGES:
         section, kinds = plugins.get(stage, (None, (None,)))
         for kind in kinds:
