@@ -51,7 +51,7 @@ class ConsensusOptions:
     contained: float = 0.8
     split: float = 0.5
     consensus: float = 0.9
-    min_points: int = 8
+    min_points: int = 4
 
 
 def flatten_masks(masks: Sequence[Array]) -> Array:

@@ -10,7 +10,7 @@ from .cells import neighbour_pairs, unpack_keys
 
 Array = np.ndarray
 
-PIECE_VIEWS = 2.0
+PIECE_VIEWS = 3.0
 """What a piece of the mesh is worth as a whole, in views of one of its faces."""
 
 

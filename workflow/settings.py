@@ -182,7 +182,7 @@ class MaskSegmentation(PiecesOfMesh):
     """A mask that more than this share of the views split is dropped: it holds several things. Smaller gives finer objects."""
     consensus: float = Field(0.9, gt=0, le=1)
     """Masks are joined if this share of the views that contain both hold them together. Larger gives finer objects."""
-    min_points: int = Field(8, ge=1)
+    min_points: int = Field(4, ge=1)
     """Masks of fewer surface points (two pixel footprints apart) are ignored."""
 
 
