@@ -22,6 +22,7 @@ EXPOSURE_LOG_RATIO = 0.05
 RESPONSE_ERRORS = 2.0
 METALLIC_PRIOR = 0.25
 SPECULAR_ROUGHNESS = 0.85
+STABLE_OBJECTS = 0.7
 CACHE_COVERAGE = 0.3
 SECOND_PASS_GAIN = 0.10
 
@@ -60,6 +61,24 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     else:
         reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
     return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
+
+
+def segmentation(kind: str, objects: int, stability: float | None, perturbed: str, facts: dict[str, Any]) -> Decision:
+    """Objects: where they come from, and how far they depend on the choice of photographs and thresholds.
+
+    Args:
+        objects: seen by some photograph. stability: adjusted Rand index with the perturbed runs, None = nothing to perturb.
+        perturbed: what the runs change, in words. facts: numbers of the clustering, if there was one.
+    """
+    component = f"objects ({kind})"
+    if stability is None:
+        return _decision(component, True, "ids taken as they are", 1.0, STABLE_OBJECTS, f"{objects} objects are seen")
+    reason = f"{objects} objects are seen"
+    if "masks" in facts:
+        reason += f"; {facts['masks_undersegmented']} of {facts['masks']} masks hold several things and were dropped"
+    if stability < STABLE_OBJECTS:
+        reason += "; they depend on the choice of photographs: judge the overlay in the report"
+    return _decision(component, True, f"adjusted Rand index with {perturbed}", stability, STABLE_OBJECTS, reason)
 
 
 def emitters(groups: int, dropped: int, candidates: int) -> Decision:

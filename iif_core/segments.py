@@ -193,6 +193,60 @@ def vote_faces(
     )
 
 
+def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDArray) -> NDArray:
+    """Labels for every face, (F,) int32: where photographs say nothing, the mesh decides.
+
+    A face without a label (-1) takes that of the nearest labelled face across shared edges, without leaving its `piece` (F,)
+    and without entering a `closed` one (F,) bool. What remains becomes one new object a piece, numbered after the others.
+    """
+    label, piece, closed = np.asarray(label, np.int64), np.asarray(piece, np.int64), np.asarray(closed, bool)
+    pairs = np.asarray(adjacency).reshape(-1, 2)
+    a, b = pairs.T
+    label = _spread(label, pairs[(piece[a] == piece[b]) & ~closed[a] & ~closed[b]])
+    rest = label < 0
+    if rest.any():
+        label[rest] = label.max(initial=-1) + 1 + np.unique(piece[rest], return_inverse=True)[1]
+    return label.astype(np.int32)
+
+
+def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float, NDArray]:
+    """How alike two partitions of one set are: the adjusted Rand index, and of every label of `a` how well it is found again.
+
+    With n_ij the weight in label i of `a` and j of `b`, a_i and b_j its sums, N the total, p = sum a_i^2, q = sum b_j^2:
+
+        ARI = (sum n_ij^2 - p q / N^2) / ((p + q) / 2 - p q / N^2)
+
+    (Hubert and Arabie 1985 for weights instead of counts): 1 = the same, about 0 = no more alike than by chance. The second
+    result, (max(a) + 1,) float64, is max_j n_ij / (a_i + b_j - n_ij), the best overlap over union; NaN without weight.
+
+    Args:
+        a, b: (n,) int labels from 0; weight: (n,) >= 0.
+
+    Raises:
+        InputError: shapes that differ, or no weight at all.
+    """
+    from scipy.sparse import coo_matrix
+
+    a, b, weight = np.ravel(a), np.ravel(b), np.ravel(weight).astype(np.float64)
+    if not (a.shape == b.shape == weight.shape):
+        raise InputError(f"partitions of {a.size} and {b.size} elements with {weight.size} weights; all must be as many")
+    total = weight.sum()
+    if not total > 0:
+        raise InputError("partitions without weight cannot be compared")
+    table = coo_matrix((weight, (a, b))).tocsr()  # sums what falls together
+    table = table.tocoo()
+    of_a, of_b = np.bincount(a, weight), np.bincount(b, weight)
+    p, q = (of_a**2).sum(), (of_b**2).sum()
+    chance = p * q / total**2
+    most = 0.5 * (p + q) - chance
+    index = ((table.data**2).sum() - chance) / most if most > 1e-12 * total**2 else 1.0
+    best = np.where(of_a > 0, 0.0, np.nan)
+    union = of_a[table.row] + of_b[table.col] - table.data
+    found = table.data > 0
+    np.maximum.at(best, table.row[found], table.data[found] / union[found])
+    return float(index), best
+
+
 def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
     """Labels grown over the face graph ring by ring; a face reached by several in one ring takes the lowest."""
     n = len(label)

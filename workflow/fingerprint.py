@@ -41,6 +41,7 @@ INFRASTRUCTURE = (
 PLUGINS = {
     "capture": (("source", "kind", "workflow.sources.{}"),),
     "prior": (("prior", "kind", "workflow.priors.{}"),),
+    "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
 }
 # Modules that know (and check) further input files of a stage.
 FILE_MODULES = {"emission": ("workflow.response_file",)}

@@ -30,7 +30,7 @@ STAGES: dict[str, Stage] = {
     for stage in (
         Stage("capture", (), ("source", "capture", "seed"), reads_raw=True),
         Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
-        Stage("segmentation", ("capture",), ("segmentation",)),
+        Stage("segmentation", ("capture",), ("segmentation", "source", "capture"), reads_raw=True),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
         Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics.views",), reads_raw=True, on_demand=True),
         Stage(

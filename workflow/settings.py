@@ -186,19 +186,54 @@ Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior | RgbxPrior | Marig
 # ----------------------------------------------------------------------------------------------------------------- stages
 
 
-class Segmentation(Section):
-    """Which surface belongs to which object."""
-
-    kind: Literal["given", "geometry"] = "given"
-    """`given`: ids of faces or views; `geometry`: Felzenszwalb on the mesh graph."""
+class SegmentationBase(Section):
     border_erosion: int = Field(1, ge=0, le=16)
     """Pixels next to another object that count as border."""
+
+
+class GivenSegmentation(SegmentationBase):
+    """Ids that the source came with, of the mesh's faces or of views."""
+
+    kind: Literal["given"] = "given"
+
+
+class PiecesOfMesh(SegmentationBase):
     scale: float = Field(0.05, gt=0)
-    """`geometry`: larger gives fewer, larger pieces."""
+    """Pieces of the mesh: larger gives fewer, larger pieces."""
     min_faces: int = Field(100, ge=1)
-    """`geometry`: smaller pieces are merged into a neighbour."""
+    """Pieces of the mesh: smaller ones are merged into a neighbour."""
     colour: float = Field(0.1, ge=0)
-    """`geometry`: weight of the photographs' mean colour of a face beside the bend of the surface (0 = shape alone)."""
+    """Pieces of the mesh: weight of the photographs' mean colour of a face beside the bend of the surface (0 = shape alone)."""
+
+
+class MaskSegmentation(PiecesOfMesh):
+    """2D masks of any tool, `masks/<view>.png|exr` or `masks/<view>/<n>.png`, clustered across the views by view consensus;
+    pieces of the mesh where there are none (docs/segmentation.md)."""
+
+    kind: Literal["masks"]
+    path: Path | None = None
+    """Folder that holds `masks/`; default: the source's folder."""
+    min_faces: int = Field(20, ge=1)
+    """Pieces of the mesh: smaller ones are merged into a neighbour."""
+    visible: float = Field(0.3, gt=0, le=1)
+    """Share of a mask that a view must see to have an opinion about it."""
+    contained: float = Field(0.8, gt=0, le=1)
+    """A view holds a mask together if one of its own masks has more than this share of what it sees of it."""
+    split: float = Field(0.5, gt=0, le=1)
+    """A mask that more than this share of the views split is dropped: it holds several things. Smaller gives finer objects."""
+    consensus: float = Field(0.9, gt=0, le=1)
+    """Masks are joined if this share of the views that contain both hold them together. Larger gives finer objects."""
+    min_points: int = Field(4, ge=1)
+    """Masks of fewer surface points (two pixel footprints apart) are ignored."""
+
+
+class GeometrySegmentation(PiecesOfMesh):
+    """Felzenszwalb on the mesh graph: no ids and no masks are needed."""
+
+    kind: Literal["geometry"]
+
+
+Segmentation = Annotated[GivenSegmentation | MaskSegmentation | GeometrySegmentation, Field(discriminator="kind")]
 
 
 _DIRECT_ALONE = ("sweeps", "ridge", "temperature", "anneal", "final_temperature", "seams", "robust", "objective")
@@ -539,7 +574,8 @@ class SceneSettings(Section):
     capture: Capture = Capture()
     prior: Prior
     """Where the K material predictions come from."""
-    segmentation: Segmentation = Segmentation()
+    segmentation: Segmentation = GivenSegmentation()
+    """Which surface belongs to which object."""
     base: Base = Base()
     emission: Emission = Emission()
     shading: Shading = Shading()
@@ -552,6 +588,11 @@ class SceneSettings(Section):
     """Pictures under other light and from elsewhere, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of everything random."""
+
+    @field_validator("segmentation", mode="before")
+    @classmethod
+    def _given_unless_named(cls, value: Any) -> Any:
+        return {"kind": "given", **value} if isinstance(value, dict) else value
 
     @model_validator(mode="after")
     def _known_predictions(self) -> SceneSettings:
@@ -639,6 +680,7 @@ _UNIONS: dict[str, dict[str, type[Section]]] = {
         "rgbx": RgbxPrior,
         "marigold": MarigoldPrior,
     },
+    "segmentation": {"given": GivenSegmentation, "masks": MaskSegmentation, "geometry": GeometrySegmentation},
 }
 
 

@@ -97,8 +97,11 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         print(json.dumps(sorted(m for m in sys.modules if m.split(".")[0] in ("iif_core", "workflow"))))
         """
     )
-    priors = ("simulated", "files", "retinex", "rgbx", "marigold")
-    plugins = {"capture": ("source", ("builtin", "mitsuba", "folder")), "prior": ("prior", priors)}
+    plugins = {
+        "capture": ("source", ("builtin", "mitsuba", "folder")),
+        "prior": ("prior", ("simulated", "files", "retinex", "rgbx", "marigold")),
+        "segmentation": ("segmentation", ("given", "masks", "geometry")),
+    }
     for stage in STAGES:
         section, kinds = plugins.get(stage, (None, (None,)))
         for kind in kinds:

@@ -58,3 +58,11 @@ def test_values_say_what_was_measured():
     assert "1 because it pays" in plan.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
     assert plan.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
     assert plan.environment("auto", np.nan, np.nan, None)["value"] == 0.0
+
+
+def test_objects_say_how_stable_they_are():
+    firm = plan.segmentation("masks", 40, 0.9, "views left out", {"masks": 100, "masks_undersegmented": 7})
+    assert firm["included"] and firm["value"] == 0.9 and firm["measure"].endswith("views left out")
+    assert "7 of 100 masks" in firm["reason"] and "overlay" not in firm["reason"]
+    assert "overlay" in plan.segmentation("geometry", 40, 0.5, "views left out", {})["reason"]
+    assert plan.segmentation("given", 40, None, "", {})["measure"] == "ids taken as they are"

@@ -539,3 +539,11 @@ def test_pictures_are_bounded():
     assert pic.linear(image).max() == 0
     assert (pic.difference(image, image * 0, np.zeros((4, 4), bool)) == 89).all()
     assert pic.data_uri(pic.linear(image)) == pic.data_uri(pic.linear(image))
+
+
+def test_overlay_shows_photograph_and_borders():
+    ids = np.array([[0, 0, 1, 1]] * 2)
+    photo = np.linspace(0, 1, 4)[None, :, None] * np.ones((2, 4, 3))
+    picture = pic.overlay(photo, ids).astype(int)
+    assert (picture[0, 1] < 20).all() and (picture[0, 1] == picture[1, 1]).all()  # the border belongs to the left pixel
+    np.testing.assert_allclose(picture[0, 3] - picture[0, 2], 0.5 * 255 / 3, atol=1)  # the same colour over another grey

@@ -13,6 +13,7 @@ from iif_core import color
 Array = np.ndarray
 
 SEGMENT_EDGE = (1.0, 0.55, 0.0)
+OBJECT_BORDER = (0.05, 0.05, 0.05)
 DEPTH_EDGE = (0.0, 0.85, 1.0)
 DEPTH_STEP = 0.05  # see `depth_edges`
 
@@ -41,6 +42,13 @@ def grey(values: Array) -> Array:
 def ids(values: Array) -> Array:
     """(H, W) ids in distinct colours."""
     return color.to_uint8(color.id_colours(values))
+
+
+def overlay(photo: Array, values: Array) -> Array:
+    """(H, W) ids in distinct colours over the photograph (H, W, 3), borders dark."""
+    picture = 0.5 * np.clip(photo, 0, 1) + 0.5 * color.id_colours(values)
+    picture[edges(values)] = OBJECT_BORDER
+    return color.to_uint8(picture)
 
 
 def difference(a: Array, b: Array, mask: Array, high: float = 0.25) -> Array:

@@ -124,7 +124,7 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         ("photographs", f"{len(capture.views)} of {size} pixels, {capture.facts['dynamic_range'].upper()}"),
         ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
         ("mesh", f"{len(recovered.surface.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
-        ("objects", str(len(recovered.object_names))),
+        ("objects", _objects_fact(job, len(recovered.object_names))),
         ("material fit", _fit_fact(job.read("affines").json("affines.json"))),
         (
             "surface cells",
@@ -136,6 +136,17 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
     if held_out:
         facts.insert(3, ("held out", f"{held_out} photographs were not used"))
     return facts
+
+
+def _objects_fact(job: Job, count: int) -> str:
+    """How many, where from, and how far they depend on what should not decide them (docs/segmentation.md)."""
+    facts = _document(job, "segmentation", "segmentation.json")
+    if not facts:
+        return str(count)
+    text = f"{count} ({facts['kind']}), {facts['objects_seen']} of them seen"
+    if facts["stability"] is None:
+        return text
+    return f"{text}; stability {facts['stability']:.2f} (adjusted Rand index with {facts['perturbed']}; 1 = unmoved)"
 
 
 def _tables(summary: dict[str, Any]) -> list[Table]:
@@ -258,7 +269,7 @@ def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> li
         channels = job.read("segmentation").exr(file)
         object_id, segment_id = ids_from_disk(channels["object.id"]), ids_from_disk(channels["segment.id"])
         out.append(tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
-        out.append(tile("objects", pic.ids(object_id), lossless=True))
+        out.append(tile("objects", pic.overlay(sensor, object_id), "one colour an object, over the photograph"))
         table = job.read("base").table("selection.parquet")
         if len(table["k"]):
             k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])

@@ -1,0 +1,62 @@
+"""Segmentation `geometry`: pieces of the mesh, by Felzenszwalb's method on bend and, weakly, colour."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from iif_core.felzenszwalb import segment_mesh, smooth_over_faces
+from workflow.segmentations.surface import FOLDS, Objects, Surface
+
+PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"
+
+COLOUR_ROUNDS = 3
+"""Steps over the mesh by which a face that no pixel saw borrows colour."""
+
+
+def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
+    """Every piece is an object."""
+    labels = pieces(surface, settings.segmentation, fold)
+    names = [f"piece {i}" for i in range(int(labels.max()) + 1)]
+    return Objects(labels, names, np.ones(len(names)), {})
+
+
+def perturbs(surface: Surface) -> bool:
+    """Always."""
+    return True
+
+
+def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> np.ndarray:
+    """(m,) int32 piece of every face, from 0; fold 0 ... FOLDS - 1: as `PERTURBED` says."""
+    scale = own.scale if fold is None else own.scale * 2 ** (0.5 * (fold - FOLDS // 2))
+    colour = None
+    if own.colour > 0:
+        mean, pixels = mean_face_colour(surface, fold)
+        colour = smooth_over_faces(mean, pixels, surface.pairs, COLOUR_ROUNDS)
+    return segment_mesh(surface.vertices, surface.faces, scale, own.min_faces, colour, own.colour, surface.pairs)
+
+
+def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(m, 3) mean colour of the pixels that see a face, roughly in [0, 1], and (m,) how many do.
+
+    Sensor values are divided by exposure^0.45 (what a usual response makes of it), radiance L is shown as
+    L / (L + mean of its view): a weak hint is all that is asked of colour.
+    """
+    capture, count = surface.capture, len(surface.faces)
+    total, pixels = np.zeros((count, 3)), np.zeros(count)
+    for view in surface.views(fold):
+        photo, valid = capture.photo(view)
+        face = capture.gbuffer(view)[1]
+        used = valid & (face >= 0)
+        if not used.any():
+            continue
+        values, face = photo[used].astype(np.float64), face[used]
+        if capture.is_hdr:
+            values = values / (values + max(float(values.mean()), 1e-12))
+        else:
+            values = np.clip(values / view.exposure**0.45, 0, 1.5)
+        pixels += np.bincount(face, minlength=count)
+        for c in range(3):
+            total[:, c] += np.bincount(face, values[:, c], count)
+    return total / np.maximum(pixels, 1)[:, None], pixels

@@ -1,0 +1,66 @@
+"""Segmentation `given`: ids of the mesh's faces, else ids in the views by the majority of the pixels that see a face."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.segments import vote_faces
+from workflow.segmentations.surface import Objects, Surface
+
+PERTURBED = "every third photograph's ids left out"
+
+
+def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
+    """Faces without an id form one object `unlabelled`; so do faces that no vote reaches. Objects that no view sees stay.
+
+    Raises:
+        InputError: no ids.
+    """
+    instance = surface.capture.faces()["instance_id"]
+    return _by_face(surface, instance) if (instance >= 0).any() else _by_view(surface, fold)
+
+
+def perturbs(surface: Surface) -> bool:
+    """Ids of faces are taken as they are; those of views vote."""
+    return not (surface.capture.faces()["instance_id"] >= 0).any()
+
+
+def _by_face(surface: Surface, instance: np.ndarray) -> Objects:
+    names = {}
+    if surface.capture.reader.has("instances.parquet"):
+        table = surface.capture.reader.table("instances.parquet")
+        names = dict(zip(table["instance_id"].tolist(), table["name"].tolist(), strict=True))
+    ids, labels = np.unique(instance, return_inverse=True)
+    # np.unique puts -1 first: roll it to the end so that given objects keep their order.
+    unlabelled = int(ids[0] < 0)
+    labels = (labels.ravel() - unlabelled) % len(ids)
+    texts = [str(names.get(i, f"instance {i}")) for i in ids[unlabelled:].tolist()] + ["unlabelled"] * unlabelled
+    return Objects(labels.astype(np.int32), texts, np.ones(len(ids)), {})
+
+
+def _by_view(surface: Surface, fold: int | None) -> Objects:
+    face_ids, instance_ids = [], []
+    for view in surface.views(fold):
+        given = surface.capture.given_instances(view)
+        if given is not None:
+            face_ids.append(surface.capture.gbuffer(view)[1].ravel())
+            instance_ids.append(given.ravel())
+    if not face_ids:
+        raise InputError(
+            "`segmentation: {kind: given}`, but the capture has no instance ids, neither of faces nor of views;"
+            " give `instances/<view>.png` or an `instance` property of the mesh's faces (docs/own-data.md),"
+            " or set `segmentation: {kind: geometry}`"
+        )
+    face, instance = np.concatenate(face_ids), np.concatenate(instance_ids)
+    if not ((face >= 0) & (instance >= 0)).any():
+        raise InputError(
+            "`segmentation: {kind: given}`: no pixel of the given instance maps has both an id and a face under it;"
+            " check the files in instances/ against the photographs, or set `segmentation: {kind: geometry}`"
+        )
+    votes = vote_faces(face, instance, len(surface.faces), surface.pairs)
+    names = ["unlabelled" if i == votes.background else f"instance {i}" for i in votes.object_id.tolist()]
+    labels = np.searchsorted(votes.object_id, votes.object_of_face).astype(np.int32)
+    return Objects(labels, names, votes.agreement, {})

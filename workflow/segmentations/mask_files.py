@@ -1,0 +1,195 @@
+"""Mask files: `masks/<view>.png|exr` label maps, or `masks/<view>/*.png` binary masks that may overlap (docs/segmentation.md).
+
+Masks belong to the photographs as they lie in the folder, at their size or any other of that shape; lens distortion is
+undone here as it is for the photographs. 0 is no mask.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from iif_core.distortion import Distortion, Pinhole, distort
+from iif_core.errors import InputError
+from iif_core.mask_clustering import flatten_masks
+from workflow.normal_form import CaptureReader, View
+from workflow.sources.folder_scene import images, transforms
+
+SHAPE_TOLERANCE = 0.02
+"""Largest relative difference of aspect ratio that still counts as the same picture (models round to 8 or 64)."""
+
+MAPS = (".png", ".exr")
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """Geometry of a stored photograph: masks are pictures of its shape. turn: EXIF orientation that makes it upright."""
+
+    camera: Pinhole
+    lens: Distortion | None = None
+    turn: int = 1
+
+
+@dataclass(frozen=True)
+class MaskFiles:
+    """folder; of every view with masks its label map (one file) or its binary masks (several); its photograph, if known."""
+
+    folder: Path
+    maps: dict[str, Path]
+    binary: dict[str, list[Path]]
+    photographs: dict[str, Photograph]
+
+    def files(self) -> list[Path]:
+        return [*self.maps.values(), *(path for paths in self.binary.values() for path in paths)]
+
+    @staticmethod
+    def of_capture(settings: SimpleNamespace, capture: CaptureReader) -> MaskFiles:
+        """The same, checked against the views that there are.
+
+        Raises:
+            InputError: names of no view (sources whose views are known only now), no masks for the views taken.
+        """
+        found = mask_files(vars(settings.segmentation), vars(settings.source), vars(settings.capture))
+        views = {view.name for view in capture}
+        if not found.photographs:
+            _refuse_unknown(found.folder, {*found.maps, *found.binary}, views)
+        if not views & {*found.maps, *found.binary}:
+            raise InputError(f"{found.folder}: no masks for any of the {len(views)} views that are used")
+        return found
+
+    def labels(self, view: View) -> np.ndarray:
+        """(H, W) int32 label of every pixel of the view, 0 = no mask; all 0 for a view without masks.
+
+        Raises:
+            InputError: a picture of another shape, in colour, or with ids between integers.
+        """
+        camera = Pinhole(view.fx, view.fy, view.cx, view.cy, view.width, view.height)
+        photograph = self.photographs.get(view.name, Photograph(camera))
+        if view.name in self.maps:
+            path = self.maps[view.name]
+            return _sampled(np.maximum(self._upright(path, images.load_ids(path), photograph), 0), photograph, camera)
+        if view.name not in self.binary:
+            return np.zeros((view.height, view.width), np.int32)
+        masks = []
+        for path in self.binary[view.name]:
+            stored = np.maximum(images.load_ids(path), 0)
+            inside = self._upright(path, 2 * stored > max(int(stored.max()), 1), photograph)
+            masks.append(_sampled(inside, photograph, camera))
+        return flatten_masks(masks)
+
+    def _upright(self, path: Path, stored: np.ndarray, photograph: Photograph) -> np.ndarray:
+        turn = _turn(path, stored.shape[1::-1], photograph)
+        return images.TURNS[turn](stored)
+
+
+def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, Any]) -> MaskFiles:
+    """The mask files of a scene, checked by names and headers.
+
+    Raises:
+        InputError: see `raw_inputs` of segmentation `masks`.
+    """
+    folder = _folder(own.get("path"), source.get("path"))
+    maps, binary = _listing(folder)
+    photographs: dict[str, Photograph] = {}
+    if source["kind"] == "folder":
+        known = transforms.read(source, {**capture, "views": 1_000_000_000}).frames
+        photographs = {frame.name: Photograph(frame.camera, frame.lens, frame.turn) for frame in known}
+        _refuse_unknown(folder, {*maps, *binary}, set(photographs))
+        used = {frame.name for frame in transforms.read(source, capture).frames}
+        maps = {name: path for name, path in maps.items() if name in used}
+        binary = {name: paths for name, paths in binary.items() if name in used}
+        if not maps and not binary:
+            raise InputError(f"{folder}: no masks for any of the {len(used)} views that are used")
+        for name, path in [*maps.items(), *((name, path) for name, paths in binary.items() for path in paths)]:
+            _turn(path, images.header(path).size, photographs[name])
+    return MaskFiles(folder, maps, binary, photographs)
+
+
+def _folder(path: str | Path | None, source: str | Path | None) -> Path:
+    base = path or source
+    if base is None:
+        raise InputError("`segmentation.path`: missing, and the source has no folder; name the folder that holds masks/")
+    folder = Path(base).parent if Path(base).is_file() else Path(base)  # a source may be a file: a scene's XML
+    folder = folder if folder.name == "masks" else folder / "masks"
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: not found; `segmentation: {{kind: masks}}` reads masks/<view>.png or masks/<view>/<n>.png there"
+            " (set `segmentation.path` to the folder that holds masks/). Masks come from any tool, such as SAM 2; without"
+            " any: `segmentation: {kind: geometry}`"
+        )
+    return folder
+
+
+def _listing(folder: Path) -> tuple[dict[str, Path], dict[str, list[Path]]]:
+    maps: dict[str, Path] = {}
+    binary: dict[str, list[Path]] = {}
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        name = entry.name if entry.is_dir() else entry.stem
+        if name in maps or name in binary:
+            first = maps[name].name if name in maps else f"{name}/"
+            raise InputError(f"{folder}: {first} and {entry.name} are masks of the same view; remove one")
+        if entry.is_dir():
+            binary[name] = sorted(path for path in entry.iterdir() if path.suffix.lower() == ".png")
+            if not binary[name]:
+                raise InputError(f"{entry}: holds no .png; expected one binary mask a file, or remove the folder")
+        elif entry.suffix.lower() in MAPS:
+            maps[name] = entry
+        else:
+            raise InputError(f"{entry}: not a mask file; allowed: <view>.png, <view>.exr, or a folder <view>/ of binary .png")
+    if not maps and not binary:
+        raise InputError(f"{folder}: empty; expected masks/<view>.png (or .exr), or masks/<view>/<n>.png")
+    return maps, binary
+
+
+def _refuse_unknown(folder: Path, found: set[str], views: set[str]) -> None:
+    unknown = sorted(found - views)
+    if unknown:
+        shown = ", ".join(unknown[:3]) + (f" and {len(unknown) - 3} more" if len(unknown) > 3 else "")
+        raise InputError(
+            f"{folder}: {shown}: no view of that name; views are called like their photographs without extension, such as"
+            f" {sorted(views)[0]}. Rename or remove"
+        )
+
+
+def _turn(path: Path, size: tuple[int, int], photograph: Photograph) -> int:
+    """EXIF turn that the mask needs, by its shape; another picture is refused."""
+    camera, turn = photograph.camera, photograph.turn
+    upright = _same_shape(size, (camera.width, camera.height))
+    stored = (camera.height, camera.width) if turn >= 5 else (camera.width, camera.height)
+    turned = turn != 1 and _same_shape(size, stored)
+    if upright and turned:
+        raise InputError(
+            f"{path}: its photograph has EXIF orientation {turn}, and nothing tells whether the mask was made of the turned"
+            " picture; save photographs and masks upright"
+        )
+    if not upright and not turned:
+        raise InputError(
+            f"{path}: {size[0]}x{size[1]} pixels, but the photograph is {camera.width}x{camera.height}: another aspect ratio,"
+            " so not the same picture. Make the masks on the photographs of this scene"
+        )
+    return turn if turned else 1
+
+
+def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= SHAPE_TOLERANCE
+
+
+def _sampled(picture: np.ndarray, photograph: Photograph, target: Pinhole) -> np.ndarray:
+    """(H, W) value of the nearest pixel of a picture of the photograph's shape, as the `target` camera sees it; 0 outside."""
+    x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
+    y = (np.arange(target.height) + 0.5 - target.cy) / target.fy
+    at, unique = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1), True
+    if photograph.lens is not None and not photograph.lens.is_identity:
+        at, unique = distort(photograph.lens, at)
+    camera = photograph.camera
+    column = np.floor((at[..., 0] * camera.fx + camera.cx) / camera.width * picture.shape[1] + 1e-9).astype(np.int64)
+    row = np.floor((at[..., 1] * camera.fy + camera.cy) / camera.height * picture.shape[0] + 1e-9).astype(np.int64)
+    inside = unique & (column >= 0) & (column < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
+    values = picture[np.clip(row, 0, picture.shape[0] - 1), np.clip(column, 0, picture.shape[1] - 1)]
+    return np.where(inside, values, 0).astype(picture.dtype)

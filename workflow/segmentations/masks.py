@@ -1,0 +1,139 @@
+"""Segmentation `masks`: 2D masks of any tool, clustered across the views by view consensus (docs/segmentation.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from iif_core.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.errors import InputError
+from iif_core.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
+from iif_core.mask_votes import joined, label_faces, view_votes
+from iif_core.segments import fill_within
+from workflow.normal_form import CaptureReader, View
+from workflow.segmentations.geometry import pieces
+from workflow.segmentations.mask_files import MaskFiles, mask_files
+from workflow.segmentations.surface import Objects, Surface
+
+PERTURBED = "every third photograph and its masks left out"
+
+POINT_FOOTPRINTS = 2.0
+"""Edge of the voxels that stand for the surface, in median pixel footprints."""
+
+GAP = 0.1
+"""Parts of a cluster further apart than about this (metres; at least GAP_POINTS voxels) are different objects."""
+
+GAP_POINTS = 3.0
+
+Load = Callable[[View], np.ndarray]
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Every mask file that this scene reads.
+
+    Raises:
+        InputError: no folder, nothing in it, names that are no view's, sizes that are not the photographs'.
+    """
+    return mask_files(document["segmentation"], document["source"], document["capture"]).files()
+
+
+def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
+    """Objects from the masks; where there are none, pieces of the mesh."""
+    own = settings.segmentation
+    files = MaskFiles.of_capture(settings, surface.capture)
+    options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
+    if "piece" not in surface.kept:
+        surface.kept |= {"piece": pieces(surface, own), "labels": {}}
+    kept = surface.kept["labels"]
+
+    def load(view: View) -> np.ndarray:
+        if view.name not in kept:
+            labels = files.labels(view)
+            kept[view.name] = labels.astype(np.uint16) if labels.max(initial=0) < 2**16 else labels
+        return kept[view.name].astype(np.int32)
+
+    return cluster_views(surface, surface.views(fold), load, options, surface.kept["piece"])
+
+
+def perturbs(surface: Surface) -> bool:
+    """Always."""
+    return True
+
+
+def cluster_views(surface: Surface, views: list[View], load: Load, options: ConsensusOptions, piece: np.ndarray) -> Objects:
+    """Objects from the label maps `load(view)` (H, W) int, 0 = no mask; `piece` (m,) of the mesh settles the rest."""
+    capture = surface.capture
+    edge = POINT_FOOTPRINTS * _footprint(capture, views)
+    points = surface_points(capture, views, edge)
+    seen = []
+    for view in views:
+        camera = (view.fx, view.fy, view.cx, view.cy)
+        seen.append(masks_at(points, load(view), capture.gbuffer(view)[0], camera, view.world_from_camera, edge))
+    masks = gather_masks(seen, len(points), options.min_points)
+    if not len(masks.view):
+        raise InputError(
+            f"`segmentation: {{kind: masks}}`: no mask of any view covers {options.min_points} surface points"
+            f" ({1000 * edge:.3g} mm apart); check that the files hold ids above 0, or lower `segmentation.min_points`"
+        )
+    cluster = cluster_masks(masks, options)
+
+    count, known = int(cluster.max(initial=-1)) + 1, cluster >= 0
+    number = np.bincount(cluster[known], minlength=count)
+    size = np.bincount(cluster[known], np.asarray(masks.in_mask.sum(1)).ravel()[known], count) / np.maximum(number, 1)
+    votes = joined(_votes(surface, views, load, masks, cluster, max(GAP, GAP_POINTS * edge)))
+    label, bare, agreeing = label_faces(votes, size, number, piece)
+    label = fill_within(label, piece, bare, surface.pairs)
+    kept, label = np.unique(label, return_inverse=True)
+    voted = kept < len(agreeing)
+    agreement = np.ones(len(kept))
+    agreement[voted] = agreeing[kept[voted]]
+    facts = {
+        "masks": len(cluster),
+        "masks_undersegmented": int((~known).sum()),
+        "clusters": count,
+        "objects_from_masks": int(voted.sum()),
+        "objects_from_shape": int((~voted).sum()),
+    }
+    names = [f"{'object' if v else 'piece'} {i}" for i, v in enumerate(voted)]
+    return Objects(label.astype(np.int32), names, agreement, facts)
+
+
+def surface_points(capture: CaptureReader, views: list[View], edge: float) -> np.ndarray:
+    """(n, 3) float32 photographed surface points, one a voxel of this edge (metres): the first that was seen."""
+    keys, points = np.zeros(0, np.uint64), np.zeros((0, 3), np.float32)
+    origin = grid_origin(capture.mesh()[0], edge)
+    for view in views:
+        depth = capture.gbuffer(view)[0]
+        here = capture.points(view, depth)[depth > 0]
+        keys = np.concatenate([keys, pack_keys(voxel_indices(here, edge, origin))])
+        keys, first = np.unique(keys, return_index=True)
+        points = np.concatenate([points, here])[first]
+    return points
+
+
+def _footprint(capture: CaptureReader, views: list[View]) -> float:
+    """Median size of a pixel on the surface, in metres."""
+    sizes = []
+    for view in views:
+        depth = capture.gbuffer(view)[0]
+        sizes.append(np.median(depth[depth > 0]) / view.fx)
+    return float(np.median(sizes))
+
+
+def _votes(surface: Surface, views: list[View], load: Load, masks: MaskPoints, cluster: np.ndarray, gap: float) -> list:
+    capture, origin, out = surface.capture, grid_origin(surface.vertices, gap), []
+    for i, view in enumerate(views):
+        labels, (depth, face) = load(view), capture.gbuffer(view)
+        hit = face >= 0
+        table = np.full(max(int(labels.max()), 0) + 1, -1, np.int32)
+        mine = masks.view == i
+        table[masks.label[mine]] = cluster[mine]
+        label = np.maximum(labels[hit], 0)
+        of_pixel = table[label]
+        key = pack_keys(voxel_indices(capture.points(view, depth)[hit], gap, origin), of_pixel)
+        out.append(view_votes(face[hit], key, of_pixel >= 0, label > 0, len(surface.faces)))
+    return out
