@@ -6,7 +6,8 @@ reduces the photographs, traces the mesh and measures whether the two belong tog
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +33,26 @@ class Inputs:
 
     transforms: transforms.Transforms
     mesh: Path
-    exposures: Path | None
-    instances: dict[str, Path]
-    truth: dict[str, dict[str, Path]]
+    exposures: Path | None = None
+    instances: dict[str, Path] = field(default_factory=dict)
+    truth: dict[str, dict[str, Path]] = field(default_factory=dict)
+    metres: float = 1.0
+    gains: tuple[float, ...] | None = None
+    """Exposures of the frames that the source itself knows."""
+    of_vertices: Callable[[], mesh.VertexIds] | None = None
+    """Object ids of the mesh's vertices."""
+    load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
+    response: np.ndarray | None = None
+    """True camera response, (3, 101)."""
+    also: tuple[Path, ...] = ()
+    """Further files that are read."""
 
     def files(self) -> list[Path]:
         out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
         for frame in self.transforms.frames:
-            out += [frame.image, *([frame.depth] if frame.depth else [])]
-        return out + [path for maps in self.truth.values() for path in maps.values()]
+            out += [path for path in (frame.image, frame.depth, frame.mask) if path]
+        out += [path for maps in self.truth.values() for path in maps.values()]
+        return [*out, *self.transforms.also, *self.also]
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -54,7 +66,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
     """The checked scene: cameras, and the files that belong to them."""
-    transforms.metres_per_unit(source["unit"])
+    metres = transforms.metres_per_unit(source["unit"])
     listed = transforms.read(source, capture)
     folder = Path(source["path"])
     if capture["test_every"] == 1:
@@ -70,6 +82,7 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
         exposures if has_exposures else None,
         _instances(folder, listed.frames),
         _truth(folder, listed.frames),
+        metres,
     )
 
 
@@ -113,30 +126,36 @@ def capture(job: Job) -> None:
     Raises:
         InputError: the mesh cannot be used, no view sees it, or photographs and mesh do not belong together.
     """
-    _Capture(job).run()
+    capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture)))
+
+
+def capture_photographs(job: Job, inputs: Inputs) -> None:
+    """Write the normal form of photographs with known cameras and a mesh, wherever these were found."""
+    _Capture(job, inputs).run()
 
 
 class _Capture:
     """State of one capture: settings, mesh, notes."""
 
-    def __init__(self, job: Job):
-        self.job, self.source, self.settings = job, job.settings.source, job.settings.capture
-        self.inputs = find_inputs(vars(self.source), vars(self.settings))
+    def __init__(self, job: Job, inputs: Inputs):
+        self.job, self.source, self.settings, self.inputs = job, job.settings.source, job.settings.capture, inputs
         self.writer = CaptureWriter(job.writer)
-        self.metres = transforms.metres_per_unit(self.source.unit)
-        self.conventions = alignment.Conventions(self.source.axes, self.metres)
+        self.metres = inputs.metres
+        self.conventions = alignment.Conventions(inputs.transforms.axes, self.metres)
+        self.listed = any(frame.split for frame in inputs.transforms.frames)
         self.encoded = self.settings.dynamic_range == "ldr"
-        self.notes: list[str] = []
-        self.counts = dict.fromkeys(("non_finite", "transparent", "negative"), 0)
+        self.notes: list[str] = list(inputs.transforms.notes)
+        self.counts = dict.fromkeys(("non_finite", "transparent", "negative", "masked"), 0)
+        self.forms: dict[str, set[str]] = {}
         self.alignment = alignment.Alignment.empty()
 
     def run(self) -> None:
         frames = self.inputs.transforms.frames
         poses = [self.conventions.pose(f) for f in frames]
-        self.mesh = mesh.load(self.inputs.mesh, self.metres)
+        self.mesh = mesh.load(self.inputs.mesh, self.metres, self.inputs.of_vertices() if self.inputs.of_vertices else None)
         self.notes += self.mesh.notes
         centres = np.array([pose[:3, 3] for pose in poses])
-        mesh.check_size(self.inputs.mesh, self.mesh, self.source.unit, self.metres, centres)
+        mesh.check_size(self.inputs.mesh, self.mesh, getattr(self.source, "unit", "m"), self.metres, centres)
         if self.mesh.from_nodes and self.inputs.instances:
             self.mesh.instance = self.mesh.names = None
         self._build()
@@ -182,7 +201,7 @@ class _Capture:
             "exposure_estimated": self.settings.exposure == "estimate",
         }
         has_truth = bool(self.inputs.truth)
-        self.writer.finish("folder", self.settings.dynamic_range, has_truth, self.notes, facts=facts)
+        self.writer.finish(self.source.kind, self.settings.dynamic_range, has_truth, self.notes, self.inputs.response, facts)
         for note in self.notes:
             self.job.log.info("%s", note)
 
@@ -212,7 +231,10 @@ class _Capture:
         size = images.fitted_size(full.width, full.height, self.settings.width, self.settings.height)
         camera = alignment.scaled(full, *size)
         every = self.settings.test_every
-        split = "test" if every and view_id % every == every - 1 else "train"
+        if self.listed:
+            split = frame.split or "train"
+        else:
+            split = "test" if every and view_id % every == every - 1 else "train"
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0, split)
 
@@ -243,16 +265,22 @@ class _Capture:
         """Sensor values, or radiance (exposure divided out), of the size of `view`; and which pixels count."""
         photo = images.load_photo(frame.image, frame.turn)
         self._upright(frame, frame.image, photo.pixels)
+        if photo.form:
+            self.forms.setdefault(photo.form, set()).add(frame.name)
+        if frame.mask is not None:
+            kept = self._upright(frame, frame.mask, images.load_mask(frame.mask, frame.turn, frame.mask_full))
+            photo.masked = int((photo.valid & ~kept).sum())
+            photo.valid &= kept
         for key in self.counts:
             self.counts[key] += getattr(photo, key)
         pixels, valid = self._resized(frame, view, photo.pixels, photo.valid)
         pixels = pixels if self.encoded else pixels / np.float32(gain)
         if not valid.any():
-            self.notes.append(f"view {view.name}: no usable pixel (all transparent or NaN)")
+            self.notes.append(f"view {view.name}: no usable pixel (all transparent, masked or NaN)")
         return pixels, valid
 
     def _ids(self, frame: Frame, view: View, path: Path) -> np.ndarray:
-        ids = self._upright(frame, path, images.load_ids(path, frame.turn))
+        ids = self._upright(frame, path, self.inputs.load_ids(path, frame.turn))
         if not frame.lens.is_identity:
             moved, seen = undistort_image(ids, frame.lens, frame.camera, self._target(frame), nearest=True)
             ids = np.where(seen, moved, -1)
@@ -295,7 +323,7 @@ class _Capture:
             raise InputError(
                 f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that"
                 f" hit it: {max(dropped.values()):.1%} at most); "
-                + (better or f"mesh and poses differ in frame or unit, or `source.axes: {self.source.axes}` is wrong")
+                + (better or f"mesh and poses differ in frame or unit, or their axes ({self.conventions.axes}) are wrong")
                 + " (docs/own-data.md)"
             )
         for name, share in dropped.items():
@@ -320,7 +348,7 @@ class _Capture:
         if not pairs:
             return ""
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
-        return alignment.explain(pairs, self._depth_along, self.source.axes, self.metres, unit, tolerance)
+        return alignment.explain(pairs, self._depth_along, self.conventions.axes, self.metres, unit, tolerance)
 
     def _depth_along(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
         from iif_core.transport import trace
@@ -330,6 +358,8 @@ class _Capture:
 
     def _given_exposures(self) -> list[float]:
         frames = self.inputs.transforms.frames
+        if self.inputs.gains is not None and self.settings.exposure == "given":
+            return list(self.inputs.gains)
         if self.inputs.exposures is None:
             return [1.0] * len(frames)
         if self.settings.exposure == "estimate":
@@ -363,8 +393,22 @@ class _Capture:
             "non_finite": "NaN or infinite pixels are ignored",
             "transparent": "transparent pixels are ignored (alpha < 0.5)",
             "negative": "pixels with negative values were set to 0",
+            "masked": f"masked pixels are ignored ({sum(f.mask is not None for f in frames)} masks)",
         }
         self.notes += [f"photographs: {self.counts[k]} {text}" for k, text in words.items() if self.counts[k]]
+        meaning = {
+            "grey": "the same value in R, G and B",
+            "16-bit": "values / 65535",
+            "16-bit grey": "values / 65535, the same in R, G and B",
+        }
+        self.notes += [f"photographs: {len(names)} {form}: {meaning[form]}" for form, names in sorted(self.forms.items())]
+        turned = sum(f.turn != 1 for f in frames)
+        if turned:
+            self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
+        if self.listed:
+            tests = sum(v.split == "test" for v in views)
+            every = "; `capture.test_every` is not used" if self.settings.test_every else ""
+            self.notes.append(f"lists of the source keep {tests} of {len(views)} views for testing{every}")
         bent = [f for f in frames if not f.lens.is_identity]
         if bent:
             self.notes.append(f"lens distortion ({bent[0].lens.kind}) removed from {len(bent)} photographs")
