@@ -19,7 +19,7 @@ from iif_core.distortion import Pinhole, pinhole_inside, undistort_image
 from iif_core.errors import InputError
 from workflow.job import Job
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.folder_scene import alignment, exposure, images, mesh, transforms
+from workflow.sources.folder_scene import alignment, colmap, exposure, images, mesh, transforms
 from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01
@@ -64,11 +64,15 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     return find_inputs(document["source"], document["capture"]).files()
 
 
-def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
-    """The checked scene: cameras, and the files that belong to them."""
+def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
+    """The checked scene: cameras, and the files that belong to them. points: read a model's sparse points too (slow)."""
     metres = transforms.metres_per_unit(source["unit"])
-    listed = transforms.read(source, capture)
-    folder = Path(source["path"])
+    folder = transforms.folder_at(source, "transforms.json or a COLMAP model")
+    stated = source["cameras"]
+    model = None
+    if not (str(stated).endswith(".json") or (stated is None and (folder / "transforms.json").is_file())):
+        model = colmap.find(folder, stated)
+    listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
     if capture["test_every"] == 1:
         raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
     mesh_path = mesh.find(folder, source.get("mesh"))
@@ -126,7 +130,7 @@ def capture(job: Job) -> None:
     Raises:
         InputError: the mesh cannot be used, no view sees it, or photographs and mesh do not belong together.
     """
-    capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture)))
+    capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
 
 
 def capture_photographs(job: Job, inputs: Inputs) -> None:
@@ -314,6 +318,9 @@ class _Capture:
             measured = images.load_depth(frame.depth, self.inputs.transforms.depth_unit)
             ratio = alignment.depth_ratio(frame, self.conventions, _pinhole(view), depth, measured)
             self.alignment.ratios[frame.name] = ratio
+        elif frame.seen is not None and len(frame.seen) >= alignment.MIN_POINTS:
+            self.alignment.what = "sparse points"
+            self.alignment.ratios[frame.name] = alignment.point_ratio(frame, self.conventions, _pinhole(view), depth)
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
         self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
 
@@ -343,8 +350,8 @@ class _Capture:
         alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
-        """Which other reading of the poses fits the depth images, in words; empty without depth images."""
-        pairs = [(frame, _pinhole(view)) for frame, view in seen if frame.depth is not None]
+        """Which other reading of the poses fits depth images or sparse points, in words; empty without them."""
+        pairs = [(f, _pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
         if not pairs:
             return ""
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance

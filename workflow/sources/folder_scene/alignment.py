@@ -7,7 +7,7 @@ how well edges of the photograph lie on edges of the mesh, against the same pict
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 DEPTH_SAMPLES = 20_000
 """Depth pixels compared a view."""
 MIN_COMPARED = 0.2
+MIN_POINTS = 20
+"""Sparse points that a photograph must see to be compared by them."""
+TRIAL_POINTS = 300
 TRIAL_VIEWS = 6
 TRIAL_WIDTH = 96
 EDGE_WIDTH = 160
@@ -54,6 +57,14 @@ class Conventions:
         matrix = self.change(frame.depth_matrix) if self.change and self.of_world else frame.depth_matrix
         return opencv_pose(matrix, "opencv", self.metres)
 
+    def points(self, frame: Frame) -> np.ndarray:
+        """(n, 3) sparse points of the photograph in metres."""
+        if not (self.change and self.of_world):
+            return frame.seen * self.metres
+        at = np.tile(np.eye(4), (len(frame.seen), 1, 1))
+        at[:, :3, 3] = frame.seen
+        return np.array([self.change(m)[:3, 3] for m in at]) * self.metres
+
 
 def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Mesh depth / measured depth (n,) float64 in the photograph's (pinhole) camera `view`, one entry a measured pixel.
@@ -76,7 +87,16 @@ def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_dept
     local = np.stack([x * z, y * z, z], -1)[known]
     pose = conventions.depth_pose(frame)
     points = local @ pose[:3, :3].T + pose[:3, 3]
-    u, v, z = project(points, view.fx, view.fy, view.cx, view.cy, conventions.pose(frame))
+    return _ratio_at(points, view, conventions.pose(frame), mesh_depth)
+
+
+def point_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray) -> np.ndarray:
+    """Mesh depth / depth of the sparse points that the photograph sees (n,), NaN where no mesh is."""
+    return _ratio_at(conventions.points(frame), view, conventions.pose(frame), mesh_depth)
+
+
+def _ratio_at(points: np.ndarray, view: Pinhole, pose: np.ndarray, mesh_depth: np.ndarray) -> np.ndarray:
+    u, v, z = project(points, view.fx, view.fy, view.cx, view.cy, pose)
     inside = (z > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     u, v, z = u[inside].astype(int), v[inside].astype(int), z[inside]
     hit = mesh_depth[v, u]
@@ -139,12 +159,14 @@ def explain(
     depth_unit: float | None,
     tolerance: float,
 ) -> str:
-    """What would fit the depth images better, in words; empty when nothing does.
+    """What would fit the depth images (or sparse points) better, in words; empty when nothing does.
 
-    frames: with depth, and their pinhole cameras. trace: (origin, directions (h, w, 3)) -> z-depth (h, w).
+    frames: with either, and their pinhole cameras. trace: (origin, directions (h, w, 3)) -> z-depth (h, w).
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, TRIAL_VIEWS).astype(int))]
-    depths = [images.load_depth(frame.depth, depth_unit) for frame, _ in chosen]
+    depths = [images.load_depth(frame.depth, depth_unit) if frame.depth else None for frame, _ in chosen]
+    some = [replace(f, seen=f.seen[:: max(1, len(f.seen) // TRIAL_POINTS)]) if f.seen is not None else f for f, _ in chosen]
+    chosen = [(frame, view) for frame, (_, view) in zip(some, chosen, strict=True)]
 
     def ratios(conventions: Conventions) -> np.ndarray:
         parts = []
@@ -152,12 +174,16 @@ def explain(
             small = shrunk(view, TRIAL_WIDTH)
             pose = conventions.pose(frame)
             mesh_depth = trace(pose[:3, 3], directions(small, pose))
-            parts.append(depth_ratio(frame, conventions, small, mesh_depth, depth))
+            parts.append(
+                point_ratio(frame, conventions, small, mesh_depth)
+                if depth is None
+                else depth_ratio(frame, conventions, small, mesh_depth, depth)
+            )
         return np.concatenate(parts)
 
     as_is = ratios(Conventions(axes, metres))
     scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres)]
-    if np.isfinite(as_is).any():
+    if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no metres of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
     best, text = min(scores)
@@ -233,6 +259,7 @@ class Alignment:
 
     ratios: dict[str, np.ndarray]
     edges: dict[str, np.ndarray]
+    what: str = "depth images"
 
     @classmethod
     def empty(cls) -> Alignment:
@@ -273,7 +300,7 @@ class Alignment:
             out.append(f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?")
         if "depth_median_disagreement" in r:
             out.append(
-                f"alignment: mesh depth differs from the depth images by {r['depth_median_disagreement']:.2%} (median"
+                f"alignment: mesh depth differs from the {self.what} by {r['depth_median_disagreement']:.2%} (median"
                 f" of {r['depth_samples']} pixels)"
             )
         if "edge_correlation" in r:
@@ -305,10 +332,10 @@ class Alignment:
         if not self.ratios or self.depth_disagreement <= tolerance:
             return ""
         number = self.depth_disagreement
-        found = f"{number:.1%}" if np.isfinite(number) else f"less than {MIN_COMPARED:.0%} of the depth pixels meet it"
+        found = f"{number:.1%}" if np.isfinite(number) else f"less than {MIN_COMPARED:.0%} of them meet it"
         better = advice()
         return (
-            f"{path}: mesh and depth images disagree (median relative difference {found}, tolerance {tolerance:.0%})."
+            f"{path}: mesh and {self.what} disagree (median relative difference {found}, tolerance {tolerance:.0%})."
             f" {better or 'No usual convention fits: check that mesh, poses and depth belong together'}."
             " To go on anyway: `source.alignment: warn`"
         )

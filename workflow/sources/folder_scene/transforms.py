@@ -131,7 +131,7 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     Raises:
         InputError: on the first thing that cannot be used; lists of files name the first few.
     """
-    path = folder_at(source, "transforms.json") / "transforms.json"
+    path = folder_at(source, "transforms.json") / (source["cameras"] or "transforms.json")
     document = load(path)
     entries = _listed_splits(path, document, entries_of(path, document))
     for entry in entries:
