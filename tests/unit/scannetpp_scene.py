@@ -23,6 +23,8 @@ MASKED = (1, 3)
 HIDDEN = (slice(20, 46), slice(60, 95))
 """What the masks hide."""
 UNLABELLED = "rug"
+POINTS = 600
+"""Sparse points of the COLMAP model."""
 
 
 def room():
@@ -115,25 +117,26 @@ def save_mask(path, mask):
 
 
 def colmap_text(folder, of_room, poses, prefix=""):
-    """cameras.txt, images.txt, points3D.txt: world-to-camera quaternions, mesh frame, corners of faces as points."""
+    """cameras.txt, images.txt, points3D.txt: world-to-camera quaternions, mesh frame, points on the surface."""
     from scipy.spatial.transform import Rotation
 
     folder.mkdir(parents=True)
     k = " ".join(map(repr, LENS.k))
     lens = f"OPENCV_FISHEYE {CAMERA.width} {CAMERA.height} {CAMERA.fx} {CAMERA.fy} {CAMERA.cx} {CAMERA.cy} {k}"
     (folder / "cameras.txt").write_text(f"# one camera\n1 {lens}\n")
-    points = of_room.vertices[:: max(1, len(of_room.vertices) // 60)].astype(float)
+    from workflow.sources.rooms.coverage import surface_points
+
+    points = surface_points(of_room, POINTS)
     shape = geometry(of_room)
     lines = ["# Image list", "# two lines an image"]
     for i, pose in enumerate(poses):
         w2c = np.linalg.inv(pose)
-        x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat()
+        x, y, z, w = Rotation.from_matrix(w2c[:3, :3]).as_quat().tolist()
         numbers = [i + 1, w, x, y, z, *w2c[:3, 3], 1, prefix + name(i)]
         keypoints = []
-        for j, point in enumerate(points):
-            pixel = fisheye_pixel(point, pose)
-            inside = (pixel > 1).all() and (pixel < [CAMERA.width - 1, CAMERA.height - 1]).all()
-            if inside and visible(shape, pose, point):
+        for j in np.flatnonzero(visible(shape, pose, points)):
+            pixel = fisheye_pixel(points[j], pose)
+            if (pixel > 1).all() and (pixel < [CAMERA.width - 1, CAMERA.height - 1]).all():
                 keypoints += [*pixel, j + 1]
         keypoints += [5.0, 5.0, -1]
         lines += [" ".join(map(str, numbers)), " ".join(map(str, keypoints))]
@@ -142,15 +145,13 @@ def colmap_text(folder, of_room, poses, prefix=""):
     (folder / "points3D.txt").write_text("# points\n" + "\n".join(rows) + "\n")
 
 
-def visible(shape, pose, point):
-    """Whether nothing is before the point: a ray that is a little too short must not hit."""
+def visible(shape, pose, points):
+    """(n,) bool: nothing is before the point."""
     from iif_core.transport import trace
 
-    away = (np.asarray(point) - pose[:3, 3]).astype(np.float32)
-    if (pose[:3, :3].T @ away)[2] <= 0.05:
-        return False
-    face, t = trace(shape, pose[:3, 3], away[None])
-    return bool(face[0] >= 0 and t[0] > 0.99)
+    away = (points - pose[:3, 3]).astype(np.float32)
+    face, t = trace(shape, pose[:3, 3], away)
+    return (face >= 0) & (t > 0.995) & ((away @ pose[:3, 2]) > 0.05)
 
 
 def segments(scans, of_room):

@@ -93,12 +93,14 @@ def test_surface_points_land_on_their_own_colour(release, captured):
         rows, columns = np.nonzero(valid & (face >= 0))
         pixels = np.array([mini.fisheye_pixel(points[r, c], pose) for r, c in zip(rows[::11], columns[::11], strict=True)])
         u, v = pixels.T - 0.5
+        inner = (u > 0) & (u < mini.CAMERA.width - 1) & (v > 0) & (v < mini.CAMERA.height - 1)
+        assert inner.mean() > 0.97  # the others lie in the outer half of the border's pixels
         i, j = np.clip(v.astype(int), 0, 95), np.clip(u.astype(int), 0, 144)
         a, b = (u - j)[:, None], (v - i)[:, None]
         upper = (1 - a) * released[i, j] + a * released[i, j + 1]
         lower = (1 - a) * released[i + 1, j] + a * released[i + 1, j + 1]
         looked_up = (1 - b) * upper + b * lower
-        assert np.abs(looked_up - photo[rows[::11], columns[::11]]).max() < 1e-3
+        assert np.abs(looked_up - photo[rows[::11], columns[::11]])[inner].max() < 1e-4
     assert captured.facts["alignment"]["edge_correlation"] > 0.05
 
 
