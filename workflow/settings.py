@@ -106,6 +106,8 @@ class FiptSource(PhotographedSource):
     """The scene's folder: holds scene.obj."""
     mesh: str = "scene.obj"
     """Mesh file inside the folder."""
+    unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
+    """Unit of mesh and camera positions (a number = metres per unit)."""
     validation: Literal["test", "none"] = "test"
     """Synthetic: photographs of `val/` are held out, or left out."""
     ids: Literal["auto", "parts", "semantic", "none"] = "auto"

@@ -20,9 +20,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from iif_core import native
-
-native.prepare()
-
 from iif_core.distortion import Distortion, Pinhole, pinhole_inside, undistort
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
@@ -107,6 +104,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--samples", type=int, default=256)
     options = parser.parse_args()
+    native.prepare()
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")

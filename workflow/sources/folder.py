@@ -152,6 +152,9 @@ class _Capture:
         self.counts = dict.fromkeys(("non_finite", "transparent", "negative", "masked"), 0)
         self.forms: dict[str, set[str]] = {}
         self.alignment = alignment.Alignment.empty()
+        count = len(inputs.transforms.frames)
+        self.tried = {inputs.transforms.frames[i].name for i in transforms.spread(count, alignment.TRIAL_VIEWS)}
+        self.trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]] = []
 
     def run(self) -> None:
         frames = self.inputs.transforms.frames
@@ -323,6 +326,9 @@ class _Capture:
             self.alignment.ratios[frame.name] = alignment.point_ratio(frame, self.conventions, _pinhole(view), depth)
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
         self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
+        if frame.name in self.tried:
+            small = alignment.shrunk(_pinhole(view), alignment.EDGE_WIDTH)
+            self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
 
     def _check_views(self, count: int, dropped: dict[str, float], blind: list[tuple[Frame, View]]) -> None:
         if len(dropped) == count:
@@ -347,7 +353,12 @@ class _Capture:
         path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
         message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views, strict=True))))
         alignment.raise_or_note(message, self.source.alignment, self.notes)
-        alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
+        warning = self.alignment.edge_warning()
+        better = self._edge_advice() if warning and not self.alignment.ratios else ""
+        if better:
+            message = f"{path}: photographs and mesh do not belong together as read: {better}. To go on anyway:"
+            alignment.raise_or_note(f"{message} `source.alignment: warn`", self.source.alignment, self.notes)
+        alignment.raise_or_note(warning, "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
         """Which other reading of the poses fits depth images or sparse points, in words; empty without them."""
@@ -355,13 +366,25 @@ class _Capture:
         if not pairs:
             return ""
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
-        return alignment.explain(pairs, self._depth_along, self.conventions.axes, self.metres, unit, tolerance)
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        return alignment.explain(pairs, self._depth_along, axes, self.metres, known, unit, tolerance)
+
+    def _edge_advice(self) -> str:
+        """Which other reading of the poses fits the photographs' edges clearly better, in words."""
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        now = self.alignment.report()["edge_correlation"]
+        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, now)
 
     def _depth_along(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        return self._surface_along(origin, rays)[0]
+
+    def _surface_along(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """z-depth (h, w) with 0 = miss, and normals (h, w, 3)."""
         from iif_core.transport import trace
 
         face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
-        return np.where(face >= 0, t, 0).reshape(rays.shape[:2])
+        normal = np.where(face[:, None] >= 0, self.normals[face], 0)
+        return np.where(face >= 0, t, 0).reshape(rays.shape[:2]), normal.reshape(*rays.shape[:2], 3)
 
     def _given_exposures(self) -> list[float]:
         frames = self.inputs.transforms.frames

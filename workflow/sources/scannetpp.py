@@ -72,7 +72,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inpu
     of_vertices, annotation = _annotation(scans)
     if of_vertices is None:
         notes.append("no segments.json and segments_anno.json: the scene comes without object ids")
-    listed = replace(listed, notes=tuple(notes), also=(*lists, *also, *annotation))
+    listed = replace(listed, known=True, notes=tuple(notes), also=(*lists, *also, *annotation))
     return folder.Inputs(listed, mesh_path, of_vertices=of_vertices)
 
 

@@ -31,6 +31,8 @@ EDGE_WIDTH = 160
 SHIFT = 4
 """Pixels (of such a picture) that the photograph is shifted to either side."""
 WEAK_CORRELATION = 0.05
+CLEAR_CORRELATION = 0.12
+"""Of another reading of the poses, and three times as much as of theirs: then theirs is wrong."""
 
 
 @dataclass(frozen=True)
@@ -125,17 +127,20 @@ def _moved(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def candidates(axes: str, metres: float) -> list[tuple[str, Conventions]]:
-    """Other readings of the poses, each with the advice that makes it true."""
+def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Conventions]]:
+    """Other readings of the poses, each with the advice that makes it true. known: the file's format tells the axes."""
     other = "opencv" if axes == "opengl" else "opengl"
     inverse = "the matrices are world-to-camera: write their inverses into transforms.json"
-    out = [
+    of_camera = [
         (f"`source.axes: {other}` fits", Conventions(other, metres)),
         (f"{inverse} (axes {axes}) fits", Conventions(axes, metres, np.linalg.inv)),
         (
             f"{inverse} with `source.axes: {other}` fits",
             Conventions(other, metres, np.linalg.inv),
         ),
+    ]
+    out = [
+        *([] if known else of_camera),
         (
             "turning the mesh from y-up to z-up (x, -z, y) fits",
             Conventions(axes, metres, _turned(Z_UP_TO_Y_UP), of_world=True),
@@ -156,6 +161,7 @@ def explain(
     trace: Callable[[np.ndarray, np.ndarray], np.ndarray],
     axes: str,
     metres: float,
+    known: bool,
     depth_unit: float | None,
     tolerance: float,
 ) -> str:
@@ -182,12 +188,38 @@ def explain(
         return np.concatenate(parts)
 
     as_is = ratios(Conventions(axes, metres))
-    scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres)]
+    scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres, known)]
     if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no metres of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
     best, text = min(scores)
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
+
+
+def explain_edges(
+    trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]],
+    trace: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    axes: str,
+    metres: float,
+    known: bool,
+    now: float,
+) -> str:
+    """Which other reading of the poses brings the mesh's edges onto those of the photographs, in words; empty: none does.
+
+    trials: (frame, pinhole camera, its photograph (h, w, 3), valid (h, w)). trace: (origin, directions (h, w, 3)) ->
+    z-depth (h, w) with 0 = miss, unit normals (h, w, 3). now: correlation of the poses as they are read.
+    """
+
+    def correlation(conventions: Conventions) -> float:
+        found = []
+        for frame, camera, photo, valid in trials:
+            pose = conventions.pose(frame)
+            depth, normal = trace(pose[:3, 3], directions(camera, pose))
+            found.append(edge_correlation(photo, valid, depth, normal)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
+        return float(np.mean(found)) if found else 0.0
+
+    best, text = max((correlation(c), text) for text, c in candidates(axes, metres, known))
+    return f"{text} (edges correlate {best:.2f}, as read {now:.2f})" if best >= max(CLEAR_CORRELATION, 3 * now) else ""
 
 
 def _unit_advice(metres: float, factor: float) -> str:

@@ -162,7 +162,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     notes = []
     if without:
         notes.append(f"{len(without)} of {len(there)} images have no pose in {model.path} and are not used, such as {without[0]}")
-    return replace(listed, axes="opencv", notes=tuple(notes), also=model.files)
+    return replace(listed, axes="opencv", known=True, notes=tuple(notes), also=model.files)
 
 
 def _check_reprojection(model: Model, listed: Transforms) -> None:

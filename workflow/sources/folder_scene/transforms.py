@@ -62,13 +62,15 @@ class Frame:
 class Transforms:
     """The checked file: its frames in order, and metres per value of the depth images where it says so.
 
-    axes: camera axes of the frames' matrices. notes: what was left out, in words. also: further files that were read.
+    axes: camera axes of the frames' matrices; `known`: by the file's format, so no setting can be wrong. notes: what was left
+    out, in words. also: further files that were read.
     """
 
     path: Path
     frames: tuple[Frame, ...]
     depth_unit: float | None
     axes: str = "opengl"
+    known: bool = False
     notes: tuple[str, ...] = ()
     also: tuple[Path, ...] = ()
 
