@@ -16,11 +16,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from iif_core import native
-from iif_core.distortion import Distortion, Pinhole, pinhole_inside, undistort
+from iif_core.distortion import Distortion, Pinhole, pinhole_inside, undistort, undistort_image
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 
@@ -64,7 +65,13 @@ def pinhole_folder(path: Path, room, views, camera: Pinhole) -> None:
     document |= {**own.intrinsics(camera), "camera_model": "PINHOLE", "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0}
     for entry in document["frames"]:
         i = int(Path(entry["file_path"]).stem[3:])
-        own.save_png(path / entry["file_path"], views[i][1])
+        mask = np.ones((mini.CAMERA.height, mini.CAMERA.width), bool)
+        if i in mini.MASKED:
+            mask[mini.HIDDEN] = False
+        _, seen = undistort_image(mask, mini.LENS, mini.CAMERA, camera, mask)
+        rgba = np.concatenate([views[i][1], seen[..., None]], -1)
+        (path / entry["file_path"]).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)).save(path / entry["file_path"])
     own.write_transforms(path, document)
 
 

@@ -63,8 +63,8 @@ def test_the_turn_of_the_world_is_a_rotation_and_its_own_inverse():
 def test_cameras_lists_and_bad_photographs(release, captured):
     _, views, _ = release
     target = pinhole_inside(mini.LENS, mini.CAMERA)
-    assert [v.name for v in captured] == ["DSC00000", "DSC00001", "DSC00003", "DSC00002", "DSC00005"]
-    assert [v.split for v in captured] == ["train", "train", "train", "test", "test"]
+    assert [v.name for v in captured] == ["DSC00000", "DSC00001", "DSC00002", "DSC00003", "DSC00005"]
+    assert [v.split for v in captured] == ["train", "train", "test", "train", "test"]
     for view in captured:
         pose = views[int(view.name[3:])][0]
         np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-9)
@@ -146,20 +146,10 @@ def test_the_same_scene_as_a_folder_gives_the_same_capture(release, captured, tm
     path = own.project(tmp_path, None, SETTINGS, {"kind": "given"})
     mini.twin(home, path, room, views)
     folder = own.run(tmp_path, "capture")
-    ours = {view.name: view for view in captured}
-    assert set(ours) == {view.name for view in folder}
-    for view in folder:
-        other = ours[view.name]
-        assert other.split == view.split
-        for key in ("width", "height", "fx", "fy", "cx", "cy", "exposure"):
-            assert getattr(view, key) == getattr(other, key)
-        np.testing.assert_allclose(view.world_from_camera, other.world_from_camera, atol=1e-12)
-        for a, b in zip(captured.photo(other), folder.photo(view), strict=True):
-            np.testing.assert_array_equal(a, b)
-        for a, b in zip(captured.gbuffer(other), folder.gbuffer(view), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-6)
-    np.testing.assert_array_equal(captured.faces()["instance_id"], folder.faces()["instance_id"])
-    np.testing.assert_array_equal(captured.mesh()[0], folder.mesh()[0])
+    manifests = [json.loads((c.reader.directory / "manifest.json").read_text()) for c in (captured, folder)]
+    ours, theirs = ({name: entry["sha256"] for name, entry in m["files"].items()} for m in manifests)
+    different = {name for name in ours if ours[name] != theirs.get(name)}
+    assert set(ours) == set(theirs) and different == {"capture.json", "instances.parquet"}  # notes; names of objects
 
 
 def test_undistorted_images_of_the_toolbox(release, copy, tmp_path):
@@ -234,7 +224,7 @@ def test_lists_without_pose_hidden_tests_and_train_alone(copy, tmp_path):
         return scannetpp.find_inputs(document["source"], document["capture"]).transforms
 
     both = listed(drop_bad=False)
-    assert [f.name for f in both.frames] == ["DSC00000", "DSC00001", "DSC00003", "DSC00004", "DSC00002"]
+    assert [f.name for f in both.frames] == ["DSC00000", "DSC00001", "DSC00002", "DSC00003", "DSC00004"]
     assert any("1 listed photographs have no pose" in note and "DSC09999" in note for note in both.notes)
     assert any("1 test photographs are not in resized_images/" in note for note in both.notes)
     assert [f.split for f in listed(lists="train").frames] == ["train"] * 3

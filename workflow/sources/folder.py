@@ -327,12 +327,11 @@ class _Capture:
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
         self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
         if frame.name in self.tried:
-            small = alignment.shrunk(_pinhole(view), alignment.EDGE_WIDTH)
-            self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
+            self._try(frame, view, photo, valid)
 
     def _check_views(self, count: int, dropped: dict[str, float], blind: list[tuple[Frame, View]]) -> None:
         if len(dropped) == count:
-            better = self._advice(blind)
+            better = self._advice(blind) or self._blind_advice(blind)
             raise InputError(
                 f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that"
                 f" hit it: {max(dropped.values()):.1%} at most); "
@@ -368,6 +367,18 @@ class _Capture:
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
         axes, known = self.conventions.axes, self.inputs.transforms.known
         return alignment.explain(pairs, self._depth_along, axes, self.metres, known, unit, tolerance)
+
+    def _blind_advice(self, blind: list[tuple[Frame, View]]) -> str:
+        """The same for photographs none of which sees the mesh as read."""
+        for frame, view in blind:
+            if frame.name in self.tried:
+                self._try(frame, view, *self._photo(frame, view, 1.0))
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, 0.0)
+
+    def _try(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray) -> None:
+        small = alignment.shrunk(_pinhole(view), alignment.EDGE_WIDTH)
+        self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
 
     def _edge_advice(self) -> str:
         """Which other reading of the poses fits the photographs' edges clearly better, in words."""

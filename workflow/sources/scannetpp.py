@@ -79,7 +79,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inpu
 def _entries(
     document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path, source: dict[str, Any]
 ) -> tuple[list[dict[str, Any]], list[str], list[Path]]:
-    """Frames of the train and test lists with their `_split`, what was left out in words, and the list file."""
+    """Frames of both lists by file name, with their `_split`; what was left out, in words; the list file."""
     entries = [{**e, "_split": "train"} for e in transforms.entries_of(cameras, document)]
     if document.get("test_frames"):
         entries += [{**e, "_split": "test"} for e in transforms.entries_of(cameras, document, "test_frames")]
@@ -104,7 +104,8 @@ def _entries(
     elif hidden:
         notes.append(f"{len(hidden)} test photographs are not in {pictures.name}/ (the release withholds some)")
     gone = {id(e) for e in hidden}
-    return [e for e in entries if id(e) not in gone], notes, [path] if path.is_file() else []
+    kept = sorted((e for e in entries if id(e) not in gone), key=lambda entry: entry["file_path"])
+    return kept, notes, [path] if path.is_file() else []
 
 
 def _lists(path: Path) -> dict[str, str]:

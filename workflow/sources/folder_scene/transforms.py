@@ -194,7 +194,8 @@ def _in_world(world: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """The pose after a similarity of the world: its scale moves the camera and does not stretch its axes."""
     scale = float(np.cbrt(np.linalg.det(world[:3, :3])))
     out = world @ matrix
-    out[:3, :3] /= scale
+    if abs(scale - 1) > 1e-12:  # axes that only change places stay exact
+        out[:3, :3] /= scale
     return out
 
 
@@ -376,7 +377,10 @@ def _same_sizes(
     sizes: dict[tuple[int, int], list[Path]] = {}
     for entry, image in located:
         if not any(key in entry for key in INTRINSICS):
-            sizes.setdefault(headers[image].size, []).append(image)
+            header = headers[image]
+            stated = (document.get("w"), document.get("h"))
+            turned = header.orientation >= 5 and stated == header.size[::-1]
+            sizes.setdefault(stated if turned else header.size, []).append(image)
     if len(sizes) > 1:
         rows = sorted(sizes.items(), key=lambda item: -len(item[1]))
         text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in rows[:4])
