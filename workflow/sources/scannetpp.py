@@ -44,11 +44,12 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Write the normal form of the scene."""
-    folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture)))
+    folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
 
 
-def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inputs:
-    """The checked scene: cameras in the mesh's frame, and the files that belong to them."""
+def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> folder.Inputs:
+    """The checked scene: cameras in the mesh's frame, and the files that belong to them. points: read the sparse points of
+    colmap/ too (slow), for the check of the mesh."""
     home = transforms.folder_at(source, "dslr/ and scans/")
     for name in ("dslr", "scans"):
         if not (home / name).is_dir():
@@ -65,7 +66,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inpu
     notes += _masks(entries, masks)
     world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
     listed = transforms.frames_of(cameras, document, entries, pictures, source, settings, world)
-    also = _agrees_with_colmap(listed, dslr / "colmap", source["world"])
+    listed, also = _agrees_with_colmap(listed, dslr / "colmap", source["world"], points)
     mesh_path = scans / "mesh_aligned_0.05.ply"
     if not mesh_path.is_file():
         raise InputError(f"{mesh_path}: not found; download the scene's `scans` too")
@@ -131,19 +132,21 @@ def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
     return []
 
 
-def _agrees_with_colmap(listed: transforms.Transforms, model: Path, world: str) -> list[Path]:
-    """Compare the poses with colmap/, which is in the mesh's frame; the files that were read.
+def _agrees_with_colmap(
+    listed: transforms.Transforms, model: Path, world: str, points: bool
+) -> tuple[transforms.Transforms, list[Path]]:
+    """Compare the poses with colmap/, which is in the mesh's frame; the frames with its sparse points, its files.
 
     Raises:
         InputError: they differ, naming `source.world` where that explains it.
     """
     if not colmap.is_model(model):
-        return []
-    found = colmap.read(model, with_points=False)
-    poses = {Path(image.name).name: image.pose for image in found.images}
-    pairs = [(f, poses[Path(f.file_path).name]) for f in listed.frames if Path(f.file_path).name in poses]
+        return listed, []
+    found = colmap.read(model, points)
+    named = {Path(image.name).name: image for image in found.images}
+    pairs = [(f, named[Path(f.file_path).name].pose) for f in listed.frames if Path(f.file_path).name in named]
     if not pairs:
-        return list(found.files)
+        return listed, list(found.files)
     moved, turned = _apart([f.matrix for f, _ in pairs], [p for _, p in pairs])
     if moved > SAME_PLACE or turned > SAME_TURN:
         before = [MESH_FROM_NERFSTUDIO @ f.matrix for f, _ in pairs]  # its own inverse
@@ -158,7 +161,11 @@ def _agrees_with_colmap(listed: transforms.Transforms, model: Path, world: str) 
             f"{listed.path}: its cameras differ from those of {found.path} (median {moved:.3g} m,"
             f" {np.degrees(turned):.1f} degrees over {len(pairs)} photographs); {advice}"
         )
-    return list(found.files)
+    if not points:
+        return listed, list(found.files)
+    seen = {name: found.seen(image)[0] for name, image in named.items()}
+    frames = [replace(f, seen=seen.get(Path(f.file_path).name)) for f in listed.frames]
+    return replace(listed, frames=tuple(frames)), list(found.files)
 
 
 def _apart(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, float]:

@@ -6,6 +6,8 @@ COLMAP's conventions are the project's own: OpenCV camera axes, pixel centres at
 from __future__ import annotations
 
 import struct
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -231,8 +233,12 @@ def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray)
 # ------------------------------------------------------------------------------------------------------------------ text
 
 
-def _lines(path: Path) -> list[str]:
-    return [line.strip() for line in path.read_text().splitlines() if not line.lstrip().startswith("#")]
+def _lines(path: Path) -> Iterator[str]:
+    """Lines without comments, one at a time: these files hold every keypoint of every image."""
+    with open(path) as file:
+        for line in file:
+            if not line.startswith("#"):
+                yield line.strip()
 
 
 def _cameras(path: Path) -> dict[int, dict[str, Any]]:
@@ -245,15 +251,11 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
 
 def _images(path: Path, keypoints: bool) -> list[Image]:
     """Two lines an image; the second (keypoints) may be empty."""
-    lines = _lines(path)
-    while lines and not lines[0]:
-        lines.pop(0)
-    if len(lines) % 2 and lines[-1]:
-        lines.append("")
-    out = []
-    for first, second in zip(lines[::2], lines[1::2], strict=False):
+    out, lines = [], _lines(path)
+    for first in lines:
         if not first:
             continue
+        second = next(lines, "")
         fields = first.split(maxsplit=9)
         numbers = np.array(second.split() if keypoints else [], np.float64).reshape(-1, 3)
         values = [float(v) for v in fields[1:8]]
@@ -262,9 +264,12 @@ def _images(path: Path, keypoints: bool) -> list[Image]:
 
 
 def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    rows = [line.split(maxsplit=4)[:4] for line in _lines(path) if line]
-    ids = np.array([int(row[0]) for row in rows], np.int64)
-    return ids, np.array([[float(v) for v in row[1:4]] for row in rows], np.float64).reshape(-1, 3)
+    ids, points = array("q"), array("d")
+    for line in filter(None, _lines(path)):
+        number, x, y, z, _ = line.split(maxsplit=4)
+        ids.append(int(number))
+        points.extend((float(x), float(y), float(z)))
+    return np.array(ids, np.int64), np.array(points, np.float64).reshape(-1, 3)
 
 
 # ---------------------------------------------------------------------------------------------------------------- binary
