@@ -4,7 +4,8 @@
 
 The tiny room is path traced through a fisheye and written twice: as a release, and as a folder (same photographs; poses in the
 mesh's frame, masks as alpha, ids in the mesh). A third scene is photographed by a perfect pinhole camera at the same places:
-what resampling costs. Mean and largest absolute difference of albedo, roughness and metallic (base and final maps), over
+what resampling and other noise cost. A fourth is the release with noise written where its masks hide something: what is hidden
+must leave no trace. Mean and largest absolute difference of albedo, roughness and metallic (base and final maps), over
 pixels that see the mesh; prior `retinex`, segmentation `given`.
 """
 
@@ -12,7 +13,10 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -58,8 +62,6 @@ def photographs(room, count: int, camera: Pinhole, lens: Distortion, samples: in
 
 def pinhole_folder(path: Path, room, views, camera: Pinhole) -> None:
     """The folder of `mini.twin` with photographs of a pinhole camera."""
-    import shutil
-
     shutil.rmtree(path / "images")
     document = json.loads((path / "transforms.json").read_text())
     document |= {**own.intrinsics(camera), "camera_model": "PINHOLE", "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.0}
@@ -73,6 +75,24 @@ def pinhole_folder(path: Path, room, views, camera: Pinhole) -> None:
         (path / entry["file_path"]).parent.mkdir(exist_ok=True)
         Image.fromarray(np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8)).save(path / entry["file_path"])
     own.write_transforms(path, document)
+
+
+@contextmanager
+def noise_under_masks() -> Iterator[None]:
+    """The capture writes noise, instead of 0, where pixels do not count."""
+    from workflow.normal_form import CaptureWriter
+
+    write = CaptureWriter.photo
+
+    def noisy(self, name, image, valid=None, encoded=True):
+        noise = np.random.default_rng(len(name)).random(image.shape)
+        write(self, name, np.where(valid[..., None], image, noise).astype(np.float32), valid, encoded)
+
+    CaptureWriter.photo = noisy
+    try:
+        yield
+    finally:
+        CaptureWriter.photo = write
 
 
 def maps(root: Path, stage: str) -> dict[str, dict[str, np.ndarray]]:
@@ -126,10 +146,13 @@ def main() -> None:
     path = own.project(options.work / "c", None, capture, {"kind": "given"})
     mini.twin(home, path, room, views)
     pinhole_folder(path, room, ideal, camera)
+    own.project(options.work / "d", {"kind": "scannetpp", "path": str(home)}, capture, {"kind": "given"})
     for name in "abc":
         own.run(options.work / name, *STAGES)
-    work = options.work
-    found = {"same photographs": differences(work / "a", work / "b"), "pinhole photographs": differences(work / "a", work / "c")}
+    with noise_under_masks():
+        own.run(options.work / "d", *STAGES)
+    names = {"b": "same photographs", "c": "pinhole photographs", "d": "noise under masks"}
+    found = {text: differences(options.work / "a", options.work / name) for name, text in names.items()}
     options.output.parent.mkdir(parents=True, exist_ok=True)
     options.output.write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(found, indent=1))
