@@ -246,6 +246,7 @@ def _(root):
 TWICE = {"fl_x": 120.0, "fl_y": 124.0, "cx": 66.0, "cy": 46.0}
 case("intrinsics for another resolution")(lambda root: changed(root, w=128, h=96, **TWICE))
 case("the same, without `w` and `h`")(lambda root: changed(root, w=None, h=None, **TWICE))
+case("w and h swapped")(lambda root: changed(root, w=48, h=64))
 case("cx and cy swapped")(lambda root: changed(root, cx=23.0, cy=33.0))
 case("no focal length")(lambda root: changed(root, fl_x=None, fl_y=None))
 
@@ -474,6 +475,12 @@ def _(root):
         own.save_raw_exr(path / entry["file_path"], dict.fromkeys("RGB", pixels))
     own.write_transforms(path, document)
     return noted(root, "NaN or infinite", capture={"dynamic_range": "hdr"})
+
+
+@case("focal lengths far apart")
+def _(root):
+    own.write_transforms(root / "data/own", own.bare(root / "data/own") | {"fl_x": 31.0})
+    return noted(root, "fl_x / fl_y")
 
 
 def first_as(root, image, word, **options):

@@ -24,6 +24,8 @@ from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01
 """A view whose rays hit the mesh less often than this looks at nothing."""
+SQUARE_PIXELS = 0.1
+"""|log(fl_x / fl_y)| above which a note asks whether that is right: real lenses stay below 0.01."""
 TRUTH = ("albedo", "roughness", "metallic", "emission")
 
 
@@ -443,6 +445,11 @@ class _Capture:
             "16-bit grey": "values / 65535, the same in R, G and B",
         }
         self.notes += [f"photographs: {len(names)} {form}: {meaning[form]}" for form, names in sorted(self.forms.items())]
+        ratio = next((f.camera.fx / f.camera.fy for f in frames if abs(np.log(f.camera.fx / f.camera.fy)) > SQUARE_PIXELS), None)
+        if ratio:
+            self.notes.append(
+                f"WARNING fl_x / fl_y is {ratio:.3g}: are the pixels that far from square, or is one of them wrong?"
+            )
         turned = sum(f.turn != 1 for f in frames)
         if turned:
             self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")

@@ -463,6 +463,8 @@ def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: i
         advice = (
             f"multiply fl_x, fl_y, cx, cy by {factor:.6g} and set w, h to {stored[0]}, {stored[1]}"
             if same_shape
+            else "w and h seem swapped: swap them, and fl_x, fl_y and cx, cy with them"
+            if stated == stored[::-1]
             else f"take the intrinsics that belong to {stored[0]}x{stored[1]}"
         )
         raise InputError(
