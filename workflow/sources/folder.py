@@ -203,7 +203,8 @@ class _Capture:
             views = self._estimated(shared, used, views)
         self.writer.cameras(views)
         self.writer.mesh(self.mesh.vertices, self.mesh.faces, self.mesh.instance, self.mesh.names)
-        self._note_pixels(frames, views)
+        self._note_pixels(frames)
+        self._note_views(frames, views)
         facts = {
             "alignment": self.alignment.report(),
             "dropped_views": dropped,
@@ -431,7 +432,7 @@ class _Capture:
         self.counts = counts
         return views
 
-    def _note_pixels(self, frames: tuple[Frame, ...], views: list[View]) -> None:
+    def _note_pixels(self, frames: tuple[Frame, ...]) -> None:
         words = {
             "non_finite": "NaN or infinite pixels are ignored",
             "transparent": "transparent pixels are ignored (alpha < 0.5)",
@@ -445,14 +446,16 @@ class _Capture:
             "16-bit grey": "values / 65535, the same in R, G and B",
         }
         self.notes += [f"photographs: {len(names)} {form}: {meaning[form]}" for form, names in sorted(self.forms.items())]
+        turned = sum(f.turn != 1 for f in frames)
+        if turned:
+            self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
+
+    def _note_views(self, frames: tuple[Frame, ...], views: list[View]) -> None:
         ratio = next((f.camera.fx / f.camera.fy for f in frames if abs(np.log(f.camera.fx / f.camera.fy)) > SQUARE_PIXELS), None)
         if ratio:
             self.notes.append(
                 f"WARNING fl_x / fl_y is {ratio:.3g}: are the pixels that far from square, or is one of them wrong?"
             )
-        turned = sum(f.turn != 1 for f in frames)
-        if turned:
-            self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
         if self.listed:
             tests = sum(v.split == "test" for v in views)
             every = "; `capture.test_every` is not used" if self.settings.test_every else ""
