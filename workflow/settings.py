@@ -49,12 +49,25 @@ class MitsubaSource(Section):
     """Leave dielectric surfaces out of the mesh (a scan has none either); recorded, pixels behind them are not scored."""
 
 
-class FolderSource(Section):
-    """Your own scene: `transforms.json`, images and a mesh in one folder (docs/own-data.md)."""
+class PhotographedSource(Section):
+    alignment: Literal["check", "warn", "off"] = "check"
+    """Reproject the mesh against depth, sparse points or image edges; `check` refuses a mismatch with the measured
+    disagreement."""
+    alignment_tolerance: float = Field(0.05, gt=0)
+    """Largest accepted median relative depth disagreement, where depth images or sparse points exist."""
+
+
+class FolderSource(PhotographedSource):
+    """Your own scene: cameras (`transforms.json` or a COLMAP model), images and a mesh in one folder (docs/own-data.md)."""
 
     kind: Literal["folder"]
     path: Path
     """The folder."""
+    cameras: str | None = None
+    """transforms.json, or the folder of a COLMAP model, inside the folder; default: `transforms.json`, else `sparse/0`,
+    `sparse`, `colmap/sparse/0`, `colmap`."""
+    images: str = "images"
+    """COLMAP: what the names of its images count from."""
     mesh: str | None = None
     """Mesh file inside the folder; default: the only one of mesh.ply, mesh.obj, mesh.glb."""
     unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
@@ -63,15 +76,45 @@ class FolderSource(Section):
     """Camera axes of `transform_matrix`."""
     pixel_centre: Literal["auto", "half", "integer"] = "auto"
     """Where principal points count from: centres at (u+0.5) or at integers; auto reads `pixel_centres_at` of the file."""
+    applied_transform: Literal["keep", "undo"] = "keep"
+    """`undo`: the mesh is in the frame before nerfstudio's `applied_transform` (a mesh that COLMAP made)."""
     frames: str | None = None
     """Keep only images whose file path matches this glob."""
-    alignment: Literal["check", "warn", "off"] = "check"
-    """Reproject the mesh against depth or image edges; `check` refuses a mismatch with the measured disagreement."""
-    alignment_tolerance: float = Field(0.05, gt=0)
-    """Largest accepted median relative depth disagreement, where depth images exist."""
 
 
-Source = Annotated[BuiltinSource | MitsubaSource | FolderSource, Field(discriminator="kind")]
+class ScanNetppSource(PhotographedSource):
+    """A scene of ScanNet++ as released: `dslr/` and `scans/` in one folder (docs/own-data.md)."""
+
+    kind: Literal["scannetpp"]
+    path: Path
+    """The scene's folder, such as `data/scannetpp/data/2a1b555966`."""
+    images: Literal["dslr", "undistorted"] = "dslr"
+    """`dslr`: fisheye `resized_images`, undistorted here; `undistorted`: what the toolbox made of them."""
+    lists: Literal["all", "train"] = "all"
+    """`all`: photographs of the test list are held out; `train`: they are left out."""
+    world: Literal["nerfstudio", "mesh"] = "nerfstudio"
+    """Frame of the poses in transforms.json: as released (turned against the mesh), or the mesh's own."""
+    drop_bad: bool = True
+    """Leave out photographs that the release marks as bad (`is_bad`)."""
+
+
+class FiptSource(PhotographedSource):
+    """A scene of FIPT or IIF, synthetic (`train/transforms.json`) or real (`cam.txt`, `K_list.txt`) (docs/own-data.md)."""
+
+    kind: Literal["fipt"]
+    path: Path
+    """The scene's folder: holds scene.obj."""
+    mesh: str = "scene.obj"
+    """Mesh file inside the folder."""
+    unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
+    """Unit of mesh and camera positions (a number = metres per unit)."""
+    validation: Literal["test", "none"] = "test"
+    """Synthetic: photographs of `val/` are held out, or left out."""
+    ids: Literal["auto", "parts", "semantic", "none"] = "auto"
+    """Object ids: `parts` = `IndexMA`, `semantic` = `segmentation`; `auto`: the first of them that exists."""
+
+
+Source = Annotated[BuiltinSource | MitsubaSource | FolderSource | ScanNetppSource | FiptSource, Field(discriminator="kind")]
 
 
 class Capture(Section):
@@ -672,7 +715,13 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
 
 
 _UNIONS: dict[str, dict[str, type[Section]]] = {
-    "source": {"builtin": BuiltinSource, "mitsuba": MitsubaSource, "folder": FolderSource},
+    "source": {
+        "builtin": BuiltinSource,
+        "mitsuba": MitsubaSource,
+        "folder": FolderSource,
+        "scannetpp": ScanNetppSource,
+        "fipt": FiptSource,
+    },
     "prior": {
         "simulated": SimulatedPrior,
         "files": FilesPrior,

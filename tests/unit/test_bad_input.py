@@ -1,5 +1,6 @@
 """Every row of docs/bad-input.md, provoked: the message (or the recorded note) is the one that the page shows."""
 
+import functools
 import json
 import re
 from pathlib import Path
@@ -11,6 +12,8 @@ from PIL import Image
 
 from iif_core.errors import InputError
 from tests.unit import own_scene as own
+from tests.unit import scannetpp_scene as mini
+from tests.unit import test_colmap, test_fipt
 from workflow import fingerprint, settings
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
@@ -22,9 +25,10 @@ def rows():
     """Case -> text of the page, over all its tables."""
     out = {}
     for line in PAGE.read_text().splitlines():
-        match = re.fullmatch(r"\| (.+?) \| (`{1,2}) ?(.+?) ?\2 \|", line)
+        match = re.fullmatch(r"\| (.+?) \| (?:(`{1,2}) ?(.+?) ?\2|(none: .+)) \|", line)
         if match:
-            out[match[1]] = match[3]
+            assert match[1] not in out, f"two rows for {match[1]}"
+            out[match[1]] = match[3] or match[4]
     return out
 
 
@@ -167,6 +171,32 @@ def _(root):
     return planned(root)
 
 
+@case("JPEG cut short")
+def _(root):
+    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+    document = own.bare(root / "data/own")
+    document["frames"][0]["file_path"] = "images/000.jpg"
+    path = root / "data/own/images/000.jpg"
+    thumbnail = path.with_name("small.jpg")
+    Image.fromarray(noise[:8, :8]).save(thumbnail)
+    exif = b"Exif\0\0" + thumbnail.read_bytes()  # a whole JPEG, with its own end mark, in the header
+    Image.fromarray(noise).save(path, exif=exif)
+    own.write_transforms(root / "data/own", document)
+    own.project(root)
+    with own.working_in(root):
+        fingerprint.fingerprint("capture", "own", "draft")  # whole, it passes
+    path.write_bytes(path.read_bytes()[:-200])
+    return planned(root)
+
+
+@case("PNG cut short")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/images/001.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    return planned(root)
+
+
 @case("image in a format not read")
 def _(root):
     document = own.bare(root / "data/own")
@@ -216,7 +246,19 @@ def _(root):
 TWICE = {"fl_x": 120.0, "fl_y": 124.0, "cx": 66.0, "cy": 46.0}
 case("intrinsics for another resolution")(lambda root: changed(root, w=128, h=96, **TWICE))
 case("the same, without `w` and `h`")(lambda root: changed(root, w=None, h=None, **TWICE))
+case("w and h swapped")(lambda root: changed(root, w=48, h=64))
+case("cx and cy swapped")(lambda root: changed(root, cx=23.0, cy=33.0))
 case("no focal length")(lambda root: changed(root, fl_x=None, fl_y=None))
+
+
+@case("pose missing")
+def _(root):
+    document = own.bare(root / "data/own")
+    del document["frames"][1]["transform_matrix"]
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
 case("pose not 4x4")(lambda root: second_pose(root, lambda pose: pose[:3]))
 case("pose with NaN")(lambda root: second_pose(root, lambda pose: pose * np.nan))
 case("pose with a scale")(lambda root: second_pose(root, lambda pose: pose @ np.diag([2.0, 2, 2, 1])))
@@ -274,6 +316,25 @@ def _(root):
     for i in range(3):
         own.save_exr(root / f"data/own/truth/albedo/{i:03d}.exr", albedo)
     return planned(root)
+
+
+@case("mask missing")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][1]["mask_path"] = "masks/001.png"
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
+case("photograph listed for train and test")(
+    lambda root: changed(root, train_filenames=["images/000.png", "images/001.png"], test_filenames=["images/001.png"])
+)
+
+
+@case("`applied_transform: undo` without one")
+def _(root):
+    own.bare(root / "data/own")
+    return planned(root, source={"applied_transform": "undo"})
 
 
 @case("exposure missing or not positive")
@@ -343,9 +404,26 @@ def _(root):
     return captured(root)
 
 
+@case("all cameras look at nothing, and other axes would see the mesh")
+def _(root):
+    """A block on a floor, no walls: cameras that look the other way see nothing at all."""
+    path = root / "data/own"
+    own.photographed(path, depth=False)
+    vertices, faces, thing = own.room_mesh()
+    on_floor = (vertices[faces][..., 2] == own.ROOM[0][2]).all(1)
+    own.save_mesh(path / "mesh.ply", vertices, faces[(thing == 1) | on_floor])
+    return captured(root, source={"axes": "opencv"})
+
+
 @case("camera axes wrong (depth images exist)")
 def _(root):
     own.photographed(root / "data/own")
+    return captured(root, source={"axes": "opencv"})
+
+
+@case("camera axes wrong (no depth images)")
+def _(root):
+    own.photographed(root / "data/own", depth=False)
     return captured(root, source={"axes": "opencv"})
 
 
@@ -399,6 +477,75 @@ def _(root):
     return noted(root, "NaN or infinite", capture={"dynamic_range": "hdr"})
 
 
+@case("focal lengths far apart")
+def _(root):
+    own.write_transforms(root / "data/own", own.bare(root / "data/own") | {"fl_x": 31.0})
+    return noted(root, "fl_x / fl_y")
+
+
+def first_as(root, image, word, **options):
+    """The note with this word when the first photograph is this picture."""
+    own.bare(root / "data/own")
+    image.save(root / "data/own/images/000.png", **options)
+    return noted(root, word)
+
+
+@case("16-bit PNG")
+def _(root):
+    import mitsuba as mi
+
+    own.bare(root / "data/own")
+    mi.Bitmap(np.full((48, 64, 3), 30000, np.uint16)).write(str(root / "data/own/images/000.png"))
+    text = noted(root, "16-bit")
+    photo = own.run(root).photo(own.run(root).views[0])[0]
+    np.testing.assert_allclose(photo, 30000 / 65535, atol=1e-6)  # not cut to 8 bits, which would give 116 / 255
+    return text
+
+
+@case("RGBA image, opaque")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/images/000.png"
+    Image.open(path).convert("RGBA").save(path)
+    own.project(root)
+    capture = own.run(root, "capture")
+    assert not [note for note in capture.facts["notes"] if "transparent" in note or "grey" in note]
+    np.testing.assert_array_equal(capture.photo(capture.views[0])[0], capture.photo(capture.views[1])[0])
+    return "none: alpha is dropped"
+
+
+@case("EXIF rotation that the cameras explain")
+def _(root):
+    document = own.bare(root / "data/own")
+    exif = Image.Exif()
+    exif[274] = 6  # stored on its side: 48x64, upright 64x48 as `w` x `h` say
+    Image.new("RGB", (48, 64)).save(root / "data/own/images/000.jpg", exif=exif)
+    document["frames"][0]["file_path"] = "images/000.jpg"
+    own.write_transforms(root / "data/own", document)
+    return noted(root, "EXIF")
+
+
+@case("masked pixels")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][1]["mask_path"] = "masks/001.png"
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[0] = 0
+    mini.save_mask(root / "data/own/masks/001.png", mask)
+    own.write_transforms(root / "data/own", document)
+    return noted(root, "masked")
+
+
+@case("lists of train and test")
+def _(root):
+    document = own.bare(root / "data/own")
+    own.write_transforms(root / "data/own", document | {"test_filenames": ["images/002.png"]})
+    return noted(root, "lists")
+
+
+case("grey image")(lambda root: first_as(root, Image.new("L", (64, 48), 90), "grey"))
+
+
 @case("transparent pixels")
 def _(root):
     own.bare(root / "data/own")
@@ -434,6 +581,119 @@ def _(root):
     return noted(root, "WARNING")
 
 
+# ---------------------------------------------------------------------------------------------------------- other sources
+
+
+@functools.cache
+def miniature():
+    """The tiny room and six photographs of it through a fisheye."""
+    room = mini.room()
+    return room, mini.photographs(room)
+
+
+def model(root):
+    """A folder with a COLMAP model of four photographs."""
+    room, views = miniature()
+    return test_colmap.scene(root / "data/own", room, views[:4])
+
+
+@case("COLMAP: no model where `cameras` says")
+def _(root):
+    model(root)
+    return planned(root, source={"cameras": "sparse/1"})
+
+
+@case("COLMAP: lens that is not read")
+def _(root):
+    test_colmap.cameras(model(root), "1 FOV 146 97 60 60 73 48 0.9")
+    return planned(root)
+
+
+@case("COLMAP: file cut short")
+def _(root):
+    test_colmap.cameras(model(root), "1 PINHOLE 146 97 60")
+    return planned(root)
+
+
+@case("COLMAP: mesh of another scale")
+def _(root):
+    own.save_mesh(model(root) / "mesh.ply", miniature()[0].vertices * 1.3, miniature()[0].faces)
+    return captured(root)
+
+
+@case("COLMAP: intrinsics changed")
+def _(root):
+    test_colmap.cameras(model(root), "1 OPENCV_FISHEYE 146 97 72.4 48.9 65.8 66.1 0 0 0 0")
+    return captured(root)
+
+
+@case("COLMAP: images without pose")
+def _(root):
+    mini.save_jpeg(model(root) / "images/DSC00099.JPG", miniature()[1][0][1])
+    return noted(root, "no pose")
+
+
+def scannetpp(root):
+    """A released scene at data/all/mini and the settings that name it."""
+    home = mini.release(root / "data/all/mini", *miniature())
+    return home, {"kind": "scannetpp", "path": "data/all/mini"}
+
+
+@case("ScanNet++: the folder of all scenes")
+def _(root):
+    _, source = scannetpp(root)
+    return planned(root, source={**source, "path": "data/all"})
+
+
+@case("ScanNet++: poses in another world than COLMAP's")
+def _(root):
+    _, source = scannetpp(root)
+    return planned(root, source={**source, "world": "mesh"})
+
+
+@case("ScanNet++: anonymisation mask missing")
+def _(root):
+    home, source = scannetpp(root)
+    (home / "dslr/resized_anon_masks/DSC00001.png").unlink()
+    return planned(root, source=source)
+
+
+@case("ScanNet++: photograph listed for train and test")
+def _(root):
+    home, source = scannetpp(root)
+    path = home / "dslr/train_test_lists.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"test": ["DSC00000.JPG"]}))
+    return planned(root, source=source)
+
+
+@case("ScanNet++: segments of another mesh")
+def _(root):
+    home, source = scannetpp(root)
+    (home / "scans/segments.json").write_text(json.dumps({"segIndices": [100] * 7}))
+    return captured(root, source=source)
+
+
+@case("ScanNet++: bad photographs")
+def _(root):
+    return noted(root, "bad", source=scannetpp(root)[1])
+
+
+@case("FIPT: neither layout")
+def _(root):
+    test_fipt.real(root / "data/own")
+    (root / "data/own/cam.txt").unlink()
+    return planned(root, source={"kind": "fipt"}, capture={"dynamic_range": "hdr"})
+
+
+@case("FIPT: look-at point and up exchanged")
+def _(root):
+    test_fipt.real(root / "data/own")
+    path = root / "data/own/cam.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], lines[3], lines[2], *lines[4:]]))
+    return planned(root, source={"kind": "fipt"}, capture={"dynamic_range": "hdr"})
+
+
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_row(name, tmp_path):
     message = CASES[name](tmp_path)
@@ -445,6 +705,6 @@ def test_every_example_of_the_guide_is_valid():
     guide = (PAGE.parent / "own-data.md").read_text()
     examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
-    assert kinds == {"builtin", "mitsuba", "folder"}
+    assert kinds == {"builtin", "mitsuba", "folder", "scannetpp", "fipt"}
     matrix = json.loads(re.search(r"```json\n(.*?)```", guide, re.DOTALL)[1])["frames"][0]["transform_matrix"]
     assert np.linalg.det(np.array(matrix)[:3, :3]) == pytest.approx(1, abs=0.02)

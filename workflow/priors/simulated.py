@@ -15,7 +15,7 @@ from workflow.normal_form import CaptureReader, View
 
 _NO_TRUTH = (
     "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"
-    " use `prior: {kind: files}` or `{kind: retinex}`, or a source with truth (builtin, mitsuba)"
+    " use `prior: {kind: files}` or `{kind: retinex}`, or a source with truth (builtin, mitsuba, fipt)"
 )
 
 

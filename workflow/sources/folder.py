@@ -6,7 +6,8 @@ reduces the photographs, traces the mesh and measures whether the two belong tog
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,13 @@ from iif_core.distortion import Pinhole, pinhole_inside, undistort_image
 from iif_core.errors import InputError
 from workflow.job import Job
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.folder_scene import alignment, exposure, images, mesh, transforms
+from workflow.sources.folder_scene import alignment, colmap, exposure, images, mesh, transforms
 from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01
 """A view whose rays hit the mesh less often than this looks at nothing."""
+SQUARE_PIXELS = 0.1
+"""|log(fl_x / fl_y)| above which a note asks whether that is right: real lenses stay below 0.01."""
 TRUTH = ("albedo", "roughness", "metallic", "emission")
 
 
@@ -32,15 +35,26 @@ class Inputs:
 
     transforms: transforms.Transforms
     mesh: Path
-    exposures: Path | None
-    instances: dict[str, Path]
-    truth: dict[str, dict[str, Path]]
+    exposures: Path | None = None
+    instances: dict[str, Path] = field(default_factory=dict)
+    truth: dict[str, dict[str, Path]] = field(default_factory=dict)
+    metres: float = 1.0
+    gains: tuple[float, ...] | None = None
+    """Exposures of the frames that the source itself knows."""
+    of_vertices: Callable[[], mesh.VertexIds] | None = None
+    """Object ids of the mesh's vertices."""
+    load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
+    response: np.ndarray | None = None
+    """True camera response, (3, 101)."""
+    also: tuple[Path, ...] = ()
+    """Further files that are read."""
 
     def files(self) -> list[Path]:
         out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
         for frame in self.transforms.frames:
-            out += [frame.image, *([frame.depth] if frame.depth else [])]
-        return out + [path for maps in self.truth.values() for path in maps.values()]
+            out += [path for path in (frame.image, frame.depth, frame.mask) if path]
+        out += [path for maps in self.truth.values() for path in maps.values()]
+        return [*out, *self.transforms.also, *self.also]
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -52,11 +66,15 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     return find_inputs(document["source"], document["capture"]).files()
 
 
-def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
-    """The checked scene: cameras, and the files that belong to them."""
-    transforms.metres_per_unit(source["unit"])
-    listed = transforms.read(source, capture)
-    folder = Path(source["path"])
+def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
+    """The checked scene: cameras, and the files that belong to them. points: read a model's sparse points too (slow)."""
+    metres = transforms.metres_per_unit(source["unit"])
+    folder = transforms.folder_at(source, "transforms.json or a COLMAP model")
+    stated = source["cameras"]
+    model = None
+    if not (str(stated).endswith(".json") or (stated is None and (folder / "transforms.json").is_file())):
+        model = colmap.find(folder, stated)
+    listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
     if capture["test_every"] == 1:
         raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
     mesh_path = mesh.find(folder, source.get("mesh"))
@@ -70,6 +88,7 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any]) -> Inputs:
         exposures if has_exposures else None,
         _instances(folder, listed.frames),
         _truth(folder, listed.frames),
+        metres,
     )
 
 
@@ -113,30 +132,39 @@ def capture(job: Job) -> None:
     Raises:
         InputError: the mesh cannot be used, no view sees it, or photographs and mesh do not belong together.
     """
-    _Capture(job).run()
+    capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
+
+
+def capture_photographs(job: Job, inputs: Inputs) -> None:
+    """Write the normal form of photographs with known cameras and a mesh, wherever these were found."""
+    _Capture(job, inputs).run()
 
 
 class _Capture:
     """State of one capture: settings, mesh, notes."""
 
-    def __init__(self, job: Job):
-        self.job, self.source, self.settings = job, job.settings.source, job.settings.capture
-        self.inputs = find_inputs(vars(self.source), vars(self.settings))
+    def __init__(self, job: Job, inputs: Inputs):
+        self.job, self.source, self.settings, self.inputs = job, job.settings.source, job.settings.capture, inputs
         self.writer = CaptureWriter(job.writer)
-        self.metres = transforms.metres_per_unit(self.source.unit)
-        self.conventions = alignment.Conventions(self.source.axes, self.metres)
+        self.metres = inputs.metres
+        self.conventions = alignment.Conventions(inputs.transforms.axes, self.metres)
+        self.listed = any(frame.split for frame in inputs.transforms.frames)
         self.encoded = self.settings.dynamic_range == "ldr"
-        self.notes: list[str] = []
-        self.counts = dict.fromkeys(("non_finite", "transparent", "negative"), 0)
+        self.notes: list[str] = list(inputs.transforms.notes)
+        self.counts = dict.fromkeys(("non_finite", "transparent", "negative", "masked"), 0)
+        self.forms: dict[str, set[str]] = {}
         self.alignment = alignment.Alignment.empty()
+        count = len(inputs.transforms.frames)
+        self.tried = {inputs.transforms.frames[i].name for i in transforms.spread(count, alignment.TRIAL_VIEWS)}
+        self.trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]] = []
 
     def run(self) -> None:
         frames = self.inputs.transforms.frames
         poses = [self.conventions.pose(f) for f in frames]
-        self.mesh = mesh.load(self.inputs.mesh, self.metres)
+        self.mesh = mesh.load(self.inputs.mesh, self.metres, self.inputs.of_vertices() if self.inputs.of_vertices else None)
         self.notes += self.mesh.notes
         centres = np.array([pose[:3, 3] for pose in poses])
-        mesh.check_size(self.inputs.mesh, self.mesh, self.source.unit, self.metres, centres)
+        mesh.check_size(self.inputs.mesh, self.mesh, getattr(self.source, "unit", "m"), self.metres, centres)
         if self.mesh.from_nodes and self.inputs.instances:
             self.mesh.instance = self.mesh.names = None
         self._build()
@@ -175,14 +203,15 @@ class _Capture:
             views = self._estimated(shared, used, views)
         self.writer.cameras(views)
         self.writer.mesh(self.mesh.vertices, self.mesh.faces, self.mesh.instance, self.mesh.names)
-        self._note_pixels(frames, views)
+        self._note_pixels(frames)
+        self._note_views(frames, views)
         facts = {
             "alignment": self.alignment.report(),
             "dropped_views": dropped,
             "exposure_estimated": self.settings.exposure == "estimate",
         }
         has_truth = bool(self.inputs.truth)
-        self.writer.finish("folder", self.settings.dynamic_range, has_truth, self.notes, facts=facts)
+        self.writer.finish(self.source.kind, self.settings.dynamic_range, has_truth, self.notes, self.inputs.response, facts)
         for note in self.notes:
             self.job.log.info("%s", note)
 
@@ -212,7 +241,10 @@ class _Capture:
         size = images.fitted_size(full.width, full.height, self.settings.width, self.settings.height)
         camera = alignment.scaled(full, *size)
         every = self.settings.test_every
-        split = "test" if every and view_id % every == every - 1 else "train"
+        if self.listed:
+            split = frame.split or "train"
+        else:
+            split = "test" if every and view_id % every == every - 1 else "train"
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0, split)
 
@@ -243,16 +275,22 @@ class _Capture:
         """Sensor values, or radiance (exposure divided out), of the size of `view`; and which pixels count."""
         photo = images.load_photo(frame.image, frame.turn)
         self._upright(frame, frame.image, photo.pixels)
+        if photo.form:
+            self.forms.setdefault(photo.form, set()).add(frame.name)
+        if frame.mask is not None:
+            kept = self._upright(frame, frame.mask, images.load_mask(frame.mask, frame.turn, frame.mask_full))
+            photo.masked = int((photo.valid & ~kept).sum())
+            photo.valid &= kept
         for key in self.counts:
             self.counts[key] += getattr(photo, key)
         pixels, valid = self._resized(frame, view, photo.pixels, photo.valid)
         pixels = pixels if self.encoded else pixels / np.float32(gain)
         if not valid.any():
-            self.notes.append(f"view {view.name}: no usable pixel (all transparent or NaN)")
+            self.notes.append(f"view {view.name}: no usable pixel (all transparent, masked or NaN)")
         return pixels, valid
 
     def _ids(self, frame: Frame, view: View, path: Path) -> np.ndarray:
-        ids = self._upright(frame, path, images.load_ids(path, frame.turn))
+        ids = self._upright(frame, path, self.inputs.load_ids(path, frame.turn))
         if not frame.lens.is_identity:
             moved, seen = undistort_image(ids, frame.lens, frame.camera, self._target(frame), nearest=True)
             ids = np.where(seen, moved, -1)
@@ -286,16 +324,21 @@ class _Capture:
             measured = images.load_depth(frame.depth, self.inputs.transforms.depth_unit)
             ratio = alignment.depth_ratio(frame, self.conventions, _pinhole(view), depth, measured)
             self.alignment.ratios[frame.name] = ratio
+        elif frame.seen is not None and len(frame.seen) >= alignment.MIN_POINTS:
+            self.alignment.what = "sparse points"
+            self.alignment.ratios[frame.name] = alignment.point_ratio(frame, self.conventions, _pinhole(view), depth)
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
         self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
+        if frame.name in self.tried:
+            self._try(frame, view, photo, valid)
 
     def _check_views(self, count: int, dropped: dict[str, float], blind: list[tuple[Frame, View]]) -> None:
         if len(dropped) == count:
-            better = self._advice(blind)
+            better = self._advice(blind) or self._blind_advice(blind)
             raise InputError(
                 f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that"
                 f" hit it: {max(dropped.values()):.1%} at most); "
-                + (better or f"mesh and poses differ in frame or unit, or `source.axes: {self.source.axes}` is wrong")
+                + (better or f"mesh and poses differ in frame or unit, or their axes ({self.conventions.axes}) are wrong")
                 + " (docs/own-data.md)"
             )
         for name, share in dropped.items():
@@ -312,24 +355,55 @@ class _Capture:
         path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
         message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views, strict=True))))
         alignment.raise_or_note(message, self.source.alignment, self.notes)
-        alignment.raise_or_note(self.alignment.edge_warning(), "warn", self.notes)
+        warning = self.alignment.edge_warning()
+        better = self._edge_advice() if warning and not self.alignment.ratios else ""
+        if better:
+            message = f"{path}: photographs and mesh do not belong together as read: {better}. To go on anyway:"
+            alignment.raise_or_note(f"{message} `source.alignment: warn`", self.source.alignment, self.notes)
+        alignment.raise_or_note(warning, "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
-        """Which other reading of the poses fits the depth images, in words; empty without depth images."""
-        pairs = [(frame, _pinhole(view)) for frame, view in seen if frame.depth is not None]
+        """Which other reading of the poses fits depth images or sparse points, in words; empty without them."""
+        pairs = [(f, _pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
         if not pairs:
             return ""
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
-        return alignment.explain(pairs, self._depth_along, self.source.axes, self.metres, unit, tolerance)
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        return alignment.explain(pairs, self._depth_along, axes, self.metres, known, unit, tolerance)
+
+    def _blind_advice(self, blind: list[tuple[Frame, View]]) -> str:
+        """The same for photographs none of which sees the mesh as read."""
+        for frame, view in blind:
+            if frame.name in self.tried:
+                self._try(frame, view, *self._photo(frame, view, 1.0))
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, 0.0)
+
+    def _try(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray) -> None:
+        small = alignment.shrunk(_pinhole(view), alignment.EDGE_WIDTH)
+        self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
+
+    def _edge_advice(self) -> str:
+        """Which other reading of the poses fits the photographs' edges clearly better, in words."""
+        axes, known = self.conventions.axes, self.inputs.transforms.known
+        now = self.alignment.report()["edge_correlation"]
+        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, now)
 
     def _depth_along(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        return self._surface_along(origin, rays)[0]
+
+    def _surface_along(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """z-depth (h, w) with 0 = miss, and normals (h, w, 3)."""
         from iif_core.transport import trace
 
         face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
-        return np.where(face >= 0, t, 0).reshape(rays.shape[:2])
+        normal = np.where(face[:, None] >= 0, self.normals[face], 0)
+        return np.where(face >= 0, t, 0).reshape(rays.shape[:2]), normal.reshape(*rays.shape[:2], 3)
 
     def _given_exposures(self) -> list[float]:
         frames = self.inputs.transforms.frames
+        if self.inputs.gains is not None and self.settings.exposure == "given":
+            return list(self.inputs.gains)
         if self.inputs.exposures is None:
             return [1.0] * len(frames)
         if self.settings.exposure == "estimate":
@@ -358,13 +432,34 @@ class _Capture:
         self.counts = counts
         return views
 
-    def _note_pixels(self, frames: tuple[Frame, ...], views: list[View]) -> None:
+    def _note_pixels(self, frames: tuple[Frame, ...]) -> None:
         words = {
             "non_finite": "NaN or infinite pixels are ignored",
             "transparent": "transparent pixels are ignored (alpha < 0.5)",
             "negative": "pixels with negative values were set to 0",
+            "masked": f"masked pixels are ignored ({sum(f.mask is not None for f in frames)} masks)",
         }
         self.notes += [f"photographs: {self.counts[k]} {text}" for k, text in words.items() if self.counts[k]]
+        meaning = {
+            "grey": "the same value in R, G and B",
+            "16-bit": "values / 65535",
+            "16-bit grey": "values / 65535, the same in R, G and B",
+        }
+        self.notes += [f"photographs: {len(names)} {form}: {meaning[form]}" for form, names in sorted(self.forms.items())]
+        turned = sum(f.turn != 1 for f in frames)
+        if turned:
+            self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
+
+    def _note_views(self, frames: tuple[Frame, ...], views: list[View]) -> None:
+        ratio = next((f.camera.fx / f.camera.fy for f in frames if abs(np.log(f.camera.fx / f.camera.fy)) > SQUARE_PIXELS), None)
+        if ratio:
+            self.notes.append(
+                f"WARNING fl_x / fl_y is {ratio:.3g}: are the pixels that far from square, or is one of them wrong?"
+            )
+        if self.listed:
+            tests = sum(v.split == "test" for v in views)
+            every = "; `capture.test_every` is not used" if self.settings.test_every else ""
+            self.notes.append(f"lists of the source keep {tests} of {len(views)} views for testing{every}")
         bent = [f for f in frames if not f.lens.is_identity]
         if bent:
             self.notes.append(f"lens distortion ({bent[0].lens.kind}) removed from {len(bent)} photographs")

@@ -7,7 +7,7 @@ how well edges of the photograph lie on edges of the mesh, against the same pict
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,9 @@ from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 DEPTH_SAMPLES = 20_000
 """Depth pixels compared a view."""
 MIN_COMPARED = 0.2
+MIN_POINTS = 20
+"""Sparse points that a photograph must see to be compared by them."""
+TRIAL_POINTS = 300
 TRIAL_VIEWS = 6
 TRIAL_WIDTH = 96
 EDGE_WIDTH = 160
@@ -28,6 +31,8 @@ EDGE_WIDTH = 160
 SHIFT = 4
 """Pixels (of such a picture) that the photograph is shifted to either side."""
 WEAK_CORRELATION = 0.05
+CLEAR_CORRELATION = 0.12
+"""Of another reading of the poses, and three times as much as of theirs: then theirs is wrong."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,14 @@ class Conventions:
         matrix = self.change(frame.depth_matrix) if self.change and self.of_world else frame.depth_matrix
         return opencv_pose(matrix, "opencv", self.metres)
 
+    def points(self, frame: Frame) -> np.ndarray:
+        """(n, 3) sparse points of the photograph in metres."""
+        if not (self.change and self.of_world):
+            return frame.seen * self.metres
+        at = np.tile(np.eye(4), (len(frame.seen), 1, 1))
+        at[:, :3, 3] = frame.seen
+        return np.array([self.change(m)[:3, 3] for m in at]) * self.metres
+
 
 def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Mesh depth / measured depth (n,) float64 in the photograph's (pinhole) camera `view`, one entry a measured pixel.
@@ -76,7 +89,16 @@ def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_dept
     local = np.stack([x * z, y * z, z], -1)[known]
     pose = conventions.depth_pose(frame)
     points = local @ pose[:3, :3].T + pose[:3, 3]
-    u, v, z = project(points, view.fx, view.fy, view.cx, view.cy, conventions.pose(frame))
+    return _ratio_at(points, view, conventions.pose(frame), mesh_depth)
+
+
+def point_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray) -> np.ndarray:
+    """Mesh depth / depth of the sparse points that the photograph sees (n,), NaN where no mesh is."""
+    return _ratio_at(conventions.points(frame), view, conventions.pose(frame), mesh_depth)
+
+
+def _ratio_at(points: np.ndarray, view: Pinhole, pose: np.ndarray, mesh_depth: np.ndarray) -> np.ndarray:
+    u, v, z = project(points, view.fx, view.fy, view.cx, view.cy, pose)
     inside = (z > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     u, v, z = u[inside].astype(int), v[inside].astype(int), z[inside]
     hit = mesh_depth[v, u]
@@ -105,17 +127,20 @@ def _moved(factor: float) -> Callable[[np.ndarray], np.ndarray]:
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def candidates(axes: str, metres: float) -> list[tuple[str, Conventions]]:
-    """Other readings of the poses, each with the advice that makes it true."""
+def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Conventions]]:
+    """Other readings of the poses, each with the advice that makes it true. known: the file's format tells the axes."""
     other = "opencv" if axes == "opengl" else "opengl"
     inverse = "the matrices are world-to-camera: write their inverses into transforms.json"
-    out = [
+    of_camera = [
         (f"`source.axes: {other}` fits", Conventions(other, metres)),
         (f"{inverse} (axes {axes}) fits", Conventions(axes, metres, np.linalg.inv)),
         (
             f"{inverse} with `source.axes: {other}` fits",
             Conventions(other, metres, np.linalg.inv),
         ),
+    ]
+    out = [
+        *([] if known else of_camera),
         (
             "turning the mesh from y-up to z-up (x, -z, y) fits",
             Conventions(axes, metres, _turned(Z_UP_TO_Y_UP), of_world=True),
@@ -136,15 +161,18 @@ def explain(
     trace: Callable[[np.ndarray, np.ndarray], np.ndarray],
     axes: str,
     metres: float,
+    known: bool,
     depth_unit: float | None,
     tolerance: float,
 ) -> str:
-    """What would fit the depth images better, in words; empty when nothing does.
+    """What would fit the depth images (or sparse points) better, in words; empty when nothing does.
 
-    frames: with depth, and their pinhole cameras. trace: (origin, directions (h, w, 3)) -> z-depth (h, w).
+    frames: with either, and their pinhole cameras. trace: (origin, directions (h, w, 3)) -> z-depth (h, w).
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, TRIAL_VIEWS).astype(int))]
-    depths = [images.load_depth(frame.depth, depth_unit) for frame, _ in chosen]
+    depths = [images.load_depth(frame.depth, depth_unit) if frame.depth else None for frame, _ in chosen]
+    some = [replace(f, seen=f.seen[:: max(1, len(f.seen) // TRIAL_POINTS)]) if f.seen is not None else f for f, _ in chosen]
+    chosen = [(frame, view) for frame, (_, view) in zip(some, chosen, strict=True)]
 
     def ratios(conventions: Conventions) -> np.ndarray:
         parts = []
@@ -152,16 +180,46 @@ def explain(
             small = shrunk(view, TRIAL_WIDTH)
             pose = conventions.pose(frame)
             mesh_depth = trace(pose[:3, 3], directions(small, pose))
-            parts.append(depth_ratio(frame, conventions, small, mesh_depth, depth))
+            parts.append(
+                point_ratio(frame, conventions, small, mesh_depth)
+                if depth is None
+                else depth_ratio(frame, conventions, small, mesh_depth, depth)
+            )
         return np.concatenate(parts)
 
     as_is = ratios(Conventions(axes, metres))
-    scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres)]
-    if np.isfinite(as_is).any():
+    scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres, known)]
+    if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no metres of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
     best, text = min(scores)
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
+
+
+def explain_edges(
+    trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]],
+    trace: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    axes: str,
+    metres: float,
+    known: bool,
+    now: float,
+) -> str:
+    """Which other reading of the poses brings the mesh's edges onto those of the photographs, in words; empty: none does.
+
+    trials: (frame, pinhole camera, its photograph (h, w, 3), valid (h, w)). trace: (origin, directions (h, w, 3)) ->
+    z-depth (h, w) with 0 = miss, unit normals (h, w, 3). now: correlation of the poses as they are read.
+    """
+
+    def correlation(conventions: Conventions) -> float:
+        found = []
+        for frame, camera, photo, valid in trials:
+            pose = conventions.pose(frame)
+            depth, normal = trace(pose[:3, 3], directions(camera, pose))
+            found.append(edge_correlation(photo, valid, depth, normal)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
+        return float(np.mean(found)) if found else 0.0
+
+    best, text = max((correlation(c), text) for text, c in candidates(axes, metres, known))
+    return f"{text} (edges correlate {best:.2f}, as read {now:.2f})" if best >= max(CLEAR_CORRELATION, 3 * now) else ""
 
 
 def _unit_advice(metres: float, factor: float) -> str:
@@ -233,6 +291,7 @@ class Alignment:
 
     ratios: dict[str, np.ndarray]
     edges: dict[str, np.ndarray]
+    what: str = "depth images"
 
     @classmethod
     def empty(cls) -> Alignment:
@@ -273,7 +332,7 @@ class Alignment:
             out.append(f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?")
         if "depth_median_disagreement" in r:
             out.append(
-                f"alignment: mesh depth differs from the depth images by {r['depth_median_disagreement']:.2%} (median"
+                f"alignment: mesh depth differs from the {self.what} by {r['depth_median_disagreement']:.2%} (median"
                 f" of {r['depth_samples']} pixels)"
             )
         if "edge_correlation" in r:
@@ -305,10 +364,10 @@ class Alignment:
         if not self.ratios or self.depth_disagreement <= tolerance:
             return ""
         number = self.depth_disagreement
-        found = f"{number:.1%}" if np.isfinite(number) else f"less than {MIN_COMPARED:.0%} of the depth pixels meet it"
+        found = f"{number:.1%}" if np.isfinite(number) else f"less than {MIN_COMPARED:.0%} of them meet it"
         better = advice()
         return (
-            f"{path}: mesh and depth images disagree (median relative difference {found}, tolerance {tolerance:.0%})."
+            f"{path}: mesh and {self.what} disagree (median relative difference {found}, tolerance {tolerance:.0%})."
             f" {better or 'No usual convention fits: check that mesh, poses and depth belong together'}."
             " To go on anyway: `source.alignment: warn`"
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -38,13 +39,18 @@ class Header:
 
 @dataclass
 class Photo:
-    """(H, W, 3) float32 sensor values in [0, 1] or radiance; (H, W) bool; counts of what was wrong with pixels."""
+    """(H, W, 3) float32 sensor values in [0, 1] or radiance; (H, W) bool; counts of what was wrong with pixels.
+
+    form: what the file held beyond 8-bit colour (`grey`, `16-bit`, `16-bit grey`).
+    """
 
     pixels: np.ndarray
     valid: np.ndarray
     non_finite: int = 0
     transparent: int = 0
     negative: int = 0
+    masked: int = 0
+    form: str = ""
 
 
 @lru_cache(4096)
@@ -65,7 +71,10 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
             if image.mode not in MODES:
                 raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
             orientation = int(image.getexif().get(274, 1) or 1)
-            return Header(image.size, orientation if 1 <= orientation <= 8 else 1)
+            found = Header(image.size, orientation if 1 <= orientation <= 8 else 1)
+        if not _complete(path):
+            raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
+        return found
     except InputError:
         raise
     except Exception as error:
@@ -73,9 +82,26 @@ def _header(path: Path, _stamp: tuple[int, int]) -> Header:
 
 
 def header(path: Path) -> Header:
-    """Size and orientation from the file's header; an unreadable or CMYK image is refused by name."""
+    """Size and orientation from the file's header; an unreadable, CMYK or cut image is refused by name."""
     status = path.stat()
     return _header(path, (status.st_size, status.st_mtime_ns))
+
+
+def _complete(path: Path) -> bool:
+    """Whether a png or jpg has its end mark; a jpg's must come after its picture began (thumbnails have their own)."""
+    if path.stat().st_size == 0:
+        return False
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        if data[:4] == b"\x89PNG":
+            return data.rfind(b"IEND") > 0
+        if data[:2] != b"\xff\xd8":
+            return True
+        at = 2
+        while data[at : at + 2] != b"\xff\xda":  # segments up to the start of the scan, which hold their own length
+            if at + 4 > len(data) or data[at] != 0xFF:
+                return data.rfind(b"\xff\xd9") > 0
+            at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        return data.rfind(b"\xff\xd9") > at
 
 
 def _is_16_bit_png(path: Path) -> bool:
@@ -130,6 +156,7 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
     Pixels with alpha < 0.5, and NaN or infinite ones, are not valid and become 0. EXR colour is divided by its alpha
     (EXR stores it multiplied). Negative EXR values become 0.
     """
+    form = ""
     if path.suffix.lower() == ".exr":
         values = _exr_colour(path, _exr(path))
         alpha = values[..., 3] if values.shape[-1] == 4 else None
@@ -140,6 +167,7 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
         stored = _stored(path)
         stored = stored[..., None] if stored.ndim == 2 else stored
         values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (values.shape[-1] < 3))
         alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
         colour = values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, -1)
     finite = np.isfinite(colour).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
@@ -152,9 +180,19 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
         int((~finite).sum()),
         int((finite & ~opaque).sum()),
         int(negative.sum()),
+        form=form,
     )
     photo.pixels, photo.valid = TURNS[turn](photo.pixels), TURNS[turn](photo.valid)
     return photo
+
+
+def load_mask(path: Path, turn: int = 1, full: bool = False) -> np.ndarray:
+    """(H, W) bool: which pixels count. Those that are not 0 (nerfstudio, COLMAP), or with `full` only those at the
+    largest value of the type (ScanNet++: 255; interpolation leaves less at the border of what is hidden)."""
+    stored = _stored(path)
+    stored = stored[..., 0] if stored.ndim == 3 else stored
+    kept = stored == np.iinfo(stored.dtype).max if full else stored > 0
+    return TURNS[turn](kept)
 
 
 def load_map(path: Path, channels: int) -> np.ndarray:

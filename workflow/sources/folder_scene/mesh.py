@@ -66,8 +66,19 @@ def find(folder: Path, name: str | None) -> Path:
     return found[0]
 
 
-def load(path: Path, metres: float) -> Mesh:
+@dataclass(frozen=True)
+class VertexIds:
+    """Object of every vertex of the file (n,) with -1 = none, the objects' names, and where they come from."""
+
+    ids: np.ndarray
+    names: dict[int, str]
+    path: Path
+
+
+def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mesh:
     """Read a mesh, merge its nodes, scale it to metres, remove what has no area, keep `instance` of the faces.
+
+    of_vertices: ids from another file; they replace those of the mesh.
 
     Raises:
         InputError: unreadable, no triangles, nothing left, or instance ids that do not fit.
@@ -77,13 +88,27 @@ def load(path: Path, metres: float) -> Mesh:
         raise InputError(f"{path}: no faces (a point cloud?); a triangle mesh is needed")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f"{path}: faces name vertices {faces.min()} ... {faces.max()}, it has 0 ... {len(vertices) - 1}")
+    if of_vertices is not None:
+        if len(of_vertices.ids) != len(vertices):
+            raise InputError(
+                f"{of_vertices.path}: ids of {len(of_vertices.ids)} vertices, {path.name} has {len(vertices)}; both must come"
+                " from the same release"
+            )
+        ids, names = majority(of_vertices.ids[faces]), None
     mesh = _cleaned(path, vertices * metres, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True
     elif mesh.instance is not None:
         given, mesh.instance = _renumbered(mesh.instance)
-        mesh.names = [f"instance {i}" for i in given]
+        known = of_vertices.names if of_vertices is not None else {}
+        mesh.names = [known.get(int(i), f"instance {i}") for i in given]
     return mesh
+
+
+def majority(ids: np.ndarray) -> np.ndarray:
+    """(m,) the id that at least two of a face's three vertices share, -1 where all differ. ids (m, 3)."""
+    a, b, c = ids.T
+    return np.where((a == b) | (a == c), a, np.where(b == c, b, -1)).astype(np.int64)
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str] | None]:

@@ -1,7 +1,8 @@
 """`transforms.json` of nerfstudio and instant-ngp -> cameras in the project's conventions, checked before any work.
 
 Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the frame,
-what was found, what is allowed and what to do.
+what was found, what is allowed and what to do. Other camera files (COLMAP, ScanNet++, FIPT) are brought into the same
+entries and pass the same checks (`frames_of`).
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import fnmatch
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_an
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 5e-3
 """Largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not."""
+SWAPPED = 0.08
+"""Share of the picture by which a principal point must be off before x and y can be said to be swapped."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,9 @@ class Frame:
 
     camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as written.
     depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix: OpenCV axes).
+    mask: picture of which pixels count: those that are not 0, with `mask_full` only the brightest value.
+    split: `train` or `test` where lists say so. seen: (n, 3) points of a sparse reconstruction that this photograph
+    sees, in the unit of the poses.
     """
 
     name: str
@@ -46,15 +52,27 @@ class Frame:
     depth: Path | None = None
     depth_camera: Pinhole | None = None
     depth_matrix: np.ndarray | None = None
+    mask: Path | None = None
+    mask_full: bool = False
+    split: str | None = None
+    seen: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class Transforms:
-    """The checked file: its frames in order, and metres per value of the depth images where it says so."""
+    """The checked file: its frames in order, and metres per value of the depth images where it says so.
+
+    axes: camera axes of the frames' matrices; `known`: by the file's format, so no setting can be wrong. notes: what was left
+    out, in words. also: further files that were read.
+    """
 
     path: Path
     frames: tuple[Frame, ...]
     depth_unit: float | None
+    axes: str = "opengl"
+    known: bool = False
+    notes: tuple[str, ...] = ()
+    also: tuple[Path, ...] = ()
 
 
 def metres_per_unit(unit: str | float) -> float:
@@ -85,6 +103,27 @@ def spread(count: int, wanted: int) -> list[int]:
     return [int((i + 0.5) * count / wanted) for i in range(wanted)]
 
 
+def chosen(entries: list[dict[str, Any]], views: int) -> list[dict[str, Any]]:
+    """At most `views` entries, evenly spread; of those that lists keep for testing (`_split`) at most one in eight."""
+    tests = [e for e in entries if e.get("_split") == "test"]
+    others = [e for e in entries if e.get("_split") != "test"]
+    if len(entries) > views:
+        kept = min(len(tests), max(1, views // 8)) if views > 1 else 0
+        tests = [tests[i] for i in spread(len(tests), kept)]
+        others = [others[i] for i in spread(len(others), views - kept)]
+    taken = {id(e) for e in (*others, *tests)}
+    return [e for e in entries if id(e) in taken]
+
+
+def folder_at(source: dict[str, Any], holds: str) -> Path:
+    """`source.path`, which must be a folder."""
+    folder = Path(source["path"])
+    if not folder.is_dir():
+        found = "is a file" if folder.exists() else "not found"
+        raise InputError(f"{folder}: {found}; `source.path` must be a folder with {holds} (docs/own-data.md)")
+    return folder
+
+
 def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     """Frames of a folder after `frames` glob and `capture.views`, everything about them checked.
 
@@ -94,31 +133,124 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     Raises:
         InputError: on the first thing that cannot be used; lists of files name the first few.
     """
-    folder = Path(source["path"])
-    if not folder.is_dir():
-        found = "is a file" if folder.exists() else "not found"
-        raise InputError(f"{folder}: {found}; `source.path` must be a folder with transforms.json (docs/own-data.md)")
-    path = folder / "transforms.json"
-    document = _load(path)
-    raw = [_entry(path, i, entry) for i, entry in enumerate(_frames(path, document))]
-    raw = _matching(path, raw, source.get("frames"))
-    raw = [raw[i] for i in spread(len(raw), capture["views"])]
+    path = folder_at(source, "transforms.json") / (source["cameras"] or "transforms.json")
+    document = load(path)
+    entries = _listed_splits(path, document, entries_of(path, document))
+    for entry in entries:
+        if entry.get("mask_path"):
+            entry["_mask"] = path.parent / str(entry["mask_path"])
+    world = _applied(path, document) if source["applied_transform"] == "undo" else None
+    return frames_of(path, document, entries, path.parent, source, capture, world)
+
+
+def frames_of(
+    path: Path,
+    document: dict[str, Any],
+    entries: list[dict[str, Any]],
+    root: Path,
+    source: dict[str, Any],
+    capture: dict[str, Any],
+    world: np.ndarray | None = None,
+) -> Transforms:
+    """The frames that `capture.views` and `source.frames` leave of `entries`, everything about them checked.
+
+    Args:
+        path: the file that messages name.
+        document: keys that all frames share (intrinsics), and those of the whole file.
+        entries: one a photograph, keys as in transforms.json; `_name`, `_mask`, `_mask_full`, `_split`, `_seen` fill the
+            fields of Frame.
+        root: what `file_path` counts from.
+        source, capture: the dumped settings sections.
+        world: (4, 4) rotation, translation and uniform scale that brings the poses into the mesh's frame; None = is so.
+    """
+    raw = chosen(_matching(path, entries, source.get("frames")), capture["views"])
+    if all(entry.get("_split") == "test" for entry in raw):
+        raise InputError(f"{path}: lists keep all {len(raw)} photographs for testing; at least one must be there to use")
     _unique_names(path, raw)
-    located = [(entry, _find_image(path, entry)) for entry in raw]
-    _all_present(path, [(entry, image) for entry, image in located if not image.is_file()])
+    located = [(entry, _find_image(path, root, entry)) for entry in raw]
+    _all_present(path, root, [image for _, image in located if not image.is_file()])
     _one_range(path, [image for _, image in located], capture["dynamic_range"])
 
-    offset = _pixel_offset(path, document, source["pixel_centre"])
+    offset = _pixel_offset(path, document, source.get("pixel_centre", "auto"))
     headers = {image: images.header(image) for _, image in located}
     _same_sizes(path, document, located, headers)
-    frames = [_frame(path, document, entry, image, headers[image], offset) for entry, image in located]
+    strict = source["alignment"] != "off"
+    frames = [_frame(path, document, entry, image, headers[image], offset, strict) for entry, image in located]
     absent = [f.depth for f in frames if f.depth is not None and not f.depth.is_file()]
     if absent:
         raise InputError(f"{path}: {_some(absent)} named by `depth_file_path`: not found; add them or remove the key")
-    return Transforms(path, tuple(frames), _depth_unit(path, document))
+    absent = [f.mask for f in frames if f.mask is not None and not f.mask.is_file()]
+    if absent:
+        raise InputError(
+            f"{path}: {len(absent)} mask(s) not found: {_some(absent)}; without them what they hide would count as surface."
+            " Add them, or leave these photographs out"
+        )
+    if world is not None:
+        frames = [replace(f, matrix=_in_world(world, f.matrix)) for f in frames]
+    return Transforms(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"))
 
 
-def _load(path: Path) -> dict[str, Any]:
+def _in_world(world: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """The pose after a similarity of the world: its scale moves the camera and does not stretch its axes."""
+    scale = float(np.cbrt(np.linalg.det(world[:3, :3])))
+    out = world @ matrix
+    if abs(scale - 1) > 1e-12:  # axes that only change places stay exact
+        out[:3, :3] /= scale
+    return out
+
+
+def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
+    """What takes nerfstudio's `applied_transform` (3 or 4 rows of 4) and `applied_scale` back."""
+    stated = document.get("applied_transform")
+    try:
+        rows = np.array(stated, np.float64)
+    except (TypeError, ValueError):
+        rows = np.zeros(0)
+    if rows.shape not in ((3, 4), (4, 4)) or not np.isfinite(rows).all():
+        raise InputError(
+            f"{path}: `source.applied_transform: undo`, but `applied_transform` is {'missing' if stated is None else stated};"
+            " it must be 3 rows of 4 numbers, as ns-process-data writes it. Set `source.applied_transform: keep`"
+        )
+    matrix = np.eye(4)
+    matrix[: len(rows)] = rows
+    turn = matrix[:3, :3]
+    if np.linalg.det(turn) <= 0 or np.abs(turn.T @ turn / np.cbrt(np.linalg.det(turn)) ** 2 - np.eye(3)).max() > RIGID_TOLERANCE:
+        raise InputError(f"{path}: `applied_transform` is no rotation with one scale (determinant {np.linalg.det(turn):.4g})")
+    scale = _number(path, "top level", document, "applied_scale", 1.0)
+    if not scale > 0:
+        raise InputError(f"{path}: `applied_scale` is {scale:g}; must be positive")
+    return np.linalg.inv(matrix) @ np.diag([1 / scale, 1 / scale, 1 / scale, 1.0])
+
+
+def _listed_splits(path: Path, document: dict[str, Any], entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """`_split` of every entry where nerfstudio's lists of file names decide it (validation counts as test)."""
+    lists = {key: document[key] for key in ("train_filenames", "val_filenames", "test_filenames") if key in document}
+    if not lists:
+        return entries
+    names = {}
+    for key, listed in lists.items():
+        if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
+            raise InputError(f"{path}: `{key}` must be a list of file paths as in `frames`")
+        for name in listed:
+            name = name.removeprefix("./")
+            other = names.setdefault(name, key)
+            if other != key and "train_filenames" in (other, key):
+                raise InputError(f"{path}: {name!r} is in `{other}` and in `{key}`: a test photograph must not be used")
+    unknown = sorted(set(names) - {e["file_path"] for e in entries})
+    if unknown:
+        raise InputError(f"{path}: {_some(unknown)} listed for train or test: no frame has such a `file_path`")
+    kept = [e for e in entries if e["file_path"] in names] if "train_filenames" in lists else entries
+    return [
+        {**e, "_split": "train" if names.get(e["file_path"], "train_filenames") == "train_filenames" else "test"} for e in kept
+    ]
+
+
+def entries_of(path: Path, document: dict[str, Any], key: str = "frames") -> list[dict[str, Any]]:
+    """The checked list of frames of a document."""
+    return [_entry(path, i, entry, key) for i, entry in enumerate(_frames(path, document, key))]
+
+
+def load(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path}: not found; a `folder` scene needs it (docs/own-data.md shows how to make one)")
     try:
@@ -130,18 +262,19 @@ def _load(path: Path) -> dict[str, Any]:
     return document
 
 
-def _frames(path: Path, document: dict[str, Any]) -> list[Any]:
-    frames = document.get("frames")
+def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
+    frames = document.get(key)
     if not isinstance(frames, list) or not frames:
-        found = "no `frames`" if frames is None else "`frames` is empty" if frames == [] else "`frames` is not a list"
+        found = f"no `{key}`" if frames is None else f"`{key}` is empty" if frames == [] else f"`{key}` is not a list"
         raise InputError(f"{path}: {found}; at least one photograph with file_path and transform_matrix is needed")
     return frames
 
 
-def _entry(path: Path, index: int, entry: Any) -> dict[str, Any]:
+def _entry(path: Path, index: int, entry: Any, key: str) -> dict[str, Any]:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
-        raise InputError(f"{path}: frames[{index}]: needs a `file_path` (text) and a `transform_matrix`")
-    return {**entry, "file_path": entry["file_path"].removeprefix("./"), "_index": index}
+        raise InputError(f"{path}: {key}[{index}]: needs a `file_path` (text) and a `transform_matrix`")
+    file_path = entry["file_path"].removeprefix("./")
+    return {**entry, "file_path": file_path, "_where": f"{key}[{index}] ({file_path})"}
 
 
 def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) -> list[dict[str, Any]]:
@@ -157,7 +290,7 @@ def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) ->
 def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
     seen: dict[str, str] = {}
     for entry in entries:
-        name = Path(entry["file_path"]).stem
+        name = _name(entry)
         if name in seen:
             raise InputError(
                 f"{path}: {seen[name]!r} and {entry['file_path']!r} would both be view {name!r}; file names without"
@@ -166,8 +299,12 @@ def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
         seen[name] = entry["file_path"]
 
 
-def _find_image(path: Path, entry: dict[str, Any]) -> Path:
-    stated = path.parent / entry["file_path"]
+def _name(entry: dict[str, Any]) -> str:
+    return entry.get("_name") or Path(entry["file_path"]).stem
+
+
+def _find_image(path: Path, root: Path, entry: dict[str, Any]) -> Path:
+    stated = root / entry["file_path"]
     if stated.suffix.lower() in images.EXTENSIONS:
         return stated
     candidates = [stated.with_name(stated.name + extension) for extension in images.EXTENSIONS]
@@ -186,12 +323,12 @@ def _some(paths: list[Any], shown: int = 3) -> str:
     return names + (f" and {len(paths) - shown} more" if len(paths) > shown else "")
 
 
-def _all_present(path: Path, missing: list[tuple[dict[str, Any], Path]]) -> None:
+def _all_present(path: Path, root: Path, missing: list[Path]) -> None:
     if missing:
-        names = _some([image for _, image in missing])
+        start = "the folder of transforms.json" if path.parent == root else str(root)
         raise InputError(
-            f"{path}: {len(missing)} image(s) not found: {names}. `file_path` counts from the folder of"
-            f" transforms.json, with extension ({', '.join(images.EXTENSIONS)}) or without"
+            f"{path}: {len(missing)} image(s) not found: {_some(missing)}. `file_path` counts from {start},"
+            f" with extension ({', '.join(images.EXTENSIONS)}) or without"
         )
 
 
@@ -240,7 +377,10 @@ def _same_sizes(
     sizes: dict[tuple[int, int], list[Path]] = {}
     for entry, image in located:
         if not any(key in entry for key in INTRINSICS):
-            sizes.setdefault(headers[image].size, []).append(image)
+            header = headers[image]
+            stated = (document.get("w"), document.get("h"))
+            turned = header.orientation >= 5 and stated == header.size[::-1]
+            sizes.setdefault(stated if turned else header.size, []).append(image)
     if len(sizes) > 1:
         rows = sorted(sizes.items(), key=lambda item: -len(item[1]))
         text = "; ".join(f"{w}x{h}: {len(found)} image(s) such as {found[0].name}" for (w, h), found in rows[:4])
@@ -260,12 +400,20 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
 
 
 def _frame(
-    path: Path, document: dict[str, Any], entry: dict[str, Any], image: Path, header: images.Header, offset: float
+    path: Path,
+    document: dict[str, Any],
+    entry: dict[str, Any],
+    image: Path,
+    header: images.Header,
+    offset: float,
+    strict: bool,
 ) -> Frame:
-    where = f"frames[{entry['_index']}] ({entry['file_path']})"
+    where = entry["_where"]
     values = {key: value for key, value in document.items() if key != "frames"} | entry
     width, height, turn = _size(path, where, values, image, header)
     camera = _camera(path, where, values, width, height, offset, strict="w" not in values)
+    if strict:
+        _not_swapped(path, where, camera)
     depth, depth_camera, depth_matrix = None, None, None
     if entry.get("depth_file_path"):
         depth = path.parent / str(entry["depth_file_path"])
@@ -276,7 +424,7 @@ def _frame(
         if "depth_c2w_opencv" in entry:
             depth_matrix = _matrix(path, where, entry, "depth_c2w_opencv")
     return Frame(
-        Path(entry["file_path"]).stem,
+        _name(entry),
         entry["file_path"],
         image,
         turn,
@@ -286,6 +434,10 @@ def _frame(
         depth,
         depth_camera,
         depth_matrix,
+        entry.get("_mask"),
+        entry.get("_mask_full", False),
+        entry.get("_split"),
+        entry.get("_seen"),
     )
 
 
@@ -301,7 +453,7 @@ def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: i
             return *stated, header.orientation
         if not (known and stated == stored and stored != turned):
             raise InputError(
-                f"{image}: its EXIF orientation is {header.orientation} and transforms.json does not tell whether the"
+                f"{image}: its EXIF orientation is {header.orientation} and {path.name} does not tell whether the"
                 " cameras belong to the turned picture; save the images upright (orientation 1) and repeat the pose"
                 " estimation, or remove the EXIF tag if the poses were made from the stored pixels"
             )
@@ -311,6 +463,8 @@ def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: i
         advice = (
             f"multiply fl_x, fl_y, cx, cy by {factor:.6g} and set w, h to {stored[0]}, {stored[1]}"
             if same_shape
+            else "w and h seem swapped: swap them, and fl_x, fl_y and cx, cy with them"
+            if stated == stored[::-1]
             else f"take the intrinsics that belong to {stored[0]}x{stored[1]}"
         )
         raise InputError(
@@ -347,6 +501,21 @@ def _camera(
             " that size"
         )
     return Pinhole(fx, fy, cx, cy, width, height)
+
+
+def _not_swapped(path: Path, where: str, camera: Pinhole) -> None:
+    """Refuse a principal point that would be in the middle if x and y changed places, and is far from it as it is."""
+
+    def off(cx: float, cy: float) -> float:
+        return max(abs(cx / camera.width - 0.5), abs(cy / camera.height - 0.5))
+
+    given, other = off(camera.cx, camera.cy), off(camera.cy, camera.cx)
+    if given > SWAPPED and other < 0.25 * given:
+        raise InputError(
+            f"{path}: {where}: the principal point ({camera.cx:g}, {camera.cy:g}) of a {camera.width}x{camera.height} image:"
+            f" cx and cy seem swapped (then {other:.1%} from the middle instead of {given:.1%}); swap cx, cy, and fl_x, fl_y"
+            " with them. If the image is a crop and they are right: `source.alignment: off`"
+        )
 
 
 def _lens(path: Path, where: str, values: dict[str, Any]) -> Distortion:

@@ -1,0 +1,278 @@
+"""Source `fipt`: scenes of FIPT and of Intrinsic Image Fusion (docs/own-data.md, METHOD 4.1, 4.2).
+
+    synthetic   scene.obj, train/ and val/: transforms.json, Image/NNN_0001.{exr,png}, Image/cam/{exposure,crf}.npy,
+                BaseCol, Roughness, Metallic, Emit, IndexMA/NNN_0001.exr, segmentation/NNN.exr
+    real        scene.obj, cam.txt, K_list.txt, Image/NNN_0001.{exr,png}, segmentation/NNN.exr
+
+`capture.dynamic_range` decides between exr (radiance) and png (through the response, with exposures).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.job import Job
+from workflow.sources import folder
+from workflow.sources.folder_scene import images, mesh, transforms
+
+LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Camera axes of the synthetic scenes (x left, y up, z forward) to OpenCV's."""
+SQUARE = 2e-3
+"""Largest |cosine| between viewing direction and up vector of a real camera."""
+TRUTH = {"albedo": "BaseCol", "roughness": "Roughness", "metallic": "Metallic", "emission": "Emit"}
+IDS = {"parts": "IndexMA", "semantic": "segmentation"}
+
+
+@dataclass
+class Listed:
+    """Cameras as entries of transforms.json with `_at`: folder and index of the photograph."""
+
+    path: Path
+    entries: list[dict[str, Any]]
+    flip: np.ndarray
+    homes: list[Path]
+    also: list[Path] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Files that the capture reads; everything that can be checked without pixels is checked here.
+
+    Raises:
+        InputError: what is missing or does not fit, by name.
+    """
+    return find_inputs(document["source"], document["capture"]).files()
+
+
+def capture(job: Job) -> None:
+    """Write the normal form of the scene."""
+    folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture)))
+
+
+def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inputs:
+    """The checked scene: cameras of OpenCV axes, and the files that belong to them."""
+    home = transforms.folder_at(source, "scene.obj")
+    encoded = settings["dynamic_range"] == "ldr"
+    if (home / "train/transforms.json").is_file():
+        found = _synthetic(home, source, encoded)
+    elif (home / "cam.txt").is_file():
+        found = _real(home, encoded)
+    else:
+        raise InputError(
+            f"{home}: neither train/transforms.json (synthetic) nor cam.txt and K_list.txt (real); `source.path` is the folder"
+            " of one FIPT scene"
+        )
+    at = {entry["_name"]: entry["_at"] for entry in found.entries}
+    frames = transforms.frames_of(found.path, {}, found.entries, home, source, settings)
+    posed = tuple(replace(f, matrix=f.matrix @ found.flip) for f in frames.frames)
+    gains, response, cam = _sensor(found, [at[f.name] for f in posed]) if encoded else (None, None, [])
+    truth = _truth(found, {f.name: at[f.name] for f in posed})
+    instances, lists = _ids(found, source["ids"], {f.name: at[f.name] for f in posed})
+    frames = replace(frames, frames=posed, axes="opencv", known=True, notes=tuple(found.notes), also=tuple(found.also))
+    return folder.Inputs(
+        frames,
+        mesh.find(home, source["mesh"]),
+        instances=instances,
+        truth=truth,
+        metres=transforms.metres_per_unit(source["unit"]),
+        gains=gains,
+        load_ids=partial(load_ids, _listed_ids(lists)),
+        response=response,
+        also=(*cam, *lists),
+    )
+
+
+def _file(index: int) -> str:
+    return f"{index:03d}_0001"
+
+
+def _entry(home: Path, place: Path, index: int, encoded: bool, **keys: Any) -> dict[str, Any]:
+    prefix = "val_" if place.name == "val" else ""
+    picture = place / "Image" / f"{_file(index)}.{'png' if encoded else 'exr'}"
+    file_path = picture.relative_to(home).as_posix()
+    name = prefix + _file(index)
+    return {"file_path": file_path, "_where": f"camera {index} ({file_path})", "_name": name, "_at": (place, index), **keys}
+
+
+# --------------------------------------------------------------------------------------------------------------- cameras
+
+
+def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
+    found = Listed(home / "train/transforms.json", [], LEFT_UP_FORWARD, [])
+    for split in ("train", "val"):
+        path = home / split / "transforms.json"
+        if split == "val" and (source["validation"] == "none" or not path.is_file()):
+            continue
+        document = transforms.load(path)
+        frames = document.get("frames")
+        if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
+            raise InputError(f"{path}: `frames` must be a list of {{transform_matrix: 4 rows of 4}}, one a photograph")
+        if "camera_angle_x" not in document:
+            raise InputError(f"{path}: no `camera_angle_x` (radians); FIPT's synthetic scenes have one lens for all views")
+        shared = {"camera_angle_x": document["camera_angle_x"], "_split": "test" if split == "val" else "train"}
+        for i, frame in enumerate(frames):
+            keys = {key: frame[key] for key in ("transform_matrix",) if key in frame}
+            found.entries.append(_entry(home, home / split, i, encoded, **shared, **keys))
+        found.homes.append(home / split)
+        found.also.append(path)
+    if len(found.homes) == 1:  # without val/ nothing decides what is held out but `capture.test_every`
+        found.entries = [{**entry, "_split": None} for entry in found.entries]
+    return found
+
+
+def _real(home: Path, encoded: bool) -> Listed:
+    cameras, lenses = home / "cam.txt", home / "K_list.txt"
+    found = Listed(cameras, [], np.eye(4), [home], [lenses])
+    poses, matrices = _triples(cameras, "origin, look-at point, up"), _triples(lenses, "the rows of K")
+    if len(poses) != len(matrices):
+        raise InputError(f"{lenses}: {len(matrices)} cameras, cam.txt has {len(poses)}; both must list the same photographs")
+    for i, (pose, k) in enumerate(zip(poses, matrices, strict=True)):
+        if k[0, 1] or k[1, 0] or not np.allclose(k[2], [0, 0, 1]):
+            raise InputError(f"{lenses}: camera {i}: K = {k.tolist()}; expected fx 0 cx / 0 fy cy / 0 0 1")
+        lens = {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2])}
+        matrix = _looking(cameras, i, *pose).tolist()
+        found.entries.append(_entry(home, home, i, encoded, transform_matrix=matrix, **lens))
+    return found
+
+
+def _triples(path: Path, what: str) -> np.ndarray:
+    """(n, 3, 3) of a file: n, then three lines of three numbers a camera."""
+    if not path.is_file():
+        raise InputError(f"{path}: not found; a real FIPT scene needs cam.txt and K_list.txt")
+    try:
+        first, *rest = path.read_text().split("\n", 1)
+        count = int(first)
+        numbers = np.array("".join(rest).split(), np.float64)
+    except ValueError as error:
+        raise InputError(f"{path}: expected the number of cameras, then three lines a camera ({error})") from None
+    if count < 1 or numbers.size != 9 * count or not np.isfinite(numbers).all():
+        raise InputError(
+            f"{path}: {numbers.size} numbers for {count} cameras; expected 9 finite ones each: {what} (three lines of three)"
+        )
+    return numbers.reshape(count, 3, 3)
+
+
+def _looking(path: Path, index: int, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """OpenCV pose: z towards the target, y = -up, x = y cross z."""
+    ahead, length = target - origin, np.linalg.norm(up)
+    distance = np.linalg.norm(ahead)
+    if distance < 1e-9 or length < 1e-9:
+        raise InputError(f"{path}: camera {index}: looks at its own place, or has no up vector")
+    z, y = ahead / distance, -up / length
+    if abs(z @ y) > SQUARE:
+        raise InputError(
+            f"{path}: camera {index}: viewing direction and up vector are not square (cosine {-z @ y:.4g}, allowed {SQUARE:g});"
+            " three lines a camera are origin, look-at point, up"
+        )
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([np.cross(y, z), y, z], 1)
+    pose[:3, 3] = origin
+    return pose
+
+
+# ---------------------------------------------------------------------------------------------------------------- sensor
+
+
+def _sensor(found: Listed, used: list[tuple[Path, int]]) -> tuple[tuple[float, ...], np.ndarray | None, list[Path]]:
+    """Exposures of the photographs that are used, the true response (3, 101) if it is there, and the files of both."""
+    files, tables = [], {}
+    for home in found.homes:
+        path = home / "Image/cam/exposure.npy"
+        if not path.is_file():
+            found.notes.append(f"no {path}: exposures are 1")
+            continue
+        table = _array(path)
+        count = sum(entry["_at"][0] == home for entry in found.entries)
+        if table.size != count or not (np.isfinite(table).all() and (table > 0).all()):
+            raise InputError(f"{path}: {table.size} exposures (smallest {table.min():g}); expected {count} positive numbers")
+        tables[home] = table.ravel()
+        files.append(path)
+    gains = tuple(float(tables[home][i]) if home in tables else 1.0 for home, i in used)
+    path = found.homes[0] / "Image/cam/crf.npy"
+    if not path.is_file():
+        return gains, None, files
+    curve = _array(path)
+    if curve.ndim != 2 or curve.shape[0] != 3 or curve.shape[1] < 2 or not np.isfinite(curve).all():
+        raise InputError(f"{path}: shape {curve.shape}; expected (3, n) samples of the response, one row a channel")
+    even = np.linspace(0, 1, curve.shape[1])
+    return gains, np.stack([np.interp(np.linspace(0, 1, 101), even, row) for row in curve]), [*files, path]
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False), np.float64)
+    except (ValueError, OSError, EOFError) as error:
+        raise InputError(f"{path}: not a readable array ({error})") from None
+
+
+# ----------------------------------------------------------------------------------------------------------------- truth
+
+
+def _truth(found: Listed, at: dict[str, tuple[Path, int]]) -> dict[str, dict[str, Path]]:
+    """The four truth maps of every photograph, and its radiance; empty where a kind has no folder."""
+    absent = sorted({name for name in TRUTH.values() for home in found.homes if not (home / name).is_dir()})
+    if absent:
+        if len(absent) < len(TRUTH):
+            found.notes.append(f"no ground truth: {', '.join(absent)} missing (DiffCol and albedo/ are no base colour)")
+        return {}
+    out = {}
+    for name, (home, i) in at.items():
+        out[name] = {kind: home / below / f"{_file(i)}.exr" for kind, below in TRUTH.items()}
+        radiance = home / "Image" / f"{_file(i)}.exr"
+        if radiance.is_file():
+            out[name]["radiance"] = radiance
+    missing = [path for maps in out.values() for path in maps.values() if not path.is_file()]
+    if missing:
+        raise InputError(f"{missing[0]}: not found ({len(missing)} truth maps are missing); complete or remove the folders")
+    return out
+
+
+def _ids(found: Listed, wanted: str, at: dict[str, tuple[Path, int]]) -> tuple[dict[str, Path], list[Path]]:
+    """Id maps of the photographs, and the lists of ids that each may hold."""
+    if wanted == "none":
+        return {}, []
+    kinds = IDS if wanted == "auto" else {wanted: IDS[wanted]}
+    kind = next((k for k, below in kinds.items() if all((home / below).is_dir() for home in found.homes)), None)
+    if kind is None:
+        if wanted != "auto":
+            raise InputError(f"{found.homes[0] / IDS[wanted]}: not found; `source.ids` is {wanted}; `auto` takes what is there")
+        return {}, []
+    files = {}
+    for name, (home, i) in at.items():
+        files[name] = home / IDS[kind] / (f"{_file(i)}.exr" if kind == "parts" else f"{i:03d}.exr")
+    missing = [path for path in files.values() if not path.is_file()]
+    if missing:
+        raise InputError(f"{missing[0]}: not found ({len(missing)} id maps are missing); or set `source: {{ids: none}}`")
+    lists = [path for home in found.homes if (path := home / IDS[kind] / "object_ids.txt").is_file()]
+    return files, lists
+
+
+def _listed_ids(lists: list[Path]) -> dict[Path, list[np.ndarray]]:
+    """Folder of id maps -> ids that occur in every photograph, by object_ids.txt (a line of numbers each)."""
+    out = {}
+    for path in lists:
+        try:
+            lines = path.read_text().splitlines()
+            out[path.parent] = [np.array([int(float(v)) for v in line.split(",") if v.strip()], np.int64) for line in lines]
+        except ValueError as error:
+            raise InputError(f"{path}: expected a line of ids, parted by commas, for every photograph ({error})") from None
+    return out
+
+
+def load_ids(listed: dict[Path, list[np.ndarray]], path: Path, turn: int = 1) -> np.ndarray:
+    """(H, W) int32 of the first channel of an EXR; -1 where it lies between integers (anti-aliased edges, METHOD H44), is
+    negative or not finite, or where object_ids.txt does not list the id for this photograph (blends of two others)."""
+    values = images.load_map(path, 1)
+    known = np.isfinite(values)
+    whole = np.rint(np.where(known, values, -1))
+    known &= (np.abs(np.where(known, values, 0) - whole) <= 1e-3) & (whole >= 0)
+    index = int(path.stem[:3])
+    if path.parent in listed and index < len(listed[path.parent]):
+        known &= np.isin(whole, listed[path.parent][index])
+    return images.TURNS[turn](np.where(known, whole, -1).astype(np.int32))

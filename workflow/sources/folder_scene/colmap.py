@@ -1,0 +1,316 @@
+"""COLMAP models (text or binary) -> entries as in transforms.json. https://colmap.github.io/format.html
+
+COLMAP's conventions are the project's own: OpenCV camera axes, pixel centres at +0.5; poses are world-to-camera.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.distortion import distort
+from iif_core.errors import InputError
+from workflow.sources.folder_scene import transforms
+from workflow.sources.folder_scene.images import EXTENSIONS
+from workflow.sources.folder_scene.transforms import Transforms
+
+PARTS = ("cameras", "images", "points3D")
+PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
+SEEN_POINTS = 2000
+"""Sparse points of a photograph that are kept: enough for medians."""
+REPROJECTION = 0.01
+"""Largest median distance of a point from its keypoint, as a share of the longer side; good models have 0.001."""
+
+MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, "PINHOLE", ("f", "cx", "cy")),
+    "PINHOLE": (1, "PINHOLE", ("fl_x", "fl_y", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, "OPENCV", ("f", "cx", "cy", "k1")),
+    "RADIAL": (3, "OPENCV", ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, "OPENCV", ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, "OPENCV_FISHEYE", ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "FULL_OPENCV": (6, "OPENCV", ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "FOV": (7, "", ("fl_x", "fl_y", "cx", "cy", "omega")),
+    "SIMPLE_RADIAL_FISHEYE": (8, "OPENCV_FISHEYE", ("f", "cx", "cy", "k1")),
+    "RADIAL_FISHEYE": (9, "OPENCV_FISHEYE", ("f", "cx", "cy", "k1", "k2")),
+    "THIN_PRISM_FISHEYE": (10, "", ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")),
+}
+"""Model -> id in binary files, the lens it is here ("" = none), its parameters in COLMAP's order."""
+_NAME_OF = {number: name for name, (number, _, _) in MODELS.items()}
+
+
+@dataclass(frozen=True)
+class Image:
+    """One registered image: its camera's id, world-from-camera (4, 4) OpenCV, keypoints (n, 2) that have a point, and
+    the points' ids (n,)."""
+
+    name: str
+    camera: int
+    pose: np.ndarray
+    keypoints: np.ndarray
+    point_ids: np.ndarray
+
+
+@dataclass(frozen=True)
+class Model:
+    """cameras: id -> keys of transforms.json. points: ids ascending and positions (n, 3), empty without points3D."""
+
+    path: Path
+    cameras: dict[int, dict[str, Any]]
+    images: list[Image]
+    point_ids: np.ndarray
+    points: np.ndarray
+    files: tuple[Path, ...]
+
+    def seen(self, image: Image) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (n, 3) of the sparse points that an image sees, and their keypoints (n, 2)."""
+        if len(self.points) == 0 or len(image.point_ids) == 0:
+            return np.zeros((0, 3)), np.zeros((0, 2))
+        at = np.minimum(np.searchsorted(self.point_ids, image.point_ids), len(self.point_ids) - 1)
+        known = np.flatnonzero(self.point_ids[at] == image.point_ids)
+        known = known[:: max(1, len(known) // SEEN_POINTS)]
+        return self.points[at[known]], image.keypoints[known]
+
+
+def find(folder: Path, stated: str | None) -> Path | None:
+    """The folder of a model: `source.cameras`, or the first of the usual places that holds one; None = there is none."""
+    if stated is not None:
+        path = folder / stated
+        path = path.parent if path.is_file() and path.stem in PARTS else path
+        if not is_model(path):
+            raise InputError(
+                f"{path}: no COLMAP model (`source.cameras: {stated}`); expected cameras and images as .bin or .txt, or name"
+                " transforms.json"
+            )
+        return path
+    return next((folder / place for place in PLACES if is_model(folder / place)), None)
+
+
+def is_model(path: Path) -> bool:
+    """Whether a folder holds cameras and images."""
+    return any(all((path / f"{part}{suffix}").is_file() for part in PARTS[:2]) for suffix in (".bin", ".txt"))
+
+
+def read(path: Path, with_points: bool = True) -> Model:
+    """A model, binary if both forms exist (COLMAP writes the text beside it). Without points no keypoints either: quick.
+
+    Raises:
+        InputError: damaged files, a lens that is not known here, images without camera.
+    """
+    suffix = ".bin" if all((path / f"{part}.bin").is_file() for part in PARTS[:2]) else ".txt"
+    files = [path / f"{part}{suffix}" for part in PARTS]
+    readers = (_binary_cameras, _binary_images, _binary_points) if suffix == ".bin" else (_cameras, _images, _points)
+    with_points = with_points and files[2].is_file()
+    cameras = _guarded(files[0], readers[0])
+    images = sorted(_guarded(files[1], lambda file: readers[1](file, with_points)), key=lambda image: image.name)
+    ids, points = _guarded(files[2], readers[2]) if with_points else (np.zeros(0, np.int64), np.zeros((0, 3)))
+    if not images:
+        raise InputError(f"{files[1]}: no image is registered; the reconstruction failed or is another model (sparse/1?)")
+    lost = next((image for image in images if image.camera not in cameras), None)
+    if lost is not None:
+        raise InputError(f"{files[1]}: {lost.name} has camera {lost.camera}, which {files[0].name} does not hold")
+    order = np.argsort(ids, kind="stable")
+    return Model(files[1], cameras, images, ids[order], points[order], tuple(files[: 3 if with_points else 2]))
+
+
+def _guarded(path: Path, reader: Any) -> Any:
+    try:
+        return reader(path)
+    except (ValueError, IndexError, KeyError, struct.error, OverflowError) as error:
+        raise InputError(f"{path}: not a COLMAP file, or cut short ({type(error).__name__}: {error})") from None
+
+
+def entry_of(model: Model, image: Image) -> dict[str, Any]:
+    """Entry as in transforms.json, with camera-to-world of OpenCV axes."""
+    where = f"image {image.name}"
+    return {
+        **model.cameras[image.camera],
+        "file_path": image.name,
+        "transform_matrix": image.pose.tolist(),
+        "_where": where,
+        "_seen": model.seen(image)[0],
+    }
+
+
+def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> Transforms:
+    """Frames of a folder whose cameras are a COLMAP model, checked like those of transforms.json.
+
+    points: read the sparse points too, check the cameras by them, and keep them for the check of the mesh.
+
+    Raises:
+        InputError: what is missing or does not fit, by name.
+    """
+    model = read(place, points)
+    root = folder / source["images"]
+    if not root.is_dir():
+        raise InputError(f"{root}: not found; `source.images` is the folder that the image names of {model.path} count from")
+    entries = [entry_of(model, image) for image in model.images]
+    masks = folder / "masks"
+    for entry in entries if masks.is_dir() else []:
+        name = masks / entry["file_path"]
+        forms = (name.with_name(name.name + ".png"), name.with_suffix(".png"))
+        entry["_mask"] = next((path for path in forms if path.is_file()), None)
+    listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
+    if points:
+        _check_reprojection(model, listed)
+    names = {image.name for image in model.images}
+    there = [path for path in sorted(root.rglob("*")) if path.suffix.lower() in EXTENSIONS]
+    without = [path.name for path in there if path.relative_to(root).as_posix() not in names]
+    notes = []
+    if without:
+        notes.append(f"{len(without)} of {len(there)} images have no pose in {model.path} and are not used, such as {without[0]}")
+    return replace(listed, axes="opencv", known=True, notes=tuple(notes), also=model.files)
+
+
+def _check_reprojection(model: Model, listed: Transforms) -> None:
+    """Refuse cameras that do not send the sparse points to their keypoints: an edited or foreign cameras file."""
+    found = {image.name: image for image in model.images}
+    errors = {}
+    for frame in listed.frames:
+        points, keypoints = model.seen(found[frame.file_path])
+        local = (points - frame.matrix[:3, 3]) @ frame.matrix[:3, :3]
+        front = local[:, 2] > 1e-9
+        at, unique = distort(frame.lens, local[front, :2] / local[front, 2:])
+        camera = frame.camera
+        pixel = at * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        off = np.linalg.norm(pixel - keypoints[front], axis=1)[unique]
+        if len(off):
+            errors[frame.name] = float(np.median(off)) / max(camera.width, camera.height)
+    median = float(np.median(list(errors.values()))) if errors else 0.0
+    if median > REPROJECTION:
+        raise InputError(
+            f"{model.path}: its sparse points miss their keypoints by {median:.1%} of the picture (median of"
+            f" {len(errors)} images, allowed {REPROJECTION:.1%}): cameras and images are of different runs, or the intrinsics"
+            " were changed (fx with fy, cx with cy?); take all files of one model"
+        )
+
+
+def _camera(path: Path, number: int, model: str, width: int, height: int, values: list[float]) -> dict[str, Any]:
+    if model not in MODELS or not MODELS[model][1]:
+        allowed = ", ".join(name for name, (_, lens, _) in MODELS.items() if lens)
+        raise InputError(f"{path}: camera {number} is {model}; allowed: {allowed}. Run `colmap image_undistorter`")
+    _, lens, names = MODELS[model]
+    if len(values) != len(names):
+        raise ValueError(f"camera {number}, {model}: {len(values)} parameters instead of {len(names)}")
+    out: dict[str, Any] = dict(zip(names, map(float, values), strict=True))
+    if model == "FULL_OPENCV" and any([out.pop(key) for key in ("k4", "k5", "k6")]):
+        raise InputError(f"{path}: camera {number} has k4, k5, k6, which are not read here. Run `colmap image_undistorter`")
+    if "f" in out:
+        out["fl_x"] = out["fl_y"] = out.pop("f")
+    return {"camera_model": lens, "w": int(width), "h": int(height), **out}
+
+
+def _pose(quaternion: Any, translation: Any) -> np.ndarray:
+    """World-from-camera of COLMAP's world-to-camera quaternion (w, x, y, z) and translation."""
+    q = np.asarray(quaternion, np.float64)
+    norm = np.linalg.norm(q)
+    if not (np.isfinite(q).all() and norm > 1e-6):
+        raise ValueError(f"quaternion {q.tolist()}")
+    w, x, y, z = q / norm
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ np.asarray(translation, np.float64)
+    return pose
+
+
+def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray) -> Image:
+    tracked = ids >= 0
+    return Image(name, camera, _pose(values[:4], values[4:7]), xy[tracked], ids[tracked])
+
+
+# ------------------------------------------------------------------------------------------------------------------ text
+
+
+def _lines(path: Path) -> Iterator[str]:
+    """Lines without comments, one at a time: these files hold every keypoint of every image."""
+    with open(path) as file:
+        for line in file:
+            if not line.startswith("#"):
+                yield line.strip()
+
+
+def _cameras(path: Path) -> dict[int, dict[str, Any]]:
+    out = {}
+    for line in filter(None, _lines(path)):
+        number, model, width, height, *values = line.split()
+        out[int(number)] = _camera(path, int(number), model, int(width), int(height), [float(v) for v in values])
+    return out
+
+
+def _images(path: Path, keypoints: bool) -> list[Image]:
+    """Two lines an image; the second (keypoints) may be empty."""
+    out, lines = [], _lines(path)
+    for first in lines:
+        if not first:
+            continue
+        second = next(lines, "")
+        fields = first.split(maxsplit=9)
+        numbers = np.array(second.split() if keypoints else [], np.float64).reshape(-1, 3)
+        values = [float(v) for v in fields[1:8]]
+        out.append(_image(fields[9], int(fields[8]), values, numbers[:, :2], numbers[:, 2].astype(np.int64)))
+    return out
+
+
+def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    ids, points = array("q"), array("d")
+    for line in filter(None, _lines(path)):
+        number, x, y, z, _ = line.split(maxsplit=4)
+        ids.append(int(number))
+        points.extend((float(x), float(y), float(z)))
+    return np.array(ids, np.int64), np.array(points, np.float64).reshape(-1, 3)
+
+
+# ---------------------------------------------------------------------------------------------------------------- binary
+
+
+def _binary_cameras(path: Path) -> dict[int, dict[str, Any]]:
+    data, out = path.read_bytes(), {}
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        name = _NAME_OF.get(model, f"model {model}")
+        size = len(MODELS[name][2]) if name in MODELS else 0
+        values = struct.unpack_from(f"<{size}d", data, at + 24)
+        out[number] = _camera(path, number, name, width, height, list(values))
+        at += 24 + 8 * size
+    return out
+
+
+_KEYPOINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("id", "<i8")])
+
+
+def _binary_images(path: Path, keypoints: bool) -> list[Image]:
+    data, out = path.read_bytes(), []
+    (count,), at = struct.unpack_from("<Q", data), 8
+    for _ in range(count):
+        fields = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode()
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        found = np.frombuffer(data, _KEYPOINT, points if keypoints else 0, end + 9)
+        out.append(_image(name, fields[8], fields[1:8], np.stack([found["x"], found["y"]], -1), found["id"].astype(np.int64)))
+        at = end + 9 + _KEYPOINT.itemsize * points
+    return out
+
+
+def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    data = path.read_bytes()
+    (count,), at = struct.unpack_from("<Q", data), 8
+    ids, points = np.zeros(count, np.int64), np.zeros((count, 3))
+    for i in range(count):
+        ids[i], *points[i] = struct.unpack_from("<Q3d", data, at)
+        (track,) = struct.unpack_from("<Q", data, at + 43)
+        at += 51 + 8 * track
+    return ids, points

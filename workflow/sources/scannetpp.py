@@ -1,0 +1,223 @@
+"""Source `scannetpp`: a scene of ScanNet++ as released (docs/own-data.md, METHOD 4.3).
+
+    scans/mesh_aligned_0.05.ply, segments.json, segments_anno.json
+    dslr/resized_images, resized_anon_masks, nerfstudio/transforms.json, colmap/, train_test_lists.json
+
+Poses of nerfstudio/transforms.json are in a world that is turned against the mesh: MESH_FROM_NERFSTUDIO brings them back,
+and colmap/, which is in the mesh's frame, is asked whether that is true of this scene.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.job import Job
+from workflow.sources import folder
+from workflow.sources.folder_scene import colmap, mesh, transforms
+
+MESH_FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+"""Rows 0, 1 change places, row 2 turns its sign: a rotation and its own inverse."""
+PLACES = {
+    "dslr": ("resized_images", "resized_anon_masks", "nerfstudio/transforms.json"),
+    "undistorted": ("undistorted_images", "undistorted_anon_masks", "nerfstudio/transforms_undistorted.json"),
+}
+"""`source.images` -> photographs, masks and cameras below dslr/."""
+SAME_PLACE, SAME_TURN = 0.01, 0.01
+"""Metres and radians by which two pose files of one release may differ (rounding)."""
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Files that the capture reads; everything that can be checked without pixels is checked here.
+
+    Raises:
+        InputError: what is missing or does not fit, by name.
+    """
+    return find_inputs(document["source"], document["capture"]).files()
+
+
+def capture(job: Job) -> None:
+    """Write the normal form of the scene."""
+    folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
+
+
+def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> folder.Inputs:
+    """The checked scene: cameras in the mesh's frame, and the files that belong to them. points: read the sparse points of
+    colmap/ too (slow), for the check of the mesh."""
+    home = transforms.folder_at(source, "dslr/ and scans/")
+    for name in ("dslr", "scans"):
+        if not (home / name).is_dir():
+            below = [path.name for path in (home / "data", *home.iterdir()) if (path / "dslr").is_dir()]
+            hint = f" One scene is meant, such as {home / below[0]}." if below else ""
+            raise InputError(f"{home}: no folder {name}/; `source.path` is the folder of one ScanNet++ scene.{hint}")
+    dslr, scans = home / "dslr", home / "scans"
+    pictures, masks, cameras = (dslr / name for name in PLACES[source["images"]])
+    if not cameras.is_file():
+        made = "the toolbox makes it (dslr.undistort)" if source["images"] == "undistorted" else "it is part of the release"
+        raise InputError(f"{cameras}: not found; {made}. `source.images` is {source['images']}; allowed: {', '.join(PLACES)}")
+    document = transforms.load(cameras)
+    entries, notes, lists = _entries(document, cameras, dslr, pictures, source)
+    notes += _masks(entries, masks)
+    world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
+    listed = transforms.frames_of(cameras, document, entries, pictures, source, settings, world)
+    listed, also = _agrees_with_colmap(listed, dslr / "colmap", source["world"], points)
+    mesh_path = scans / "mesh_aligned_0.05.ply"
+    if not mesh_path.is_file():
+        raise InputError(f"{mesh_path}: not found; download the scene's `scans` too")
+    of_vertices, annotation = _annotation(scans)
+    if of_vertices is None:
+        notes.append("no segments.json and segments_anno.json: the scene comes without object ids")
+    listed = replace(listed, known=True, notes=tuple(notes), also=(*lists, *also, *annotation))
+    return folder.Inputs(listed, mesh_path, of_vertices=of_vertices)
+
+
+def _entries(
+    document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path, source: dict[str, Any]
+) -> tuple[list[dict[str, Any]], list[str], list[Path]]:
+    """Frames of both lists by file name, with their `_split`; what was left out, in words; the list file."""
+    entries = [{**e, "_split": "train"} for e in transforms.entries_of(cameras, document)]
+    if document.get("test_frames"):
+        entries += [{**e, "_split": "test"} for e in transforms.entries_of(cameras, document, "test_frames")]
+    notes: list[str] = []
+    path = dslr / "train_test_lists.json"
+    if path.is_file():
+        stated = _lists(path)
+        entries = [{**e, "_split": stated.get(e["file_path"], e["_split"])} for e in entries]
+        posed = {e["file_path"] for e in entries}
+        without = [name for name in stated if name not in posed]
+        if without:
+            notes.append(f"{len(without)} listed photographs have no pose and are not used, such as {without[0]}")
+    if source["drop_bad"]:
+        bad = [e for e in entries if e.get("is_bad")]
+        entries = [e for e in entries if not e.get("is_bad")]
+        if bad:
+            notes.append(f"{len(bad)} photographs that the release marks as bad are left out")
+    tests = [e for e in entries if e["_split"] == "test"]
+    hidden = [e for e in tests if not (pictures / e["file_path"]).is_file()]
+    if source["lists"] == "train":
+        hidden = tests
+    elif hidden:
+        notes.append(f"{len(hidden)} test photographs are not in {pictures.name}/ (the release withholds some)")
+    gone = {id(e) for e in hidden}
+    kept = sorted((e for e in entries if id(e) not in gone), key=lambda entry: entry["file_path"])
+    return kept, notes, [path] if path.is_file() else []
+
+
+def _lists(path: Path) -> dict[str, str]:
+    """File name -> train or test, of train_test_lists.json."""
+    try:
+        document = json.loads(path.read_text())
+        found = {key: [str(name) for name in document[key]] for key in ("train", "test")}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f'{path}: expected {{"train": [names], "test": [names]}} ({type(error).__name__}: {error})') from None
+    both = sorted(set(found["train"]) & set(found["test"]))
+    if both:
+        raise InputError(f"{path}: {both[0]} is in both lists ({len(both)} in all): a test photograph must not be used")
+    return {name: key for key, names in found.items() for name in names}
+
+
+def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
+    """Give every entry its anonymisation mask; where the release has none, say so."""
+    if not masks.is_dir():
+        return [f"no {masks.name}/: nothing is masked"]
+    for entry in entries:
+        entry["_mask"] = masks / str(entry.get("mask_path") or Path(entry["file_path"]).with_suffix(".png"))
+        entry["_mask_full"] = True
+    return []
+
+
+def _agrees_with_colmap(
+    listed: transforms.Transforms, model: Path, world: str, points: bool
+) -> tuple[transforms.Transforms, list[Path]]:
+    """Compare the poses with colmap/, which is in the mesh's frame; the frames with its sparse points, its files.
+
+    Raises:
+        InputError: they differ, naming `source.world` where that explains it.
+    """
+    if not colmap.is_model(model):
+        return listed, []
+    found = colmap.read(model, points)
+    named = {Path(image.name).name: image for image in found.images}
+    pairs = [(f, named[Path(f.file_path).name].pose) for f in listed.frames if Path(f.file_path).name in named]
+    if not pairs:
+        return listed, list(found.files)
+    moved, turned = _apart([f.matrix for f, _ in pairs], [p for _, p in pairs])
+    if moved > SAME_PLACE or turned > SAME_TURN:
+        before = [MESH_FROM_NERFSTUDIO @ f.matrix for f, _ in pairs]  # its own inverse
+        other = _apart(before, [p for _, p in pairs])
+        fits = other[0] <= SAME_PLACE and other[1] <= SAME_TURN
+        advice = (
+            f"`source.world: {'mesh' if world == 'nerfstudio' else 'nerfstudio'}` fits"
+            if fits
+            else "one of the files is not of this release: download both again"
+        )
+        raise InputError(
+            f"{listed.path}: its cameras differ from those of {found.path} (median {moved:.3g} m,"
+            f" {np.degrees(turned):.1f} degrees over {len(pairs)} photographs); {advice}"
+        )
+    if not points:
+        return listed, list(found.files)
+    seen = {name: found.seen(image)[0] for name, image in named.items()}
+    frames = [replace(f, seen=seen.get(Path(f.file_path).name)) for f in listed.frames]
+    return replace(listed, frames=tuple(frames)), list(found.files)
+
+
+def _apart(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, float]:
+    """Median distance (metres) and angle (radians) between poses of OpenGL and of OpenCV axes."""
+    a, b = np.array([transforms.opencv_pose(m, "opengl", 1.0) for m in opengl]), np.array(opencv)
+    chord = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8)  # = sin(angle / 2)
+    distance = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
+    return float(np.median(distance)), float(np.median(2 * np.arcsin(np.clip(chord, 0, 1))))
+
+
+def _annotation(scans: Path) -> tuple[Any, list[Path]]:
+    """What reads the object ids of the vertices, and its files; None where the scene is not annotated."""
+    files = [scans / "segments.json", scans / "segments_anno.json"]
+    there = [path.is_file() for path in files]
+    if not any(there):
+        return None, []
+    if not all(there):
+        raise InputError(f"{files[there.index(False)]}: not found, but {files[there.index(True)].name} is; both are needed")
+    return partial(vertex_ids, *files), files
+
+
+def vertex_ids(segments: Path, annotation: Path) -> mesh.VertexIds:
+    """Object of every vertex: `objectId` of the group whose segments hold the vertex's segment; 0 and none are -1.
+
+    Where groups overlap, the one with fewer vertices (the more specific) wins.
+
+    Raises:
+        InputError: files of another form.
+    """
+    try:
+        index = np.asarray(json.loads(segments.read_text())["segIndices"], np.int64)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{segments}: expected `segIndices`, a segment of every vertex ({type(error).__name__}: {error})"
+        ) from None
+    try:
+        groups = json.loads(annotation.read_text())["segGroups"]
+        objects = [(int(g["objectId"]), str(g.get("label", "object")), np.asarray(g["segments"], np.int64)) for g in groups]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{annotation}: expected `segGroups` with objectId, label and segments ({type(error).__name__}: {error})"
+        ) from None
+    if index.ndim != 1:
+        raise InputError(f"{segments}: `segIndices` must be one list of numbers")
+    kept, position, size = np.unique(index, return_inverse=True, return_counts=True)
+    of_segment = np.full(len(kept), -1, np.int64)
+    weighed = []
+    for number, label, members in objects:
+        at = np.searchsorted(kept, members)
+        at = at[(at < len(kept)) & (kept[np.minimum(at, len(kept) - 1)] == members)] if len(kept) else at[:0]
+        weighed.append((int(size[at].sum()), number, label, at))
+    for _, number, _, at in sorted(weighed, key=lambda item: (-item[0], item[1])):
+        of_segment[at] = number if number > 0 else -1
+    names = {number: f"{label} {number}" for _, number, label, _ in weighed}
+    return mesh.VertexIds(of_segment[position.ravel()], names, segments)
