@@ -201,10 +201,11 @@ def test_images_without_pose_masks_and_places(room, views, tmp_path):
     mask = np.full((97, 146), 7, np.uint8)
     mask[:10] = 0
     mini.save_mask(path / "masks/DSC00001.JPG.png", mask)
-    mini.save_mask(path / "masks/DSC00002.png", mask)
+    mini.save_mask(path / "masks/DSC00002.JPG.png", mask)
+    mini.save_mask(path / "masks/DSC00003.png", mask)  # the form of a segmentation's masks: not of what counts
     found = listed(path)
     assert any("1 of 5 images have no pose" in note and "DSC00099" in note for note in found.notes)
-    assert [f.mask.name if f.mask else None for f in found.frames] == [None, "DSC00001.JPG.png", "DSC00002.png", None]
+    assert [f.mask.name if f.mask else None for f in found.frames] == [None, "DSC00001.JPG.png", "DSC00002.JPG.png", None]
     (path / "sparse/0").rename(path / "elsewhere")
     assert "transforms.json: not found" in refused(path)
     assert len(listed(path, cameras="elsewhere").frames) == 4

@@ -98,7 +98,7 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         """
     )
     plugins = {
-        "capture": ("source", ("builtin", "mitsuba", "folder")),
+        "capture": ("source", ("builtin", "mitsuba", "folder", "scannetpp", "fipt")),
         "prior": ("prior", ("simulated", "files", "retinex", "rgbx", "marigold")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }

@@ -152,9 +152,9 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     entries = [entry_of(model, image) for image in model.images]
     masks = folder / "masks"
     for entry in entries if masks.is_dir() else []:
-        name = masks / entry["file_path"]
-        forms = (name.with_name(name.name + ".png"), name.with_suffix(".png"))
-        entry["_mask"] = next((path for path in forms if path.is_file()), None)
+        # COLMAP's own form of the name; 0001.png would be a segmentation's masks (docs/segmentation.md).
+        name = masks / (entry["file_path"] + ".png")
+        entry["_mask"] = name if name.is_file() else None
     listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
     if points:
         _check_reprojection(model, listed)
