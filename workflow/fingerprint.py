@@ -32,6 +32,7 @@ INFRASTRUCTURE = (
     "workflow.registry",
     "workflow.settings",
     "workflow.studies",
+    "workflow.batch",
     "workflow.fingerprint",
     "workflow.artifacts",
     "iif_core.native",
@@ -228,7 +229,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
     except InputError as error:
-        raise InputError(f"{settings_module.scene_file(scene)}: {error}") from None
+        raise InputError(f"{settings_module.scene_origin(scene)}: {error}") from None
     facts = {
         "stage": stage,
         "settings": settings_module.select(document, STAGES[stage].settings),

@@ -1,0 +1,79 @@
+# Every scene of config/batch.tsv (docs/batch.md). A scene that cannot be run is kept out of the plan, one whose job fails does
+# not stop the others; the summary says so, and Snakemake ends with an error when the others are done.
+import subprocess
+
+from workflow import batch as batch_table
+
+batch_asked = []
+
+
+def batch_plan():
+    """What can be run; a table that cannot be read stops here, before any job."""
+    try:
+        plan = batch_table.plan(QUALITY)
+    except InputError as error:
+        stop(error)
+    if not batch_asked:
+        batch_asked.append(True)
+        for reason in plan.refused.values():
+            print(f"batch: left out: {reason}", file=sys.stderr)
+        # A batch is independent scenes: as --keep-going, for this target without being told.
+        workflow.execution_settings.keep_going = True
+    return plan
+
+
+rule batch:
+    input:
+        lambda wildcards: [f"scenes/{name}" for name in batch_plan().ready],
+    output:
+        table="results/batch/summary.parquet",
+        text="results/batch/summary.tsv",
+        page="results/batch/report.html",
+    log:
+        "results/batch/summary.log",
+    localrule: True
+    params:
+        mark=lambda wildcards: batch_table.fingerprint(QUALITY),
+        quality=QUALITY,
+        python=sys.executable,
+    message:
+        "the batch: table and page"
+    shell:
+        "{params.python:q} -m workflow batch --quality {params.quality} --fingerprint {params.mark} --log {log:q}"
+
+
+# Comes last and fails: a batch that left scenes out has not done what it was asked.
+rule refused:
+    input:
+        "results/batch/report.html",
+    output:
+        "results/batch/refused",
+    log:
+        "results/batch/refused.log",
+    localrule: True
+    retries: 0
+    params:
+        quality=QUALITY,
+        python=sys.executable,
+    message:
+        "the batch: what could not be run"
+    shell:
+        "{params.python:q} -m workflow batch --refused --quality {params.quality} --log {log:q}"
+
+
+rule scenes:
+    default_target: True
+    input:
+        lambda wildcards: [
+            "results/batch/report.html",
+            *(["results/batch/refused"] if batch_plan().refused else []),
+        ],
+
+
+# Jobs failed, so rule `batch` did not run: the summary then tells of what there is.
+onerror:
+    if batch_asked:
+        subprocess.run(
+            [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY],
+            check=False,
+        )
