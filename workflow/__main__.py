@@ -35,7 +35,7 @@ def _arguments() -> argparse.Namespace:
     lpips.add_argument("--log", type=Path)
     batch = commands.add_parser("batch")
     batch.add_argument("--quality", default="draft")
-    batch.add_argument("--fingerprint", help="of the plan; recorded by Snakemake, not checked")
+    batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
     batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
     batch.add_argument("--log", type=Path)
     verify = commands.add_parser("verify")
@@ -91,7 +91,7 @@ def _batch(arguments: argparse.Namespace) -> int:
 
     if arguments.refused:
         return _guarded("batch", lambda: batch_summary.refuse(arguments.quality))
-    return _guarded("batch", lambda: batch_summary.write_summary(arguments.quality))
+    return _guarded("batch", lambda: batch_summary.write_summary(arguments.quality, arguments.fingerprint))
 
 
 def main() -> int:

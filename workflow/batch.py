@@ -81,7 +81,7 @@ def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
             continue
         problem = _problem_of_cells(cells, header, text)
         line = Line(number, **dict(zip(header, cells, strict=False)))
-        problem = problem or _problem_of_name(line, lines)
+        problem = problem or _problem_of_name(line, lines) or _problem_of_file(line, path.parent / "scenes")
         if problem:
             problems.append(f"{TABLE}, line {number}{problem}")
         else:
@@ -144,6 +144,15 @@ def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
     if name in earlier:
         return where + f"{name!r} stands in line {earlier[name].number} already; names must differ"
     return ""
+
+
+def _problem_of_file(line: Line, folder: Path) -> str:
+    if line.is_plain or not (folder / f"{line.name}.yaml").is_file():
+        return ""
+    return (
+        f", column name: config/scenes/{line.name}.yaml is there already; leave the other cells empty to run it as it is,"
+        f" or take another name and write {line.name} into column base"
+    )
 
 
 # -------------------------------------------------------------------------------------------------------- one scene
@@ -258,16 +267,18 @@ def plan(quality: str) -> Plan:
         InputError: only for the table as such (`read_table`).
     """
     from workflow import fingerprint as fp
+    from workflow import input_digests
 
     lines = read_table()
     ready, refused = {}, {}
-    for line in lines:
-        try:
-            ready[line.name] = fp.fingerprint("publish", line.name, quality)
-        except InputError as error:
-            refused[line.name] = str(error)
-        except Exception as error:  # one scene must not stop hundreds of others, whatever is wrong with it
-            refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (unexpected: please report it)"
+    with input_digests.saved_once():
+        for line in lines:
+            try:
+                ready[line.name] = fp.fingerprint("publish", line.name, quality)
+            except InputError as error:
+                refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
+            except Exception as error:  # one scene must not stop hundreds of others, whatever is wrong with it
+                refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
     return Plan(lines, ready, refused)
 
 

@@ -66,8 +66,14 @@ COLUMNS = {
 Row = dict[str, Any]
 
 
-def write_summary(quality: str) -> None:
-    """Write table and page; say in the log what is not done, and why."""
+def write_summary(quality: str, complete: str | None = None) -> None:
+    """Write table and page; say in the log what is not done, and why.
+
+    Args:
+        complete: fingerprint of the plan, when all its jobs are done. Without it `results/batch/complete` is taken away, lest
+            Snakemake take what a failed run left for the summary of a finished one.
+    """
+    (FOLDER / "complete").unlink(missing_ok=True)
     plan = batch.plan(quality)
     rows = [row_of(line, plan, quality) for line in plan.lines]
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
@@ -76,6 +82,8 @@ def write_summary(quality: str) -> None:
 
     page = render(rows, quality, SCORES, STATUSES)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
+    if complete:
+        write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
     logging.getLogger("batch").info("%s", closing(rows))
 
 

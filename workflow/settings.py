@@ -634,9 +634,9 @@ def _explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         where = problem["loc"]
         tags = {tag for union in _UNIONS.values() for tag in union}
         dotted = ".".join(str(p) for i, p in enumerate(where) if not (i == 1 and str(p) in tags))
-        path = origin(dotted)
         found = problem.get("input")
         kind = problem["type"]
+        path = origin(f"{dotted}.kind" if kind.startswith("union_tag") else dotted)
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []

@@ -29,6 +29,7 @@ rule batch:
         table="results/batch/summary.parquet",
         text="results/batch/summary.tsv",
         page="results/batch/report.html",
+        complete="results/batch/complete",
     log:
         "results/batch/summary.log",
     localrule: True
@@ -45,7 +46,7 @@ rule batch:
 # Comes last and fails: a batch that left scenes out has not done what it was asked.
 rule refused:
     input:
-        "results/batch/report.html",
+        "results/batch/complete",
     output:
         "results/batch/refused",
     log:
@@ -61,16 +62,20 @@ rule refused:
         "{params.python:q} -m workflow batch --refused --quality {params.quality} --log {log:q}"
 
 
+def batch_targets(wildcards):
+    """Every scene by itself: a summary that a failed run left must not stand for scenes that are not there."""
+    plan = batch_plan()
+    refused = ["results/batch/refused"] if plan.refused else []
+    return [f"scenes/{name}" for name in plan.ready] + ["results/batch/complete"] + refused
+
+
 rule scenes:
     default_target: True
     input:
-        lambda wildcards: [
-            "results/batch/report.html",
-            *(["results/batch/refused"] if batch_plan().refused else []),
-        ],
+        batch_targets,
 
 
-# Jobs failed, so rule `batch` did not run: the summary then tells of what there is.
+# Jobs failed, so rule `batch` did not run: the summary then tells of what there is. It is not `complete`, so the next run makes it.
 onerror:
     if batch_asked:
         subprocess.run(
