@@ -51,8 +51,8 @@ rule refused:
         "results/batch/refused",
     log:
         "results/batch/refused.log",
-    localrule: True
     retries: 0
+    localrule: True
     params:
         quality=QUALITY,
         python=sys.executable,
@@ -63,10 +63,14 @@ rule refused:
 
 
 def batch_targets(wildcards):
-    """Every scene by itself: a summary that a failed run left must not stand for scenes that are not there."""
+    """The summary, and every scene by itself lest an old summary stand for one that is gone. Parts (`--batch batch=1/10`) divide
+    what the summary reads, so there it stands alone."""
     plan = batch_plan()
+    scenes = (
+        [] if workflow.dag_settings.batch else [f"scenes/{name}" for name in plan.ready]
+    )
     refused = ["results/batch/refused"] if plan.refused else []
-    return [f"scenes/{name}" for name in plan.ready] + ["results/batch/complete"] + refused
+    return [*scenes, "results/batch/complete", *refused]
 
 
 rule scenes:
