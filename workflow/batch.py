@@ -20,8 +20,10 @@ import yaml
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
+from workflow.artifacts.files import sha256_of
 
 TABLE = Path("config/batch.tsv")
+PAGE = Path(__file__).parent / "report/batch.html.j2"
 COLUMNS = ("name", "source", "path", "base", "overrides")
 RESERVED = ("batch", "studies", "weights")  # folders of results/ that are no scene's
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
@@ -287,6 +289,6 @@ def fingerprint(quality: str) -> str:
     from workflow import fingerprint as fp
 
     found = plan(quality)
-    code = fp.modules_digest(fp.import_closure("workflow.batch_summary"))
+    code = [fp.modules_digest(fp.import_closure("workflow.batch_summary")), sha256_of(PAGE)]
     facts = [[line.number, line.name] for line in found.lines], found.ready, found.refused, quality, code
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
