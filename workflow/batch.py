@@ -10,6 +10,8 @@ import difflib
 import hashlib
 import json
 import re
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -161,8 +163,8 @@ def _problem_of_file(line: Line, folder: Path) -> str:
 
 
 def find(name: str, root: Path = Path(".")) -> Line | None:
-    """The line that makes a scene; None for a scene with a file of its own, and for one that is not listed."""
-    if (root / "config/scenes" / f"{name}.yaml").is_file() or not (root / TABLE).is_file():
+    """The line that makes a scene; None for a scene with a file of its own, a study's, and one that is not listed."""
+    if "--" in name or (root / "config/scenes" / f"{name}.yaml").is_file() or not (root / TABLE).is_file():
         return None
     return next((line for line in read_table(root) if line.name == name and not line.is_plain), None)
 
@@ -273,8 +275,12 @@ def plan(quality: str) -> Plan:
 
     lines = read_table()
     ready, refused = {}, {}
+    said = time.monotonic()
     with input_digests.saved_once():
-        for line in lines:
+        for done, line in enumerate(lines):
+            if time.monotonic() > said + 5:
+                said = time.monotonic()
+                print(f"batch: {done} of {len(lines)} scenes checked", file=sys.stderr)
             try:
                 ready[line.name] = fp.fingerprint("publish", line.name, quality)
             except InputError as error:

@@ -1,6 +1,7 @@
 """The batch table: what it makes of its lines, how it names mistakes, and what the summary says of each scene."""
 
 import csv
+import io
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from iif_core.errors import InputError
 from workflow import batch, batch_summary, settings
 from workflow import fingerprint as fp
-from workflow.artifacts.files import write_json, write_parquet
+from workflow.artifacts.files import write_exr, write_json, write_parquet
 from workflow.outcome import Outcome
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
@@ -311,6 +312,33 @@ def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
     Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
     batch_summary.write_summary("draft")
     assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
+
+
+@pytest.mark.parametrize(("dynamic_range", "photograph", "rendered"), [("ldr", 102, 51), ("hdr", 188, 124)])
+def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph, rendered):
+    """sRGB code of 0.4 and 0.2 as they are (LDR), of linear 0.4 x exposure 1.25 = 0.5 and linear 0.2 (HDR); albedo linear 0.5."""
+    import base64
+
+    from PIL import Image
+
+    from workflow.report.batch_page import thumbnails
+
+    flat = {c: np.full((4, 300), 0.4, np.float32) for c in "RGB"}
+    channels = {f"ldr.{c}": np.full((4, 300), 0.2, np.float32) for c in "RGB"}
+    channels |= {f"albedo.{c}": np.full((4, 300), 0.5, np.float32) for c in "RGB"}
+    for name in ("000", "001", "002"):
+        write_exr(Path(f"scenes/a/maps/{name}.exr"), channels)
+        write_exr(Path(f"results/a/capture/photos/{name}.exr"), flat)
+    write_json(Path("results/a/capture/capture.json"), {"dynamic_range": dynamic_range})
+    cameras = {"name": ["000", "001", "002"], "exposure": np.array([9.0, 1.25, 9.0])}
+    write_parquet(Path("results/a/capture/cameras.parquet"), cameras, {})
+    shown = thumbnails("a")
+    assert [title for title, _ in shown] == [f"{what}, view 001" for what in ("photograph", "re-rendering", "albedo")]
+    for (_, address), value in zip(shown, (photograph, rendered, 188), strict=True):
+        picture = np.array(Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))))
+        assert picture.shape == (1, 100, 3) and np.abs(picture.astype(int) - value).max() <= 2
+    Path("scenes/a/maps/001.exr").write_bytes(b"rubbish")
+    assert thumbnails("a") == []
 
 
 def test_only_a_finished_plan_counts_as_complete(five):

@@ -57,7 +57,7 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 def thumbnails(scene: str) -> list[tuple[str, str]]:
     """(title, `data:` address): photograph, re-rendering and albedo of the middle view; nothing where a file is damaged."""
-    from workflow.artifacts.files import read_exr
+    from workflow.artifacts.files import read_exr, read_parquet
     from workflow.artifacts.store import rgb
 
     maps = sorted((Path("scenes") / scene / "maps").glob("*.exr"))
@@ -66,9 +66,13 @@ def thumbnails(scene: str) -> list[tuple[str, str]]:
         capture = Path("results") / scene / "capture"
         channels, photo = read_exr(path), rgb(read_exr(capture / "photos" / path.name))
         hdr = json.loads((capture / "capture.json").read_text())["dynamic_range"] == "hdr"
+        show = pic.linear if hdr else pic.encoded  # what `ldr` of an HDR scene holds is linear
+        if hdr:
+            cameras = read_parquet(capture / "cameras.parquet")
+            photo = photo * float(cameras["exposure"][cameras["name"].tolist().index(path.stem)])
         shown = [
-            ("photograph", pic.linear(_small(photo)) if hdr else pic.encoded(_small(photo))),
-            ("re-rendering", pic.encoded(_small(rgb(channels, "ldr")))),
+            ("photograph", show(_small(photo).clip(0, 1))),
+            ("re-rendering", show(_small(rgb(channels, "ldr")))),
             ("albedo", pic.linear(_small(rgb(channels, "albedo")))),
         ]
         return [(f"{title}, view {path.stem}", pic.data_uri(image)) for title, image in shown]

@@ -1,5 +1,6 @@
-# Every scene of config/batch.tsv (docs/batch.md). A scene that cannot be run is kept out of the plan, one whose job fails does
-# not stop the others; the summary says so, and Snakemake ends with an error when the others are done.
+# Every scene of config/batch.tsv (docs/batch.md). An input function that raises ends Snakemake's plan for all scenes, so each is
+# checked first and a bad one kept out of the plan; one whose job fails does not stop the others. The summary names them, and
+# Snakemake ends with an error when the others are done.
 import subprocess
 
 from workflow import batch as batch_table
