@@ -214,7 +214,12 @@ def _base(line: Line, root: Path) -> tuple[str, dict[str, Any]]:
         near = difflib.get_close_matches(name, names, 1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise InputError(f"{line.at('base')}: config/scenes/{name}.yaml not found.{hint} Known: {', '.join(names) or 'none'}.")
-    return f"config/scenes/{name}.yaml (base of {line.at()})", settings_module.read_yaml(path)
+    return f"config/scenes/{name}.yaml (base of {line.at()})", _read_base(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(8)
+def _read_base(path: Path, _stamp: int) -> dict[str, Any]:
+    return settings_module.read_yaml(path)  # hundreds of lines share one base
 
 
 def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
