@@ -30,6 +30,12 @@ localrules:
     verify,
 
 
+rule scenes:
+    default_target: True
+    input:
+        batch_targets,
+
+
 rule verify:
     log:
         "results/verify.log",

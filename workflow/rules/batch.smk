@@ -74,12 +74,6 @@ def batch_targets(wildcards):
     return [*scenes, "results/batch/complete", *refused]
 
 
-rule scenes:
-    default_target: True
-    input:
-        batch_targets,
-
-
 # Jobs failed, so rule `batch` did not run: the summary then tells of what there is. It is not `complete`, so the next run makes it.
 onerror:
     if batch_asked:
