@@ -1,6 +1,7 @@
 # Intrinsic Image Fusion: photographs, cameras and a mesh -> scenes/<name>/ with materials, lights and camera response.
 #   snakemake --cores 2 scenes/kitchen
 #   snakemake --cores 2 scenes/kitchen --config quality=standard
+#   snakemake --cores 2 scenes                                     every scene of config/batch.tsv
 # What depends on what is in workflow/rules/, what is computed in iif_core/. docs/architecture.md is the map.
 from snakemake.utils import min_version
 
@@ -21,6 +22,7 @@ include: "workflow/rules/affines.smk"
 include: "workflow/rules/deliver.smk"
 include: "workflow/rules/relight.smk"
 include: "workflow/rules/studies.smk"
+include: "workflow/rules/batch.smk"
 
 
 localrules:
@@ -31,7 +33,7 @@ localrules:
 rule scenes:
     default_target: True
     input:
-        expand("scenes/{scene}", scene=scene_names()),
+        batch_targets,
 
 
 rule verify:

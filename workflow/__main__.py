@@ -1,7 +1,7 @@
 """`python -m workflow <stage> <scene>`: what the rules call, and what a person calls in a debugger.
 
-Also `python -m workflow verify [scene ...]`, `python -m workflow study <study>` (collects what its jobs left) and
-`python -m workflow lpips_vgg` (fetches weights).
+Also `python -m workflow verify [scene ...]`, `python -m workflow study <study>` and `python -m workflow batch` (collect what
+their jobs left, at any time) and `python -m workflow lpips_vgg` (fetches weights).
 """
 
 from __future__ import annotations
@@ -33,6 +33,11 @@ def _arguments() -> argparse.Namespace:
     study.add_argument("--log", type=Path)
     lpips = commands.add_parser("lpips_vgg")
     lpips.add_argument("--log", type=Path)
+    batch = commands.add_parser("batch")
+    batch.add_argument("--quality", default="draft")
+    batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
+    batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
+    batch.add_argument("--log", type=Path)
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
     return parser.parse_args()
@@ -48,16 +53,45 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
-def _guarded(what: str, run: Callable[[], None]) -> int:
+def _guarded(what: str, run: Callable[[], None], failed: Callable[[str], None] = lambda reason: None) -> int:
     try:
         run()
     except InputError as error:
         logging.getLogger("error").error("%s", error)
+        failed(str(error))
         return 1
-    except Exception:
+    except Exception as error:
         logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
+        failed(f"{type(error).__name__}: {error} (a bug: please report it with the log)")
         return 1
     return 0
+
+
+def _run_stage(arguments: argparse.Namespace) -> int:
+    from workflow.job import run_stage
+    from workflow.outcome import Outcome
+
+    note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
+    note.parent.mkdir(parents=True, exist_ok=True)
+    note.write_text(f"{arguments.threads}\n")
+    outcome = Outcome(arguments.scene, arguments.command, arguments.fingerprint)
+    outcome.started()
+    code = _guarded(
+        f"{arguments.command} of {arguments.scene}",
+        lambda: run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint),
+        outcome.failed,
+    )
+    if code == 0:
+        outcome.done()
+    return code
+
+
+def _batch(arguments: argparse.Namespace) -> int:
+    from workflow import batch_summary
+
+    if arguments.refused:
+        return _guarded("batch", lambda: batch_summary.refuse(arguments.quality))
+    return _guarded("batch", lambda: batch_summary.write_summary(arguments.quality, arguments.fingerprint))
 
 
 def main() -> int:
@@ -73,7 +107,7 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    from workflow.job import configure_logging, run_stage
+    from workflow.job import configure_logging
 
     configure_logging(arguments.log)
     if arguments.command == "study":
@@ -84,13 +118,9 @@ def main() -> int:
         from workflow.weights import fetch_vgg
 
         return _guarded("fetching VGG16", fetch_vgg)
-    note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
-    note.parent.mkdir(parents=True, exist_ok=True)
-    note.write_text(f"{arguments.threads}\n")
-    return _guarded(
-        f"{arguments.command} of {arguments.scene}",
-        lambda: run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint),
-    )
+    if arguments.command == "batch":
+        return _batch(arguments)
+    return _run_stage(arguments)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow import input_digests, studies
 from workflow import settings as settings_module
-from workflow import studies
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
 
@@ -32,7 +32,9 @@ INFRASTRUCTURE = (
     "workflow.registry",
     "workflow.settings",
     "workflow.studies",
+    "workflow.batch",
     "workflow.fingerprint",
+    "workflow.input_digests",
     "workflow.artifacts",
     "iif_core.native",
     "iif_core.errors",
@@ -158,17 +160,24 @@ def _digest_of(tree: ast.Module) -> str:
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
+@lru_cache(None)
+def _roots_digest(roots: tuple[str, ...]) -> str:
+    return modules_digest(import_closure(*roots))
+
+
 def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
     """Modules whose code a stage's result depends on, with these settings."""
-    roots = [STAGES[stage].module]
-    for section, key, pattern in PLUGINS.get(stage, ()):
-        roots.append(pattern.format(settings[section][key]))
-    return import_closure(*roots)
+    return import_closure(*_roots(stage, settings))
+
+
+def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
+    plugins = PLUGINS.get(stage, ())
+    return STAGES[stage].module, *(pattern.format(settings[section][key]) for section, key, pattern in plugins)
 
 
 def code_digest(stage: str, settings: dict[str, Any]) -> str:
     """Digest of the code behind a stage, blind to comments, docstrings and layout."""
-    return modules_digest(stage_modules(stage, settings))
+    return _roots_digest(_roots(stage, settings))
 
 
 def modules_digest(modules: list[str]) -> str:
@@ -178,27 +187,9 @@ def modules_digest(modules: list[str]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
-_DIGESTS = Path("results/.input-digests.json")
-
-
 def raw_digest(paths: list[Path]) -> str:
-    """Digest of the contents of input files; contents are hashed again only when size or time stamp changed."""
-    try:
-        cache: dict[str, list[Any]] = json.loads(_DIGESTS.read_text())
-    except (OSError, ValueError):
-        cache = {}
-    changed, parts = False, []
-    for path in sorted(paths):
-        status = path.stat()
-        stamp = [status.st_size, status.st_mtime_ns]
-        entry = cache.get(str(path))
-        if entry is None or entry[:2] != stamp:
-            cache[str(path)] = entry = [*stamp, sha256_of(path)]
-            changed = True
-        parts.append(f"{path}:{entry[2]}")
-    if changed:
-        write_json(_DIGESTS, cache)
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    """Digest of the contents of input files (workflow/input_digests.py says how large ones are told apart)."""
+    return hashlib.sha256("\n".join(input_digests.digests(paths)).encode()).hexdigest()[:16]
 
 
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
@@ -229,7 +220,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
     except InputError as error:
-        raise InputError(f"{settings_module.scene_file(scene)}: {error}") from None
+        raise InputError(f"{settings_module.scene_origin(scene)}: {error}") from None
     facts = {
         "stage": stage,
         "settings": settings_module.select(document, STAGES[stage].settings),

@@ -19,6 +19,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow import fingerprint as fp
+from workflow import input_digests
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import sha256_of, write_json
@@ -195,6 +196,8 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()
+    if job.stage.reads_raw:
+        input_digests.remember(fp.raw_inputs(stage, job.document))
     job.write_timings()
 
 

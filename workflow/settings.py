@@ -1,7 +1,8 @@
 """The settings of a scene: one typed model that validates, documents and generates (schema, defaults, reference page).
 
 Order of precedence: defaults here < `config/quality/<quality>.yaml` < `config/scenes/<scene>.yaml`; for a variant of a study
-(workflow/studies.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`.
+(workflow/studies.py) also < `config/studies/scenes.yaml` < `config/studies/<study>.yaml`; for a line of `config/batch.tsv`
+(workflow/batch.py) its base stands in the place of the scene's file, under the line's columns.
 Nothing else is consulted: no environment variables, no hidden files.
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -698,20 +700,30 @@ def scene_names(root: Path = Path(".")) -> list[str]:
 
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
     """Path of a scene's file, of a study's derived scene its parent's; an unknown scene is an error with the nearest name."""
-    from workflow import studies  # it needs this module first
+    from workflow import batch, studies  # they need this module first
 
     parts = studies.derived(scene, root)
     scene = parts.scene if parts else scene
     path = root / "config/scenes" / f"{scene}.yaml"
     if not path.is_file():
-        names = scene_names(root)
-        near = difflib.get_close_matches(scene, names, 1)
+        files = scene_names(root)
+        listed = [line.name for line in batch.read_table(root) if line.name not in files]
+        near = difflib.get_close_matches(scene, files + listed, 1)
         hint = f" Did you mean scenes/{near[0]}?" if near else ""
+        more = f" and {len(listed)} of {batch.TABLE}" if listed else ""
         raise InputError(
-            f"config/scenes/{scene}.yaml: not found.{hint} Known scenes: {', '.join(names) or 'none'}."
+            f"config/scenes/{scene}.yaml: not found.{hint} Known scenes: {', '.join(files) or 'none'}{more}."
             " Add a file there to add a scene (docs/own-data.md)."
         )
     return path
+
+
+def scene_origin(scene: str, root: Path = Path(".")) -> str:
+    """Where a scene is described, for messages: its file, or its line of the batch table."""
+    from workflow import batch
+
+    line = batch.find(scene, root)
+    return line.at() if line else str(scene_file(scene, root))
 
 
 _UNIONS: dict[str, dict[str, type[Section]]] = {
@@ -753,7 +765,8 @@ def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
     return model if isinstance(model, type) else None
 
 
-def _explain(error: ValidationError, path: str) -> str:
+def _explain(error: ValidationError, origin: Callable[[str], str]) -> str:
+    """One line a problem; `origin` tells the file of a dotted key."""
     lines = []
     for problem in error.errors():
         where = problem["loc"]
@@ -761,6 +774,7 @@ def _explain(error: ValidationError, path: str) -> str:
         dotted = ".".join(str(p) for i, p in enumerate(where) if not (i == 1 and str(p) in tags))
         found = problem.get("input")
         kind = problem["type"]
+        path = origin(f"{dotted}.kind" if kind.startswith("union_tag") else dotted)
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
@@ -787,11 +801,17 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
     """Settings of `scene` at `quality`; an `InputError` names file, key, what was found and what is allowed."""
     if quality not in QUALITIES:
         raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
-    from workflow import studies
+    from workflow import batch, studies
 
-    path = scene_file(scene, root)
     preset_file = root / "config/quality" / f"{quality}.yaml"
     preset = read_yaml(preset_file) if preset_file.is_file() else {}
+    if line := batch.find(scene, root):
+        layers = [(f"config/quality/{quality}.yaml", preset), *batch.layers(line, root)]
+        try:
+            return SceneSettings.model_validate(_merged(layers))
+        except ValidationError as error:
+            raise InputError(_explain(error, batch.blame(line, layers))) from None
+    path = scene_file(scene, root)
     shown = path.relative_to(root) if path.is_absolute() else path
     layers = [("", preset), (str(shown), read_yaml(path))]
     if parts := studies.derived(scene, root):
@@ -803,7 +823,7 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
             except ValidationError as error:
-                raise InputError(_explain(error, layers[count - 1][0])) from None
+                raise InputError(_explain(error, lambda _, blamed=layers[count - 1][0]: blamed)) from None
         raise
 
 

@@ -6,7 +6,7 @@ sys.path.insert(0, workflow.basedir)
 from iif_core import native
 from iif_core.errors import InputError
 from workflow import fingerprint as fingerprints
-from workflow.settings import QUALITIES, scene_names
+from workflow.settings import QUALITIES
 
 native.process_environment()
 

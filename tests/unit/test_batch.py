@@ -1,0 +1,360 @@
+"""The batch table: what it makes of its lines, how it names mistakes, and what the summary says of each scene."""
+
+import csv
+import io
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from iif_core.errors import InputError
+from workflow import batch, batch_summary, settings
+from workflow import fingerprint as fp
+from workflow.artifacts.files import write_exr, write_json, write_parquet
+from workflow.outcome import Outcome
+
+HEADER = "name\tsource\tpath\tbase\toverrides\n"
+BASE = "source: {kind: folder, path: data/tpl, unit: mm}\nprior: {kind: retinex, samples: 5}\nseed: 4\n"
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A working directory with one scene file, `tpl`, and `write(table)`."""
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    (tmp_path / "config/scenes/tpl.yaml").write_text(BASE)
+    monkeypatch.chdir(tmp_path)
+    caches = (fp.resolved, fp.fingerprint, batch.plan)
+    for cache in caches:
+        cache.cache_clear()
+
+    def write(table, header=HEADER):
+        data = table if isinstance(table, bytes) else (header + table).encode()
+        (tmp_path / "config/batch.tsv").write_bytes(data)
+        for cache in caches:
+            cache.cache_clear()
+        return tmp_path
+
+    yield write
+    for cache in caches:
+        cache.cache_clear()
+
+
+# ---------------------------------------------------------------------------------------------------------------- table
+
+
+def test_columns_may_come_in_any_order_and_cells_may_be_missing(project):
+    project("# remark\n\n x \t data/with space \n0a5c\n", header="name\tpath\tsource\n")
+    lines = batch.read_table()
+    assert [(line.number, line.name, line.path, line.source, line.is_plain) for line in lines] == [
+        (4, "x", "data/with space", "", False),
+        (5, "0a5c", "", "", True),
+    ]
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+def test_what_spreadsheets_write_is_read(project, end, mark):
+    project(mark + f"name\tbase{end}a\ttpl{end}b\ttpl{end}".encode())
+    assert [(line.number, line.name, line.base) for line in batch.read_table()] == [(2, "a", "tpl"), (3, "b", "tpl")]
+
+
+def test_without_a_table_every_scene_file_counts(project, tmp_path):
+    (tmp_path / "config/scenes/other.yaml").write_text(BASE)
+    assert [line.name for line in batch.read_table()] == ["other", "tpl"]
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (HEADER, ["no scene in it", "name <tab> source"]),
+        ("name source path\n", ["line 1", "one column", "tabs, not by spaces"]),
+        ("# x\nname\tsuorce\n", ["line 2", "column 2", "'suorce'", "Did you mean source?"]),
+        ("name\tpath\tpath\n", ["line 1", "column path stands twice"]),
+        ("path\tbase\n", ["line 1", "no column name"]),
+        (HEADER + "a b folder\n", ["line 2, column name", "'a b folder'", "tabs", "spaces"]),
+        (HEADER + "a\t\t\t\t\textra\n", ["line 2, column 6", "6 cells", "5 columns", "'extra'"]),
+        (HEADER + "\tfolder\n", ["line 2, column name", "empty"]),
+        (HEADER + "a/b\tfolder\n", ["line 2, column name", "'a/b'", "letters, digits"]),
+        (HEADER + "a--s0\tfolder\n", ["line 2, column name", "single -"]),
+        (HEADER + "studies\tfolder\n", ["line 2, column name", "'studies'", "results/"]),
+        (HEADER + "a\n# c\na\tfolder\n", ["line 4, column name", "'a' stands in line 2 already"]),
+        (HEADER + "tpl\tfolder\n", ["line 2, column name", "config/scenes/tpl.yaml is there already", "column base"]),
+        (HEADER.encode("utf-16"), ["zero bytes", "UTF-8"]),
+        (HEADER.encode() + b"a\t\xff\n", ["line 2", "not UTF-8", "byte"]),
+    ],
+)
+def test_mistakes_about_which_scenes_there_are(project, table, words):
+    project(table if isinstance(table, bytes) else table.encode())
+    with pytest.raises(InputError) as caught:
+        batch.read_table()
+    assert str(caught.value).startswith("config/batch.tsv")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_all_mistakes_of_a_table_come_at_once(project):
+    project("a b c\nok\ttpl\nd/e\n" + "".join(f"x{i}/\n" for i in range(30)))
+    with pytest.raises(InputError) as caught:
+        batch.read_table()
+    assert "line 2," in str(caught.value) and "line 4," in str(caught.value) and "... and 12 more" in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------------------ overrides
+
+
+def test_overrides_are_yaml_values_under_dotted_keys():
+    got = batch.parse_overrides("capture.views=24; prior.samples = 8;base.flag=true;a.b.c=[1, 2];seed=0;x.path=data/a=b;")
+    assert got == {
+        "capture": {"views": 24},
+        "prior": {"samples": 8},
+        "base": {"flag": True},
+        "a": {"b": {"c": [1, 2]}},
+        "seed": 0,
+        "x": {"path": "data/a=b"},
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("capture.views", ["'capture.views'", "key=value"]),
+        ("capture.views=", ["key=value"]),
+        ("capture..views=3", ["key=value", "dotted"]),
+        ("capture.views=3;capture.views=4", ["'capture.views' stands twice"]),
+        ("prior={kind: retinex};prior.samples=3", ["'prior' and 'prior.samples' set the same thing"]),
+        ("source.path=x", ["'source.path'", "column of its own, path"]),
+        ("source.kind=folder", ["column of its own, source"]),
+        ("seed=[1", ["'seed'", "not a YAML value"]),
+    ],
+)
+def test_mistakes_in_overrides(text, words):
+    with pytest.raises(InputError) as caught:
+        batch.parse_overrides(text, "here")
+    assert str(caught.value).startswith("here: ")
+    for word in words:
+        assert word in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------------------ one scene
+
+
+def test_a_line_lies_over_its_base_and_the_quality_below(project, tmp_path):
+    project("a\t\tdata/a\ttpl\tcapture.views=7;prior.samples=3\nb\tbuiltin\t\ttpl\tprior.kind=simulated;source.scene=tiny\n")
+    (tmp_path / "config/quality").mkdir()
+    (tmp_path / "config/quality/draft.yaml").write_text("capture: {views: 9, width: 99}\nprior: {samples: 9}\n")
+    a, b = settings.load("a"), settings.load("b")
+    assert (a.source.kind, a.source.path, a.source.unit) == ("folder", Path("data/a"), "mm")
+    assert (a.capture.views, a.capture.width, a.prior.samples, a.seed) == (7, 99, 3, 4)
+    assert (b.source.kind, b.source.scene, b.prior.kind, b.capture.views) == ("builtin", "tiny", "simulated", 9)
+    assert settings.load("tpl").seed == 4
+
+
+def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
+    (tmp_path / "config/scenes/tpl.yaml").write_text("source: {kind: folder}\nprior: {kind: retinex}\n")
+    project("a\t\tdata/a\tconfig/scenes/tpl.yaml\t\n")
+    assert settings.load("a").source.path == Path("data/a")
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("a\t\t\ttpl\tcapture.veiws=3", ["line 2, column overrides: `capture.veiws`: unknown key", "Did you mean `views`?"]),
+        ("a\t\t\ttpl\tcapture.views=0", ["line 2, column overrides: `capture.views`: found 0"]),
+        ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides: `capture`: found 3"]),
+        ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source: `source.kind`: found 'foldr', allowed: builtin"]),
+        ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path: `source.path`: missing"]),
+        ("a\tfolder\tx\t\t", ["line 2: `prior`: missing"]),
+        ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path: `source.path`: unknown key"]),
+        ("a\t\t\ttlp\t", ["line 2, column base: config/scenes/tlp.yaml not found", "Did you mean tpl?"]),
+        ("a\t\t\ttpl\tviews", ["line 2, column overrides: found 'views', needed key=value"]),
+        ("a\t\t\tbad\t", ["config/scenes/bad.yaml (base of config/batch.tsv, line 2): `seed`: found 'x'"]),
+    ],
+)
+def test_a_mistake_in_a_scene_names_line_column_and_key(project, tmp_path, line, words):
+    (tmp_path / "config/scenes/bad.yaml").write_text(BASE.replace("seed: 4", "seed: x"))
+    project(line + "\n")
+    with pytest.raises(InputError) as caught:
+        settings.load("a")
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_unknown_scene_is_looked_for_in_the_table_too(project):
+    project("office\t\tdata/a\ttpl\t\n")
+    with pytest.raises(InputError, match=r"Did you mean scenes/office\? Known scenes: tpl and 1 of config/batch.tsv"):
+        settings.load("ofice")
+
+
+# ----------------------------------------------------------------------------------------------------------- all scenes
+
+
+def test_every_scene_is_refused_by_itself(project, monkeypatch):
+    project(
+        "good\tbuiltin\t\t\tsource.scene=tiny;prior.kind=simulated\n"
+        "key\t\t\ttpl\tcapture.veiws=3\n"
+        "data\tfolder\tno/where\t\tprior.kind=retinex\n"
+        "gone\n"
+        "disk\tmitsuba\tx.xml\t\tprior.kind=simulated\n"
+    )
+    from workflow.sources import mitsuba
+
+    monkeypatch.setattr(mitsuba, "raw_inputs", lambda document: 1 / 0)
+    plan = batch.plan("draft")
+    assert list(plan.ready) == ["good"] and list(plan.refused) == ["key", "data", "gone", "disk"]
+    assert "line 3, column overrides" in plan.refused["key"]
+    assert plan.refused["data"].startswith("config/batch.tsv, line 4: no/where: not found; `source.path` must be a folder")
+    assert "line 5: config/scenes/gone.yaml: not found" in plan.refused["gone"]
+    assert "line 6: ZeroDivisionError" in plan.refused["disk"] and "a bug" in plan.refused["disk"]
+    assert plan.ready["good"] == fp.fingerprint("publish", "good", "draft")
+
+
+def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
+    marks = []
+    for overrides in ("seed=1", "seed=2", "seeds=2", "seedz=2"):
+        project(f"a\tbuiltin\t\t\tsource.scene=tiny;prior.kind=simulated;{overrides}\n")
+        marks.append(batch.fingerprint("draft"))
+    assert len(set(marks)) == 4
+
+
+# -------------------------------------------------------------------------------------------------------------- summary
+
+
+@pytest.fixture
+def five(project, monkeypatch):
+    """Five scenes that ended differently, without running them."""
+    names = ("done", "refused", "failed", "killed", "idle")
+    lines = tuple(batch.Line(i + 2, name, "builtin") for i, name in enumerate(names))
+    monkeypatch.setattr(fp, "fingerprint", lambda stage, scene, quality: f"{stage} of {scene}")
+    monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps({"source": {"kind": "builtin"}}))
+    reason = "config/batch.tsv, line 3: <script>bad\tdata</script>\nsecond line"
+    plan = batch.Plan(lines, {n: f"publish of {n}" for n in names if n != "refused"}, {"refused": reason})
+    monkeypatch.setattr(batch, "plan", lambda quality: plan)
+
+    write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
+    view = ["000", "001", "000", "000"]
+    columns = {"view": view, "quantity": ["rgb", "rgb", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
+    columns |= {"protocol": ["raw"] * 4, "value": np.array([30.0, 20.0, 25.0, 9.0])}
+    write_parquet(Path("scenes/done/metrics.parquet"), columns, {})
+    cameras = {"name": ["000", "001"], "split": ["train", "test"]}
+    write_parquet(Path("results/done/capture/cameras.parquet"), cameras, {})
+    benchmarks = Path("results/done/benchmarks")
+    benchmarks.mkdir()
+    (benchmarks / "capture.jsonl").write_text('{"s": 3.0, "cpu_time": 4.0, "max_rss": 100.0}\n')
+    (benchmarks / "base.jsonl").write_text('{"s": 5.0, "cpu_time": 6.0, "max_rss": 80.0}\n')
+    write_json(benchmarks / "base.parts.json", {"job": {"cpu_seconds": 7.0, "max_rss_mb": 120.0}})
+
+    write_json(Path("scenes/idle/manifest.json"), {"fingerprint": "publish of other settings"})
+    write_json(Path("results/idle/capture/manifest.json"), {"fingerprint": "capture of idle"})
+    Outcome("idle", "prior", "prior of other settings").failed("long ago")
+    Outcome("killed", "capture", "capture of killed").started()
+    Outcome("failed", "capture", "capture of failed").started()
+    Outcome("failed", "capture", "capture of failed").done()
+    write_json(Path("results/failed/capture/manifest.json"), {"fingerprint": "capture of failed"})
+    Outcome("failed", "prior", "prior of failed").started()  # both were running when one failed
+    Outcome("failed", "segmentation", "segmentation of failed").failed("mesh: no faces")
+    return plan
+
+
+def test_every_scene_has_a_row_that_says_how_it_ended(five):
+    batch_summary.write_summary("draft")
+    with open("results/batch/summary.tsv", newline="") as file:
+        rows = {row["scene"]: row for row in csv.DictReader(file, delimiter="\t")}
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "done": "done",
+        "refused": "refused",
+        "failed": "failed",
+        "killed": "killed",
+        "idle": "not run",
+    }
+    done = rows["done"]
+    assert (done["rgb_psnr"], done["rgb_psnr_held_out"], done["albedo_psnr"], done["roughness_l2"]) == ("30", "20", "25", "")
+    assert (done["seconds"], done["cpu_seconds"], done["max_rss_mb"], done["slowest"]) == ("8", "11", "120", "base 5 s")
+    assert rows["refused"]["reason"].endswith("<script>bad data</script> | second line")
+    assert (rows["failed"]["stage"], rows["failed"]["reason"]) == ("segmentation", "mesh: no faces")
+    assert rows["failed"]["log"] == "results/failed/logs/segmentation.log"
+    assert (rows["killed"]["stage"], rows["idle"]["stage"]) == ("capture", "prior")
+    import pyarrow.parquet as pq
+
+    table = pq.read_table("results/batch/summary.parquet")
+    assert table.column_names == list(batch_summary.COLUMNS)
+    assert table["rgb_psnr"].to_pylist() == [30.0, None, None, None, None]
+
+
+class _Addresses(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.tags = [], set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        self.found += [value for name, value in attrs if name in ("src", "href")]
+
+
+def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
+    batch_summary.write_summary("draft")
+    text = Path("results/batch/report.html").read_text()
+    page = _Addresses(text)
+    assert "script" not in page.tags and "&lt;script&gt;" in text
+    assert {a for a in page.found if not a.startswith("data:")} == {
+        "../../scenes/done/report.html",
+        "../../results/failed/logs/segmentation.log",
+        "../../results/killed/logs/capture.log",
+    }
+    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 not run", "mesh: no faces", "held-out PSNR"):
+        assert words in text
+    assert "roughness L2" not in text  # no scene has it
+
+
+def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
+    Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
+    batch_summary.write_summary("draft")
+    assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
+
+
+@pytest.mark.parametrize(("dynamic_range", "photograph", "rendered"), [("ldr", 102, 51), ("hdr", 188, 124)])
+def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph, rendered):
+    """sRGB code of 0.4 and 0.2 as they are (LDR), of linear 0.4 x exposure 1.25 = 0.5 and linear 0.2 (HDR); albedo linear 0.5."""
+    import base64
+
+    from PIL import Image
+
+    from workflow.report.batch_page import thumbnails
+
+    flat = {c: np.full((4, 300), 0.4, np.float32) for c in "RGB"}
+    channels = {f"ldr.{c}": np.full((4, 300), 0.2, np.float32) for c in "RGB"}
+    channels |= {f"albedo.{c}": np.full((4, 300), 0.5, np.float32) for c in "RGB"}
+    for name in ("000", "001", "002"):
+        write_exr(Path(f"scenes/a/maps/{name}.exr"), channels)
+        write_exr(Path(f"results/a/capture/photos/{name}.exr"), flat)
+    write_json(Path("results/a/capture/capture.json"), {"dynamic_range": dynamic_range})
+    cameras = {"name": ["000", "001", "002"], "exposure": np.array([9.0, 1.25, 9.0])}
+    write_parquet(Path("results/a/capture/cameras.parquet"), cameras, {})
+    shown = thumbnails("a")
+    assert [title for title, _ in shown] == [f"{what}, view 001" for what in ("photograph", "re-rendering", "albedo")]
+    for (_, address), value in zip(shown, (photograph, rendered, 188), strict=True):
+        picture = np.array(Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))))
+        assert picture.shape == (1, 100, 3) and np.abs(picture.astype(int) - value).max() <= 2
+    Path("scenes/a/maps/001.exr").write_bytes(b"rubbish")
+    assert thumbnails("a") == []
+
+
+def test_only_a_finished_plan_counts_as_complete(five):
+    batch_summary.write_summary("draft", "mark")
+    assert Path("results/batch/complete").read_text() == "mark\n"
+    batch_summary.write_summary("draft")
+    assert not Path("results/batch/complete").exists()
+
+
+def test_refusing_names_every_scene(five):
+    with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
+        batch_summary.refuse("draft")
+
+
+def test_the_shipped_table_can_be_read(repository):
+    lines = batch.read_table(repository)
+    assert [line.name for line in lines if line.is_plain] and all(
+        settings.load(line.name, quality, repository) for line in lines for quality in settings.QUALITIES
+    )

@@ -1,0 +1,131 @@
+"""Input files in fingerprints: content decides, and large files are not read while Snakemake plans."""
+
+import json
+import os
+
+import pytest
+
+from workflow import input_digests
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty working directory, small limits, and a list of the files whose whole content was read."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(input_digests, "WHOLE", 64)
+    monkeypatch.setattr(input_digests, "SAMPLE", 8)
+    read = []
+    whole = input_digests.sha256_of
+    monkeypatch.setattr(input_digests, "sha256_of", lambda path: read.append(path.name) or whole(path))
+    forget()
+    return tmp_path, read
+
+
+def forget():
+    """As a new process would find it."""
+    input_digests._read_at = None
+    input_digests._new.clear()
+
+
+def write(path, data, time=None):
+    path.write_bytes(data)
+    if time:
+        os.utime(path, ns=(time, time))
+    return path
+
+
+LARGE = bytes(range(200))
+EDITED = LARGE[:50] + b"!" + LARGE[51:]  # between the samples
+
+
+def test_a_large_file_is_not_read_until_a_job_has_read_it(here):
+    folder, read = here
+    path = write(folder / "large", LARGE)
+    first = input_digests.digests([path])
+    assert read == []
+    input_digests.remember([path])
+    forget()
+    assert input_digests.digests([path]) == first and read == ["large"]
+
+
+@pytest.mark.parametrize("size", [20, 200])
+def test_touching_changes_nothing(here, size):
+    folder, _ = here
+    path = write(folder / "f", LARGE[:size])
+    first = input_digests.digests([path])
+    input_digests.remember([path])
+    for time in (10**18, 2 * 10**18):
+        os.utime(path, ns=(time, time))
+        forget()
+        assert input_digests.digests([path]) == first
+
+
+def test_an_edit_that_keeps_size_and_samples_is_noticed_every_time(here):
+    folder, _ = here
+    path = write(folder / "f", LARGE)
+    seen = input_digests.digests([path])
+    input_digests.remember([path])
+    for i in range(1, 4):  # planned again and again without a job in between
+        write(path, LARGE[:50] + bytes([i]) + LARGE[51:], i * 10**18)
+        forget()
+        now = input_digests.digests([path])
+        assert now[0] not in seen
+        seen += now
+
+
+@pytest.mark.parametrize("at", [0, 99, 199])
+def test_an_edit_within_the_samples_or_of_the_size_is_noticed_without_reading_all(here, at):
+    folder, read = here
+    path = write(folder / "f", LARGE)
+    first = input_digests.digests([path])
+    edited = bytearray(LARGE)
+    edited[at] ^= 1
+    write(path, bytes(edited), 10**18)
+    second = input_digests.digests([path])
+    write(path, LARGE + b"x", 2 * 10**18)
+    assert len({*first, *second, *input_digests.digests([path])}) == 3 and read == []
+
+
+def test_copies_elsewhere_have_the_same_digest(here, tmp_path, monkeypatch):
+    digests = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        monkeypatch.chdir(tmp_path / name)
+        path = write(tmp_path / name / "f", LARGE, len(digests) * 10**18 + 1)
+        digests.append(input_digests.digests([path.relative_to(tmp_path / name)]))
+    assert digests[0] == digests[1]
+
+
+def test_what_changed_while_the_job_ran_is_not_taken_for_what_it_read(here):
+    folder, read = here
+    path = write(folder / "f", LARGE)
+    input_digests.digests([path])
+    write(path, EDITED, 10**18)
+    input_digests.remember([path])
+    assert read == []
+
+
+def test_what_other_processes_noted_is_kept_and_a_batch_saves_once(here, monkeypatch):
+    folder, _ = here
+    a, b, c = (write(folder / name, LARGE) for name in "abc")
+    input_digests.digests([a])
+    stored = json.loads(input_digests.CACHE.read_text())
+    saves = []
+    save = input_digests.write_atomically
+    monkeypatch.setattr(input_digests, "write_atomically", lambda *args: saves.append(1) or save(*args))
+    with input_digests.saved_once():
+        input_digests.digests([b])
+        input_digests.CACHE.write_text(json.dumps({**stored, "elsewhere": [1, 2, "3", "4"]}))
+        input_digests.digests([c])
+    assert len(saves) == 1
+    assert set(json.loads(input_digests.CACHE.read_text())) == {str(a), str(b), str(c), "elsewhere"}
+
+
+def test_a_damaged_or_older_file_of_digests_is_made_anew(here):
+    folder, _ = here
+    path = write(folder / "f", LARGE)
+    first = input_digests.digests([path])
+    for text in ("rubbish", "[]", json.dumps({str(path): [1, 2, "of an older version"]})):
+        input_digests.CACHE.write_text(text)
+        forget()
+        assert input_digests.digests([path]) == first

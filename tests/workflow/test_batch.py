@@ -1,0 +1,80 @@
+"""`snakemake scenes`: bad scenes are named and do not stop the others, and what is done is not done again."""
+
+import csv
+
+import pytest
+from support import planned
+
+from tests.unit import own_scene as own
+
+HEADER = "name\tsource\tpath\tbase\toverrides\n"
+SMALL = "prior.kind=retinex;segmentation.kind=geometry;capture.width=64;capture.height=48"
+
+
+@pytest.fixture(scope="module")
+def ended(finished, tmp_path_factory):
+    """A batch of a scene that lacks its last two jobs, one with a misspelt key, one without data, one whose first job fails."""
+    workflow = finished.copy(tmp_path_factory.mktemp("batch") / "run")
+    for path in ("results/tiny/report/manifest.json", "scenes/tiny/manifest.json"):
+        (workflow.folder / path).unlink()
+    own.bare(workflow.folder / "data/mm")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(workflow.folder / "data/mm/mesh.ply", 1000 * vertices, faces)
+    workflow.table = workflow.folder / "config/batch.tsv"
+    lines = ["tiny", "key\t\t\ttiny\tcapture.veiws=3", f"data\tfolder\tno/where\t\t{SMALL}", f"mm\tfolder\tdata/mm\t\t{SMALL}"]
+    workflow.table.write_text(HEADER + "".join(f"{line}\n" for line in lines))
+    first = "results/mm/capture/manifest.json"
+    workflow.said = workflow.run("scenes", "--prioritize", first, "--forcerun", "report")  # so that the failure comes first
+    return workflow
+
+
+def summary(workflow):
+    with open(workflow.folder / "results/batch/summary.tsv", newline="") as file:
+        return {row["scene"]: row for row in csv.DictReader(file, delimiter="\t")}
+
+
+def test_the_good_scene_is_done_and_the_bad_ones_are_named(ended):
+    assert ended.said.returncode == 1
+    rows = summary(ended)
+    assert {name: row["status"] for name, row in rows.items()} == {
+        "tiny": "done",
+        "key": "refused",
+        "data": "refused",
+        "mm": "failed",
+    }
+    assert float(rows["tiny"]["rgb_psnr"]) > 10 and float(rows["tiny"]["max_rss_mb"]) > 50
+    assert "line 3, column overrides: `capture.veiws`: unknown key. Did you mean `views`?" in rows["key"]["reason"]
+    assert "line 4: no/where: not found" in rows["data"]["reason"]
+    assert rows["mm"]["stage"] == "capture" and "is 5590 m across" in rows["mm"]["reason"]
+    said = ended.said.stderr
+    assert said.index("is 5590 m across") < said.index("publishing scenes/tiny"), "the failure was to come first"
+    assert "1 of 4 scenes done" in said and "Traceback" not in said
+    page = (ended.folder / "results/batch/report.html").read_text()
+    assert page.count('src="data:image/jpeg') == 3 and '"../../scenes/tiny/report.html"' in page
+
+
+def test_what_is_left_runs_when_the_table_is_mended_and_then_nothing_does(ended):
+    ended.table.write_text(HEADER + "tiny\nmm\t\t\tother\tseed=1\n")
+    (ended.folder / "config/scenes/other.yaml").write_text((ended.folder / "config/scenes/tiny.yaml").read_text())
+    assert planned(ended.run("scenes", "-n")) >= {"capture", "publish", "batch"}  # mm is another scene now
+    ended.table.write_text(HEADER + "tiny\n")
+    # `scenes` is what plain `snakemake` makes; the summary that the failed run left is not taken for the one wanted
+    assert planned(ended.run("-n")) == {"batch"}
+    mended = ended.run("scenes")
+    assert mended.returncode == 0 and "1 of 1 scenes done" in mended.stderr, mended.stderr[-2000:]
+    assert list(summary(ended)) == ["tiny"]
+    assert "Nothing to be done" in ended.run("scenes").stderr
+
+
+def test_a_table_that_cannot_be_read_stops_at_once(workflow):
+    (workflow.folder / "config/batch.tsv").write_text(HEADER + "tiny\ntiny\n")
+    result = workflow.run("scenes")
+    assert result.returncode == 1 and "line 3, column name: 'tiny' stands in line 2 already" in result.stderr
+    assert "Traceback" not in result.stderr and not (workflow.folder / "results/batch").exists()
+
+
+def test_a_named_scene_of_the_table_stops_with_its_mistake(workflow):
+    (workflow.folder / "config/batch.tsv").write_text(HEADER + "tiny\nkey\t\t\ttiny\tcapture.veiws=3\n")
+    result = workflow.run("scenes/tiny", "scenes/key")
+    assert result.returncode == 1 and "error: config/batch.tsv, line 3, column overrides: `capture.veiws`" in result.stderr
+    assert not (workflow.folder / "results/key").exists()

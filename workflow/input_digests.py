@@ -1,0 +1,135 @@
+"""Digests of input files for fingerprints, without reading gigabytes while Snakemake plans.
+
+A file of at most `WHOLE` bytes is known by its content. A larger one (photographs of a camera, meshes: hundreds of gigabytes in a
+batch) by its size and three samples of it; the job that reads it anyway notes the digest of its whole content (`remember`). When
+the time stamp of such a file changes, its whole content decides: touched or copied it is the same, edited it is another, even if
+size and samples are as before. What is known is kept in `results/.input-digests.json` by path, size and time stamp.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from workflow.artifacts.files import sha256_of, write_atomically
+
+WHOLE = 1 << 20
+SAMPLE = 1 << 12
+CACHE = Path("results/.input-digests.json")
+
+
+class Known(NamedTuple):
+    """What is known of a file: stamp, the digest that fingerprints use, the digest of the whole content ("" = not known)."""
+
+    size: int
+    mtime_ns: int
+    digest: str
+    whole: str
+
+
+_known: dict[str, Known] = {}
+_new: dict[str, Known] = {}
+_read_at: tuple[Path, int] | None = None  # which file, and its time stamp, `_known` was read from
+_held = False
+
+
+def digests(paths: Iterable[Path]) -> list[str]:
+    """`path:digest` of every file, sorted by path."""
+    _recall()
+    out = [f"{path}:{_digest(path)}" for path in sorted(paths)]
+    _save()
+    return out
+
+
+def remember(paths: Iterable[Path]) -> None:
+    """Note the whole content of large files that a job has just read; of none that changed since it was fingerprinted."""
+    _recall()
+    for path in paths:
+        entry, status = _known.get(str(path)), path.stat()
+        if entry and not entry.whole and entry[:2] == (status.st_size, status.st_mtime_ns):
+            _note(path, entry._replace(whole=sha256_of(path)))
+    _save()
+
+
+@contextmanager
+def saved_once() -> Iterator[None]:
+    """Within it nothing is saved; at its end all is, once: the file has an entry for every photograph of a batch."""
+    global _held
+    _held = True
+    try:
+        yield
+    finally:
+        _held = False
+        _save()
+
+
+def _digest(path: Path) -> str:
+    status = path.stat()
+    stamp = (status.st_size, status.st_mtime_ns)
+    entry = _known.get(str(path))
+    if entry is None or entry[:2] != stamp:
+        _note(path, entry := _look(path, stamp, entry))
+    return entry.digest
+
+
+def _look(path: Path, stamp: tuple[int, int], before: Known | None) -> Known:
+    if stamp[0] <= WHOLE:
+        content = sha256_of(path)
+        return Known(*stamp, content, content)
+    if before is None or not before.whole:
+        return Known(*stamp, _samples(path, stamp[0]), "")
+    whole = sha256_of(path)
+    return Known(*stamp, before.digest if whole == before.whole else whole, whole)
+
+
+def _samples(path: Path, size: int) -> str:
+    """Digest of size, beginning, middle and end."""
+    out = hashlib.sha256(f"{size}\n".encode())
+    with open(path, "rb", buffering=0) as handle:
+        for start in (0, (size - SAMPLE) // 2, size - SAMPLE):
+            handle.seek(start)
+            out.update(handle.read(SAMPLE))
+    return out.hexdigest()
+
+
+def _note(path: Path, entry: Known) -> None:
+    _known[str(path)] = _new[str(path)] = entry
+
+
+def _recall() -> None:
+    """Take over what the file says, if another process has written it or the working directory is another."""
+    global _read_at
+    path = CACHE.absolute()
+    try:
+        now = (path, path.stat().st_mtime_ns)
+    except OSError:
+        now = (path, 0)
+    if now != _read_at:
+        if _read_at and _read_at[0] != path:
+            _new.clear()
+        _known.clear()
+        _known.update(_stored())
+        _known.update(_new)
+        _read_at = now
+
+
+def _stored() -> dict[str, Known]:
+    try:
+        return {path: Known(*entry) for path, entry in json.loads(CACHE.read_text()).items() if len(entry) == 4}
+    except (OSError, ValueError, AttributeError, TypeError):
+        return {}
+
+
+def _save() -> None:
+    """Add what is new to the file; what other processes wrote meanwhile is kept."""
+    global _read_at
+    if _held or not _new:
+        return
+    text = json.dumps({**_stored(), **_new}, sort_keys=True, separators=(",", ":"))
+    write_atomically(CACHE, lambda temporary: temporary.write_text(text))
+    _new.clear()
+    _read_at = (CACHE.absolute(), CACHE.stat().st_mtime_ns)
