@@ -124,18 +124,26 @@ def calibrate_response(
         return given_response(start, reason, exposure)
     gains = CameraGains.plain(exposure)
     if not given:
-        gains = _gains(rows, response(families[0]), gains, None)
+        gains = _gains(rows, response(families[0]), gains)
     channels = [_channel(rows, c, gains, saturation, min_stops) for c in range(3)]
     enough = [c for c in range(3) if len(channels[c].cell) >= min_rows]
     stops = max(channel.stops for channel in channels)
     if not enough:
+        gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
         return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, gains, given)
     common = _joined([_channel(rows, c, gains, saturation, min_stops, _FIT_ROWS // len(enough)) for c in enough])
     fits, found = [], []
+    if not given:
+        # Which terms it takes is asked of the richest curve, fitted with one gain a view: under a wrong curve, channels of
+        # different brightness seem to need gains of their own.
+        rich = _fit(families[-1], common, channels, enough).response
+        gains = _gains(rows, rich, gains, choose=True)
+        logs = _log_factor(rows, gains)
+        common, channels = common.exposed(logs), [channel.exposed(logs) for channel in channels]
     for family in families:
         fit, views = _fit(family, common, channels, enough), gains
         if not given:  # the gains that go with this curve, and the curve that goes with them
-            views = _gains(rows, fit.response, gains, gains)
+            views = _gains(rows, fit.response, gains)
             logs = _log_factor(rows, views)
             fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
         fits.append(fit)
@@ -152,7 +160,7 @@ def calibrate_response(
     chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
     before = _maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
-    views = found[chosen] if given else _gains(rows, fits[chosen].response, gains, None)
+    views = found[chosen] if given else found[chosen]
     return CalibratedResponse(
         fits[chosen].response,
         fits[chosen].covariance,
@@ -199,18 +207,30 @@ def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
     return GainRows(rows.patch.astype(np.int64), rows.view, values, radius2, rows.block)
 
 
-def _gains(rows: PatchRows, curve: Response, start: CameraGains, model: CameraGains | None) -> CameraGains:
-    """Gains that a curve implies where views overlap, their mean that of `start`; the terms of `model`, or whatever
-    held-out surface speaks for."""
+def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False) -> CameraGains:
+    """Gains that a curve implies where views overlap, their mean that of `start`: with the terms that `start` was found to
+    need (exposure and vignetting if nobody asked), or, to `choose`, those that held-out surface speaks for.
+
+    The power that is open is one for all channels: white balance is taken as uncorrelated with exposure.
+    """
     linear, n_views = gain_rows(rows, curve), len(start.gain)
-    if model is None:
+    if choose:
         found = choose_gains(linear, n_views)
     else:
-        terms = {name: entry.included for name, entry in model.evidence.items()}
-        found = estimate(linear, n_views, **terms)
+        terms = {name: entry.included for name, entry in start.evidence.items()} or {"white_balance": False}
+        found = replace(estimate(linear, n_views, **terms), evidence=start.evidence)
+    found = replace(found, gain=_without_powers(found.gain, found.estimated))
     known = start.exposure[np.isfinite(start.exposure) & (start.exposure > 0)]
     mean = float(np.exp(np.mean(np.log(known)))) if len(known) else 1.0
-    return replace(found, gain=found.gain * mean, evidence=found.evidence or (model.evidence if model else {}))
+    return replace(found, gain=found.gain * mean)
+
+
+def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(V, 3) gains whose chroma does not go with exposure."""
+    logs = np.log(gain)
+    level = logs.mean(1, keepdims=True)
+    chroma, x = logs - level, np.where(seen[:, None], level - level[seen].mean() if seen.any() else 0.0, 0.0)
+    return np.exp(level + chroma - x * (x * chroma).sum(0) / max(float((x**2).sum()), 1e-12))
 
 
 def _log_factor(rows: PatchRows, gains: CameraGains) -> np.ndarray:
@@ -230,9 +250,7 @@ def _unknown(
     else:
         reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
     covariance = _PRIOR**2 * np.eye(start.params.size)
-    return CalibratedResponse(
-        start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains
-    )
+    return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 
 
 def _because(table: list[dict[str, object]], chosen: int, best: int, rows: int, stops: float) -> str:
