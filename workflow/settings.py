@@ -69,6 +69,9 @@ class FolderSource(Section):
     """Reproject the mesh against depth or image edges; `check` refuses a mismatch with the measured disagreement."""
     alignment_tolerance: float = Field(0.05, gt=0)
     """Largest accepted median relative depth disagreement, where depth images exist."""
+    registration: Literal["auto", "off"] = "auto"
+    """`auto`: poses, focal length and principal point corrected by what mesh and other photographs show, if held-out surface
+    agrees; blurred and badly posed photographs left out. `off`: as given."""
 
 
 Source = Annotated[BuiltinSource | MitsubaSource | FolderSource, Field(discriminator="kind")]
