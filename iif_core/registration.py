@@ -34,6 +34,7 @@ BLOCK = 0.3
 """Edge in metres of the blocks of surface that are held out together."""
 EDGE_SAY = 0.15
 """Neighbouring edge points err together: what one counts against a row of texture."""
+MIN_VIEWS = 6
 MIN_ROWS = 40
 """Points that a view shares with others before anything is said about it."""
 HELD_OUT = 3
@@ -74,7 +75,8 @@ class Registration:
         edges: (before, after) mean photograph edge at edges of the mesh that the fit did not see.
         edge_gain, edge_error: its rise and the standard error over views.
         rows: (point, view) pairs compared.
-        accepted: one of the two is better by more than two standard errors, and the other not worse by as much.
+        accepted: texture is better by more than two standard errors and edges not worse by as many, or edges are better and
+            texture not worse at all; and there are `MIN_VIEWS` views, without which a standard error means nothing.
         sharpness: (V,) gradient of the texture as this view shows it / as the others do; 1 = as usual, 0 = not compared.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
         shift: (V,) pixels by which a view still lies off the others' texture, as one translation.
@@ -174,9 +176,10 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     unseen = [world[h] for world, h in zip(edges, held, strict=True)]
     spread, gain, error = _compared(photos, maps, (start, state), rows.take(rows.held_out))
     tied, edge_gain, edge_error = _tied(photos, maps, (start, state), unseen)
-    better = gain > 2.0 * error or edge_gain > 2.0 * edge_error
+    better = gain > 2.0 * error or (edge_gain > 2.0 * edge_error and gain > 0.0)
     worse = gain < -2.0 * error or edge_gain < -2.0 * edge_error
-    final = state if better and not worse else start
+    accepted = bool(better and not worse and len(photos) >= MIN_VIEWS)
+    final = state if accepted else start
     return Registration(
         state.pose,
         state.principal,
@@ -189,7 +192,7 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
         edge_gain,
         edge_error,
         len(rows.view),
-        bool(better and not worse),
+        accepted,
         *_quality(photos, maps, final, rows),
     )
 
