@@ -213,7 +213,7 @@ def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = 
 
     The power that is open is one for all channels: white balance is taken as uncorrelated with exposure.
     """
-    linear, n_views = gain_rows(rows, curve), len(start.gain)
+    linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
     if choose:
         found = choose_gains(linear, n_views)
     else:

@@ -113,7 +113,7 @@ def calibrated(photos: Photographs) -> tuple[Photographs, CalibratedResponse]:
         linear, own = gain_rows(rows, found.response), found.gains
         if own is None:  # the curve is given, the gains are not
             ahead = linear.take(moving[linear.view])
-            found_here = choose_gains(ahead, len(gains.gain))
+            found_here = choose_gains(ahead.thinned(), len(gains.gain))
             gains = replace(found_here, gain=np.where(found_here.estimated[:, None], found_here.gain, gains.gain))
         else:
             every = gains.gain.copy()
