@@ -107,22 +107,22 @@ def calibrated(photos: Photographs) -> tuple[Photographs, CalibratedResponse]:
         moving = replace(moving, view=np.searchsorted(number, moving.view).astype(np.int32))
         found = calibrate_response(moving, exposure, families, settings.emission.saturation, given=given)
     photos.job.log.info("camera response: %s", found.reason)
-    gains = photos.gains
-    if estimated:
-        moving = np.isin(np.arange(len(gains.gain)), number)
-        linear, own = gain_rows(rows, found.response), found.gains
-        if own is None:  # the curve is given, the gains are not
-            ahead = linear.take(moving[linear.view])
-            found_here = choose_gains(ahead.thinned(), len(gains.gain))
-            gains = replace(found_here, gain=np.where(found_here.estimated[:, None], found_here.gain, gains.gain))
-        else:
-            every = gains.gain.copy()
-            every[number] = own.gain
-            seen = moving.copy()
-            seen[number] = own.estimated
-            gains = replace(own, gain=every, estimated=seen)
-        gains = follow(linear, gains, moving)
+    gains = _all_gains(photos.gains, number, found, rows) if estimated else photos.gains
     return replace(photos, sensor=replace(photos.sensor, curve=found.response), gains=gains), found
+
+
+def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse, rows: PatchRows) -> CameraGains:
+    """Gains of all views of the capture: of those `number` that were used, and of those that follow them."""
+    moving = np.isin(np.arange(len(start.gain)), number)
+    linear = gain_rows(rows, found.response)
+    if found.gains is None:  # the curve is given, the gains are not
+        own = choose_gains(linear.take(moving[linear.view]).thinned(), len(start.gain))
+        ahead = replace(own, gain=np.where(own.estimated[:, None], own.gain, start.gain))
+    else:
+        gain, seen = start.gain.copy(), np.zeros(len(moving), bool)
+        gain[number], seen[number] = found.gains.gain, found.gains.estimated
+        ahead = replace(found.gains, gain=gain, estimated=seen)
+    return follow(linear, ahead, moving)
 
 
 def _shared_surface(photos: Photographs) -> PatchRows:

@@ -140,3 +140,14 @@ def test_plain_gains():
     assert plain.is_plain
     np.testing.assert_allclose(plain.factor(1, np.array([0.0, 1.0])), 2.0)
     np.testing.assert_allclose(plain.exposure, [0.5, 2.0])
+
+
+def test_balanced_light_shows_what_the_gains_say():
+    """Stage affines knows one exposure a pixel; the channels' ratios to it are in the light."""
+    from workflow.stages.affines import _balanced
+
+    rng = np.random.default_rng(0)
+    factor, lobes = rng.uniform(0.3, 3, (5, 3)), rng.uniform(0, 1, (5, 4, 3))
+    exposure = np.exp(np.log(factor).mean(1))
+    shown = exposure[:, None, None] * _balanced(lobes, factor / exposure[:, None])
+    np.testing.assert_allclose(shown, factor[:, None] * lobes)
