@@ -21,7 +21,7 @@ from iif_core.exposure import components
 SIGNIFICANT = 2.0
 """Standard errors by which a term must help on held-out surface."""
 NOTICEABLE = 0.01
-"""Median |log gain| between channels, or |log falloff| in the corners, below which a term is not worth having."""
+"""Median |log gain| between channels, or largest |log falloff|, below which a term is not worth having."""
 MIN_ROWS = 8
 """(patch, channel) rows on shared patches that a view needs."""
 LIMIT = 40_000
@@ -167,7 +167,7 @@ def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
     best = estimate(rows, n_views, **model)
     for term in model:
         wider = estimate(rows, n_views, **{**model, term: True})
-        size = _chroma(wider) if term == "white_balance" else float(np.abs(np.log(falloff(wider.vignetting, np.ones(1)))[0]))
+        size = _chroma(wider) if term == "white_balance" else _depth(wider)
         gain, error, before, after = _judge(rows, half, n_views, model, term)
         included = gain > SIGNIFICANT * error and size > NOTICEABLE
         evidence[term] = Evidence(gain, error, size, included, before, after)
@@ -265,6 +265,10 @@ class _Long:
 def _chroma(gains: CameraGains) -> float:
     logs = np.log(gains.gain[gains.estimated])
     return float(np.median(np.abs(logs - logs.mean(1, keepdims=True)))) if len(logs) else 0.0
+
+
+def _depth(gains: CameraGains) -> float:
+    return float(np.abs(np.log(falloff(gains.vignetting, np.linspace(0, 1, 33)))).max())
 
 
 def _halves(rows: GainRows) -> np.ndarray:

@@ -125,7 +125,7 @@ def camera_term(term: str, evidence: Evidence) -> Decision:
     """
     measure = "fall of the held-out loss by this term, in standard errors"
     value = evidence.gain / evidence.error if evidence.error > 0 else 0.0
-    what = "median |log gain| of a channel" if term == "white_balance" else "|log falloff| in the corners"
+    what = "median |log gain| of a channel" if term == "white_balance" else "largest |log falloff|"
     reason = (
         f"{what} {evidence.size:.3f}; spread on surface that the fit did not see {evidence.before:.4f} without,"
         f" {evidence.after:.4f} with it"
