@@ -26,7 +26,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from iif_core.exposure import estimate_gains
+from iif_core.camera_gains import CameraGains, GainRows, choose_gains, estimate
 from iif_core.overlap import PatchRows
 from iif_core.response import START, Response, response
 
@@ -74,7 +74,8 @@ class CalibratedResponse:
     Attributes:
         response: chosen curve, (3, P); the start where the data say nothing.
         covariance: (3 P, 3 P) of its parameters; the prior's where the data say nothing.
-        exposure: (V,) of the views: the given ones, or those found with the curve.
+        exposure: (V,) of the views: the given ones, or those found with the curve (mean over the channels).
+        gains: exposure, white balance and vignetting found with the curve; None where exposures are given.
         gauge: what cannot be known, in words; empty with given exposures.
         stops: largest difference of exposure within a patch, in stops.
         rows: (patch, view, channel) rows used.
@@ -93,6 +94,7 @@ class CalibratedResponse:
     reason: str
     exposure: np.ndarray
     gauge: str = ""
+    gains: CameraGains | None = None
 
 
 def calibrate_response(
@@ -120,21 +122,30 @@ def calibrate_response(
         start = response(families[0])
         reason = "photographs are linear radiance" if start.family == "identity" else "set to srgb"
         return given_response(start, reason, exposure)
-    exposure = np.asarray(exposure, np.float64)
+    gains = CameraGains.plain(exposure)
     if not given:
-        exposure = _gains(rows, response(families[0]), exposure)
-    channels = [_channel(rows, c, exposure, saturation, min_stops) for c in range(3)]
+        gains = _gains(rows, response(families[0]), gains)
+    channels = [_channel(rows, c, gains, saturation, min_stops) for c in range(3)]
     enough = [c for c in range(3) if len(channels[c].cell) >= min_rows]
     stops = max(channel.stops for channel in channels)
     if not enough:
-        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, exposure)
-    common = _joined([_channel(rows, c, exposure, saturation, min_stops, _FIT_ROWS // len(enough)) for c in enough])
+        gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
+        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, gains, given)
+    common = _joined([_channel(rows, c, gains, saturation, min_stops, _FIT_ROWS // len(enough)) for c in enough])
     fits, found = [], []
+    if not given:
+        # Which terms it takes is asked of the richest curve, fitted with one gain a view: under a wrong curve, channels of
+        # different brightness seem to need gains of their own.
+        rich = _fit(families[-1], common, channels, enough).response
+        gains = _gains(rows, rich, gains, choose=True)
+        logs = _log_factor(rows, gains)
+        common, channels = common.exposed(logs), [channel.exposed(logs) for channel in channels]
     for family in families:
-        fit, views = _fit(family, common, channels, enough), exposure
-        if not given:  # the exposures that go with this curve, and the curve that goes with them
-            views = _gains(rows, fit.response, exposure)
-            fit = _fit(family, common.exposed(views), [channel.exposed(views) for channel in channels], enough)
+        fit, views = _fit(family, common, channels, enough), gains
+        if not given:  # the gains that go with this curve, and the curve that goes with them
+            views = _gains(rows, fit.response, gains)
+            logs = _log_factor(rows, views)
+            fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
         fits.append(fit)
         found.append(views)
     scores = np.array([fit.score for fit in fits])
@@ -149,6 +160,7 @@ def calibrate_response(
     chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
     before = _maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
+    views = found[chosen] if given else found[chosen]
     return CalibratedResponse(
         fits[chosen].response,
         fits[chosen].covariance,
@@ -158,8 +170,9 @@ def calibrate_response(
         fits[chosen].width,
         table,
         _because(table, chosen, best, used, stops),
-        found[chosen],
+        views.exposure,
         "" if given else GAUGE,
+        None if given else views,
     )
 
 
@@ -187,22 +200,57 @@ def calibration_facts(found: CalibratedResponse) -> dict[str, object]:
     return {"covariance": found.covariance.tolist(), **{name: getattr(found, name) for name in names}}
 
 
-def _gains(rows: PatchRows, curve: Response, exposure: np.ndarray) -> np.ndarray:
-    """(V,) exposures that a curve implies where views overlap; their mean is that of `exposure`."""
+def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
+    """The rows as `camera_gains` wants them: linear under a curve, unsaturated, not dark."""
     values = curve.inverse(np.where(rows.clipped | ~(rows.value > DARK), np.nan, rows.value))
-    gains = estimate_gains(rows.patch, rows.view, values, len(exposure))
-    positive = exposure[np.isfinite(exposure) & (exposure > 0)]
-    return gains.gain * (np.exp(np.mean(np.log(positive))) if len(positive) else 1.0)
+    radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
+    return GainRows(rows.patch.astype(np.int64), rows.view, values, radius2, rows.block)
 
 
-def _unknown(family: str, stops: float, rows: int, min_stops: float, min_rows: int, exposure: np.ndarray) -> CalibratedResponse:
+def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False) -> CameraGains:
+    """Gains that a curve implies where views overlap, their mean that of `start`: with the terms that `start` was found to
+    need (exposure and vignetting if nobody asked), or, to `choose`, those that held-out surface speaks for.
+
+    The power that is open is one for all channels: white balance is taken as uncorrelated with exposure.
+    """
+    linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
+    if choose:
+        found = choose_gains(linear, n_views)
+    else:
+        terms = {name: entry.included for name, entry in start.evidence.items()} or {"white_balance": False}
+        found = replace(estimate(linear, n_views, **terms), evidence=start.evidence)
+    found = replace(found, gain=_without_powers(found.gain, found.estimated))
+    known = start.exposure[np.isfinite(start.exposure) & (start.exposure > 0)]
+    mean = float(np.exp(np.mean(np.log(known)))) if len(known) else 1.0
+    return replace(found, gain=found.gain * mean)
+
+
+def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(V, 3) gains whose chroma does not go with exposure."""
+    logs = np.log(gain)
+    level = logs.mean(1, keepdims=True)
+    chroma, x = logs - level, np.where(seen[:, None], level - level[seen].mean() if seen.any() else 0.0, 0.0)
+    return np.exp(level + chroma - x * (x * chroma).sum(0) / max(float((x**2).sum()), 1e-12))
+
+
+def _log_factor(rows: PatchRows, gains: CameraGains) -> np.ndarray:
+    """(n, 3) log of what radiance was multiplied by in each row; NaN where the exposure is not known."""
+    radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
+    factor = gains.factor(rows.view, radius2)
+    return np.log(np.where(np.isfinite(factor) & (factor > 0), factor, np.nan))
+
+
+def _unknown(
+    family: str, stops: float, rows: int, min_stops: float, min_rows: int, gains: CameraGains, given: bool
+) -> CalibratedResponse:
     start = response(family)
     start = start.with_params(np.tile(start.params, (3, 1)))
     if stops < min_stops:
         reason = f"exposures differ by less than {min_stops:g} stop where photographs overlap: taken as {family}"
     else:
         reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
-    return CalibratedResponse(start, _PRIOR**2 * np.eye(start.params.size), stops, 0, 0.0, 0.0, [], reason, exposure)
+    covariance = _PRIOR**2 * np.eye(start.params.size)
+    return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 
 
 def _because(table: list[dict[str, object]], chosen: int, best: int, rows: int, stops: float) -> str:
@@ -230,6 +278,8 @@ class _Channel:
     full: np.ndarray  # (b,) patch of the bounds
     full_e: np.ndarray
     full_cluster: np.ndarray
+    row: np.ndarray  # (n,) entry of the flattened (rows, 3) table
+    full_row: np.ndarray
     stops: float
     saturation: float
     knot: np.ndarray = field(init=False)
@@ -242,11 +292,9 @@ class _Channel:
         members = np.bincount(self.cell, minlength=self.cells)
         self.share = (1.0 - 1.0 / np.maximum(members, 1))[self.cell]
 
-    def exposed(self, exposure: np.ndarray) -> _Channel:
-        """The same rows under other exposures (V,)."""
-        log_e = np.log(exposure)
-        views = len(exposure) + 1
-        return replace(self, log_e=log_e[self.cluster % views], full_e=log_e[self.full_cluster % views])
+    def exposed(self, log_factor: np.ndarray) -> _Channel:
+        """The same rows under other gains: `_log_factor`, (all rows, 3)."""
+        return replace(self, log_e=log_factor.ravel()[self.row], full_e=log_factor.ravel()[self.full_row])
 
     @property
     def cells(self) -> int:
@@ -264,13 +312,12 @@ class _Channel:
 
 
 def _channel(
-    rows: PatchRows, c: int, exposure: np.ndarray, saturation: float, min_stops: float, budget: int = _FIT_ROWS
+    rows: PatchRows, c: int, gains: CameraGains, saturation: float, min_stops: float, budget: int = _FIT_ROWS
 ) -> _Channel:
     """About `budget` rows on patches whose exposures span `min_stops` and that some view saw unsaturated."""
     value, clipped = rows.value[:, c], rows.clipped[:, c]
-    known = np.isfinite(exposure) & (exposure > 0)
-    log_e = np.log(np.where(known, exposure, 1.0))[rows.view]
-    use = np.flatnonzero(np.isfinite(value) & (value > DARK) & known[rows.view])
+    log_e = _log_factor(rows, gains)[:, c]
+    use = np.flatnonzero(np.isfinite(value) & (value > DARK) & np.isfinite(log_e))
     owner = np.unique(rows.patch[use], return_inverse=True)[1]
     size = int(owner.max(initial=-1)) + 1
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
@@ -281,7 +328,7 @@ def _channel(
     stops = float(span.max(initial=0.0))
     index = use[_thinned(owner, value[use], clipped[use], kept, budget)[owner]]
     cell = np.unique(rows.patch[index], return_inverse=True)[1]
-    cluster = rows.block[index].astype(np.int64) * (len(exposure) + 1) + rows.view[index]
+    cluster = rows.block[index].astype(np.int64) * (len(gains.gain) + 1) + rows.view[index]
     block = np.unique(rows.block[index], return_inverse=True)[1]
     full = clipped[index]
     clear = ~full
@@ -294,6 +341,8 @@ def _channel(
         cell[full],
         log_e[index[full]],
         cluster[full],
+        3 * index[clear] + c,
+        3 * index[full] + c,
         stops,
         saturation,
     )
@@ -321,7 +370,7 @@ def _thinned(owner: np.ndarray, value: np.ndarray, clipped: np.ndarray, kept: np
 def _joined(channels: Sequence[_Channel]) -> _Channel:
     """Several channels as one: patches of their own, common clusters."""
     offsets = np.cumsum([0] + [channel.cells for channel in channels])
-    names = ("value", "log_e", "block", "cluster", "full_e", "full_cluster")
+    names = ("value", "log_e", "block", "cluster", "full_e", "full_cluster", "row", "full_row")
     parts = {name: np.concatenate([getattr(channel, name) for channel in channels]) for name in names}
     return _Channel(
         np.concatenate([channel.cell + o for channel, o in zip(channels, offsets, strict=False)]),
@@ -332,6 +381,8 @@ def _joined(channels: Sequence[_Channel]) -> _Channel:
         np.concatenate([channel.full + o for channel, o in zip(channels, offsets, strict=False)]),
         parts["full_e"],
         parts["full_cluster"],
+        parts["row"],
+        parts["full_row"],
         max(channel.stops for channel in channels),
         channels[0].saturation,
     )

@@ -76,7 +76,7 @@ def estimate_gains(
     if not len(cell):
         return nothing
     cell = np.unique(cell, return_inverse=True)[1]
-    group = _components(cell, view, n_views)
+    group = components(cell, view, n_views)
     gains, error, scale = _solve(cell, view, log_y, weight, group, n_views, iterations)
     estimated = group >= 0
     return ExposureGains(np.where(estimated, np.exp(gains), 1.0), error, estimated, group, scale, len(cell))
@@ -98,7 +98,8 @@ def _pairs(
     return np.unique(cells, return_inverse=True)[1], views.astype(np.int64), logs, weights
 
 
-def _components(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
+def components(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
+    """(V,) int32: views with the same number are tied together by cells (n,) that they share; -1 = sees none."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -32,6 +32,7 @@ class PatchRows:
         value: (n, 3) float64 sensor value; NaN where a channel cannot be used.
         clipped: (n, 3) bool: at least three quarters of the pixels are saturated; `value` is a bound.
         count: (n,) int32 pixels.
+        radius2: (n,) mean squared distance of the pixels from the picture's centre, 1 in its corners; None = unknown.
     """
 
     patch: np.ndarray
@@ -41,10 +42,11 @@ class PatchRows:
     value: np.ndarray
     clipped: np.ndarray
     count: np.ndarray
+    radius2: np.ndarray | None = None
 
     def take(self, index: np.ndarray) -> PatchRows:
         """Some of the rows."""
-        return PatchRows(**{name: array[index] for name, array in self.__dict__.items()})
+        return PatchRows(**{name: None if array is None else array[index] for name, array in self.__dict__.items()})
 
 
 def patch_edge(footprint: float, extent: float = 0.0) -> float:
@@ -70,6 +72,7 @@ def patch_rows(
     min_pixels: int = 4,
     evenness: float = 0.05,
     share: float = 1.0,
+    radius2: np.ndarray | None = None,
 ) -> PatchRows:
     """Rows of one photograph.
 
@@ -81,6 +84,7 @@ def patch_rows(
         min_pixels: pixels that a row needs.
         evenness: largest interquartile range / value; one and a half 8-bit steps are always allowed.
         share: of the patches, the same ones in every view, to keep.
+        radius2: (n,) squared distance of the pixels from the picture's centre (`camera_gains.radius_squared`); 0 if None.
     """
     value, normal = np.asarray(value, np.float64), np.asarray(normal)
     good = np.isfinite(value).all(1)
@@ -90,6 +94,7 @@ def patch_rows(
     value, patch, block, axis = value[good], np.asarray(patch)[good], np.asarray(block)[good], np.abs(normal[good]).argmax(1)
     facing = (2 * axis + (np.take_along_axis(normal[good], axis[:, None], 1)[:, 0] > 0)).astype(np.int8)
     order = np.lexsort((facing, patch))
+    radius2 = (np.zeros(len(good)) if radius2 is None else np.asarray(radius2, np.float64))[good][order]
     value, patch, block, facing = value[order], patch[order], block[order], facing[order]
     fresh = np.ones(len(patch), bool)
     fresh[1:] = (patch[1:] != patch[:-1]) | (facing[1:] != facing[:-1])
@@ -116,6 +121,7 @@ def patch_rows(
         out[use],
         clipped[use],
         count[use].astype(np.int32),
+        (np.bincount(member, radius2, len(start)) / np.maximum(count, 1))[use],
     )
 
 
@@ -123,7 +129,7 @@ def no_rows() -> PatchRows:
     """Nothing seen."""
     kinds = (np.uint64, np.int8, np.int32, np.int32)
     empty = [np.zeros(0, kind) for kind in kinds]
-    return PatchRows(*empty, np.zeros((0, 3)), np.zeros((0, 3), bool), np.zeros(0, np.int32))
+    return PatchRows(*empty, np.zeros((0, 3)), np.zeros((0, 3), bool), np.zeros(0, np.int32), np.zeros(0))
 
 
 def join_rows(parts: Sequence[PatchRows]) -> PatchRows:

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.camera_gains import SIGNIFICANT, Evidence
+
 Decision = dict[str, Any]
 
 ESCAPE_PRIMARY = 1e-3
@@ -132,6 +134,22 @@ def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
     if spread <= EXPOSURE_LOG_RATIO:
         return _decision("exposure", False, measure, spread, EXPOSURE_LOG_RATIO, "overlapping views agree")
     return _decision("exposure", True, measure, spread, EXPOSURE_LOG_RATIO, f"gains estimated for {estimated} views")
+
+
+def camera_term(term: str, evidence: Evidence) -> Decision:
+    """White balance of the views, or vignetting of the lens: whether held-out surface speaks for it.
+
+    Args:
+        term: `white_balance` or `vignetting`; evidence: of `camera_gains.choose_gains`.
+    """
+    measure = "fall of the held-out loss by this term, in standard errors"
+    value = evidence.gain / evidence.error if evidence.error > 0 else 0.0
+    what = "median |log gain| of a channel" if term == "white_balance" else "largest |log falloff|"
+    reason = (
+        f"{what} {evidence.size:.3f}; spread on surface that the fit did not see {evidence.before:.4f} without,"
+        f" {evidence.after:.4f} with it"
+    )
+    return _decision(term, evidence.included, measure, value, SIGNIFICANT, reason)
 
 
 def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:

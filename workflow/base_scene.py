@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from iif_core.camera_gains import CameraGains, radius_squared
 from iif_core.cells import grid_origin
 from iif_core.mesh import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
@@ -224,9 +225,17 @@ def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.
     return out
 
 
-def read_exposures(job: Job) -> np.ndarray:
-    """(views,) exposure of every view of the capture, in order, as stage emission used them. Needs emission upstream."""
-    return np.asarray(job.read("emission").json("emission.json")["exposure"], np.float64)
+def read_gains(job: Job) -> CameraGains:
+    """Exposure, white balance and vignetting of every view of the capture, in order, as stage emission used them. Needs
+    emission upstream."""
+    facts = job.read("emission").json("emission.json")
+    gain = np.asarray(facts["gain"], np.float64)
+    return CameraGains(gain, np.asarray(facts["vignetting"], np.float64), np.ones(len(gain), bool))
+
+
+def pixel_gains(gains: CameraGains, number: int, view: View, index: np.ndarray) -> np.ndarray:
+    """(n, 3) what the radiance of pixels (flattened indices) of the view at `number` in the capture is multiplied by."""
+    return gains.factor(number, radius_squared(index, view.width, view.height))
 
 
 def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:

@@ -31,7 +31,9 @@ from workflow.base_scene import (
     BaseScene,
     ViewPixels,
     base_maps,
+    pixel_gains,
     read_base_scene,
+    read_gains,
     read_light,
     view_pixels,
 )
@@ -207,7 +209,7 @@ class _Pixels:
 
     def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
         """With the diffuse light of blocks; without: that of the pixels, and no lobes."""
-        job, capture = self.job, self.capture
+        job, capture, gains = self.job, self.capture, read_gains(self.job)
         views = [view for view in capture.views if view.split != "test"] or capture.views
         for done, view in enumerate(views):
             pixels = view_pixels(job, capture, self.scene, view)
@@ -223,7 +225,12 @@ class _Pixels:
             value = np.asarray(pixels.value, np.float32)
             saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
             value = np.minimum(value, SATURATION) if not capture.is_hdr else value
-            exposure = np.full(len(cell), view.exposure if not capture.is_hdr else 1.0)
+            number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
+            factor = np.ones((len(cell), 3)) if capture.is_hdr else pixel_gains(gains, number, view, pixels.index)
+            exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
+            if not gains.is_plain:
+                ratio = (factor / exposure[:, None]).astype(np.float32)
+                d, s0, s1 = d * ratio, s0 * ratio[:, None], s1 * ratio[:, None]
             weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
             yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
             job.progress(done + 1, len(views), "views read")

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core import plan
-from iif_core.calibration import CalibratedResponse, calibrate_response, candidates, given_response, needs_rows
+from iif_core.calibration import CalibratedResponse, calibrate_response, candidates, gain_rows, given_response, needs_rows
+from iif_core.camera_gains import CameraGains, choose_gains, follow, radius_squared
 from iif_core.cells import grid_origin
 from iif_core.emission.cache import RadianceSums, RadianceVoxels
 from iif_core.emission.candidates import FaceStatistics, face_statistics, radiance_threshold, with_thin_objects
@@ -20,7 +21,7 @@ from iif_core.emission.groups import EmitterGroups
 from iif_core.emission.problem import PixelRows
 from iif_core.emission.sensor import Sensor
 from iif_core.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
-from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, view_pixels
+from workflow.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, pixel_gains, view_pixels
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.response_file import read_response_file
@@ -46,7 +47,7 @@ class Photographs:
     scene: BaseScene
     views: list[View]
     sensor: Sensor
-    exposures: dict[int, float]
+    gains: CameraGains  # of the views of the capture, in order
 
     def pixels(self, view: View) -> ViewPixels:
         return view_pixels(self.job, self.capture, self.scene, view)
@@ -56,44 +57,77 @@ class Photographs:
         """Geometry and materials on the device, made once."""
         return self.scene.traceable()
 
-    def radiance(self, view: View, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self.sensor.radiance(value, self.exposures[view.view_id])
+    def number(self, view: View) -> int:
+        """Place of a view in the capture."""
+        return next(i for i, other in enumerate(self.capture.views) if other.view_id == view.view_id)
+
+    def radiance(self, view: View, value: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of sensor values (n, 3) of pixels `index` (n,): radiance, and where it is a bound."""
+        number = self.number(view)
+        if self.gains.is_plain:
+            return self.sensor.radiance(value, float(self.gains.gain[number, 0]))
+        return self.sensor.radiance(value, pixel_gains(self.gains, number, view, index))
 
 
-def view_exposures(capture: CaptureReader, views: list[View], notes: list[str]) -> tuple[dict[int, float], plan.Decision]:
-    """Exposure per view id, and whether the source estimated it."""
-    exposures = {view.view_id: float(view.exposure) for view in capture.views}
+def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:
+    """Exposures of the views as the source knows them."""
+    exposures = capture.exposures()
     bad = [view.name for view in capture.views if not view.exposure > 1e-6]
     if bad:  # METHOD H31
         notes.append(f"exposure not positive, taken as 1: {', '.join(bad)}")
-        exposures.update({view.view_id: 1.0 for view in capture.views if view.name in bad})
+        exposures = np.where(exposures > 1e-6, exposures, 1.0)
+    return CameraGains.plain(exposures)
+
+
+def gain_plan(capture: CaptureReader, gains: CameraGains) -> list[plan.Decision]:
+    """What was found about exposure, white balance and vignetting."""
     if not capture.facts.get("exposure_estimated"):
-        return exposures, plan.exposure("given", np.zeros(0), 0)
-    logs = np.log([exposures[view.view_id] for view in views])
-    return exposures, plan.exposure("estimate", logs, len(views))
+        return [plan.exposure("given", np.zeros(0), 0)]
+    decisions = [plan.exposure("estimate", np.log(gains.exposure), int(gains.estimated.sum()))]
+    for term, evidence in gains.evidence.items():
+        decisions.append(plan.camera_term(term, evidence))
+    return decisions
 
 
 def calibrated(photos: Photographs) -> tuple[Photographs, CalibratedResponse]:
     """The photographs with their camera response (the measured curve, the family that is set, or the one that surface under
-    different exposures speaks for) and the exposures that go with it; and how it was found."""
+    different exposures speaks for) and the gains that go with it; and how it was found. Views kept for testing follow."""
     settings, facts = photos.job.settings, photos.capture.facts
-    setting = settings.affines.response
-    exposure = np.array([photos.exposures[view.view_id] for view in photos.views])
-    if not isinstance(setting, str) and not photos.capture.is_hdr:
+    setting, given = settings.affines.response, not photos.capture.facts.get("exposure_estimated", False)
+    number = np.array([photos.number(view) for view in photos.views])
+    exposure = photos.gains.exposure[number] if not given else photos.gains.gain[number, 0]
+    measured = not isinstance(setting, str) and not photos.capture.is_hdr
+    families = () if measured else candidates(setting, facts["dynamic_range"])
+    estimated = not given and not photos.capture.is_hdr
+    rows = _shared_surface(photos) if estimated or (families and needs_rows(families)) else no_rows()
+    if measured:
         found = given_response(read_response_file(Path(setting.file)), f"measured: {setting.file}", exposure)
     else:
-        families = candidates(setting, facts["dynamic_range"])
-        rows = _shared_surface(photos) if needs_rows(families) else no_rows()
-        given = not facts.get("exposure_estimated", False)
-        found = calibrate_response(rows, exposure, families, settings.emission.saturation, given=given)
+        moving = rows.take(np.isin(rows.view, number))
+        moving = replace(moving, view=np.searchsorted(number, moving.view).astype(np.int32))
+        found = calibrate_response(moving, exposure, families, settings.emission.saturation, given=given)
     photos.job.log.info("camera response: %s", found.reason)
-    known = photos.exposures | {view.view_id: float(e) for view, e in zip(photos.views, found.exposure, strict=True)}
-    return replace(photos, sensor=replace(photos.sensor, curve=found.response), exposures=known), found
+    gains = _all_gains(photos.gains, number, found, rows) if estimated else photos.gains
+    return replace(photos, sensor=replace(photos.sensor, curve=found.response), gains=gains), found
+
+
+def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse, rows: PatchRows) -> CameraGains:
+    """Gains of all views of the capture: of those `number` that were used, and of those that follow them."""
+    moving = np.isin(np.arange(len(start.gain)), number)
+    linear = gain_rows(rows, found.response)
+    if found.gains is None:  # the curve is given, the gains are not
+        own = choose_gains(linear.take(moving[linear.view]).thinned(), len(start.gain))
+        ahead = replace(own, gain=np.where(own.estimated[:, None], own.gain, start.gain))
+    else:
+        gain, seen = start.gain.copy(), np.zeros(len(moving), bool)
+        gain[number], seen[number] = found.gains.gain, found.gains.estimated
+        ahead = replace(found.gains, gain=gain, estimated=seen)
+    return follow(linear, ahead, moving)
 
 
 def _shared_surface(photos: Photographs) -> PatchRows:
     """Patches of interior surface as the views show them."""
-    capture, scene, views = photos.capture, photos.scene, photos.views
+    capture, scene, views = photos.capture, photos.scene, photos.capture.views
     footprints = [np.median(depth[depth > 0]) / view.fx for view in views if (depth := capture.gbuffer(view)[0]).any()]
     extent = float(np.ptp(scene.vertices, axis=0).max())
     edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
@@ -105,7 +139,9 @@ def _shared_surface(photos: Photographs) -> PatchRows:
         pixels = photos.pixels(view)
         pixels = pixels.take(np.flatnonzero(pixels.valid & pixels.interior))
         patch = patch_numbers(pixels.points, pixels.object_id, edge, origin)
-        parts.append(patch_rows(patch, pixels.normals, pixels.object_id, pixels.value, number, saturation, share=share))
+        radius2 = radius_squared(pixels.index, view.width, view.height)
+        rows = (patch, pixels.normals, pixels.object_id, pixels.value, number)
+        parts.append(patch_rows(*rows, saturation, share=share, radius2=radius2))
         photos.job.progress(number + 1, len(views), "views compared for the camera response")
     return join_rows(parts)
 
@@ -119,7 +155,7 @@ def statistics_of_faces(photos: Photographs) -> tuple[FaceStatistics, float]:
     for done, view in enumerate(views):
         pixels = photos.pixels(view)
         pixels = pixels.take(np.flatnonzero(pixels.valid)[::stride])
-        radiance, bound = photos.radiance(view, pixels.value)
+        radiance, bound = photos.radiance(view, pixels.value, pixels.index)
         parts.append((pixels.face, radiance.astype(np.float32), bound, pixels.from_front, pixels.interior))
         photos.job.progress(done + 1, len(views), "views searched for emitters")
     face, radiance, bound, front, inside = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -138,7 +174,7 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
     total, mean_hit, hits = 0, 0.0, 0
     for done, view in enumerate(photos.views):
         pixels = photos.pixels(view)
-        radiance, bound = photos.radiance(view, pixels.value)
+        radiance, bound = photos.radiance(view, pixels.value, pixels.index)
         use = pixels.valid & pixels.interior & (groups.of_face[pixels.face] < 0)
         sums.add(pixels.points[use], radiance[use], bound[use].any(1))
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
@@ -147,7 +183,7 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
         values = photo.reshape(-1, 3)
         out = valid.ravel() & np.isfinite(values).all(1)
         out[pixels.index] = False
-        sky.add(photos.capture.directions(view).reshape(-1, 3)[out], *photos.radiance(view, values[out]))
+        sky.add(photos.capture.directions(view).reshape(-1, 3)[out], *photos.radiance(view, values[out], np.flatnonzero(out)))
         total += int(valid.sum())
         photos.job.progress(done + 1, len(photos.views), "views cached")
     brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None
@@ -199,7 +235,7 @@ def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tu
         row, column = part.index // view.width, part.index % view.width
         tile = (row // TILE) * (-(-view.width // TILE)) + column // TILE
         number = np.full(len(choice), view.view_id)
-        rows = PixelRows(*photos.radiance(view, part.value), part.object_id, number, tile, group[choice])
+        rows = PixelRows(*photos.radiance(view, part.value, part.index), part.object_id, number, tile, group[choice])
         parts.append((part, base_maps(photos.job, view)[part.index], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
     joined, group = _joined(pixels), np.concatenate([part.group for part in rows])

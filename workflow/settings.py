@@ -57,6 +57,9 @@ class PhotographedSource(Section):
     disagreement."""
     alignment_tolerance: float = Field(0.05, gt=0)
     """Largest accepted median relative depth disagreement, where depth images or sparse points exist."""
+    registration: Literal["auto", "off"] = "auto"
+    """`auto`: poses, focal length and principal point corrected by what mesh and other photographs show, if held-out surface
+    agrees; blurred and badly posed photographs left out. `off`: as given."""
 
 
 class FolderSource(PhotographedSource):

@@ -17,9 +17,10 @@ from iif_core import native
 from iif_core.color import linear_from_srgb
 from iif_core.distortion import Pinhole, pinhole_inside, undistort_image
 from iif_core.errors import InputError
+from iif_core.registration import Photo
 from workflow.job import Job
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.folder_scene import alignment, colmap, exposure, images, mesh, transforms
+from workflow.sources.folder_scene import alignment, colmap, exposure, images, mesh, registration, transforms
 from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01
@@ -170,6 +171,7 @@ class _Capture:
         self._build()
         self.normals = self._face_normals()
         given = self._given_exposures()
+        frames, poses, found = self._registered(frames, poses, given)
         shared = exposure.SharedSurface(len(frames), self.encoded)
 
         views: list[View] = []
@@ -177,7 +179,9 @@ class _Capture:
         blind: list[tuple[Frame, View]] = []
         dropped: dict[str, float] = {}
         for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
-            view = self._view(frame, pose, len(views), given[i])
+            if frame.name in found.left_out:
+                continue
+            view = replace(self._view(frame, pose, len(views), given[i]), split=self._split(frame, i))
             depth, face = self._trace(view)
             share = float((face >= 0).mean())
             if share < MIN_COVERAGE:
@@ -208,6 +212,8 @@ class _Capture:
         facts = {
             "alignment": self.alignment.report(),
             "dropped_views": dropped,
+            "left_out_views": found.left_out,
+            "registration": found.facts,
             "exposure_estimated": self.settings.exposure == "estimate",
         }
         has_truth = bool(self.inputs.truth)
@@ -240,13 +246,43 @@ class _Capture:
         full = self._target(frame)
         size = images.fitted_size(full.width, full.height, self.settings.width, self.settings.height)
         camera = alignment.scaled(full, *size)
-        every = self.settings.test_every
-        if self.listed:
-            split = frame.split or "train"
-        else:
-            split = "test" if every and view_id % every == every - 1 else "train"
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0, split)
+        return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0)
+
+    def _split(self, frame: Frame, number: int) -> str:
+        """Lists of the data set come before every n-th photograph."""
+        if self.listed:
+            return frame.split or "train"
+        every = self.settings.test_every
+        return "test" if every and number % every == every - 1 else "train"
+
+    def _registered(
+        self, frames: tuple[Frame, ...], poses: list[np.ndarray], gains: list[float]
+    ) -> tuple[tuple[Frame, ...], list[np.ndarray], registration.Registered]:
+        """Frames and poses as the mesh and the other photographs speak for."""
+        if self.source.registration == "off":
+            return frames, poses, registration.Registered(list(frames), poses, {}, {}, [])
+        counts, notes, photos = dict(self.counts), list(self.notes), []
+        for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+            full = self._target(frame)
+            width, height = min(registration.WIDTH, self.settings.width), min(registration.WIDTH, self.settings.height)
+            camera = alignment.scaled(full, *images.fitted_size(full.width, full.height, width, height))
+            size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+            view = View(i, frame.name, *size, pose)
+            depth, face = self._trace(view)
+            photos.append(None)
+            if (face >= 0).mean() < MIN_COVERAGE:
+                continue
+            photo, valid = self._photo(frame, view, gains[i])
+            normal = np.where(face[..., None] >= 0, self.normals[face], 0)
+            held = self._split(frame, i) == "test"
+            photos[-1] = Photo(photo, valid, depth, normal, (view.fx, view.fy), (view.cx, view.cy), pose, held)
+            self.job.progress(i + 1, len(frames), "photographs registered")
+        self.counts, self.notes = counts, notes
+        found = registration.registered(frames, poses, photos, self.source.axes, self.metres)
+        self.notes += found.notes
+        self.notes += [f"view {name} left out: {reason}" for name, reason in found.left_out.items()]
+        return tuple(found.frames), found.poses, found
 
     def _trace(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """z-depth (0 = miss) and face ids of a view."""

@@ -23,6 +23,7 @@ from iif_core.affines import (
     pin,
     reference_loss,
 )
+from iif_core.camera_gains import CameraGains
 from iif_core.errors import InputError
 from iif_core.response import Response, response_facts, response_from_facts
 from workflow import baselines
@@ -31,8 +32,9 @@ from workflow.base_scene import (
     MATERIAL,
     BaseScene,
     base_maps,
+    pixel_gains,
     read_base_scene,
-    read_exposures,
+    read_gains,
     read_light,
     view_pixels,
 )
@@ -54,8 +56,7 @@ def run(job: Job) -> None:
     names = _names(job, scene.n_objects)
     find_gauge = _gauge(job, capture, names)  # bad settings stop here, before any work
     emits = read_light(job, len(scene.faces)).emits
-    exposures = dict(zip((v.view_id for v in capture.views), read_exposures(job), strict=True))
-    problem, places = _problem(job, capture, scene, emits, exposures)
+    problem, places = _problem(job, capture, scene, emits, read_gains(job))
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     solve = _solver(job, prior)
@@ -226,7 +227,7 @@ def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
 
 
 def _problem(
-    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, exposures: dict[int, float]
+    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
     """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
@@ -246,14 +247,17 @@ def _problem(
         rows["object"].append(chosen.object_id[keep])
         rows["base"].append(base_maps(job, view)[index])
         rows["value"].append(chosen.value[keep])
-        rows["exposure"].append(np.full(len(index), exposures[view.view_id] if not capture.is_hdr else 1.0))
+        number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
+        factor = pixel_gains(gains, number, view, index) if not capture.is_hdr else np.ones((len(index), 3))
+        exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
+        rows["exposure"].append(exposure)
         rows["view"].append(np.full(len(index), view.view_id, np.int32))
         rows["index"].append(index.astype(np.int32))
         rows["cell"].append(ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[index])
         channels = shading.exr(f"maps/{view.name}.exr")
         for half in range(2):
-            for number, part in enumerate(_cached(channels, half, len(levels), index)):
-                cached[half][number].append(part)
+            for layer, part in enumerate(_cached(channels, half, len(levels), index)):
+                cached[half][layer].append(part if gains.is_plain else _balanced(part, factor / exposure[:, None]))
         job.progress(done + 1, len(views), "views read")
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
     value = np.asarray(joined["value"], np.float32)
@@ -295,6 +299,11 @@ def _cached(
 
     lobes = [np.stack([read(f"{name}.{j:02d}") for j in range(levels)], 1) for name in ("s0", "s1")]
     return read("diffuse"), lobes[0], lobes[1]
+
+
+def _balanced(light: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Light (n, ..., 3) as the view's white balance shows it; ratio (n, 3) of the channels' gains to their mean."""
+    return light * ratio.reshape(len(ratio), *[1] * (light.ndim - 2), 3).astype(light.dtype)
 
 
 def _names(job: Job, n_objects: int) -> list[str]:

@@ -30,6 +30,7 @@ from workflow.photographs import (
     calibrated,
     choose_rows,
     escaping_share,
+    gain_plan,
     radiance_cache,
     statistics_of_faces,
     view_exposures,
@@ -46,10 +47,9 @@ def run(job: Job) -> None:
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     views = [view for view in capture.views if view.split != "test"] or list(capture.views)
     notes: list[str] = []
-    exposures, exposure_plan = view_exposures(capture, views, notes)
+    known = view_exposures(capture, notes)
     unknown = Sensor(response("identity"), capture.is_hdr, job.settings.emission.saturation)
-    photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, exposures))
-    exposures = photos.exposures
+    photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, known))
     notes.extend([camera.gauge] if camera.gauge else [])
     statistics, threshold = statistics_of_faces(photos)
     adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
@@ -80,7 +80,7 @@ def run(job: Job) -> None:
         notes.append(f"{len(areas)} candidates (the largest {max(areas):.2g} m^2) left out before the solve: {why}")
     if not kept and not environment["included"]:
         notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
-    decisions = [environment, exposure_plan, plan.emitters(kept, candidates - kept, candidates)]
+    decisions = [environment, *gain_plan(capture, photos.gains), plan.emitters(kept, candidates - kept, candidates)]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",
@@ -95,7 +95,9 @@ def run(job: Job) -> None:
             "active_set": active_set,
             "escape_share": {"primary": escape, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
-            "exposure": [exposures[view.view_id] for view in capture.views],
+            "exposure": photos.gains.exposure.tolist(),
+            "gain": photos.gains.gain.tolist(),
+            "vignetting": photos.gains.vignetting.tolist(),
             "response": {**response_facts(camera.response), "calibration": calibration_facts(camera)},
             "plan": decisions,
             "notes": notes,

@@ -7,7 +7,7 @@ import numpy as np
 from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.base_scene import BLACK, read_exposures
+from workflow.base_scene import BLACK, pixel_gains, read_gains
 from workflow.denoise import denoise, require_denoiser
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
@@ -19,10 +19,10 @@ _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of 
 def run(job: Job) -> None:
     """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps.
 
-    Sensor value: the re-rendering through the view's exposure and the fitted response, clipped to [0, 1].
+    Sensor value: the re-rendering through the gains of the view and the fitted response, clipped to [0, 1].
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
-    curve, exposures = read_response(job.read("affines")), read_exposures(job)
+    curve, gains = read_response(job.read("affines")), read_gains(job)
     geometry, material = scene.surface.traceable(scene.light.emits)
     from iif_core.transport import render
 
@@ -31,7 +31,7 @@ def run(job: Job) -> None:
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
-    for done, (view, exposure) in enumerate(zip(capture.views, exposures, strict=True)):
+    for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")
         eye = view.world_from_camera[:3, 3]
         radiance = render(
@@ -51,7 +51,8 @@ def run(job: Job) -> None:
         fitted = _fitted(job, view)
         if job.settings.render.denoise:
             radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
-        sensor = curve(np.clip(exposure * radiance, 0, 1))
+        factor = pixel_gains(gains, done, view, np.arange(view.height * view.width)).reshape(radiance.shape)
+        sensor = curve(np.clip(factor * radiance, 0, 1))
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))

@@ -1,0 +1,75 @@
+"""What `source.registration` does with what registration found: cameras, names, words."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter
+
+from iif_core.distortion import Distortion, Pinhole
+from tests.unit.painted_room import FOCAL, HEIGHT, WIDTH, look, posed, room, twisted
+from workflow.sources.folder_scene.registration import registered
+from workflow.sources.folder_scene.transforms import Frame, opencv_pose
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _frames(poses, metres):
+    camera = Pinhole(4 * FOCAL, 4 * FOCAL, 2.0 * WIDTH, 2.0 * HEIGHT, 4 * WIDTH, 4 * HEIGHT)
+    out = []
+    for i, pose in enumerate(poses):
+        matrix = pose.copy()
+        matrix[:3, 3] /= metres
+        name = f"{i:03d}"
+        out.append(Frame(name, f"images/{name}.jpg", Path(name), 0, camera, Distortion("radial_tangential"), matrix @ OPENGL))
+    return out
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The principal point is 2 pixels off in every photograph; view 2 is blurred, view 6 badly posed."""
+    photos = room(12)
+    photos = [replace(p, image=np.repeat(look(p.pose, (WIDTH / 2 + 2, HEIGHT / 2))[0][..., None], 3, -1)) for p in photos]
+    photos[2] = replace(photos[2], image=uniform_filter(photos[2].image, (9, 11, 1)))
+    bad = twisted(photos[6].pose, np.array([0.25, 0.3, 0.1]), np.array([0.3, 0.2, 0.1]))
+    photos = posed(photos, [bad if k == 6 else p.pose for k, p in enumerate(photos)])
+    frames, poses = _frames([p.pose for p in photos], 0.001), [p.pose for p in photos]
+    return frames, poses, registered(frames, poses, [*photos[:-1], None], "opengl", 0.001)
+
+
+def test_blurred_and_badly_posed_views_are_named(found):
+    _, _, out = found
+    assert set(out.left_out) == {"002", "006"}
+    assert out.left_out["002"].startswith("blurred") and out.left_out["006"].startswith("badly posed")
+
+
+def test_cameras_are_corrected_and_read_back(found):
+    frames, poses, out = found
+    assert out.facts["accepted"] and "moved by" in out.notes[0]
+    json.dumps(out.facts, allow_nan=False)
+    for frame, pose in zip(out.frames[:-1], out.poses[:-1], strict=True):
+        np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 0.001), pose, atol=1e-9)
+    # Rotation, translation and principal point share the shift; a point in front of the camera shows what they make of it.
+    columns = []
+    for k in (k for k in range(11) if k not in (2, 6)):
+        camera, point = out.frames[k].camera, poses[k] @ [0.0, 0.0, 1.6, 1.0]
+        x, _, z, _ = np.linalg.inv(out.poses[k]) @ point
+        columns.append((camera.cx + camera.fx * x / z) / 4)
+    # With a wrong pose among few photographs only about half of the 2 pixels is found (alone: test_registration, within 0.3).
+    assert 0.7 < np.median(columns) - WIDTH / 2 < 2.5
+
+
+def test_a_view_that_sees_nothing_stays_as_it_is(found):
+    frames, poses, out = found
+    assert out.frames[-1] is frames[-1] and out.poses[-1] is poses[-1] and "011" not in out.facts["views"]
+
+
+def test_one_photograph_has_nothing_to_be_registered_with():
+    photo = room(1)
+    frames = _frames([photo[0].pose], 1.0)
+    out = registered(frames, [photo[0].pose], photo, "opengl", 1.0)
+    assert out.frames == frames and not out.left_out and not out.notes

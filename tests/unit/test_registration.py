@@ -1,0 +1,75 @@
+"""Registration on the painted room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import uniform_filter1d
+
+from iif_core.errors import InputError
+from iif_core.registration import Photo, register
+from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
+
+
+@pytest.fixture(scope="module")
+def photos() -> list[Photo]:
+    return room()
+
+
+def test_poses_are_found_again(photos: list[Photo]) -> None:
+    rng = np.random.default_rng(0)
+    wrong = [twisted(p.pose, rng.normal(0, 0.012, 3), rng.normal(0, 0.01, 3)) for p in photos]
+    found = register(posed(photos, wrong), points=4000, intrinsics=False)
+    assert found.accepted
+    before, after = off(np.array(wrong), photos), off(found.pose, photos)
+    assert np.median(before) > 1.0
+    # Half a pixel of drift of all together remains: texture slides along the surface, edges alone forbid it.
+    assert np.median(after) < 0.6
+    assert found.held_out[1] < 0.5 * found.held_out[0]
+
+
+def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> None:
+    """Photographs whose true principal point lies (2, -1.5) pixels from the believed one."""
+    taken = [replace(p, image=np.repeat(look(p.pose, (66.0, 46.5))[0][..., None], 3, -1)) for p in photos]
+    found = register(taken, points=4000, own=False)
+    assert found.accepted
+    np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
+    assert abs(found.focal - 1) < 0.01
+
+
+def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:
+    found = register(photos, points=4000)
+    assert not found.accepted
+    assert found.shift.max() < 0.3
+    assert found.agreement.min() > 0.9
+
+
+def test_a_view_that_is_kept_for_testing_moves_nobody(photos: list[Photo]) -> None:
+    """The texture it is laid on is the others': changing its picture changes nothing but its own pose."""
+    wrong = posed(
+        photos, [twisted(p.pose, np.array([0.0, 0.02, 0.0]), np.zeros(3)) if k == 3 else p.pose for k, p in enumerate(photos)]
+    )
+    kept = [replace(p, held=k == 3) for k, p in enumerate(wrong)]
+    black = [replace(p, image=np.full_like(p.image, 0.2)) if k == 3 else p for k, p in enumerate(kept)]
+    a, b = (register(x, points=5000, intrinsics=False) for x in (kept, black))
+    rest = [k for k in range(len(photos)) if k != 3]
+    np.testing.assert_allclose(a.pose[rest], b.pose[rest], atol=1e-3)
+    assert off(a.pose, photos)[3] < 0.6 * off(np.array([p.pose for p in wrong]), photos)[3]
+
+
+def test_a_blurred_view_and_a_badly_posed_one_stand_out(photos: list[Photo]) -> None:
+    blurred = uniform_filter1d(uniform_filter1d(photos[2].image, 11, axis=1), 9, axis=0)
+    bad = twisted(photos[6].pose, np.array([0.25, 0.3, 0.1]), np.array([0.3, 0.2, 0.1]))
+    views = [replace(p, image=blurred) if k == 2 else p for k, p in enumerate(photos)]
+    views = posed(views, [bad if k == 6 else p.pose for k, p in enumerate(photos)])
+    found = register(views, points=4000)
+    others = [k for k in range(len(photos)) if k not in (2, 6)]
+    assert found.sharpness[2] < 0.5 < 0.7 < found.sharpness[others].min()
+    assert found.agreement[6] < 0.4 < 0.6 < found.agreement[others].min()
+
+
+def test_no_photograph_is_refused() -> None:
+    with pytest.raises(InputError, match="no photograph"):
+        register([])
