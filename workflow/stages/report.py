@@ -190,7 +190,7 @@ def _emission_exposure(recovered: Recovered) -> float:
 
 def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emission_exposure: float) -> ViewRows:
     file = f"maps/{view.name}.exr"
-    photo, valid = capture.photo(view)
+    photo, valid = capture.photo(view, held_out=True)
     depth, face_id = capture.gbuffer(view)
     hit = face_id >= 0
     rendered = job.read("render").exr(file)

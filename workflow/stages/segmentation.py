@@ -107,7 +107,7 @@ def given_objects(capture: CaptureReader, vertices: np.ndarray, faces: np.ndarra
         texts = [str(names.get(i, f"instance {i}")) for i in ids[unlabelled:].tolist()] + ["unlabelled"] * unlabelled
         return Objects(labels.astype(np.int32), texts, np.ones(len(ids)))
     face_ids, instance_ids = [], []
-    for view in capture:
+    for view in capture.used:
         given = capture.given_instances(view)
         if given is not None:
             face_ids.append(capture.gbuffer(view)[1].ravel())
@@ -149,7 +149,7 @@ def mean_face_colour(capture: CaptureReader, count: int) -> tuple[np.ndarray, np
     L / (L + mean of its view): a weak hint is all that is asked of colour.
     """
     total, pixels = np.zeros((count, 3)), np.zeros(count)
-    for view in capture:
+    for view in capture.used:
         photo, valid = capture.photo(view)
         face = capture.gbuffer(view)[1]
         used = valid & (face >= 0)
