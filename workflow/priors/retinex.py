@@ -1,4 +1,7 @@
-"""Prior `retinex`: photograph / gathered light, then colour retinex, without learned weights (docs/real-scenes.md). A baseline."""
+"""Prior `retinex`: photograph / gathered light, then colour retinex, without learned weights (docs/real-scenes.md).
+
+A baseline, and called one.
+"""
 
 from __future__ import annotations
 
