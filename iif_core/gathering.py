@@ -362,7 +362,10 @@ def _tangents(n: NDArray) -> tuple[NDArray, NDArray]:
 
 def _sums(row: NDArray, count: int, values: NDArray) -> NDArray:
     """(count, c) sums of the rows (n, c) by their number, in the order of the rows."""
-    return np.stack([np.bincount(row, values[:, c], count) for c in range(values.shape[1])], 1) if count else values[:0]
+    out = np.zeros((count, values.shape[1]))
+    for c in range(values.shape[1]):
+        out[:, c] = np.bincount(row, values[:, c], count)
+    return out
 
 
 def with_light(cells: SurfaceCells, trace: Trace, mean_albedo: float, reaches: tuple[float, ...], seed: int = 0) -> NDArray:

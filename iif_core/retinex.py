@@ -36,6 +36,8 @@ HOLD = 0.005
 """Weight of the image beside its gradient: slow changes over more than some 1 / sqrt(HOLD) = 14 pixels are kept."""
 ALBEDO = (0.01, 1.0)
 """Range of albedo in rooms; what lies outside is gloss, noise or an emitter."""
+BRIGHT, BRIGHT_SHARE = 0.9, 0.03
+"""Few things in rooms are whiter than snow: albedo is scaled down until no more than this share of pixels is above."""
 ROUGHNESS, METALLIC = (0.65, 0.15), (0.0, 0.1)
 """Mean and standard deviation of the draws of roughness, cut at [0.2, 1]; range of those of metallic."""
 
@@ -80,6 +82,7 @@ def retinex_predictions(
     log = np.log(np.maximum(np.where(known[..., None], linear, DARKEST), DARKEST))
     spread = np.linspace(0, 1, samples) if samples > 1 else np.array([0.5])
     out = np.empty((samples, *shape, 5), np.float32)
+    hold = 0.0 if light is None else HOLD  # of a photograph with its light in it, slow changes are to go
     lights = np.zeros((1, *linear.shape)) if light is None else np.asarray(light, np.float64)
     for number, own in enumerate(lights[:samples]):
         image = log - own
@@ -88,10 +91,24 @@ def retinex_predictions(
         steps = [_Steps(image, axis, known, object_id, normals) for axis in (0, 1)]
         for k in range(number, samples, len(lights)):
             threshold = THRESHOLDS[0] * (THRESHOLDS[1] / THRESHOLDS[0]) ** spread[k]
-            albedo = np.exp(_integrated([step.material(threshold) for step in steps], image, HOLD))
+            albedo = np.exp(_integrated([step.material(threshold) for step in steps], image, hold))
             out[k, ..., :3] = _scaled(albedo, known, mean_albedo) if light is None else np.clip(albedo, *ALBEDO)
     out[..., 3:] = _draws(shape, samples, object_id, seed)
     return out
+
+
+def albedo_level(albedo: NDArray, weight: NDArray, mean_albedo: float) -> float:
+    """Gain that gives albedos (n, 3) of weight (n,) the wanted mean, less where more than BRIGHT_SHARE would be above BRIGHT.
+
+    White paper must not clip because the rest of a room is dark: what is cut at 1 has lost its texture for good.
+    """
+    total = float(np.sum(weight))
+    if not total > 0:
+        return 1.0
+    mean = float(albedo.mean(-1) @ weight) / total
+    order = np.argsort(albedo.max(-1), kind="stable")
+    place = min(int(np.searchsorted(np.cumsum(weight[order]), (1 - BRIGHT_SHARE) * total)), len(order) - 1)
+    return min(mean_albedo / max(mean, 1e-9), BRIGHT / max(float(albedo.max(-1)[order[place]]), 1e-9))
 
 
 def _draws(shape: tuple[int, int], samples: int, object_id: NDArray | None, seed: int) -> NDArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from iif_core.gathering import LightField, SurfaceCellsBuilder, Trace, with_light
 from iif_core.mesh import face_geometry
-from iif_core.retinex import retinex_predictions
+from iif_core.retinex import albedo_level, retinex_predictions
 from workflow.normal_form import CaptureReader, View
 
 GAMMA = 2.2
@@ -121,8 +121,8 @@ def _scene(capture: CaptureReader, mean_albedo: float, seed: int) -> _Scene:
     if not len(cells):
         return _Scene(normals, group, None, np.zeros((len(REACHES), 0, 3)))
     light = with_light(cells, _tracer(vertices, faces), mean_albedo, REACHES, seed)
-    level = np.minimum(np.exp(cells.log_radiance - light), 1).mean(-1) @ cells.pixels / max(cells.pixels.sum(), 1)
-    return _Scene(normals, group, LightField(cells), light + np.log(np.maximum(level, 1e-6) / mean_albedo)[:, None, None])
+    levels = [albedo_level(np.exp(cells.log_radiance - own), cells.pixels, mean_albedo) for own in light]
+    return _Scene(normals, group, LightField(cells), light - np.log(levels)[:, None, None])
 
 
 def _groups(capture: CaptureReader, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
