@@ -40,6 +40,8 @@ WIDTH = 0.25
 SWEEPS = 15
 SPREAD = {"lamp": 1.5, "sky": 1.0, "unseen": 0.3, "albedo": 0.9}
 """Standard deviation, in log, of the weak priors; a lamp that is not saturated is known to 0.2."""
+BRIGHT_TIMES = 10.0
+"""Surface so many times brighter than the mean is a lamp, saturated or not: too small for rays that go everywhere."""
 LAMP_ABOVE = 2.0
 """A saturated lamp is taken to be this many times brighter than what its saturated photographs show, to begin with."""
 CHROMA_SHARE = 0.5
@@ -187,13 +189,13 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
 def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
     """(n,) lamp of each cell or -1; first guess of log radiance (lamps, 3); its spread (lamps,).
 
-    Lamps are cells mostly saturated, or 10 times brighter than the mean, joined where they are within two edges."""
+    Lamps are cells mostly saturated, or BRIGHT_TIMES brighter than the mean, joined where they are within two edges."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     bright = cells.voxel_radiance.max(1)
-    shines = (cells.saturated > 0.5) | (bright > 10 * max(float(bright.mean()), 1e-9))[cells.voxel]
+    shines = (cells.saturated > 0.5) | (bright > BRIGHT_TIMES * max(float(bright.mean()), 1e-9))[cells.voxel]
     own = np.flatnonzero(shines)
     lamp = np.full(len(cells), -1)
     if not len(own):

@@ -60,7 +60,7 @@ def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, s
 def _scores(left: ShadingLeft, spread: ViewSpread) -> list[Score]:
     shading, apart = left.finish(), spread.finish()
     return [
-        Score("shading_left", "raw", shading.correlation),
+        Score("shading_left", "raw", abs(shading.correlation)),
         Score("shading_slope", "raw", shading.slope),
         Score("view_spread", "raw", apart, "" if apart is not None else "no surface is seen in two views"),
     ]
