@@ -212,7 +212,7 @@ def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
 
     def gain(quantity: str, protocol: str) -> dict[str, float] | None:
         pair = [means.get(v, {}).get(quantity, {}).get(protocol) for v in ("prior_mean_k", "result")]
-        if None in pair:
+        if any(scores is None or "psnr" not in scores for scores in pair):  # without truth there is no distance to it
             return None
         prior, result = pair
         out = {"psnr_db": round(result["psnr"]["mean"] - prior["psnr"]["mean"], 4)}
