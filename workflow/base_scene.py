@@ -133,8 +133,11 @@ class ViewPixels:
 
 
 def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:
-    """Photograph, G-buffer and segmentation of a view as one row a pixel that hits the mesh."""
-    photo, valid = capture.photo(view)
+    """Photograph, G-buffer and segmentation of a view, a row a pixel that hits the mesh; no pixel of a held-out view is valid."""
+    if view.split == "test":  # geometry alone: no stage that finds anything sees what it shows
+        photo, valid = np.zeros((view.height, view.width, 3), np.float32), np.zeros((view.height, view.width), bool)
+    else:
+        photo, valid = capture.photo(view)
     depth, face = capture.gbuffer(view)
     maps = job.read("segmentation").exr(f"maps/{view.name}.exr")
     hit = np.flatnonzero((face.ravel() >= 0) & (depth.ravel() > 0))

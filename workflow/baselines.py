@@ -1,7 +1,8 @@
 """What stage affines does for `affines.model` other than `objects`: earlier methods, over the same light and shading.
 
 All read the emission and the cached shading that ours reads, and leave what ours leaves, so that rendering, scores, export
-and page need not know. `base`: the fused base as it is. `object_mean`: the mean of all predictions of an object. `fipt`,
+and page need not know. `base`: the fused base as it is. `object_mean`: the mean of all predictions of an object.
+`texture_average`: the photographs' mean colour in every surface cell, taken as albedo, with no prior at all. `fipt`,
 `iris`: a free BRDF in every surface cell (METHOD 6.2, 6.3).
 
 Where the originals would do worse for reasons that have nothing to do with their idea, they get our treatment: the light of
@@ -52,6 +53,7 @@ _SEEDS = 0x626C6E  # keeps the random numbers of this module apart from those of
 WORDS = {
     "base": "identity",
     "object_mean": "mean of the predictions",
+    "texture_average": "mean of the photographs",
     "fipt": "free cells (FIPT)",
     "iris": "free cells (IRIS)",
 }
@@ -73,7 +75,9 @@ def run(job: Job) -> None:
     """Write what stage affines writes, for the model that the settings name."""
     model = job.settings.affines.model
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    if model in ("fipt", "iris"):
+    if model == "texture_average":
+        result = _texture_average(job, capture, scene)
+    elif model in ("fipt", "iris"):
         result = _free_cells(job, capture, scene, model)
     else:
         result = _given(job, capture, scene, model)
@@ -119,6 +123,44 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
                 sums[:, i] += np.bincount(object_id[seen], value, scene.n_objects)
             sums[:, 5] += np.bincount(object_id[seen], minlength=scene.n_objects)
     return np.where(sums[:, 5:] > 0, sums[:, :5] / np.maximum(sums[:, 5:], 1), scene.object_values)
+
+
+def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Result:
+    """Mean radiance that the used photographs show of every cell (of the object, where none does), as albedo: matte, no metal.
+
+    One gain for all: that with which albedo x the diffuse light of stage shading is nearest to the radiance (least squares). The
+    response is that of stage emission, saturated values count as they are.
+    """
+    curve, gains = _start(job), read_gains(job)
+    cells, objects = np.zeros((len(scene.cell_object), 4)), np.zeros((scene.n_objects, 4))
+    emits = read_light(job, len(scene.faces)).emits
+    lit: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for number, view in enumerate(capture.views):
+        if view.split == "test":
+            continue
+        pixels = view_pixels(job, capture, scene, view)
+        cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+        use = pixels.valid & (cell >= 0) & ~emits[pixels.face]
+        pixels, cell = pixels.take(use), cell[use]
+        radiance = np.asarray(pixels.value, np.float64)
+        if not capture.is_hdr:
+            radiance = curve.inverse(np.clip(radiance, 0, 1)) / pixel_gains(gains, number, view, pixels.index)
+        for sums, row in ((cells, cell), (objects, scene.cell_object[cell])):
+            for c in range(3):
+                sums[:, c] += np.bincount(row, radiance[:, c], len(sums))
+            sums[:, 3] += np.bincount(row, minlength=len(sums))
+        lit.append((cell, _mean_of_halves(job.read("shading").exr(f"maps/{view.name}.exr"), "diffuse", pixels.index), radiance))
+    of_object = objects[:, :3] / np.maximum(objects[:, 3:], 1)
+    of_cell = np.where(cells[:, 3:] > 0, cells[:, :3] / np.maximum(cells[:, 3:], 1), of_object[scene.cell_object])
+    across = sum(float((of_cell[cell] * light * radiance).sum()) for cell, light, radiance in lit)
+    square = sum(float(((of_cell[cell] * light) ** 2).sum()) for cell, light, _ in lit)
+    gain = across / square if square > 0 else 1.0
+
+    def material(albedo: np.ndarray) -> np.ndarray:
+        rest = np.tile(np.float64(UNKNOWN_MATERIAL[3:]), (len(albedo), 1))
+        return np.concatenate([np.clip(gain * albedo, 0, 1), rest], 1)
+
+    return _Result(material(of_cell), material(of_object), np.zeros(len(of_cell)), curve, objects[:, 3], {"gain": gain})
 
 
 # --------------------------------------------------------------------------------------------------------- free cells
@@ -210,7 +252,7 @@ class _Pixels:
     def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
         """With the diffuse light of blocks; without: that of the pixels, and no lobes."""
         job, capture, gains = self.job, self.capture, read_gains(self.job)
-        views = [view for view in capture.views if view.split != "test"] or capture.views
+        views = capture.used
         for done, view in enumerate(views):
             pixels = view_pixels(job, capture, self.scene, view)
             cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]

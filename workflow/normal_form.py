@@ -176,8 +176,18 @@ class CaptureReader:
         f = self.faces()
         return np.stack([f[f"emission_{c}"] for c in "rgb"], 1) if "emission_r" in f else None
 
-    def photo(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 3) float32 sensor values or radiance, and (H, W) bool: which pixels count."""
+    @property
+    def used(self) -> list[View]:
+        """The views that may be read to find anything: all but those held out."""
+        return [view for view in self.views if view.split != "test"]
+
+    def photo(self, view: View, held_out: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """(H, W, 3) float32 sensor values or radiance, and (H, W) bool: which pixels count.
+
+        A held-out photograph is refused unless `held_out` says that it is read to score or to show, never to fit.
+        """
+        if view.split == "test" and not held_out:
+            raise AssertionError(f"view {view.name} is held out: its photograph is for scores alone")
         channels = self.reader.exr(f"photos/{view.name}.exr")
         return rgb(channels), channels["valid"] > 0.5
 

@@ -54,7 +54,10 @@ STAGES: dict[str, Stage] = {
             on_demand=True,
         ),
         Stage(
-            "metrics", ("capture", "prior", "segmentation", "base", "emission", "affines", "render"), ("metrics",), reads_raw=True
+            "metrics",
+            ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render"),
+            ("metrics",),
+            reads_raw=True,
         ),
         Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(

@@ -140,7 +140,7 @@ class Capture(Section):
     denoise: bool = False
     """Denoise rendered photographs: fewer samples do, at the price of a bias of a few per cent."""
     test_every: int = Field(0, ge=0)
-    """Every n-th view is kept for testing and never used (0 = none)."""
+    """Every n-th view is held out: no stage before `render` and `metrics` reads its photograph (0 = none)."""
 
     @field_validator("test_every")
     @classmethod
@@ -181,7 +181,8 @@ class FilesPrior(PriorBase):
 
 
 class RetinexPrior(PriorBase):
-    """No weights: photograph / smooth shading with varied smoothness. A baseline, not a learned prior."""
+    """No weights: photograph / light gathered from all photographs, then colour retinex (docs/real-scenes.md). A baseline, not
+    a learned prior."""
 
     kind: Literal["retinex"]
     mean_albedo: float = Field(0.4, gt=0, lt=1)
@@ -473,9 +474,10 @@ class KnownScale(Section):
 class Affines(Section):
     """One affine per object and the camera response."""
 
-    model: Literal["objects", "base", "object_mean", "fipt", "iris"] = "objects"
+    model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
     """`objects`: one affine an object; the others are baselines over the same light: `base` fits nothing, `object_mean`: the
-    predictions' mean of each object, `fipt`, `iris`: a free BRDF in every surface cell (docs/studies.md)."""
+    predictions' mean of each object, `texture_average`: the photographs' mean colour of each surface cell taken as albedo,
+    `fipt`, `iris`: a free BRDF in every surface cell (docs/studies.md)."""
     solver: Literal["direct", "sgd", "adam"] = "direct"
     """`objects`: `direct` Gauss-Newton; `sgd`: the paper's optimiser on the paper's loss; `adam`: the same with its safe variant.
     `fipt`, `iris`: `direct` exact per cell; `adam` as published."""

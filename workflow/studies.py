@@ -29,7 +29,8 @@ _DERIVED = re.compile(
 )
 
 METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg", "coverage_50", "coverage_80", "coverage_95", "log_l2", "iou")
-QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb")
+METRICS += ("shading_left", "shading_slope", "view_spread")
+QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb", "rgb_held_out")
 Protocol = Literal["raw", "scaled", "oracle_affine"]
 
 

@@ -34,8 +34,13 @@ NAMES = {
     "log_l2": "L2 of log(1 + E)",
     "iou": "IoU",
 }
-HIGHER_IS_BETTER["psnr_3d"] = True
+HIGHER_IS_BETTER |= {"psnr_3d": True, "view_spread": False}
 NAMES["psnr_3d"] = "PSNR over cells, one affine an object"
+NAMES |= {
+    "shading_left": "shading left (correlation with light inside objects)",
+    "shading_slope": "shading left (slope over light inside objects)",
+    "view_spread": "spread of log albedo over views",
+}
 NAMES |= {f"coverage_{n}": f"share within the claimed {n} % interval" for n in (50, 80, 95)}
 PROTOCOLS = {"raw": "raw", "scaled": "scaled", "oracle_affine": "oracle"}
 EXPLAINED = {

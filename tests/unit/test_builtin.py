@@ -417,7 +417,7 @@ def test_photographs_are_what_the_camera_made_of_the_radiance(captured):
     assert len({view.exposure for view in captured}) > 1
     assert [view.split for view in captured] == ["train", "train", "test", "train"]
     for view in captured:
-        photo, valid = captured.photo(view)
+        photo, valid = captured.photo(view, held_out=True)
         assert photo.shape == (40, 48, 3) and valid.all()
         np.testing.assert_array_equal(photo, expose(captured.truth(view).radiance, view.exposure, curve))
         truth = captured.truth(view)
@@ -466,7 +466,7 @@ def test_hdr_photographs_are_radiance(llvm, tmp_path, monkeypatch):
     assert capture.is_hdr and "response_truth" not in capture.facts
     for view in capture:
         assert view.exposure == 1.0
-        np.testing.assert_array_equal(capture.photo(view)[0], capture.truth(view).radiance)
+        np.testing.assert_array_equal(capture.photo(view, held_out=True)[0], capture.truth(view).radiance)
 
 
 def test_unknown_room_is_refused():

@@ -315,7 +315,7 @@ def test_capture_matches_the_known_room(scene):
     for view, (pose, picture, _, _) in zip(capture, shots, strict=True):
         assert (view.width, view.height, view.fx, view.cx, view.cy) == (32, 24, 30.0, 16.5, 11.5)
         np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-9)
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         assert valid.all()
         np.testing.assert_allclose(photo, picture.reshape(24, 2, 32, 2, 3).mean((1, 3)), atol=0.003)
         _, z, face = own.shoot(own.geometry(), pose, small)
@@ -357,7 +357,7 @@ def test_distortion_is_removed(tmp_path, lens):
     assert len(capture.views) == len(shots)
     for view in capture:
         assert (view.width, view.height, view.fx) == (target.width, target.height, target.fx)
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         depth, _ = capture.gbuffer(view)
         error = np.abs(own.pattern(capture.points(view, depth)) - photo)[valid]
         assert valid.mean() > 0.98
@@ -387,7 +387,7 @@ def test_hdr_exposure_nan_instances_and_truth(tmp_path):
     capture = own.run(tmp_path, "capture", "segmentation")
     assert capture.has_truth and capture.is_hdr
     for i, view in enumerate(capture):
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         assert view.exposure == 1.0
         np.testing.assert_allclose(photo[valid], own.pattern(capture.points(view, capture.gbuffer(view)[0]))[valid], atol=2e-5)
         truth = capture.truth(view)

@@ -136,6 +136,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     for view, _, objects, _ in seen:
         segment = (3 * view.view_id + objects).reshape(HEIGHT, WIDTH)
         channels = {"object.id": ids_to_disk(objects.reshape(HEIGHT, WIDTH)), "segment.id": ids_to_disk(segment)}
+        channels["interior"] = np.ones((HEIGHT, WIDTH), np.float32)
         job.writer.exr(f"maps/{view.name}.exr", channels)
     job.writer.finish()
 
@@ -189,6 +190,10 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.finish()
 
     job = FakeJob("shading", root)
+    for view, p, _, _ in seen:
+        light = np.repeat(1 + 0.3 * p[:, :1], 3, 1).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
+        job.writer.exr(f"maps/{view.name}.exr", split_rgb(light, "half0.diffuse") | split_rgb(light, "half1.diffuse"))
+    job.writer.json("shading.json", {"diffuse": {"cell_edge_m": 0.1}, "plan": []})
     job.writer.finish()
 
     job = FakeJob("affines", root)
@@ -478,7 +483,10 @@ def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
     make_scene(tmp_path, truth=False, dynamic_range=dynamic_range)
     finish(tmp_path)
     table = read_parquet(tmp_path / "scenes/toy/metrics.parquet")
-    assert set(table["quantity"]) == {"rgb"} and set(table["view"]) == {"v0", "v1"}
+    assert set(table["quantity"]) == {"rgb", "albedo"} and set(table["view"]) == {"v0", "v1", "all"}
+    found = {m: v for q, m, v in zip(table["quantity"], table["metric"], table["value"], strict=True) if q == "albedo"}
+    assert list(found) == ["shading_left", "shading_slope", "view_spread"]
+    assert found["shading_left"] == 0 and found["view_spread"] < 1e-3  # objects of one colour each
     page = (tmp_path / "scenes/toy/report.html").read_text()
     text = "".join(parsed(page).text)
     assert "no ground truth" in text and "albedo error" not in text

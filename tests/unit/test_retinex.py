@@ -51,8 +51,29 @@ def test_steps_between_objects_are_material():
 
 def test_integration_is_the_inverse_of_differences():
     image = np.random.default_rng(1).normal(size=(13, 9, 3))
-    found = retinex._integrated([np.diff(image, axis=0), np.diff(image, axis=1)], (13, 9))
-    np.testing.assert_allclose(found, image - image.mean((0, 1)), atol=1e-12)
+    steps = [np.diff(image, axis=0), np.diff(image, axis=1)]
+    np.testing.assert_allclose(retinex._integrated(steps, image, 0.0), image, atol=1e-12)
+    np.testing.assert_allclose(retinex._integrated(steps, image, 0.3), image, atol=1e-12)
+
+
+def test_screened_integration_is_the_least_squares_solution():
+    rng = np.random.default_rng(2)
+    image, steps = rng.normal(size=(4, 3, 3)), [rng.normal(size=(3, 3, 3)), rng.normal(size=(4, 2, 3))]
+    index = np.arange(12).reshape(4, 3)
+    pairs = [(index[:-1], index[1:]), (index[:, :-1], index[:, 1:])]
+    rows = [np.eye(12)[b.ravel()] - np.eye(12)[a.ravel()] for a, b in pairs] + [np.sqrt(0.2) * np.eye(12)]
+    right = np.concatenate([*(s.reshape(-1, 3) for s in steps), np.sqrt(0.2) * image.reshape(-1, 3)])
+    expected = np.linalg.lstsq(np.concatenate(rows), right, rcond=None)[0].reshape(4, 3, 3)
+    np.testing.assert_allclose(retinex._integrated(steps, image, 0.2), expected, atol=1e-12)
+
+
+def test_known_light_gives_the_albedo_as_it_is():
+    """Two versions of the light, used in turn: the right one leaves the albedo, level included."""
+    albedo, photo, tile = patches()
+    right = np.log(photo / albedo)
+    found = retinex.retinex_predictions(photo, 4, object_id=tile, light=np.stack([right, right + np.log(2.0)]))[..., :3]
+    for k, factor in enumerate((1, 0.5, 1, 0.5)):
+        np.testing.assert_allclose(found[k], factor * albedo, rtol=1e-4)
 
 
 @pytest.mark.parametrize("mean", [0.1, 0.4, 0.8])
@@ -67,7 +88,27 @@ def test_hypotheses_differ_and_materials_are_neutral():
     grain = np.exp(0.15 * np.random.default_rng(0).standard_normal((48, 64, 1)))
     predictions = retinex.retinex_predictions(photo * grain, 4)
     assert np.abs(np.diff(predictions[..., :3], axis=0)).max((1, 2, 3)).min() > 1e-3
-    assert (np.diff(predictions[:, 0, 0, 3]) > 0).all() and predictions[..., 4].max() <= 0.1
+    assert len(np.unique(predictions[:, 0, 0, 3])) == 4 and predictions[..., 4].max() <= 0.1
+
+
+def test_an_object_has_one_draw_of_roughness_in_all_views():
+    _, photo, tile = patches()
+    first = retinex.retinex_predictions(photo, 3, object_id=tile, seed=5)[..., 3:]
+    other = retinex.retinex_predictions(photo[:, ::-1], 3, object_id=tile[:, ::-1], seed=5)[..., 3:]
+    np.testing.assert_array_equal(first, other[:, :, ::-1])
+    assert len(np.unique(first[0, ..., 0])) == 12
+    assert not np.array_equal(first, retinex.retinex_predictions(photo, 3, object_id=tile, seed=6)[..., 3:])
+
+
+def test_level_of_the_albedo():
+    """The wanted mean, unless more than 3 % would be brighter than 0.9."""
+    weight = np.full(100, 2.0)
+    assert retinex.albedo_level(np.full((100, 3), 0.2), weight, 0.4) == pytest.approx(2.0)
+    few, many = np.full((100, 3), 0.1), np.full((100, 3), 0.1)
+    few[:2], many[:20] = 1.0, 1.0
+    assert retinex.albedo_level(few, weight, 0.4) == pytest.approx(0.4 / few.mean())
+    assert retinex.albedo_level(many, weight, 0.4) == pytest.approx(0.9)
+    assert retinex.albedo_level(many, 0 * weight, 0.4) == 1.0 and np.isfinite(retinex.albedo_level(0 * many, weight, 0.4))
 
 
 @pytest.mark.parametrize(
@@ -96,5 +137,7 @@ def test_bad_input_is_refused():
         retinex.retinex_predictions(np.zeros((4, 4)), 1)
     with pytest.raises(InputError, match="object ids"):
         retinex.retinex_predictions(np.zeros((4, 4, 3)), 1, object_id=np.zeros((3, 4), int))
+    with pytest.raises(InputError, match="light"):
+        retinex.retinex_predictions(np.zeros((4, 4, 3)), 1, light=np.zeros((4, 4, 3)))
     with pytest.raises(InputError, match="samples"):
         retinex.retinex_predictions(np.zeros((4, 4, 3)), 0)

@@ -7,7 +7,7 @@ from light_room import AFFINES, EMISSION, SHADING, StubJob, build
 from workflow.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
-MODELS = ("base", "object_mean", "fipt", "iris")
+MODELS = ("base", "object_mean", "texture_average", "fipt", "iris")
 
 
 def _reader(folder, stage):
@@ -86,6 +86,35 @@ def test_what_is_given_is_left_alone(ldr):
     # Surface without a cell shows the affine of the object's base mean: the same constant.
     np.testing.assert_allclose(objects["T_albedo"][owner, 3], cells["albedo_r"], rtol=1e-6)
     assert not objects["T_albedo"][:, :3].any()
+
+
+def test_texture_average_is_the_mean_of_the_photographs(ldr):
+    """Counted again, cell by cell: mean radiance (sRGB, exposure divided out) times one gain, matte."""
+    folder = ldr[0]
+    reader, capture, base = (
+        _fit(folder, "ldr", "texture_average"),
+        CaptureReader(_reader(folder, "capture")),
+        _reader(folder, "base"),
+    )
+    emission = _reader(folder, "emission")
+    exposure, lamps = emission.json("emission.json")["exposure"], emission.table("emitters.parquet")
+    shines = emission.table("emitter_faces.parquet")
+    lit = shines["face_id"][np.isin(shines["emitter_id"], lamps["emitter_id"][lamps["kept"].astype(bool)])]
+    cells = reader.table("cells.parquet")
+    sums, count = np.zeros(len(cells["cell_id"])), np.zeros(len(cells["cell_id"]))
+    for view, gain in zip(capture.views, exposure, strict=True):
+        photo, valid = capture.photo(view)
+        cell = base.exr(f"maps/{view.name}.exr")["cell.id"].astype(np.int64)
+        face = capture.gbuffer(view)[1]
+        use = valid & (cell < len(sums)) & (face >= 0) & ~np.isin(face, lit)
+        y = np.clip(photo[use][:, 1].astype(np.float64), 0, 1)
+        radiance = np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4) / gain
+        np.add.at(sums, cell[use], radiance)
+        np.add.at(count, cell[use], 1)
+    gain = reader.json("affines.json")["gain"]
+    seen = (count > 0) & (gain * sums / np.maximum(count, 1) < 1)
+    np.testing.assert_allclose(cells["albedo_g"][seen], (gain * sums / np.maximum(count, 1))[seen], rtol=2e-2, atol=2e-3)
+    assert seen.mean() > 0.8 and (cells["metallic"] == 0).all() and np.ptp(cells["roughness"]) == 0
 
 
 def test_free_cells_see_what_the_prior_does_not(tmp_path, llvm):

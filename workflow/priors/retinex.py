@@ -1,39 +1,145 @@
-"""Prior `retinex`: photograph / smooth shading, without learned weights (iif_core.retinex). A baseline."""
+"""Prior `retinex`: photograph / gathered light, then colour retinex, without learned weights (docs/real-scenes.md).
+
+A baseline, and called one.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 from types import SimpleNamespace
 
 import numpy as np
 
+from iif_core.gathering import LightField, SurfaceCellsBuilder, Trace, with_light
 from iif_core.mesh import face_geometry
-from iif_core.retinex import retinex_predictions
+from iif_core.retinex import albedo_level, retinex_predictions
 from workflow.normal_form import CaptureReader, View
+from workflow.segmentations.geometry import pieces
+from workflow.segmentations.surface import Surface
 
 GAMMA = 2.2
 """Stands for the unknown inverse response of an LDR photograph, as in the reference's prior (METHOD 1.3)."""
-SATURATED = 0.995
+SATURATED = 0.99
+CELL_FOOTPRINTS = 6.0
+"""Edge of a surface cell in median pixel footprints."""
+REACHES = (3.0, 8.0)
+"""How far, in edges of a cell, light that the gathering does not explain reaches: two versions of the light."""
+PIECES = SimpleNamespace(scale=0.05, min_faces=100, colour=0.1)
+"""Where the capture names no objects, pieces of the mesh stand for them (as `segmentation: {kind: geometry}` by default)."""
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """K hypotheses of a view, (K, H, W, 5) float32, guided by the mesh's normals and, where given, instances."""
+    """K hypotheses of a view, (K, H, W, 5) float32. The light is found once, from all views that are not held out."""
+    scene = _scene(capture, settings.prior.mean_albedo, seed)
+    pixels = _pixels(view, capture, scene.normals, scene.group)
+    log_light = np.zeros((len(REACHES), view.height * view.width, 3))
+    hit = pixels.hit.ravel()
+    if hit.any() and scene.field is not None:
+        row, weight = scene.field.weights(pixels.points.reshape(-1, 3)[hit], pixels.normals.reshape(-1, 3)[hit])
+        for number, light in enumerate(scene.log_light):
+            log_light[number, hit] = (weight[..., None] * light[row]).sum(1) + np.log(pixels.exposure)
+            log_light[number, ~hit] = log_light[number, hit].mean(0)
+    log_light = log_light.reshape(len(REACHES), view.height, view.width, 3)
+    return retinex_predictions(
+        pixels.linear,
+        settings.prior.samples,
+        settings.prior.mean_albedo,
+        pixels.group,
+        pixels.normals,
+        pixels.valid & ~pixels.saturated,
+        log_light if scene.field is not None else None,
+        seed,
+    )
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """Faces: normals (m, 3), group (m,). Light: versions (len(REACHES), cells, 3) scaled to the mean albedo; None = no cells."""
+
+    normals: np.ndarray
+    group: np.ndarray
+    field: LightField | None
+    log_light: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """One view: photograph as radiance x exposure, and what the mesh says, (H, W) each."""
+
+    linear: np.ndarray
+    valid: np.ndarray
+    saturated: np.ndarray
+    hit: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    group: np.ndarray
+    exposure: float
+
+
+def _pixels(view: View, capture: CaptureReader, face_normals: np.ndarray, face_group: np.ndarray) -> _Pixels:
     photo, valid = capture.photo(view)
+    saturated = np.zeros(photo.shape[:2], bool)
     if not capture.is_hdr:
-        valid = valid & (photo.max(-1) < SATURATED)
+        saturated = photo.max(-1) >= SATURATED
         photo = np.clip(photo, 0, 1) ** GAMMA
-    _, face_id = capture.gbuffer(view)
-    normal_of_face, instance_of_face = _mesh(capture)
-    hit = face_id >= 0
-    normals = np.where(hit[..., None], normal_of_face[face_id], 0)
-    towards = np.sign((normals * capture.directions(view)).sum(-1, keepdims=True))
-    instance = capture.given_instances(view)
-    if instance is None:
-        instance = np.where(hit, instance_of_face[face_id], -1)
-    return retinex_predictions(photo, settings.prior.samples, settings.prior.mean_albedo, instance, normals * -towards, valid)
+    depth, face = capture.gbuffer(view)
+    hit = (face >= 0) & (depth > 0)
+    normals = np.where(hit[..., None], face_normals[face], 0)
+    directions = capture.directions(view)
+    # A face without area has no normal; any unit vector towards the camera will do.
+    towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    normals = np.where(((normals**2).sum(-1, keepdims=True) < 0.5) & hit[..., None], towards, normals)
+    normals = np.where((normals * towards).sum(-1, keepdims=True) < 0, -normals, normals)
+    group = capture.given_instances(view)
+    if group is None:
+        group = np.where(hit, face_group[face], -1)
+    exposure = 1.0 if capture.is_hdr or not view.exposure > 1e-6 else float(view.exposure)
+    return _Pixels(photo, valid, saturated, hit, capture.points(view, depth), normals, group, exposure)
 
 
 @lru_cache(1)
-def _mesh(capture: CaptureReader) -> tuple[np.ndarray, np.ndarray]:
-    normals, _ = face_geometry(*capture.mesh())
-    return normals, capture.faces()["instance_id"].astype(np.int32)
+def _scene(capture: CaptureReader, mean_albedo: float, seed: int) -> _Scene:
+    """Light on the surface cells, from every view that is not held out."""
+    vertices, faces = capture.mesh()
+    normals, _ = face_geometry(vertices, faces)
+    group = _groups(capture)
+    views = capture.used
+    footprints = []
+    for view in views:
+        depth, face = capture.gbuffer(view)
+        seen = (face >= 0) & (depth > 0)
+        if seen.any():
+            footprints.append(float(np.median(depth[seen])) / view.fx)
+    if not footprints:
+        return _Scene(normals, group, None, np.zeros((len(REACHES), 0, 3)))
+    builder = SurfaceCellsBuilder(vertices[faces.ravel()], CELL_FOOTPRINTS * float(np.median(footprints)))
+    for view in views:
+        pixels = _pixels(view, capture, normals, group)
+        use = pixels.hit & pixels.valid & np.isfinite(pixels.linear).all(-1)
+        value = pixels.linear[use] / pixels.exposure
+        builder.add(pixels.points[use], pixels.normals[use], pixels.group[use], value, pixels.saturated[use], pixels.exposure)
+    cells = builder.finish()
+    if not len(cells):
+        return _Scene(normals, group, None, np.zeros((len(REACHES), 0, 3)))
+    light = with_light(cells, _tracer(vertices, faces), mean_albedo, REACHES, seed)
+    levels = [albedo_level(np.exp(cells.log_radiance - own), cells.pixels, mean_albedo) for own in light]
+    return _Scene(normals, group, LightField(cells), light - np.log(levels)[:, None, None])
+
+
+def _groups(capture: CaptureReader) -> np.ndarray:
+    """(m,) object of each face: as the capture names them, else pieces of the mesh."""
+    given = capture.faces()["instance_id"].astype(np.int64)
+    if (given >= 0).any():
+        return given
+    return pieces(Surface(capture), PIECES).astype(np.int64)
+
+
+def _tracer(vertices: np.ndarray, faces: np.ndarray) -> Trace:
+    import mitsuba
+
+    mitsuba.set_variant("llvm_ad_rgb")
+    from iif_core.transport import build_geometry, trace
+
+    geometry = build_geometry(vertices, faces, np.full(len(faces), -1, np.int32))
+    return lambda origins, directions: trace(geometry, origins, directions)

@@ -17,9 +17,10 @@ VARIANT_NAMES = {
     "base": "base texture (fused)",
     "result": "result",
 }
-_DECIMALS = {"psnr": 2, "ssim": 3, "iou": 3, "flip": 3}
+_DECIMALS = {"psnr": 2, "ssim": 3, "iou": 3, "flip": 3, "shading_left": 3, "shading_slope": 3, "view_spread": 3}
 _BETTER_HIGH = {"psnr", "ssim", "iou"}
 _LABELS = {"l2": "L2", "psnr": "PSNR", "ssim": "SSIM", "log_l2": "log L2", "iou": "IoU", "flip": "FLIP"}
+_LABELS |= {"shading_left": "shading left", "shading_slope": "its slope", "view_spread": "spread over views"}
 
 
 @dataclass(frozen=True)

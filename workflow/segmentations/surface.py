@@ -55,15 +55,15 @@ class Surface:
         return face_adjacency(self.faces, self.vertices)
 
     def views(self, fold: int | None = None) -> list[View]:
-        """All photographs, or those that are not in this fold (all, where nothing would be left)."""
-        views = list(self.capture)
+        """All photographs but those held out, or of them those that are not in this fold (all, where nothing would be left)."""
+        views = self.capture.used
         return [view for i, view in enumerate(views) if fold is None or i % FOLDS != fold] or views
 
     @cached_property
     def pixels_of_face(self) -> list[np.ndarray]:
         """Pixels that see each face, (m,) for every fold."""
         out = [np.zeros(len(self.faces), np.int64) for _ in range(FOLDS)]
-        for i, view in enumerate(self.capture):
+        for i, view in enumerate(self.capture.used):
             face = self.capture.gbuffer(view)[1]
             out[i % FOLDS] += np.bincount(face[face >= 0], minlength=len(self.faces))
         return out

@@ -193,7 +193,7 @@ class _Capture:
             self.writer.gbuffer(view.name, depth, face)
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
-            if self.settings.exposure == "estimate":
+            if self.settings.exposure == "estimate" and view.split != "test":
                 points = view.world_from_camera[:3, 3] + depth[..., None] * alignment.directions(_pinhole(view), pose)
                 footprint = float(np.median(depth[face >= 0])) / view.fx
                 shared.add(photo, valid & (face >= 0), points, footprint)
@@ -448,6 +448,9 @@ class _Capture:
         return exposure.read_given(self.inputs.exposures, [(f.name, f.file_path) for f in frames])
 
     def _estimated(self, shared: exposure.SharedSurface, used: list[Frame], views: list[View]) -> list[View]:
+        """Exposures of all views but the held-out ones, which keep 1: theirs are found when they are scored."""
+        every, own = views, [i for i, view in enumerate(views) if view.split != "test"]
+        used, views = [used[i] for i in own], [views[i] for i in own]
         gains = shared.gains()
         apart = int((~gains.estimated).sum())
         groups = int(gains.group.max()) + 1
@@ -459,14 +462,15 @@ class _Capture:
             low, high = gains.gain.min(), gains.gain.max()
             self.notes.append(f"exposure estimated from shared surface: {low:.3g} to {high:.3g} (residual {gains.residual:.3f})")
         if self.encoded:
-            return [replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)]
+            found = {v.view_id: replace(v, exposure=float(g)) for v, g in zip(views, gains.gain, strict=True)}
+            return [found.get(v.view_id, v) for v in every]
         counts = dict(self.counts)
         for frame, view, gain in zip(used, views, gains.gain, strict=True):
             photo, valid = self._photo(frame, view, float(gain))
             self.writer.photo(view.name, photo, valid, encoded=False)
             self._extras(frame, view, photo, valid, self._trace(view)[1])
         self.counts = counts
-        return views
+        return every
 
     def _note_pixels(self, frames: tuple[Frame, ...]) -> None:
         words = {

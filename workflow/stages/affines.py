@@ -144,7 +144,7 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
             )
         number = names.index(patch.object)
         return lambda problem, places: Gauge("white_patch", patch.albedo, problem.object_id == number)
-    known = {view.name: view for view in capture.views}
+    known = {view.name: view for view in capture.used}
     if patch.view not in known:
         raise InputError(f"affines.scale.white_patch.view: no view {patch.view!r}; there are {', '.join(sorted(known)[:20])}")
     view, (left, top, right, bottom) = known[patch.view], patch.box
@@ -230,7 +230,7 @@ def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
     """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
-    views = [view for view in capture.views if view.split != "test"] or list(capture.views)
+    views = capture.used
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
         counts += np.bincount(_eligible(job, capture, scene, view, emits).object_id, minlength=len(counts))

@@ -52,7 +52,7 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     prior, segmentation = job.read("prior"), job.read("segmentation")
     settings = job.settings.base
-    views = [view for view in capture if view.split != "test" and prior.has(f"maps/{view.name}.exr")]
+    views = [view for view in capture.used if prior.has(f"maps/{view.name}.exr")]
     surface = _Surface(capture, segmentation)
     cells, cell_maps = _cells(job, capture, surface, views)
     weights, segment_maps = _pixels(job, capture, segmentation, views)

@@ -45,7 +45,7 @@ METAL = 0.9
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet, environment_texels.parquet and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    views = [view for view in capture.views if view.split != "test"] or list(capture.views)
+    views = capture.used
     notes: list[str] = []
     known = view_exposures(capture, notes)
     unknown = Sensor(response("identity"), capture.is_hdr, job.settings.emission.saturation)

@@ -23,6 +23,7 @@ from workflow.scores import (
     perceptual_networks,
     prediction_numbers,
 )
+from workflow.truth_free import truth_free_scores
 from workflow.weights import FETCH_VGG
 
 BASELINES = {
@@ -63,6 +64,8 @@ def run(job: Job) -> None:
             for entry in scored:
                 rows.add(*entry)
             job.progress(done + 1, len(capture.views), "views scored")
+    for entry in truth_free_scores(job, capture):
+        rows.add(*entry)
     job.writer.table("metrics.parquet", rows.table(job.scene, {"result"}), UNITS)
     job.writer.table("variants.parquet", rows.table(job.scene), UNITS)
     job.writer.json("summary.json", _summary(rows, capture))
@@ -77,7 +80,8 @@ def _view_scores(
     networks: Mapping[str, Mapping[str, Weights]],
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
     """(variant, view, quantity, scores) of one view."""
-    photo, valid = capture.photo(view)
+    photo, valid = capture.photo(view, held_out=True)
+    rgb_of = "rgb_held_out" if view.split == "test" else "rgb"
     _, face_id = capture.gbuffer(view)
     hit = face_id >= 0
     file = f"maps/{view.name}.exr"
@@ -86,17 +90,17 @@ def _view_scores(
     yield (
         "result",
         view.name,
-        "rgb",
+        rgb_of,
         metrics.score_map("rgb", rgb(rendered, "ldr"), sensor, valid & hit, encoded=not capture.is_hdr, networks=networks["rgb"]),
     )
     if capture.is_hdr:
-        yield "result", view.name, "rgb", _log_scores(rgb(rendered), photo, valid & hit)
+        yield "result", view.name, rgb_of, _log_scores(rgb(rendered), photo, valid & hit)
     if means is None:
         return
     materials = material_truth(capture, job.read("segmentation"), view, networks)
     truth = materials.truth
     if not capture.is_hdr:
-        yield "result", view.name, "rgb", _log_scores(rgb(rendered), truth.radiance, valid & hit)
+        yield "result", view.name, rgb_of, _log_scores(rgb(rendered), truth.radiance, valid & hit)
     yield (
         "result",
         view.name,
@@ -208,7 +212,7 @@ def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
 
     def gain(quantity: str, protocol: str) -> dict[str, float] | None:
         pair = [means.get(v, {}).get(quantity, {}).get(protocol) for v in ("prior_mean_k", "result")]
-        if None in pair:
+        if any(scores is None or "psnr" not in scores for scores in pair):  # without truth there is no distance to it
             return None
         prior, result = pair
         out = {"psnr_db": round(result["psnr"]["mean"] - prior["psnr"]["mean"], 4)}

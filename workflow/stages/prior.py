@@ -29,7 +29,7 @@ def run(job: Job) -> None:
     """
     capture = CaptureReader(job.read("capture"))
     prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
-    views = [view for view in capture if view.split != "test"]
+    views = capture.used
     seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
     rows: list[Row] = []
     for done, view in enumerate(views):

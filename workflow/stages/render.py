@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from iif_core.camera import direction_derivatives, pixel_directions
+from iif_core.consistency import held_out_gain
 from iif_core.errors import InputError
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.base_scene import BLACK, pixel_gains, read_gains
@@ -19,7 +20,9 @@ _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of 
 def run(job: Job) -> None:
     """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps.
 
-    Sensor value: the re-rendering through the gains of the view and the fitted response, clipped to [0, 1].
+    Sensor value: the re-rendering through the gains of the view and the fitted response, clipped to [0, 1]. A held-out
+    photograph whose exposure nobody gave (automatic exposure) gets the one gain with which its own re-rendering is nearest to
+    it: held_out.parquet. That is the only number that is ever taken from a held-out photograph.
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, gains = read_response(job.read("affines")), read_gains(job)
@@ -31,6 +34,7 @@ def run(job: Job) -> None:
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
+    found: dict[int, float] = {}
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")
         eye = view.world_from_camera[:3, 3]
@@ -52,11 +56,19 @@ def run(job: Job) -> None:
         if job.settings.render.denoise:
             radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
         factor = pixel_gains(gains, done, view, np.arange(view.height * view.width)).reshape(radiance.shape)
+        if view.split == "test" and capture.facts.get("exposure_estimated"):
+            photo, valid = capture.photo(view, held_out=True)
+            found[view.view_id] = held_out_gain(factor * radiance, photo, valid & (face_id >= 0), curve)
+            factor = factor * found[view.view_id]
         sensor = curve(np.clip(factor * radiance, 0, 1))
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
+    job.writer.table(
+        "held_out.parquet",
+        {"view_id": np.array(list(found), np.int32), "exposure": np.array(list(found.values()), np.float64)},
+    )
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
 
 

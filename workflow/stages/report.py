@@ -88,6 +88,9 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     means = summary["means"].get("result", {})
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
     text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
+    held_out = means.get("rgb_held_out", {}).get("raw", {}).get("psnr")
+    if held_out is not None:
+        text += f" {held_out['views']} photographs that nothing was fitted to: {held_out['mean']:.1f} dB."
     gains = summary.get("gain_over_raw_predictions", {})
     gain = gains.get("albedo", {}).get("scaled", {}).get("psnr_db")
     if gain is not None:
@@ -165,6 +168,14 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
             "Linear values. Emitters, pixels without meaningful truth and (albedo) mirrors are left out, by the truth."
             " scaled = one gain per image and channel.",
         ),
+        score_table(
+            "Without truth",
+            means,
+            [("rgb_held_out", "raw", m) for m in ("l2", "psnr", "ssim", "flip")]
+            + [("albedo", "raw", m) for m in ("shading_left", "shading_slope", "view_spread")],
+            "Held-out photographs: one exposure gain each where it is estimated. Shading left: correlation, inside objects, of"
+            " log albedo with the log of the diffuse light that was found; 0 is none.",
+        ),
         score_table("Light and re-rendering", means, light, "rgb: sensor values; its log L2: radiance, where known."),
         score_table(
             "With the best affine per image and object (an oracle)",
@@ -201,7 +212,7 @@ def _emission_exposure(recovered: Recovered) -> float:
 
 def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emission_exposure: float) -> ViewRows:
     file = f"maps/{view.name}.exr"
-    photo, valid = capture.photo(view)
+    photo, valid = capture.photo(view, held_out=True)
     depth, face_id = capture.gbuffer(view)
     hit = face_id >= 0
     rendered = job.read("render").exr(file)

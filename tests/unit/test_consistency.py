@@ -1,0 +1,91 @@
+"""Scores without truth: shading left, spread over views, the gain of a held-out photograph."""
+
+import numpy as np
+import pytest
+
+from iif_core.consistency import ShadingLeft, ViewSpread, held_out_gain
+from iif_core.response import response
+
+
+def surface(n=4000, seed=0):
+    """(albedo, light, object): texture that knows nothing of the light."""
+    rng = np.random.default_rng(seed)
+    object_id = rng.integers(0, 5, n)
+    albedo = (0.2 + 0.6 * rng.random((5, 3)))[object_id] * np.exp(0.1 * rng.standard_normal((n, 1)))
+    light = np.exp(0.5 * rng.standard_normal((n, 1)) + rng.random(5)[object_id][:, None]) * np.ones(3)
+    return albedo, light, object_id
+
+
+def left(albedo, light, object_id):
+    score = ShadingLeft()
+    for part in np.array_split(np.arange(len(albedo)), 3):
+        score.add(albedo[part], light[part], object_id[part])
+    return score.finish()
+
+
+def test_shading_left():
+    albedo, light, object_id = surface()
+    clean, photograph = left(albedo, light, object_id), left(albedo * light, light, object_id)
+    assert abs(clean.correlation) < 0.05 and abs(clean.slope) < 0.02
+    assert photograph.slope == pytest.approx(1, abs=0.02) and photograph.correlation > 0.95
+    assert left(albedo * light**0.3, light, object_id).slope == pytest.approx(0.3, abs=0.02)
+    # a level of every object says nothing
+    other = left(albedo * np.arange(1, 6)[object_id][:, None], light, object_id)
+    assert other.correlation == pytest.approx(clean.correlation, abs=1e-9)
+
+
+def test_shading_left_is_the_pooled_correlation():
+    albedo, light, object_id = surface(300)
+    x, y = np.log(light).mean(-1), np.log(albedo).mean(-1)
+    for o in range(5):
+        x[object_id == o] -= x[object_id == o].mean()
+        y[object_id == o] -= y[object_id == o].mean()
+    found = left(albedo, light, object_id)
+    assert found.correlation == pytest.approx(np.corrcoef(x, y)[0, 1], abs=1e-9)
+    assert found.slope == pytest.approx((x * y).sum() / (x * x).sum(), abs=1e-9) and found.pixels == 300
+
+
+def test_extremes_of_shading_left():
+    albedo, light, object_id = surface(50)
+    assert ShadingLeft().finish().pixels == 0
+    assert left(albedo, np.ones_like(light), object_id).correlation == 0.0
+    score = ShadingLeft()
+    score.add(np.full((2, 3), np.nan), light[:2], object_id[:2])
+    score.add(albedo[:2], light[:2], np.array([-1, -1]))
+    assert score.finish().pixels == 0
+    assert np.isfinite(left(np.zeros_like(albedo), light * 0, object_id).slope)
+
+
+def test_spread_over_views():
+    """Two views 2 d apart in log: standard deviation sqrt(2) d; cells seen once do not count."""
+    cell = np.repeat(np.arange(10, dtype=np.uint64), 3)
+    albedo = np.full((30, 3), 0.4)
+    score = ViewSpread()
+    score.add(albedo * np.exp(0.1), cell)
+    assert score.finish() is None
+    score.add(albedo[:15] * np.exp(-0.1), cell[:15])
+    assert score.finish() == pytest.approx(np.sqrt(2) * 0.1, rel=1e-9)
+    same = ViewSpread()
+    for _ in range(3):
+        same.add(albedo, cell)
+    assert same.finish() == pytest.approx(0, abs=1e-7)
+
+
+@pytest.mark.parametrize("gain", [1e-3, 0.3, 1.0, 7.0])
+def test_gain_of_a_held_out_photograph(gain):
+    rng = np.random.default_rng(0)
+    radiance = 0.4 * rng.random((12, 16, 3)) / gain
+    curve = response("srgb")
+    photo = curve(np.clip(gain * radiance, 0, 1)) + 0.01 * rng.standard_normal(radiance.shape)
+    mask = np.ones((12, 16), bool)
+    mask[0] = False
+    photo[0] = 1.0  # not counted
+    assert held_out_gain(radiance, photo, mask, curve) == pytest.approx(gain, rel=0.01)
+
+
+def test_extremes_of_the_gain():
+    curve, some = response("srgb"), np.full((2, 2, 3), 0.5)
+    assert held_out_gain(np.zeros((2, 2, 3)), some, np.ones((2, 2), bool), curve) == 1.0
+    assert held_out_gain(some, some, np.zeros((2, 2), bool), curve) == 1.0
+    assert np.isfinite(held_out_gain(some, np.zeros((2, 2, 3)), np.ones((2, 2), bool), curve))
+    assert np.isfinite(held_out_gain(some, np.ones((2, 2, 3)), np.ones((2, 2), bool), curve))

@@ -1,0 +1,41 @@
+"""Held-out photographs: nothing that is fitted may depend on what they show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit import own_scene as own
+
+STAGES = ("capture", "segmentation", "prior", "base")
+"""The later ones read photographs through `CaptureReader.photo` alone, which refuses."""
+CAPTURE = {"views": 5, "width": 32, "height": 24, "test_every": 4, "exposure": "estimate"}
+HELD_OUT = "003"
+
+
+def everything(root):
+    """Bytes of every file of the stages but manifests and the held-out photograph itself."""
+    folder = Path(root) / "results/own"
+    files = sorted(
+        p for p in folder.rglob("*") if p.is_file() and p.name != "manifest.json" and p.parts[-2] not in ("benchmarks",)
+    )
+    return {str(p.relative_to(folder)): p.read_bytes() for p in files if p != folder / f"capture/photos/{HELD_OUT}.exr"}
+
+
+def test_nothing_that_is_fitted_sees_a_held_out_photograph(tmp_path):
+    """Noise in its place: every artefact of every stage stays the same, byte for byte."""
+    path = own.project(tmp_path, capture=CAPTURE)
+    own.photographed(path, 5, gains=[1.0, 0.8, 1.1, 0.9, 0.7])
+    capture = own.run(tmp_path, *STAGES)
+    assert [view.name for view in capture if view not in capture.used] == [HELD_OUT]
+    first = everything(tmp_path)
+    assert f"base/maps/{HELD_OUT}.exr" in first and f"prior/maps/{HELD_OUT}.exr" not in first
+    rng = np.random.default_rng(0)
+    own.save_png(path / f"images/{HELD_OUT}.png", rng.random((own.CAMERA.height, own.CAMERA.width, 3)))
+    capture = own.run(tmp_path, *STAGES)
+    second = everything(tmp_path)
+    assert first.keys() == second.keys()
+    assert [name for name in first if first[name] != second[name] and not name.startswith("capture/capture.json")] == []
+    with pytest.raises(AssertionError, match="held out"):
+        capture.photo(capture.views[3])
+    assert capture.views[3].exposure == 1.0 and capture.photo(capture.views[3], held_out=True)[1].all()
