@@ -93,7 +93,7 @@ def test_capture_of_a_model_matches_the_room(room, views, tmp_path):
     capture = own.run(tmp_path, "capture")
     assert len(capture.views) == 4
     for view in capture:
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         depth, face = capture.gbuffer(view)
         error = np.abs(own.pattern(capture.points(view, depth)) - photo)[valid & (face >= 0)]
         assert np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.03
@@ -213,7 +213,7 @@ def test_images_without_pose_masks_and_places(room, views, tmp_path):
     root = tmp_path / "run"
     own.project(root, {"path": str(path), "cameras": "elsewhere"}, CAPTURE)
     capture = own.run(root, "capture")
-    hidden = [float((~capture.photo(view)[1]).mean()) for view in capture]
+    hidden = [float((~capture.photo(view, held_out=True)[1]).mean()) for view in capture]
     assert hidden[0] == hidden[3] < 0.01 and min(hidden[1:3]) > 0.02
     assert any("masked pixels are ignored (2 masks)" in note for note in capture.facts["notes"])
 
@@ -249,7 +249,7 @@ def test_nerfstudio_lists_masks_and_applied_transform(room, views, tmp_path):
     for view, (pose, _) in zip(capture, views, strict=False):
         np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-12)
     # A mask of ones and zeros, not 255: what is not 0 counts.
-    shares = [float(capture.photo(view)[1].mean()) for view in capture]
+    shares = [float(capture.photo(view, held_out=True)[1].mean()) for view in capture]
     assert shares[0] > 0.99 and shares[2] > 0.99 and 0.4 < shares[1] < 0.6
 
 

@@ -69,8 +69,9 @@ class Capture:
         self.is_hdr = is_hdr
         self.views = [View(i, f"v{i}", WIDTH, HEIGHT, 50.0, 50.0, 28.0, 20.0, np.eye(4)) for i in range(views)]
 
-    def __iter__(self):
-        return iter(self.views)
+    @property
+    def used(self):
+        return self.views
 
     def photo(self, view):
         rng = np.random.default_rng(view.view_id)

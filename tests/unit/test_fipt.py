@@ -121,7 +121,7 @@ def test_synthetic_radiance_truth_ids_and_splits(tmp_path):
     for view, pose in zip(capture, [*shots["train"], *shots["val"]], strict=True):
         np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-9)
         assert (view.fx, view.fy, view.cx, view.cy) == pytest.approx((FOCAL, FOCAL, 32, 24))
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         depth, face = capture.gbuffer(view)
         assert valid.all() and view.exposure == 1
         np.testing.assert_allclose(own.pattern(capture.points(view, depth)), photo, atol=1e-3)
@@ -141,7 +141,7 @@ def test_synthetic_photographs_exposures_and_response(tmp_path):
     curve = np.array(capture.facts["response_truth"])
     np.testing.assert_allclose(curve, np.linspace(0, 1, 101) ** np.array([[0.4], [0.5], [0.6]]), atol=2e-3)
     for view in capture:
-        photo, _ = capture.photo(view)
+        photo, _ = capture.photo(view, held_out=True)
         radiance = capture.truth(view).radiance  # of the EXR beside the photograph
         np.testing.assert_allclose(own.pattern(capture.points(view, capture.gbuffer(view)[0])), radiance, atol=1e-3)
         exposed = np.clip(view.exposure * radiance, 0, 1)
@@ -164,7 +164,7 @@ def test_real(tmp_path):
     for view, (pose, camera) in zip(capture, shots, strict=True):
         np.testing.assert_allclose(view.world_from_camera, pose, atol=1e-6)
         assert (view.fx, view.fy, view.cx, view.cy) == (camera.fx, camera.fy, camera.cx, camera.cy)
-        photo, _ = capture.photo(view)
+        photo, _ = capture.photo(view, held_out=True)
         depth, face = capture.gbuffer(view)
         np.testing.assert_allclose(own.pattern(capture.points(view, depth)), photo, atol=1e-3)
         np.testing.assert_array_equal(capture.given_instances(view), face // 12)

@@ -186,7 +186,8 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.table("emitters.parquet", rows)
     job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
     exposure = [view.exposure for view, *_ in seen]
-    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "exposure": exposure})
+    gains = {"exposure": exposure, "gain": [[e] * 3 for e in exposure], "vignetting": [0.0, 0.0]}
+    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], **gains})
     job.writer.finish()
 
     job = FakeJob("shading", root)

@@ -80,7 +80,7 @@ def test_surface_points_land_on_their_own_colour(release, captured):
     photograph, and through the captured pinhole into the captured one; both show the colour that the point has."""
     _, views, home = release
     for view in captured:
-        photo, valid = captured.photo(view)
+        photo, valid = captured.photo(view, held_out=True)
         depth, face = captured.gbuffer(view)
         points = captured.points(view, depth)
         error = np.abs(own.pattern(points) - photo)[valid & (face >= 0)]
@@ -122,7 +122,7 @@ def test_masked_pixels_do_not_count(release, captured, tmp_path):
     hidden = np.zeros((mini.CAMERA.height, mini.CAMERA.width), bool)
     hidden[mini.HIDDEN] = True
     for view in captured:
-        photo, valid = captured.photo(view)
+        photo, valid = captured.photo(view, held_out=True)
         depth, _ = captured.gbuffer(view)
         rows, columns = np.mgrid[0 : view.height : 3, 0 : view.width : 3].reshape(2, -1)
         points = captured.points(view, depth)[rows, columns]
@@ -135,8 +135,8 @@ def test_masked_pixels_do_not_count(release, captured, tmp_path):
     project(tmp_path, other)
     again = own.run(tmp_path, "capture")
     for view in captured:
-        photo, valid = captured.photo(view)
-        photo_again, valid_again = again.photo(view)
+        photo, valid = captured.photo(view, held_out=True)
+        photo_again, valid_again = again.photo(view, held_out=True)
         np.testing.assert_array_equal(valid, valid_again)
         assert np.abs(photo - photo_again).max() < 0.02
 
@@ -166,7 +166,7 @@ def test_undistorted_images_of_the_toolbox(release, copy, tmp_path):
     project(tmp_path, copy, images="undistorted")
     capture = own.run(tmp_path, "capture")
     for view in capture:
-        photo, valid = capture.photo(view)
+        photo, valid = capture.photo(view, held_out=True)
         error = np.abs(own.pattern(capture.points(view, capture.gbuffer(view)[0])) - photo)
         assert valid.all() and np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.03
     assert "no undistorted_anon_masks/: nothing is masked" in capture.facts["notes"]

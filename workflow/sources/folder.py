@@ -279,7 +279,7 @@ class _Capture:
             photos[-1] = Photo(photo, valid, depth, normal, (view.fx, view.fy), (view.cx, view.cy), pose, held)
             self.job.progress(i + 1, len(frames), "photographs registered")
         self.counts, self.notes = counts, notes
-        found = registration.registered(frames, poses, photos, self.source.axes, self.metres)
+        found = registration.registered(frames, poses, photos, self.conventions.axes, self.metres)
         self.notes += found.notes
         self.notes += [f"view {name} left out: {reason}" for name, reason in found.left_out.items()]
         return tuple(found.frames), found.poses, found

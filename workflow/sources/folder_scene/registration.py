@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.registration import Photo, Registration, register
+from iif_core.registration import MIN_VIEWS, Photo, Registration, register
 from workflow.sources.folder_scene.transforms import Frame
 
 WIDTH = 200
@@ -18,7 +18,7 @@ ROWS = 300_000
 BLURRED, ASTRAY = 0.4, 0.2
 """Sharpness, and agreement with the other views, below which a photograph is left out."""
 LEFT_OUT = 1 / 3
-"""More views than this share are never left out: then it is not they that are wrong."""
+"""More views than this share are never left out: then it is not they that are wrong. Nor is any of fewer than MIN_VIEWS."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def _hopeless(names: list[str], found: Registration) -> dict[str, str]:
             out[name] = f"badly posed? It correlates {agreement:.2f} with what the others show of the same surface"
         elif sharp > 0 and sharp < BLURRED:
             out[name] = f"blurred: {sharp:.2f} of the texture's contrast that the others show"
-    return out if len(out) <= LEFT_OUT * len(names) else {}
+    return out if len(names) >= MIN_VIEWS and len(out) <= LEFT_OUT * len(names) else {}
 
 
 def _facts(frames: Sequence[Frame], seen: list[int], found: Registration, scale: float) -> dict[str, Any]:
