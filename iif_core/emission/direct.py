@@ -120,10 +120,12 @@ def solve_emission(
 
 FAMILY_WIDTH = 0.3
 """Standard deviation of the groups of one object around their common radiance, relative to it."""
+OUTSIDE_WIDTH = 0.5
+"""The same of the directions that stand for what lies outside a mesh with large openings."""
 
 
 def solve_families(
-    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float = FAMILY_WIDTH
+    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float | np.ndarray = FAMILY_WIDTH
 ) -> EmissionSolution:
     """`solve_emission` in two steps: groups of one object first share one radiance, then deviate from it.
 
@@ -132,7 +134,7 @@ def solve_families(
     prior width of groups that have company is `width`.
 
     Args:
-        family: (G,) int, groups with the same number are parts of one object.
+        family: (G,) int, groups with the same number are parts of one object; width: number or (G,).
     """
     number, members = np.unique(family, return_inverse=True)
     size = np.bincount(members, minlength=len(number))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..environment import texel_of
+from ..environment import direction_in, texel_of
 from ..xp import NUMPY
 
 HEIGHT, WIDTH = 16, 32
@@ -32,6 +32,11 @@ class Sky:
     @property
     def size(self) -> int:
         return len(self.pixels)
+
+    @property
+    def is_unseen(self) -> bool:
+        """No group is taken for what a camera sees of it (`SkySums.directions`)."""
+        return not self.pixels.any()
 
 
 class SkySums:
@@ -86,6 +91,20 @@ class SkySums:
         radiance[pixels == 0] = self.mean()
         bounded = 2 * np.bincount(number, saturated, size) > pixels
         return Sky(number.reshape(self.shape).astype(np.int32), pixels.astype(np.int64), radiance, bounded)
+
+    def directions(self) -> Sky:
+        """Twelve directions for the outside of a mesh with large openings, all unknown.
+
+        What lies outside is near then - a ceiling with its lamps, the rest of the room - and lights surfaces from where no camera
+        looks; what a camera sees through an opening says nothing about that. A texel belongs to the nearest of the twelve
+        vertices of an icosahedron; all start at the mean of what was seen.
+        """
+        golden = (1 + 5**0.5) / 2
+        corners = [np.roll([0.0, a, b * golden], i) for i in range(3) for a in (-1, 1) for b in (-1, 1)]
+        towards = np.stack(direction_in(NUMPY, *np.indices(self.shape), 0.5, 0.5, *self.shape), -1)
+        number = (towards @ np.array(corners).T).argmax(-1)
+        size = len(corners)
+        return Sky(number.astype(np.int32), np.zeros(size, np.int64), np.tile(self.mean(), (size, 1)), np.zeros(size, bool))
 
 
 def texels(directions: np.ndarray, height: int, width: int) -> np.ndarray:

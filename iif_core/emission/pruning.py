@@ -19,6 +19,10 @@ from .rows import EmissionRows
 CERTAIN = 2.0
 """Brightness relative to a white surface from which a group shines for certain; twice, since the light that the white
 surface would reflect is only known as well as the other emitters are."""
+CERTAIN_OPEN = 8.0
+"""The same where much of the light comes through large openings of the mesh, from lamps that no camera sees: a table under such
+a lamp is three times as bright as a white surface under the mean light, a lamp in view ten times or more."""
+
 
 RESIDUAL_CHANGE = 0.03
 """Growth of the residual from which a group is missed. METHOD 8 has 0.001; with albedos that are only predicted, one
@@ -70,13 +74,14 @@ def prune_groups(
     elsewhere: np.ndarray,
     protected: np.ndarray,
     share: float = 0.01,
+    certain: float = CERTAIN,
     residual_change: float = RESIDUAL_CHANGE,
     cross: bool = True,
 ) -> PrunedEmission:
     """Solve, then drop groups that do not shine, the least credible first, and solve again.
 
     Dropped is a group without emission left; and, unless the residual elsewhere grows by more than `residual_change`
-    without it, one that is not brighter than `CERTAIN` white surfaces or has less than `share` of the total power
+    without it, one that is not brighter than `certain` white surfaces or has less than `share` of the total power
     area x sum E.
 
     Args:
@@ -96,7 +101,7 @@ def prune_groups(
         excess = np.where(kept, white.excess(shown), excess)
         dark = kept & ~protected & (emission <= 0)
         open_ = kept & ~protected & ~dark & ~missed
-        reflecting, weak = open_ & (excess < CERTAIN), open_ & (power < share)
+        reflecting, weak = open_ & (excess < certain), open_ & (power < share)
         if dark.any():
             drop = dark
         elif reflecting.any():

@@ -6,7 +6,7 @@ import pytest
 from iif_core.emission.direct import solve_emission
 from iif_core.emission.environment import HEIGHT, WIDTH, Sky, SkySums, cosine_directions, texels
 from iif_core.emission.problem import PixelRows, assemble
-from iif_core.environment import direction_in
+from iif_core.environment import direction_in, solid_angles
 from iif_core.xp import NUMPY
 
 
@@ -91,3 +91,15 @@ def test_cosine_directions():
     np.testing.assert_allclose(np.linalg.norm(way, axis=1), 1, atol=1e-9)
     assert (cosine >= -1e-9).all()
     np.testing.assert_allclose([cosine.mean(), (cosine**2).mean()], [2 / 3, 1 / 2], atol=0.005)
+
+
+def test_directions_of_an_open_mesh_are_unseen_and_share_the_sphere():
+    sums = SkySums()
+    sums.add(np.array([[0.0, 0, 1]] * 5), np.full((5, 3), 2.0), np.zeros((5, 3), bool))
+    sky = sums.directions()
+    assert sky.size == 12 and sky.is_unseen and not sums.groups(min_pixels=1).is_unseen
+    np.testing.assert_allclose(sky.radiance, 2.0)
+    share = np.bincount(sky.columns.ravel(), solid_angles(*sky.columns.shape).ravel(), 12) / (4 * np.pi)
+    np.testing.assert_allclose(share, 1 / 12, atol=0.03)
+    up, down = sky.columns[0], sky.columns[-1]
+    assert not set(up) & set(down)

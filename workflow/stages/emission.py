@@ -10,13 +10,13 @@ from iif_core import plan
 from iif_core.calibration import calibration_facts
 from iif_core.emission.cache import RadianceVoxels
 from iif_core.emission.candidates import emitter_candidates
-from iif_core.emission.direct import EmissionSolution, solve_families
-from iif_core.emission.environment import MAX_GROUPS, Sky
+from iif_core.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
+from iif_core.emission.environment import Sky
 from iif_core.emission.gains import LEVEL_OF_PRIOR
 from iif_core.emission.groups import EmitterGroups, group_emitters
 from iif_core.emission.loss import reference_loss
 from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
-from iif_core.emission.pruning import PrunedEmission, prune_groups
+from iif_core.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
 from iif_core.emission.sensor import Sensor
 from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.response import response, response_facts
@@ -60,10 +60,13 @@ def run(job: Job) -> None:
     secondary = escaping_share(photos)
     environment = plan.environment(job.settings.emission.environment, escape, secondary, brightness)
     is_open = secondary > plan.ESCAPE_OPEN
-    outside = sums.groups(max_groups=1 if is_open else MAX_GROUPS) if environment["included"] else None
+    outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
     if outside is not None and is_open:
-        notes.append(f"{secondary:.0%} of the rays from the surface leave the mesh: one radiance for all that is outside, no map")
-    pruned = _trial(photos, groups, cache, outside)
+        notes.append(
+            f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
+        )
+    certain = CERTAIN_OPEN if outside is not None and outside.is_unseen else CERTAIN
+    pruned = _trial(photos, groups, cache, outside, certain)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
     reasons = [reason for reason, keep in zip(pruned.reason, pruned.kept, strict=True) if not keep]
@@ -108,7 +111,7 @@ def run(job: Job) -> None:
 # -------------------------------------------------------------------------------------------------------------- solve
 
 
-def _trial(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None) -> PrunedEmission:
+def _trial(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float) -> PrunedEmission:
     """Which groups shine, from half of the rows."""
     pixels, base, rows = choose_rows(photos, groups, 2)
     own = rows.group >= 0
@@ -121,7 +124,7 @@ def _trial(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, s
     area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
-    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share)
+    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain)
 
 
 def _initial(photos: Photographs, groups: EmitterGroups, rows: PixelRows, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
@@ -142,6 +145,9 @@ def _solve(
     face = np.flatnonzero(groups.of_face >= 0)
     family = -1 - np.arange(len(initial))
     family[groups.of_face[face]] = photos.scene.object_id[face]
+    width = np.full(len(initial), FAMILY_WIDTH)
+    if sky is not None and sky.is_unseen:
+        family[groups.size :], width[groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
     settings = photos.job.settings.emission
     if settings.solver == "sgd":
         # What shines is known by now, so the paper's pruning has nothing left to do in `safe`.
@@ -149,7 +155,7 @@ def _solve(
         options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
-        solution = solve_families(problem.rows, initial, family)
+        solution = solve_families(problem.rows, initial, family, width=width)
     solution = solution.with_level_error(min(problem.level_error, LEVEL_OF_PRIOR))
     return solution, reference_loss(problem.rows, solution.radiance), problem.level_error
 
