@@ -6,7 +6,8 @@ undone here as it is for the photographs. 0 is no mask.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import importlib
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,12 +18,14 @@ from iif_core.distortion import Distortion, Pinhole, distort
 from iif_core.errors import InputError
 from iif_core.mask_clustering import flatten_masks
 from workflow.normal_form import CaptureReader, View
-from workflow.sources.folder_scene import images, transforms
+from workflow.sources.folder_scene import images
 
 SHAPE_TOLERANCE = 0.02
 """Largest relative difference of aspect ratio that still counts as the same picture (models round to 8 or 64)."""
 
 MAPS = (".png", ".exr")
+PHOTOGRAPHED = ("folder", "scannetpp", "fipt")
+"""Sources of photographs that lie in a folder, perhaps distorted or turned."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +72,19 @@ class MaskFiles:
         """
         camera = Pinhole(view.fx, view.fy, view.cx, view.cy, view.width, view.height)
         photograph = self.photographs.get(view.name, Photograph(camera))
+        # Without a lens the view is the photograph, pixel for pixel, also where its intrinsics were corrected.
+        straight = photograph.lens is None or photograph.lens.is_identity
+        sampled = replace(photograph, camera=camera) if straight else photograph
         if view.name in self.maps:
             path = self.maps[view.name]
-            return _sampled(np.maximum(self._upright(path, images.load_ids(path), photograph), 0), photograph, camera)
+            return _sampled(np.maximum(self._upright(path, images.load_ids(path), photograph), 0), sampled, camera)
         if view.name not in self.binary:
             return np.zeros((view.height, view.width), np.int32)
         masks = []
         for path in self.binary[view.name]:
             stored = np.maximum(images.load_ids(path), 0)
             inside = self._upright(path, 2 * stored > max(int(stored.max()), 1), photograph)
-            masks.append(_sampled(inside, photograph, camera))
+            masks.append(_sampled(inside, sampled, camera))
         return flatten_masks(masks)
 
     def _upright(self, path: Path, stored: np.ndarray, photograph: Photograph) -> np.ndarray:
@@ -95,11 +101,12 @@ def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, A
     folder = _folder(own.get("path"), source.get("path"))
     maps, binary = _listing(folder)
     photographs: dict[str, Photograph] = {}
-    if source["kind"] == "folder":
-        known = transforms.read(source, {**capture, "views": 1_000_000_000}).frames
+    if source["kind"] in PHOTOGRAPHED:
+        find_inputs = importlib.import_module(f"workflow.sources.{source['kind']}").find_inputs
+        known = find_inputs(source, {**capture, "views": 1_000_000_000}).transforms.frames
         photographs = {frame.name: Photograph(frame.camera, frame.lens, frame.turn) for frame in known}
         _refuse_unknown(folder, {*maps, *binary}, set(photographs))
-        used = {frame.name for frame in transforms.read(source, capture).frames}
+        used = {frame.name for frame in find_inputs(source, capture).transforms.frames}
         maps = {name: path for name, path in maps.items() if name in used}
         binary = {name: paths for name, paths in binary.items() if name in used}
         if not maps and not binary:
