@@ -99,26 +99,31 @@ class ViewSpread:
         return float(np.sqrt(max(float(variance.sum()), 0.0) / (3 * float((views - 1).sum()))))
 
 
-def held_out_gain(radiance: NDArray, photo: NDArray, mask: NDArray, response: Callable[[NDArray], NDArray]) -> float:
-    """The exposure g > 0 of one photograph that nothing was fitted to: argmin of sum |f(clip(g L, 0, 1)) - I|^2 over `mask`.
+def held_out_gain(
+    radiance: NDArray, photo: NDArray, mask: NDArray, response: Callable[[NDArray], NDArray], per_channel: bool = False
+) -> NDArray:
+    """The gains g (3,) > 0 of one photograph that nothing was fitted to: argmin of sum |f(clip(g L, 0, 1)) - I|^2 over `mask`.
 
-    One number a photograph, for scoring alone. radiance (H, W, 3) of the re-rendering, photo (H, W, 3) sensor values; `response`:
-    f on (n, 3). Searched on a grid of 1/4 stop within GAIN_STOPS of the ratio of medians, then by golden section. 1 where
-    nothing is seen or the re-rendering is black.
+    For scoring alone: one number a photograph, or with `per_channel` (a camera with automatic white balance) one a channel.
+    radiance (H, W, 3) of the re-rendering, photo (H, W, 3) sensor values; `response`: f on (n, 3), each channel by itself.
+    Searched on a grid of 1/4 stop within GAIN_STOPS of the ratio of medians, then by golden section. 1 where nothing is seen
+    or the re-rendering is black.
     """
     light, value = np.asarray(radiance, np.float64)[mask], np.asarray(photo, np.float64)[mask]
     if not len(light) or not np.median(light) > 0:
-        return 1.0
+        return np.ones(3)
 
-    def error(stops: float) -> float:
-        return float(np.mean((response(np.clip(start * 2**stops * light, 0, 1)) - value) ** 2))
+    def error(stops: NDArray) -> NDArray:
+        own = ((response(np.clip(start * 2**stops * light, 0, 1)) - value) ** 2).mean(0)
+        return own if per_channel else np.full(3, own.mean())
 
     # sensor value 0.5 is about 0.2 of the full radiance in any usual response
     start = max(float(np.median(value)), 1e-3) ** 2.2 / float(np.median(light))
     grid = np.arange(-GAIN_STOPS, GAIN_STOPS + 0.125, 0.25)
-    best = grid[int(np.argmin([error(s) for s in grid]))]
+    best = grid[np.argmin([error(np.full(3, s)) for s in grid], axis=0)]
     low, high, golden = best - 0.25, best + 0.25, (5**0.5 - 1) / 2
     for _ in range(24):
         a, b = high - golden * (high - low), low + golden * (high - low)
-        low, high = (low, b) if error(a) <= error(b) else (a, high)
-    return float(start * 2 ** (0.5 * (low + high)))
+        left = error(a) <= error(b)
+        low, high = np.where(left, low, a), np.where(left, b, high)
+    return start * 2 ** (0.5 * (low + high))

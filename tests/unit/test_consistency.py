@@ -80,12 +80,15 @@ def test_gain_of_a_held_out_photograph(gain):
     mask = np.ones((12, 16), bool)
     mask[0] = False
     photo[0] = 1.0  # not counted
-    assert held_out_gain(radiance, photo, mask, curve) == pytest.approx(gain, rel=0.01)
+    assert held_out_gain(radiance, photo, mask, curve) == pytest.approx([gain] * 3, rel=0.01)
+    tint = np.array([1.2, 1.0, 0.8])
+    photo[1:] = curve(np.clip(gain * tint * radiance[1:], 0, 1))
+    assert held_out_gain(radiance, photo, mask, curve, per_channel=True) == pytest.approx(gain * tint, rel=0.01)
 
 
 def test_extremes_of_the_gain():
     curve, some = response("srgb"), np.full((2, 2, 3), 0.5)
-    assert held_out_gain(np.zeros((2, 2, 3)), some, np.ones((2, 2), bool), curve) == 1.0
-    assert held_out_gain(some, some, np.zeros((2, 2), bool), curve) == 1.0
-    assert np.isfinite(held_out_gain(some, np.zeros((2, 2, 3)), np.ones((2, 2), bool), curve))
-    assert np.isfinite(held_out_gain(some, np.ones((2, 2, 3)), np.ones((2, 2), bool), curve))
+    assert held_out_gain(np.zeros((2, 2, 3)), some, np.ones((2, 2), bool), curve).tolist() == [1.0] * 3
+    assert held_out_gain(some, some, np.zeros((2, 2), bool), curve).tolist() == [1.0] * 3
+    assert np.isfinite(held_out_gain(some, np.zeros((2, 2, 3)), np.ones((2, 2), bool), curve)).all()
+    assert np.isfinite(held_out_gain(some, np.ones((2, 2, 3)), np.ones((2, 2), bool), curve)).all()

@@ -21,8 +21,9 @@ def run(job: Job) -> None:
     """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps.
 
     Sensor value: the re-rendering through the gains of the view and the fitted response, clipped to [0, 1]. A held-out
-    photograph whose exposure nobody gave (automatic exposure) gets the one gain with which its own re-rendering is nearest to
-    it: held_out.parquet. That is the only number that is ever taken from a held-out photograph.
+    photograph whose exposure nobody gave (automatic exposure) gets the gain with which its own re-rendering is nearest to it,
+    a gain a channel where the camera's white balance was found to change: held_out.parquet. Nothing else is taken from its
+    colours.
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, gains = read_response(job.read("affines")), read_gains(job)
@@ -34,7 +35,8 @@ def run(job: Job) -> None:
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
-    found: dict[int, float] = {}
+    found: dict[int, np.ndarray] = {}
+    white_balance = bool((gains.gain != gains.gain[:, :1]).any())
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")
         eye = view.world_from_camera[:3, 3]
@@ -58,17 +60,16 @@ def run(job: Job) -> None:
         factor = pixel_gains(gains, done, view, np.arange(view.height * view.width)).reshape(radiance.shape)
         if view.split == "test" and capture.facts.get("exposure_estimated"):
             photo, valid = capture.photo(view, held_out=True)
-            found[view.view_id] = held_out_gain(factor * radiance, photo, valid & (face_id >= 0), curve)
+            found[view.view_id] = held_out_gain(factor * radiance, photo, valid & (face_id >= 0), curve, white_balance)
             factor = factor * found[view.view_id]
         sensor = curve(np.clip(factor * radiance, 0, 1))
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
-    job.writer.table(
-        "held_out.parquet",
-        {"view_id": np.array(list(found), np.int32), "exposure": np.array(list(found.values()), np.float64)},
-    )
+    rows = np.array(list(found.values())).reshape(-1, 3)
+    columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
+    job.writer.table("held_out.parquet", columns)
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
 
 
