@@ -67,9 +67,10 @@ def run(job: Job) -> None:
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
-    rows = np.array(list(found.values())).reshape(-1, 3)
-    columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
-    job.writer.table("held_out.parquet", columns)
+    if found:
+        rows = np.array(list(found.values()))
+        columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
+        job.writer.table("held_out.parquet", columns)
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
 
 
