@@ -12,11 +12,15 @@ A term enters when it helps on surface that the fit did not see (`choose_gains`)
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.exposure import components
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
 
 SIGNIFICANT = 2.0
 """Standard errors by which a term must help on held-out surface."""
@@ -231,7 +235,7 @@ class _Long:
         cell = np.unique(key, return_inverse=True)[1]
         return cls(cell, view, channel, np.log(rows.y[row, channel]), rows.radius2[row])
 
-    def design(self, n_views: int, white_balance: bool, vignetting: bool):  # noqa: ANN201
+    def design(self, n_views: int, white_balance: bool, vignetting: bool) -> csr_matrix:
         """Sparse (n, V or 3 V, and 2)."""
         from scipy.sparse import coo_matrix
 
@@ -244,7 +248,7 @@ class _Long:
         row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
         return coo_matrix((value, (row, column)), (len(number), gains + 2 * vignetting)).tocsr()
 
-    def members(self, weight: np.ndarray):  # noqa: ANN201
+    def members(self, weight: np.ndarray) -> csr_matrix:
         """Sparse (cells, n)."""
         from scipy.sparse import coo_matrix
 

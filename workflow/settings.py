@@ -381,7 +381,8 @@ class Emission(Section):
     prune: float = Field(0.01, ge=0, lt=1)
     """Groups below this share of the total power are dropped."""
     environment: Literal["auto", "on", "off"] = "auto"
-    """Environment light (16 x 32 texels in groups) for rays that escape; `auto`: when enough of them do."""
+    """Environment light (16 x 32 texels in groups; twelve directions where the mesh is open) for rays that escape;
+    `auto`: when enough of them do."""
     solver: Literal["direct", "sgd"] = "direct"
     """`direct`: non-negative least squares; `sgd`: the paper's descent on the same rows, to compare with."""
     preset: Literal["safe", "paper"] = "safe"

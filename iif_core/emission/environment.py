@@ -66,7 +66,7 @@ class SkySums:
         last group all that too few pixels have seen: nothing tells them apart.
 
         Args:
-            max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice; 1 = all texels together.
+            max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice.
             min_pixels: of a texel that counts as seen.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
@@ -74,7 +74,7 @@ class SkySums:
         seen, hidden = count >= min_pixels, 2 * saturated > count
         level = np.log(np.maximum(mean.sum(1), 1e-12))
         number, step = np.zeros(len(count), np.int64), np.log(max_ratio)
-        while max_groups > 1:
+        while True:
             number[:] = -1
             for part in (seen & ~hidden, seen & hidden):
                 if part.any():

@@ -56,15 +56,6 @@ def test_nothing_seen_is_one_group(pixels):
     assert np.isfinite(sky.radiance).all() and not sky.bounded[0] or pixels == 0
 
 
-def test_one_group_is_the_mean_of_all():
-    sums, rng = SkySums(), np.random.default_rng(3)
-    way, radiance = rng.normal(size=(4000, 3)), rng.uniform(0.1, 3.0, (4000, 3))
-    sums.add(way, radiance, np.zeros((4000, 3), bool))
-    sky = sums.groups(max_groups=1)
-    assert sky.size == 1 and (sky.columns == 0).all() and sky.pixels.tolist() == [4000]
-    np.testing.assert_allclose(sky.radiance[0], radiance.mean(0), rtol=1e-6)
-
-
 def test_groups_of_texels_are_solved_with_the_rest():
     """One emitter, a bright and a dark part of the sky, a part nobody sees; only the last is known by its light alone."""
     rng = np.random.default_rng(1)

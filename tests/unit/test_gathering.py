@@ -77,7 +77,9 @@ def test_lamp_of_unknown_radiance_is_found():
     light, _ = fit_light(cells, gather(cells, trace_cube), 0.4)
     clear = cells.pixels > 0
     key = {tuple(np.round(p, 2)): i for i, p in enumerate(points)}
-    row = np.array([key[tuple(np.round(np.round(p * N - 0.5) / N + 0.5 / N, 2) * (np.abs(n) < 0.5) + (np.abs(n) > 0.5) * (p > 0.5))] for p, n in zip(cells.points, cells.normals, strict=True)])  # fmt: skip  # noqa: E501
+    centre = np.round(np.round(cells.points * N - 0.5) / N + 0.5 / N, 2)  # of the patch, along its wall
+    across = np.abs(cells.normals) > 0.5
+    row = np.array([key[tuple(p)] for p in np.where(across, cells.points > 0.5, centre)])
     found, truth = np.exp(cells.log_radiance - light)[clear], albedo[row][clear]
     before = np.log(photographed[row][clear] / truth)
     after = np.log(found / truth)

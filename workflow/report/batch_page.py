@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from workflow.report import pictures as pic
-from workflow.report.page import number
+from workflow.report.page import template
 
 if TYPE_CHECKING:
     from workflow.batch_summary import Score
@@ -22,19 +22,9 @@ WIDTH = 132
 
 def render(rows: Sequence[dict[str, Any]], quality: str, columns: Sequence[Score], statuses: dict[str, str]) -> str:
     """The page as HTML text; every text is escaped. `columns`: scores to show where a scene has them; `statuses`: meanings."""
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["number"] = number
     done = [row for row in rows if row["status"] == "done"]
     scores = [score for score in columns if any(row[score.column] is not None for row in done)]
-    return environment.get_template(TEMPLATE).render(
+    return template(TEMPLATE).render(
         rows=rows,
         done=done,
         others=[row for row in rows if row["status"] != "done"],

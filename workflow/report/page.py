@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import jinja2
 
 TEMPLATE = "page.html.j2"
 
@@ -83,6 +86,11 @@ class Page:
 
 def render_page(page: Page) -> str:
     """The page as HTML text; every text is escaped."""
+    return template(TEMPLATE).render(page=page)
+
+
+def template(name: str) -> jinja2.Template:
+    """A template of this folder; it escapes every text, and a name that it lacks is an error."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -93,7 +101,7 @@ def render_page(page: Page) -> str:
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
-    return environment.get_template(TEMPLATE).render(page=page)
+    return environment.get_template(name)
 
 
 def number(value: Any, digits: int = 3) -> str:
