@@ -248,6 +248,7 @@ case("intrinsics for another resolution")(lambda root: changed(root, w=128, h=96
 case("the same, without `w` and `h`")(lambda root: changed(root, w=None, h=None, **TWICE))
 case("w and h swapped")(lambda root: changed(root, w=48, h=64))
 case("cx and cy swapped")(lambda root: changed(root, cx=23.0, cy=33.0))
+case("misspelt key in transforms.json")(lambda root: changed(root, fl_x=None, flx=60.0))
 case("no focal length")(lambda root: changed(root, fl_x=None, fl_y=None))
 
 
@@ -692,6 +693,41 @@ def _(root):
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines[:2], lines[3], lines[2], *lines[4:]]))
     return planned(root, source={"kind": "fipt"}, capture={"dynamic_range": "hdr"})
+
+
+def sam2(root, **keys):
+    """The message while Snakemake plans, where SAM 2 is to make the masks."""
+    own.bare(root / "data/own")
+    own.project(root, segmentation={"kind": "masks", "sam2": {"accept_license": True} | keys})
+    with own.working_in(root), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(root / "hub"))
+        return error(lambda: fingerprint.fingerprint("segmentation", "own", "draft"))
+
+
+def sam2_folder(root, model, weights):
+    """A folder in transformers' layout: config.json says `model`."""
+    folder = root / "sam2"
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps({"model_type": model}))
+    (folder / "model.safetensors").write_bytes(weights)
+    return str(folder)
+
+
+HEADER = b'{"a": {"dtype": "U8", "shape": [0], "data_offsets": [0, 0]}}'
+ONE_TENSOR = len(HEADER).to_bytes(8, "little") + HEADER
+case("SAM 2: no weights here")(sam2)
+case("SAM 2: licence not accepted")(
+    lambda root: sam2(root, checkpoint=sam2_folder(root, "sam2", ONE_TENSOR), accept_license=False)
+)
+case("SAM 2: another model's folder")(lambda root: sam2(root, checkpoint=sam2_folder(root, "clip", ONE_TENSOR)))
+case("SAM 2: weights cut short")(lambda root: sam2(root, checkpoint=sam2_folder(root, "sam2", ONE_TENSOR[:20])))
+
+
+@case("masks to read and a model to make them")
+def _(root):
+    own.project(root, segmentation={"kind": "masks", "path": "elsewhere", "sam2": {}})
+    with own.working_in(root):
+        return error(lambda: settings.load("own"))
 
 
 @pytest.mark.parametrize("name", sorted(CASES))

@@ -4,7 +4,7 @@ import pytest
 
 from iif_core.errors import InputError
 from workflow import settings
-from workflow.registry import STAGES, downstream_order
+from workflow.registry import STAGES
 
 GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
 
@@ -37,7 +37,11 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", "found 0"]),
         ("source: {kind: buildin}\nprior: {kind: simulated}\n", ["source.kind", "'buildin'", "builtin, mitsuba, folder"]),
+        ("source: {kind: builtin}\nprior: {samples: 3}\n", ["prior.kind", "missing. Add it", "simulated, files"]),
         ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "missing"]),
+        (GOOD + "affines: {scale: {kind: prior}}\n", ["`affines.scale.kind`: unknown key", "lamp, mean_albedo, white_patch"]),
+        (GOOD + "affines: {scale: x}\n", ["`affines.scale`: found 'x'", "'found' or 'prior'; it may also be `key: value` pairs"]),
+        (GOOD + "affines: {scale: {mean_albedo: 3}}\n", ["`affines.scale.mean_albedo`: found 3", "less than or equal to 1"]),
         ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", "found 3"]),
         ("prior: {kind: simulated}\n", ["`source`: missing"]),
         ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
@@ -56,6 +60,16 @@ def test_errors_tell_what_to_do(scene, text, words):
         settings.load("x", "draft", root)
     for word in words:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "words"), [("Küche 1", ["'Küche 1'", "letters from a to z"]), ("studies", ["results/ uses"])])
+def test_scene_file_with_a_name_that_cannot_be(scene, name, words):
+    root = scene(GOOD)
+    (root / "config/scenes" / f"{name}.yaml").write_text(GOOD)
+    with pytest.raises(InputError) as caught:
+        settings.load(name, "draft", root)
+    for word in [f"config/scenes/{name}.yaml", *words, "rename the file"]:
+        assert word.lower() in str(caught.value).lower()
 
 
 def test_scene_file_that_is_not_utf8(scene):
@@ -88,7 +102,8 @@ def test_bounds_are_words():
 
 
 def test_registry_is_ordered_and_its_settings_exist(repository):
-    assert downstream_order()[0] == "capture"
+    names = list(STAGES)
+    assert all(names.index(needed) < names.index(stage.name) for stage in STAGES.values() for needed in stage.upstream)
     document = settings.dump(settings.load("kitchen", "draft", repository))
     for stage in STAGES.values():
         settings.select(document, stage.settings)

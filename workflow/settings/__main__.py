@@ -1,0 +1,9 @@
+"""Writes what is made from the settings: `python -m workflow.settings`."""
+
+from pathlib import Path
+
+from workflow.settings import reference_markdown, schema_json
+
+if __name__ == "__main__":
+    Path("config/scene.schema.json").write_text(schema_json())
+    Path("docs/settings.md").write_text(reference_markdown())

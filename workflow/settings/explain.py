@@ -1,0 +1,88 @@
+"""What is wrong with a scene file, in words."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from workflow.settings.scene import UNIONS, SceneSettings, section_in
+from workflow.settings.section import Section
+
+
+def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
+    model: Any = SceneSettings
+    parts = [str(p) for p in where]
+    for part in parts[:-1]:
+        if part in UNIONS and model is SceneSettings:
+            model = UNIONS[part]
+        elif isinstance(model, dict):
+            model = model.get(part, model)
+        else:
+            field = getattr(model, "model_fields", {}).get(part)
+            model = section_in(field.annotation) if field else model
+    return model if isinstance(model, type) else None
+
+
+def _dotted(where: tuple[str | int, ...]) -> str:
+    """`prior.samples`: the keys as they stand in the file, without pydantic's names of alternatives."""
+    tags = {tag for union in UNIONS.values() for tag in union}
+    parts = [str(part) for part in where]
+    return ".".join(p for i, p in enumerate(parts) if not (i == 1 and p in tags) and not _is_alternative(parts, i))
+
+
+def _is_alternative(parts: list[str], i: int) -> bool:
+    """Whether part `i` names one of several types that a value may have (`literal['found','prior']`, `WhitePatch`), not a key."""
+    return i > 0 and ("[" in parts[i] or parts[i] == "float" or parts[i][:1].isupper())
+
+
+def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
+    """A value that fits none of its alternatives fails once in each: keep what is wrong inside the one that was meant, else all
+    of them in one sentence."""
+    groups: dict[Any, list[Any]] = {}
+    for number, problem in enumerate(problems):
+        parts = [str(part) for part in problem["loc"]]
+        cut = next((i for i in range(len(parts)) if _is_alternative(parts, i)), None)
+        groups.setdefault(number if cut is None else tuple(parts[:cut]), []).append((problem, cut))
+    kept = []
+    for group in groups.values():
+        inside = [p for p, cut in group if cut is None or len(p["loc"]) > cut + 1 or p["type"] == "value_error"]
+        if not inside:
+            said = dict.fromkeys("it may also be `key: value` pairs" if p["type"] == "model_type" else p["msg"] for p, _ in group)
+            inside = [{**group[0][0], "msg": "; ".join(said)}]
+        kept.extend(inside)
+    return kept
+
+
+def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
+    """One line a problem; `origin` tells the file of a dotted key."""
+    lines = []
+    for problem in _one_of_each_choice(error.errors()):
+        where = problem["loc"]
+        dotted = _dotted(where)
+        found = problem.get("input")
+        kind = problem["type"]
+        path = origin(f"{dotted}.kind" if kind.startswith("union_tag") else dotted)
+        if kind == "extra_forbidden":
+            section = _section_of(where)
+            allowed = sorted(section.model_fields) if section else []
+            near = difflib.get_close_matches(str(where[-1]), allowed, 1)
+            hint = f" Did you mean `{near[0]}`?" if near else ""
+            lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
+        elif kind in ("model_type", "model_attributes_type", "dict_type"):
+            lines.append(f"{path}: `{dotted}`: found {found!r}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`.")
+        elif kind == "missing":
+            lines.append(f"{path}: `{dotted}`: missing. Add it; config/scenes/kitchen.yaml is a complete example.")
+        elif kind in ("union_tag_invalid", "union_tag_not_found"):
+            union = UNIONS.get(str(where[0]), {})
+            got = found.get("kind") if isinstance(found, dict) else found
+            said = "missing. Add it;" if got is None else f"found {got!r},"
+            lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.")
+        elif kind == "value_error" and isinstance(found, dict):  # keys that do not go together: the message says which
+            lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
+        else:
+            shown = found if not isinstance(found, dict) else "a mapping"
+            lines.append(f"{path}: `{dotted}`: found {shown!r}. {problem['msg']}.")
+    return "\n".join(lines)

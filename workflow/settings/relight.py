@@ -1,0 +1,101 @@
+"""Pictures under other light and from elsewhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from iif_core.errors import InputError
+from workflow.settings.section import Section
+
+
+class RelightSphere(Section):
+    """A black sphere that shines, put into the room."""
+
+    center: tuple[float, float, float]
+    """Metres, world axes."""
+    radius: float = Field(0.2, gt=0)
+    """Metres."""
+    radiance: tuple[float, float, float] = (53.0, 50.0, 45.0)
+    """In the units of emitters.parquet."""
+    path_to: tuple[float, float, float] | None = None
+    """Where it has moved to in the last frame."""
+
+
+class RelightCamera(Section):
+    """Stills or a flight between views."""
+
+    views: list[str] = Field(default_factory=list)
+    """Names of the views to fly along (one: a still camera); default: the first view."""
+    frames: int = Field(1, ge=1, le=10000)
+    """Pictures."""
+    fov: float | None = Field(None, gt=1, lt=170)
+    """Horizontal field of view in degrees; default: as photographed."""
+    width: int | None = Field(None, ge=8, le=8192)
+    """Pixels; default: of the first view."""
+    height: int | None = Field(None, ge=8, le=8192)
+    """Pixels; default: of the first view."""
+
+
+class Relighting(Section):
+    """One relighting of the recovered scene: `snakemake --cores 2 relight/<scene>` (docs/relighting.md)."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    """Folder of its pictures."""
+    emitters: float = Field(1.0, ge=0)
+    """`on`, `off`, or what their radiance is multiplied by."""
+    environment: Literal["keep", "off"] | tuple[float, float, float] | Path = "keep"
+    """Light from outside: `keep`, `off`, one radiance `[r, g, b]`, or a latitude-longitude EXR (top row = up)."""
+    environment_turn: float = 0.0
+    """Degrees by which an EXR is turned about the up axis."""
+    sphere: RelightSphere | None = None
+    """A lamp that is put in."""
+    camera: RelightCamera = RelightCamera()
+    """Where from."""
+    exposure: float | None = Field(None, gt=0)
+    """What radiance is multiplied by before the camera response; default: by the brightness of the first frame."""
+    samples: int = Field(64, ge=1)
+    """Paths a pixel."""
+    max_bounces: int = Field(8, ge=1, le=64)
+    """Path length."""
+    denoise: bool = True
+    """Denoise the pictures."""
+
+    @field_validator("emitters", mode="before")
+    @classmethod
+    def _switch(cls, value: Any) -> Any:
+        return {"on": 1.0, "off": 0.0}.get(value, value) if isinstance(value, str) else value
+
+    @field_validator("environment", mode="before")
+    @classmethod
+    def _no_environment(cls, value: Any) -> Any:  # YAML reads a bare `off` as false
+        return {False: "off", True: "keep"}[value] if isinstance(value, bool) else value
+
+
+def require_relighting(document: dict[str, Any], scene: str) -> list[dict[str, Any]]:
+    """The relightings of a dumped settings tree; an error where there are none, or two of one name."""
+    wanted: list[dict[str, Any]] = document["relight"]
+    if not wanted:
+        raise InputError(
+            f"config/scenes/{scene}.yaml: no relighting is configured. Add one, for example"
+            " `relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]` (docs/relighting.md)."
+        )
+    names = [entry["name"] for entry in wanted]
+    if len(set(names)) < len(names):
+        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
+    return wanted
+
+
+def relight_files(document: dict[str, Any]) -> list[Path]:
+    """Environment files that the relightings of a dumped settings tree name; a missing one is an error."""
+    named = [entry["environment"] for entry in document["relight"]]
+    files = [Path(value) for value in named if isinstance(value, str) and value not in ("keep", "off")]
+    for path in files:
+        if path.suffix.lower() != ".exr" or not path.is_file():
+            raise InputError(
+                f"`relight.environment`: found {str(path)!r}, which is no EXR file here; allowed: keep, off, [r, g, b] or the"
+                " path of a latitude-longitude EXR"
+            )
+    return files

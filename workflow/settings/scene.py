@@ -1,0 +1,87 @@
+"""Everything about one scene: the sections together, as a model and as a tree of plain values."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+from pydantic import Field, field_validator, model_validator
+
+from workflow.settings.affines import Affines
+from workflow.settings.base import Base
+from workflow.settings.light import Emission, Shading
+from workflow.settings.outputs import Export, Metrics, Render, Report
+from workflow.settings.prior import Prior
+from workflow.settings.relight import Relighting
+from workflow.settings.section import Section
+from workflow.settings.segmentation import GivenSegmentation, Segmentation
+from workflow.settings.source import Capture, Source
+
+
+class SceneSettings(Section):
+    """Everything about one scene."""
+
+    source: Source
+    """Where photographs, cameras and mesh come from."""
+    capture: Capture = Capture()
+    prior: Prior
+    """Where the K material predictions come from."""
+    segmentation: Segmentation = GivenSegmentation()
+    """Which surface belongs to which object."""
+    base: Base = Base()
+    emission: Emission = Emission()
+    shading: Shading = Shading()
+    affines: Affines = Affines()
+    render: Render = Render()
+    metrics: Metrics = Metrics()
+    export: Export = Export()
+    report: Report = Report()
+    relight: list[Relighting] = Field(default_factory=list)
+    """Pictures under other light and from elsewhere, made on demand."""
+    seed: int = Field(0, ge=0, lt=2**31)
+    """Seed of everything random."""
+
+    @field_validator("segmentation", mode="before")
+    @classmethod
+    def _given_unless_named(cls, value: Any) -> Any:
+        return {"kind": "given", **value} if isinstance(value, dict) else value
+
+    @model_validator(mode="after")
+    def _known_predictions(self) -> SceneSettings:
+        made, used = getattr(self.prior, "samples", None), self.base.predictions
+        if made is not None and used is not None and used > made:
+            raise ValueError(
+                f"`base: predictions` is {used}, but `prior: samples` makes {made}; lower the one or raise the other"
+            )
+        return self
+
+
+def _members(union: Any) -> dict[str, type[Section]]:
+    """The sections of a union by their `kind`."""
+    sections = get_args(get_args(union)[0])
+    return {get_args(section.model_fields["kind"].annotation)[0]: section for section in sections}
+
+
+UNIONS = {"source": _members(Source), "prior": _members(Prior), "segmentation": _members(Segmentation)}
+"""Sections whose `kind` chooses what other keys they have: kind -> its model."""
+
+
+def section_in(annotation: Any) -> Any:
+    """The section in `list[Section]` and `Section | None`; other types as they are."""
+    inner = [t for t in getattr(annotation, "__args__", ()) if isinstance(t, type) and issubclass(t, Section)]
+    return inner[0] if inner else annotation
+
+
+def dump(settings: SceneSettings) -> dict[str, Any]:
+    """Plain JSON values of the settings."""
+    return settings.model_dump(mode="json")
+
+
+def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
+    """The parts of a dumped settings tree named by dotted `keys`."""
+    out: dict[str, Any] = {}
+    for key in keys:
+        value: Any = document
+        for part in key.split("."):
+            value = value[part]
+        out[key] = value
+    return out
