@@ -58,7 +58,7 @@ class SurfaceCells:
         edge: metres; origin: (3,).
         points, normals (unit): (n, 3) means; group: (n,) int; log_radiance: (n, 3) mean of log L over unsaturated pixels;
             pixels: (n,) of those; saturated: (n,) share of all pixels; voxel: (n,) row of the next three.
-        voxel_key: (v,) uint64 sorted; voxel_radiance: (v, 3) mean; voxel_saturated: (v,) share.
+        voxel_key: (v,) uint64 sorted; voxel_radiance: (v, 3) mean.
     """
 
     edge: float
@@ -72,7 +72,6 @@ class SurfaceCells:
     voxel: NDArray
     voxel_key: NDArray
     voxel_radiance: NDArray
-    voxel_saturated: NDArray
 
     def __len__(self) -> int:
         return len(self.points)
@@ -118,7 +117,7 @@ class SurfaceCellsBuilder:
         ijk, _ = unpack_keys(self.keys)
         voxel_key, voxel = np.unique(pack_keys(ijk, np.full(len(ijk), -1)), return_inverse=True)
         voxel = voxel.ravel()
-        of_voxel = _sums(voxel, len(voxel_key), self.sums[:, [0, 1, 11, 12, 13]])
+        of_voxel = _sums(voxel, len(voxel_key), self.sums[:, [0, 11, 12, 13]])
         normals = self.sums[:, 5:8]
         seen = np.maximum(of_voxel[:, 0], 1)
         return SurfaceCells(
@@ -132,8 +131,7 @@ class SurfaceCellsBuilder:
             shone / np.maximum(count, 1),
             voxel,
             voxel_key,
-            of_voxel[:, 2:5] / seen[:, None],
-            of_voxel[:, 1] / seen,
+            of_voxel[:, 1:] / seen[:, None],
         )
 
 

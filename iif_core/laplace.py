@@ -1,4 +1,4 @@
-"""Laplace distributions: divergence, its slopes, and the closed-form scales of the material base.
+"""Laplace distributions: divergence, its weights, and the closed-form scales of the material base.
 
 Every texture value is a Laplace distribution (location mu, scale b); the predictions of one pixel make a
 reference distribution and the surface cell the texture distribution. Matching the two is a Kullback-Leibler
@@ -37,24 +37,6 @@ def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_
     d = np.abs(distance)
     b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
     return np.log(b_p) - np.log(b_r) + (d + b_r * np.exp(-d / b_r)) / b_p - 1.0
-
-
-def kl_derivatives(
-    distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Slopes of `kl` with respect to d, b_ref and b_pred (of the floored scales; METHOD 2.3.4).
-
-    dKL/dd   = (1 - e^(-d/b_r)) / b_p
-    dKL/db_r = -1/b_r + (1 + d/b_r) e^(-d/b_r) / b_p
-    dKL/db_p = 1/b_p - (d + b_r e^(-d/b_r)) / b_p^2
-    """
-    d = np.abs(distance)
-    b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
-    decay = np.exp(-d / b_r)
-    d_distance = -np.expm1(-d / b_r) / b_p
-    d_ref = -1.0 / b_r + (1.0 + d / b_r) * decay / b_p
-    d_pred = 1.0 / b_p - (d + b_r * decay) / b_p**2
-    return d_distance, d_ref, d_pred
 
 
 def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:

@@ -132,6 +132,13 @@ class ViewPixels:
         return ViewPixels(**{name: array[choice] for name, array in self.__dict__.items()})
 
 
+def sensor_bounds(value: np.ndarray, is_hdr: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Sensor values, and which of them are bounds: at the top of the range, whatever is stored above it. Radiance has no top."""
+    if is_hdr:
+        return value, np.zeros(value.shape, bool)
+    return np.minimum(value, saturation), value >= saturation
+
+
 def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:
     """Photograph, G-buffer and segmentation of a view, a row a pixel that hits the mesh; no pixel of a held-out view is valid."""
     if view.split == "test":  # geometry alone: no stage that finds anything sees what it shows

@@ -18,7 +18,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.direct import solve_base
+from iif_core.base.options import BaseOptions
 from iif_core.base.problem import BaseProblem
 
 VIEWS = 8

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from iif_core import laplace, metrics, simulate
-from iif_core.base.direct import VARIANTS, BaseOptions, solve_base
+from iif_core.base.direct import solve_base
 from iif_core.base.gauge import covisible_parts
+from iif_core.base.options import VARIANTS, BaseOptions
 from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem, object_means, prediction_faults
 from iif_core.base.selection import selection_weights
 from iif_core.errors import InputError

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.direct import solve_base
+from iif_core.base.options import BaseOptions
 from iif_core.base.problem import LOWEST, BaseProblem, one_segment_per_view
 from iif_core.base.selection import selection_weights
 from iif_core.cells import grid_origin, pack_keys, voxel_indices

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from iif_core import cells
-from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.direct import solve_base
 from iif_core.base.gauge import Parts, anchor_shifts, seam_shifts
+from iif_core.base.options import BaseOptions
 from iif_core.base.problem import BaseProblem
 
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.direct import BaseOptions, solve_base
+from iif_core.base.direct import solve_base
 from iif_core.base.kernels import IDENTITY, as_words
+from iif_core.base.options import BaseOptions
 from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem
 from iif_core.base.reference_loss import loss_of_result, reference_loss
 from iif_core.base.sgd import SgdOptions, converged, kernels, numba_engine, sgd_options, solve_base_sgd, torch_engine

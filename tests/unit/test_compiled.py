@@ -18,7 +18,7 @@ PROGRAM = """
 import hashlib
 import numpy as np
 from iif_core.base import kernels
-from iif_core.base.direct import LOWEST
+from iif_core.base.problem import LOWEST
 
 rng = np.random.default_rng(0)
 n, n_segments, n_predictions = 20000, 40, 8

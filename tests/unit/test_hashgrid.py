@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from iif_core import hashgrid
 from iif_core.errors import InputError
-from iif_core.hashgrid import HashGridOptions, HashGridTexture, layout, parameter_counts
+from iif_core.hashgrid import HashGridOptions, HashGridTexture, layout, numba_engine, parameter_counts
+from iif_core.hashgrid.levels import ROWS
 
 # direct levels (7, 11 vertices: 343, 1331 entries) and hashed ones; odd sizes everywhere, collisions
 SMALL = HashGridOptions(
@@ -69,7 +69,7 @@ def test_layout_and_parameter_count_are_the_papers():
     encoding, network = parameter_counts(HashGridOptions())
     assert encoding / 1e6 == pytest.approx(27.95, abs=0.005)
     assert network == 64 * 64 + 64 + 64 * 64 + 64 + 64 * 10 + 10
-    assert all(level.start % hashgrid.ROWS == 0 for level in levels)
+    assert all(level.start % ROWS == 0 for level in levels)
 
 
 def test_cap_ends_the_levels_at_the_first_that_reaches_it():
@@ -177,7 +177,7 @@ def assert_same_state(one, two):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_backward_passes_add_up(backend, monkeypatch):
     if backend == "numba":
-        monkeypatch.setattr(hashgrid, "PENDING", 700)  # the third pass is scattered early, the last waits
+        monkeypatch.setattr(numba_engine, "PENDING", 700)  # the third pass is scattered early, the last waits
     parts, whole = (HashGridTexture(SMALL, seed=2, backend=backend) for _ in range(2))
     batches = [points(n, seed=n) for n in (300, 200, 250, 10)]
     graphs = [(parts(u) ** 3).sum() for u in batches]

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.base.direct import BaseOptions, describe_fit, solve_base
+from iif_core.base.direct import describe_fit, solve_base
 from iif_core.base.matching import REGULARISER
+from iif_core.base.options import BaseOptions
 from iif_core.base.problem import CHANNELS, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, one_segment_per_view
 from iif_core.base.reference_loss import loss_of_result
 from iif_core.base.sgd import SgdFit, converged, sgd_options, solve_base_sgd
@@ -87,8 +88,12 @@ def run(job: Job) -> None:
             maps |= _raw_maps(prior, view, samples, ids_from_disk(maps["cell.id"]) >= 0)
         job.writer.exr(f"maps/{view.name}.exr", maps)
         job.progress(done + 1, len(capture.views), "maps")
-    seen = np.unique(np.concatenate([np.unique(m[m >= 0]) for m in problem.segment_of_pixel]))
-    last = result.history[-1]
+    _write_facts(job, cells, problem, result, fit, used)
+
+
+def _write_facts(job: Job, cells: Cells, problem: BaseProblem, result: BaseResult, fit: SgdFit | None, used: int) -> None:
+    """base.json, and the same in a line of the log; `used` predictions a view."""
+    settings = job.settings.base
     job.writer.json(
         "base.json",
         {
@@ -112,8 +117,8 @@ def run(job: Job) -> None:
         len(cells.keys),
         1e3 * cells.edge,
         100 * (result.views == 1).mean(),
-        len(seen),
-        ", ".join(f"{name} {value:.4g}" for name, value in last.items()),
+        len(np.unique(np.concatenate([np.unique(m[m >= 0]) for m in problem.segment_of_pixel]))),
+        ", ".join(f"{name} {value:.4g}" for name, value in result.history[-1].items()),
     )
 
 

@@ -22,7 +22,7 @@ class Adam:
     """Adam of a float32 array (torch.optim.Adam's defaults, dense), in the kernel of the hash grid."""
 
     def __init__(self, parameter: NDArray):
-        from ...hashgrid_kernels import SPAN
+        from ...hashgrid.kernels import SPAN
 
         self.parameter = parameter.reshape(-1)
         self.gradient, self.first, self.second = (np.zeros_like(self.parameter) for _ in range(3))
@@ -32,7 +32,7 @@ class Adam:
 
     def step(self, lr: float, run: Callable = lambda task, arguments: [task(a) for a in arguments]) -> None:
         """One update; zeroes the gradient. `run` shares pieces out: elements are independent."""
-        from ...hashgrid_kernels import adam
+        from ...hashgrid.kernels import adam
 
         self.steps += 1
         beta1, beta2 = 0.9, 0.999
