@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from iif_core.color import linear_from_srgb
 from workflow.sources.rooms.patterns import Colour, Material, facing
 
 UP, EAST, NORTH = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
@@ -12,8 +13,7 @@ UP, EAST, NORTH = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
 
 def paint(code: str) -> Colour:
     """Linear colour of a `#rrggbb` sRGB code."""
-    values = [int(code[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    r, g, b = (v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in values)
+    r, g, b = (float(linear_from_srgb(int(code[i : i + 2], 16) / 255)) for i in (1, 3, 5))
     return r, g, b
 
 

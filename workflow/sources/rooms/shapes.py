@@ -254,9 +254,3 @@ def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: 
     a, b = i * 10 + j, (i + 1) % segments * 10 + j
     c, d = (i + 1) % segments * 10 + (j + 1) % 10, i * 10 + (j + 1) % 10
     return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-
-
-def volume(shape: Shape) -> float:
-    """Signed volume; positive when closed and outward."""
-    a, b, c = (shape[0][shape[1][:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
