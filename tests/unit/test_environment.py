@@ -6,24 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from iif_core import environment, native
+from iif_core import environment
 from iif_core.errors import InputError
 from iif_core.xp import NUMPY
 
 H, W = 16, 32
-
-
-@pytest.fixture(scope="module")
-def T():
-    native.prepare()
-    import drjit as dr
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(2)
-    from iif_core import transport
-
-    return transport
 
 
 def sky(seed=0):

@@ -10,7 +10,7 @@ from iif_core.relighting import axes_of_map, camera_path, ease, exposure_for, fr
 from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.settings import Relighting
+from workflow.settings.relight import Relighting
 from workflow.stages import relight
 
 

@@ -5,15 +5,6 @@ import pytest
 
 from iif_core import brdf
 
-pytestmark = pytest.mark.usefixtures("llvm")
-
-
-@pytest.fixture(scope="module")
-def T(llvm):
-    from iif_core import transport
-
-    return transport
-
 
 def quad(corner, edge1, edge2):
     c, a, b = (np.asarray(v, np.float32) for v in (corner, edge1, edge2))

@@ -1,0 +1,123 @@
+"""Light transport: extremes of the furnished room, far from the origin, bad input."""
+
+import numpy as np
+import pytest
+
+from iif_core.errors import InputError
+from tests.unit.transport_rooms import box, lambertian, quad
+
+
+def test_extremes_are_finite(T, room):
+    mirror = T.FaceMaterials(np.tile([0, 0, 0, 0, 1.0], (len(room.faces), 1)))  # black metal, r clamped to 0.02
+    bright = T.Emitters(room.geometry, room.radiance * 1e6, room.side)
+    grazing = room.normals * 1e-6 + np.cross(room.normals, (0.3, 0.5, 0.8))
+    behind = np.cross(room.normals, (0.3, 0.5, 0.8))
+    some = slice(0, 300)
+    for material in (mirror, room.material):
+        for wo in (grazing, behind, room.wo):
+            caches = T.shading_caches(
+                room.geometry,
+                material,
+                bright,
+                room.points[some],
+                room.normals[some],
+                wo[some],
+                [0.02, 1],
+                8,
+                6,
+                0,
+            )
+            matrix = T.transport_matrix(
+                room.geometry,
+                material,
+                room.points[some],
+                room.normals[some],
+                wo[some],
+                np.zeros((300, 3)),
+                np.zeros(300),
+                np.ones(300),
+                room.group,
+                2,
+                room.side,
+                8,
+                6,
+                0,
+            )
+            for value in (*caches, *matrix):
+                assert np.isfinite(value).all() and (value >= 0).all()
+        assert np.isfinite(T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)).all()
+    dark = T.Emitters(room.geometry, np.zeros((len(room.faces), 3)))
+    assert not T.render(room.geometry, room.material, dark, room.origin, room.directions, 2, 4, 0).any()
+
+
+def test_far_from_the_origin_nothing_shadows_itself(T):
+    """At 5 km a float32 hit is off by 5e-4 m: the offset along the normal must grow with it (METHOD H24)."""
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_euler("xyz", (0.4, 0.7, 1.1)).as_matrix()
+    corners, faces = box((-1, -1, -1), (1, 1, 1), inward=True)
+    directions = np.random.default_rng(0).normal(size=(3000, 3))
+    material, rho = lambertian(0.5)
+    seen = []
+    for shift in (np.zeros(3), np.array([5000.0, -4000, 3000])):
+        geometry = T.build_geometry(corners @ turn.T + shift, faces, np.zeros(12, np.int32))
+        emitters = T.Emitters(geometry, np.ones((12, 3)), np.ones(12), sampling_weight=np.zeros(12))
+        seen.append(T.render(geometry, material, emitters, shift, directions, 32, 1, 0)[:, 0])
+    assert 1 + rho < seen[0].mean() < 1 + rho + 0.01
+    assert seen[1].mean() == pytest.approx(seen[0].mean(), rel=5e-3)
+
+
+def test_bad_input_is_named(T, room):
+    square = quad((0, 0, 0), (1, 0, 0), (0, 1, 0))
+    with pytest.raises(InputError, match="no face of area"):
+        T.build_geometry(np.zeros((3, 3)), [[0, 1, 2]], [0])
+    with pytest.raises(InputError, match="vertices 0 ... 9"):
+        T.build_geometry(square[0], [[0, 1, 9]], [0])
+    with pytest.raises(InputError, match="NaN"):
+        T.build_geometry(np.full((4, 3), np.nan), square[1], [0, 0])
+    with pytest.raises(InputError, match="one id for each face"):
+        T.build_geometry(*square, [0])
+    geometry = T.build_geometry(*square, [0, 0])
+    with pytest.raises(InputError, match="never negative"):
+        T.Emitters(geometry, -np.ones((2, 3)))
+    with pytest.raises(InputError, match="side"):
+        T.Emitters(geometry, np.ones((2, 3)), [2, 0])
+    with pytest.raises(InputError, match="NaN"):
+        T.FaceMaterials(np.full((2, 5), np.nan))
+    with pytest.raises(InputError, match="roughness levels"):
+        T.shading_caches(
+            room.geometry,
+            room.material,
+            room.emitters,
+            room.points,
+            room.normals,
+            room.wo,
+            [0.5, 0.1],
+            1,
+            1,
+            0,
+        )
+    with pytest.raises(InputError, match="samples=0"):
+        room.render(T, 0, seed=0)
+    with pytest.raises(InputError, match="zero vector"):
+        T.render(room.geometry, room.material, room.emitters, [0, 0, 0], np.zeros((1, 3)), 1, 1, 0)
+    with pytest.raises(InputError, match="emitter_of_face"):
+        T.transport_matrix(
+            room.geometry,
+            room.material,
+            room.points,
+            room.normals,
+            room.wo,
+            room.base_color,
+            room.roughness,
+            room.metallic,
+            room.group,
+            1,
+            room.side,
+            1,
+            1,
+            0,
+        )
+    none = np.zeros((0, 3), np.float32)
+    assert T.render(room.geometry, room.material, room.emitters, none, none, 1, 1, 0).shape == (0, 3)
+    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[1].shape == (0, 1, 3)
