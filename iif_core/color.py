@@ -1,6 +1,6 @@
 """Colour for the border: the sRGB transfer curve, luminance, and pictures of radiance, ids and errors for people.
 
-Everything inside the project is linear; nothing here is used in a computation that ends in a material.
+Everything inside the project is linear. The curve as a camera response, with derivatives, is `response("srgb")`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ Array = np.ndarray
 
 REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear R, G, B in luminance (ITU-R BT.709)."""
+
+SRGB_KNEE = 0.0031308
+"""Linear value below which the sRGB curve is a straight line, 12.92 x (IEC 61966-2-1)."""
 
 GOLDEN_RATIO = 0.6180339887498949
 NO_ID_COLOUR = (0.08, 0.08, 0.08)
@@ -34,8 +37,8 @@ def srgb_from_linear(x: ArrayLike) -> Array:
     """
     x = _floating(x)
     size = np.abs(x)
-    high = 1.055 * np.maximum(size, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.copysign(np.where(size <= 0.0031308, 12.92 * size, high), x).astype(x.dtype)
+    high = 1.055 * np.maximum(size, SRGB_KNEE) ** (1 / 2.4) - 0.055
+    return np.copysign(np.where(size <= SRGB_KNEE, 12.92 * size, high), x).astype(x.dtype)
 
 
 def linear_from_srgb(y: ArrayLike) -> Array:
@@ -54,23 +57,14 @@ def luminance(rgb: ArrayLike) -> Array:
     return rgb @ np.asarray(REC709_LUMINANCE, rgb.dtype)
 
 
-def display_exposure(radiance: ArrayLike, valid: Array | None = None, quantile: float = 0.9, target: float = 0.7) -> float:
-    """Factor that brings the `quantile` of luminance to `target`; 1 where there is nothing to go by.
+def key_exposure(radiance: ArrayLike, valid: Array | None = None, key: float = 0.18) -> float:
+    """Factor that brings the log-average of luminance, exp(mean(ln Y)), to `key` (Reinhard et al. 2002); 1 without light.
+
+    Luminance below 1e-6 of its mean counts as that, so that black pixels do not decide.
 
     Args:
         radiance: (..., 3) linear.
         valid: (...) bool, which pixels count; default all.
-    """
-    y = luminance(radiance)
-    y = y[np.isfinite(y) if valid is None else np.isfinite(y) & valid]
-    level = float(np.quantile(y, quantile)) if y.size else 0.0
-    return target / level if level > 1e-12 else 1.0
-
-
-def key_exposure(radiance: ArrayLike, valid: Array | None = None, key: float = 0.18) -> float:
-    """Factor that brings the log-average of luminance, exp(mean(ln Y)), to `key` (Reinhard et al. 2002); 1 without light.
-
-    Luminance below 1e-6 of its mean counts as that, so that black pixels do not decide. Arguments as of `display_exposure`.
     """
     y = luminance(radiance).astype(np.float64)
     y = y[np.isfinite(y) if valid is None else np.isfinite(y) & valid]

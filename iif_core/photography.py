@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from iif_core.color import luminance, srgb_from_linear
 from iif_core.errors import InputError
 
 STOPS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Exposures of the five groups of views, brightest group first (METHOD 4.1)."""
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _THIRD = 2.0 ** (-1 / 3)
 
 
@@ -52,7 +52,7 @@ class ResponseCurve:
         """Sensor values in [0, 1] of exposed radiance x (..., 3), clipped to [0, 1]; float64."""
         y = np.clip(np.asarray(x, np.float64), 0, 1) ** np.array(self.gamma)
         if not self.linear:
-            y = np.where(y <= 0.0031308, 12.92 * y, 1.055 * np.maximum(y, 0.0031308) ** (1 / 2.4) - 0.055)
+            y = srgb_from_linear(y)
         return y + np.array(self.strength) * y * (1 - y) * (2 * y - np.array(self.pivot))
 
     def samples(self, count: int = 101) -> np.ndarray:
@@ -123,9 +123,9 @@ def exposures(
         raise InputError(f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1")
     pixels = [_valid_pixels(v, r, None if valid is None else valid[v]) for v, r in enumerate(views)]
 
-    luminance = [p @ _LUMINANCE for p in pixels]
-    mean = np.array([y.mean() if len(y) else 0.0 for y in luminance])
-    median = np.array([np.median(y) if len(y) else 0.0 for y in luminance])
+    bright = [luminance(p) for p in pixels]
+    mean = np.array([y.mean() if len(y) else 0.0 for y in bright])
+    median = np.array([np.median(y) if len(y) else 0.0 for y in bright])
     order = np.argsort(-mean, kind="stable")
     stop = np.empty(len(views))
     stop[order] = stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)

@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.color import SRGB_KNEE, srgb_from_linear
 from iif_core.errors import InputError
 
 FAMILIES = ("identity", "srgb", "gamma", "ggcm", "spline", "sampled")
@@ -84,11 +85,6 @@ class Response:
         """df/dx: float64, shape of x, > 0."""
         return self._evaluate(x)[1]
 
-    def parameter_derivatives(self, x: np.ndarray) -> np.ndarray:
-        """df/dparams: float64, shape of x + (P,)."""
-        x = np.asarray(x, np.float64)
-        return self._evaluate(x, True)[2]
-
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """f, df/dx and df/dparams in one pass: shapes x, x, x + (P,); float64."""
         return self._evaluate(x, True)
@@ -136,10 +132,8 @@ class Response:
         if self.family == "identity":
             return x, np.ones_like(x), none, none
         if self.family == "srgb":
-            low = x <= 0.0031308
-            safe = np.where(low, 1.0, x)
-            f = np.where(low, 12.92 * x, 1.055 * safe ** (1 / 2.4) - 0.055)
-            return f, np.where(low, 12.92, 1.055 / 2.4 * safe ** (1 / 2.4 - 1)), none, none
+            steep = 1.055 / 2.4 * np.maximum(x, SRGB_KNEE) ** (1 / 2.4 - 1)
+            return srgb_from_linear(x), np.where(x <= SRGB_KNEE, 12.92, steep), none, none
         if self.family == "sampled":
             f, slope = self._interpolate(x)
             return f, slope, none, none
@@ -264,7 +258,7 @@ class Response:
     def _inverse_shared(self, y: np.ndarray) -> np.ndarray:
         inside = np.clip(y, 0.0, 1.0)
         if self.family == "srgb":
-            x = np.where(inside <= 12.92 * 0.0031308, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
+            x = np.where(inside <= 12.92 * SRGB_KNEE, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
         elif self.family == "gamma" and not np.any(inside < self(np.array(_TOE))):
             x = inside ** self.params[0]
         elif self.family == "sampled":

@@ -137,18 +137,10 @@ def simulate_predictions(
     Raises:
         InputError: shapes that do not match, samples < 1, strength outside [0, 4], truth that is not finite.
     """
-    shape = np.shape(object_id)
-    found = [np.shape(a) for a in (albedo, roughness, metallic)] + ([] if shading is None else [np.shape(shading)])
-    if len(shape) != 2 or found[0] != (*shape, 3) or any(f != shape for f in found[1:]):
-        raise InputError(
-            f"simulated prior: albedo, roughness, metallic (and shading) {found} and object ids {shape} do not "
-            "share height and width"
-        )
-    truth = np.concatenate([albedo, np.asarray(roughness)[..., None], np.asarray(metallic)[..., None]], -1, dtype=np.float32)
     if samples < 1 or not 0 <= strength <= 4:
         raise InputError(f"simulated prior: samples {samples} (at least 1), strength {strength} (between 0 and 4)")
-    if not np.isfinite(truth).all():
-        raise InputError(f"simulated prior: {np.sum(~np.isfinite(truth))} values of the truth are not finite; fix the capture")
+    shape = np.shape(object_id)
+    truth = _truth(albedo, roughness, metallic, shading, shape)
     if strength == 0 or truth.size == 0:
         return np.repeat(np.clip(truth, 0, 1)[None], samples, 0)
 
@@ -197,6 +189,20 @@ def simulate_predictions(
             out[k, ..., 3 + p] = value + shift[p, unit, k] + rippled[unit, k] * patterns[k][..., p]
         out[k] += np.float32(s * e.noise) * draw.pixel_normal(k, shape)
     return np.clip(out, 0, 1)
+
+
+def _truth(albedo: NDArray, roughness: NDArray, metallic: NDArray, shading: NDArray | None, shape: tuple[int, ...]) -> NDArray:
+    """(H, W, 5) float32 of maps that share the height and width of the object ids and are finite."""
+    found = [np.shape(a) for a in (albedo, roughness, metallic)] + ([] if shading is None else [np.shape(shading)])
+    if len(shape) != 2 or found[0] != (*shape, 3) or any(f != shape for f in found[1:]):
+        raise InputError(
+            f"simulated prior: albedo, roughness, metallic (and shading) {found} and object ids {shape} do not "
+            "share height and width"
+        )
+    truth = np.concatenate([albedo, np.asarray(roughness)[..., None], np.asarray(metallic)[..., None]], -1, dtype=np.float32)
+    if not np.isfinite(truth).all():
+        raise InputError(f"simulated prior: {np.sum(~np.isfinite(truth))} values of the truth are not finite; fix the capture")
+    return truth
 
 
 def shading_proxy(radiance: NDArray, albedo: NDArray, object_id: NDArray, sigma: float = 0.02) -> NDArray:

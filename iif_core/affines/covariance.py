@@ -10,9 +10,9 @@ McCaffrey 2002, "CR2"). What the few clusters of an object say about their own s
 by (1 + 1 / (2 nu))^2, so that one standard deviation either way holds Student's t of nu degrees of freedom 68 % of the time;
 nu = (sum_k l_k)^2 / sum_k l_k^2, l_k = trace(H_k B).
 
-The response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every object by -B C d_k on
-top of its own move; so do the errors of every pull, and that of the response's own prior. What is not in it: errors of light and
-geometry that all clusters of an object share.
+The response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every object by
+-B (C - W c) d_k on top of its own move, c how the pull's centre moves with the response; so do the errors of every pull, and that
+of the response's own prior. What is not in it: errors of light and geometry that all clusters of an object share.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ def sandwich(
         system: undamped, at the solution `state`; tone: there.
     """
     free, through, schur = state.free, system.through, system.schur
+    if pull.drift is not None:
+        through = through - system.inverse @ pull.drift
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     alone, reduced = np.zeros((len(owner), PARAMETERS)), np.zeros((len(owner), len(schur)))
     lever = np.zeros(len(owner))
@@ -74,7 +76,7 @@ def _clusters(px: Pixels, state: State, tone: Tone, opt: FitOptions) -> Iterator
         each = np.repeat(np.arange(count), np.diff(some.starts))
         affine = np.repeat(state.affine[low:high], np.diff(some.first), 0)
         terms = evaluate(replace(some, obj=each, first=np.arange(count + 1)), affine, tone, opt, True)
-        yield slice(px.first[low], px.first[high]), terms.scores, terms.h
+        yield slice(px.first[low], px.first[high]), terms.g, terms.h
         low = high
 
 

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.affines.pixels import Pixels, Terms, evaluate, other_tone, restore, revise
+from iif_core.affines.pixels import Pixels, Terms, evaluate
 from iif_core.affines.problem import PARAMETERS, FitOptions
 from iif_core.affines.tone import Tone
 
 _NOTHING = 1e-9
 """Residual, in sensor units, that counts as none: a perfect fit has no relative decrease to judge by."""
 _QUIET = 3  # steps that together must lower the objective by more than the tolerance
-_ALONE = 12  # steps of objects alone after one of everything
-_REST = 0.1  # of the tolerance, that an object may be expected to gain and still be left where it is
+_BETWEEN, _ALONE = 6, 40  # most steps of the objects alone between those of everything, and once the response is at rest
+_POOR = 0.5  # of what the quadratic model promised
 _PATIENCE = 6  # refused steps in a row after which no step will be found
 
 
@@ -27,11 +27,17 @@ class Pull:
     """Quadratic pull of each object, 0.5 (theta - centre)' weight (theta - centre); centre (O, 16), weight (O, 16, 16).
 
     `scatter` (O, 16, 16): what the error of the centre adds to the scatter of the gradient; None: nothing (a regulariser).
+    `drift` (O, 16, P): weight times how the centre moves with the response; None: it does not.
     """
 
     centre: np.ndarray
     weight: np.ndarray
     scatter: np.ndarray | None = None
+    drift: np.ndarray | None = None
+
+    def only(self, objects: np.ndarray) -> Pull:
+        """Of some objects."""
+        return Pull(self.centre[objects], self.weight[objects])
 
     def cost(self, affine: np.ndarray) -> np.ndarray:
         away = affine - self.centre
@@ -86,6 +92,11 @@ class Spectrum:
         unit = (self.vectors / values[:, None, :]) @ self.vectors.transpose(0, 2, 1)
         return unit * self.scale[:, :, None] * self.scale[:, None, :]
 
+    def form(self, x: np.ndarray) -> np.ndarray:
+        """x' H x of the undamped blocks, x (O, k)."""
+        along = np.einsum("oji,oj->oi", self.vectors, x / self.scale)
+        return (np.abs(self.values) * along**2).sum(1)
+
 
 def spectrum(h: np.ndarray) -> Spectrum:
     """Of symmetric blocks (O, k, k)."""
@@ -96,12 +107,12 @@ def spectrum(h: np.ndarray) -> Spectrum:
     return Spectrum(values, vectors, scale)
 
 
-def object_blocks(terms: Terms, free: np.ndarray, pull: Pull) -> Spectrum:
-    """Of the object blocks with the pull; fixed numbers have rows of the identity."""
+def object_blocks(h: np.ndarray, free: np.ndarray, pull: Pull) -> Spectrum:
+    """Of the object blocks (O, 16 + P, 16 + P) with the pull; fixed numbers have rows of the identity."""
     some = np.flatnonzero(free.any(1))  # of thousands of objects, most may have nothing to fit
     own = free[some]
     keep = own[:, :, None] & own[:, None, :]
-    block = np.where(keep, terms.h[some, :PARAMETERS, :PARAMETERS] + pull.weight[some], 0.0)
+    block = np.where(keep, h[some, :PARAMETERS, :PARAMETERS] + pull.weight[some], 0.0)
     i = np.arange(PARAMETERS)
     block[:, i, i] += ~own
     found = spectrum(block)
@@ -140,7 +151,6 @@ def response_prior(opt: FitOptions, pixels: int, start_params: np.ndarray) -> Re
 
 def arrowhead(
     terms: Terms,
-    px: Pixels,
     state: State,
     pull: Pull,
     prior: ResponsePrior,
@@ -152,7 +162,7 @@ def arrowhead(
     free = state.free
     keep = free[:, :, None] & free[:, None, :]
     inverse = np.where(keep, blocks.inverse(state.damping if damped else 0.0), 0.0)
-    gradient = terms.gradient(px.first)
+    gradient = terms.g
     g = np.where(free, gradient[:, :PARAMETERS] + pull.gradient(state.affine), 0.0)
     size = terms.h.shape[1] - PARAMETERS
     coupling = np.where(free[:, :, None], terms.h[:, :PARAMETERS, PARAMETERS:], 0.0)
@@ -185,7 +195,8 @@ def descend(
 
     The expected fall is the Newton decrement g' H^-1 g / 2 of the undamped system. Where pixels sit at the edge of the allowed
     range the objective has a kink and the decrement never vanishes: three steps that gain less than the tolerance count too.
-    Returns the state and the system there.
+    The response moves with everything else, until it has nothing to gain by it; between such steps, and after the last, each
+    object goes on alone until it has nothing to gain either. Returns the state and the system there.
     """
     most = opt.iterations if iterations is None else iterations
     start_params = state.params if start_params is None else start_params
@@ -195,18 +206,18 @@ def descend(
     def total_of(cost: np.ndarray, affine: np.ndarray, params: np.ndarray) -> float:
         return float((cost + pull.cost(affine)).sum() + prior.cost(params))
 
-    terms = evaluate(px, state.affine, tone.at(state.params), opt, True)
+    tone = tone.at(state.params)
+    terms = evaluate(px, state.affine, tone, opt, True, state.free)
     total = total_of(terms.cost, state.affine, state.params)
     state = replace(state, history=(total,), converged=False, reason="no step was allowed")
-    refused, taken, blocks = 0, 0, None
+    refused, taken, settled = 0, 0, False
     floor = len(px.obj) * _NOTHING**2
     for step in range(most + 1):
-        if blocks is None:
-            blocks = object_blocks(terms, state.free, pull)
-        plain = arrowhead(terms, px, state, pull, prior, fitted, blocks, damped=False)
-        expected = _decrement(plain)
+        blocks = object_blocks(terms.h, state.free, pull)
+        objects, response = _decrement(arrowhead(terms, state, pull, prior, fitted, blocks, damped=False))
         scale = terms.size.sum() + pull.cost(state.affine).sum()
-        if expected <= opt.tolerance * scale + floor:
+        enough = opt.tolerance * scale + floor
+        if objects + response <= enough or (settled and response <= 0.5 * enough):
             return replace(state, converged=True, reason="the expected fall is below the tolerance"), terms
         if taken >= _QUIET and state.history[-1 - _QUIET] - total <= opt.tolerance * scale:
             return replace(state, converged=True, reason=f"{_QUIET} steps gained less than the tolerance"), terms
@@ -214,110 +225,91 @@ def descend(
             return replace(state, reason=f"{most} steps were allowed"), terms
         if refused >= _PATIENCE:
             return replace(state, converged=True, reason="no step lowers the objective"), terms
-        moved = _step(px, state, terms, pull, tone, opt, prior, fitted, blocks)
-        if fitted and iterations is None:
-            moved = _settle(px, moved, pull, tone, opt)
-        new_total = total_of(moved.terms.cost, moved.state.affine, moved.state.params)
-        refused = 0 if new_total < total - 1e-15 * abs(total) else refused + 1
-        changed = new_total < total
-        state = (
-            moved.state if changed else replace(state, damping=moved.state.damping, response_damping=moved.state.response_damping)
-        )
-        if changed:
-            state = replace(state, history=(*state.history, new_total))
-            terms, blocks = moved.terms, None
-            total, taken = new_total, taken + 1
+        moves = fitted and response > 0.5 * enough
+        moved = _step(px, state, terms, pull, tone, opt, prior, blocks) if moves else None
+        if moved is not None:
+            state, terms, tone = moved
+        elif moves:
+            state = replace(state, response_damping=float(_adapt(state.response_damping, False)))
+        if moved is None or iterations is None:
+            rounds = 1 if iterations is not None else _BETWEEN if moved is not None else _ALONE
+            state, settled = _settle(px, state, terms, pull, tone, opt, rounds)
+        new_total = total_of(terms.cost, state.affine, state.params)
+        fell = new_total < total - 1e-15 * abs(total)
+        refused, taken = (0, taken + 1) if fell else (refused + 1, taken)
+        total = min(total, new_total)
+        state = replace(state, history=(*state.history, total)) if fell else state
     raise AssertionError("unreachable")
 
 
-def _decrement(system: Arrowhead) -> float:
+def _decrement(system: Arrowhead) -> tuple[float, float]:
+    """What the objects are expected to gain with the response held, and what moving it adds."""
     objects = 0.5 * np.einsum("oi,oij,oj->", system.g, system.inverse, system.g)
     right = system.g_w - np.einsum("oip,oi->p", system.through, system.g)
-    return float(abs(objects) + abs(0.5 * right @ system.schur @ right))
-
-
-@dataclass(frozen=True)
-class _Moved:
-    """Where a step led, and the system there."""
-
-    state: State
-    terms: Terms
-    better: np.ndarray
+    return float(abs(objects)), float(abs(0.5 * right @ system.schur @ right))
 
 
 def _step(
-    px: Pixels,
-    state: State,
-    terms: Terms,
-    pull: Pull,
-    tone: Tone,
-    opt: FitOptions,
-    prior: ResponsePrior,
-    fitted: bool,
-    blocks: Spectrum,
-) -> _Moved:
-    """One step of everything; where it does not pay, one of the objects alone with the response held."""
-    system = arrowhead(terms, px, state, pull, prior, fitted, blocks)
-    mu = state.response_damping
-    if fitted:
-        right = -system.g_w + np.einsum("oip,oi->p", system.through, system.g)
-        params = tone.at(state.params + (system.schur @ right).clip(-0.5, 0.5)).response.params.ravel()
-        shift = params - state.params
-        delta = -np.einsum("oij,oj->oi", system.inverse, system.g) - system.through @ shift
-        new_tone = tone.at(params)
-        stay = other_tone(terms, px, new_tone, opt)
-        go = evaluate(px, state.affine + delta, new_tone, opt, True)
-        away = pull.cost(state.affine + delta) - pull.cost(state.affine)
-        better = go.cost + away < stay
-        affine = np.where(better[:, None], state.affine + delta, state.affine)
-        cost = np.where(better, go.cost, stay)
-        gained = float((cost - terms.cost + np.where(better, away, 0.0)).sum())
-        gained += prior.cost(params) - prior.cost(state.params)
-        if gained < 0:
-            revise(go, px, affine, new_tone, opt, np.flatnonzero(~better))
-            damping = _adapt(state.damping, better)
-            moved = replace(state, affine=affine, params=params, damping=damping, response_damping=float(_adapt(mu, True)))
-            return _Moved(moved, go, better)
-        mu = float(_adapt(mu, False))
-    moved = _alone(px, replace(state, response_damping=mu), terms, pull, tone, opt, np.ones(len(terms.cost), bool))
-    return moved or _Moved(replace(state, response_damping=mu), terms, np.zeros(len(terms.cost), bool))
-
-
-def _alone(px: Pixels, state: State, terms: Terms, pull: Pull, tone: Tone, opt: FitOptions, active: np.ndarray) -> _Moved | None:
-    """A step of the `active` objects (O,) that are expected to gain something by it, with the response held; None: there is none.
-
-    What the others are expected to gain adds up to less than the tolerance: they are not looked at."""
-    free = state.free & active[:, None]
-    keep = free[:, :, None] & free[:, None, :]
-    blocks = object_blocks(terms, free, pull)
-    g = np.where(free, terms.gradient(px.first)[:, :PARAMETERS] + pull.gradient(state.affine), 0.0)
-    expected = 0.5 * np.einsum("oi,oij,oj->o", g, np.where(keep, blocks.inverse(), 0.0), g)
-    here = terms.cost + pull.cost(state.affine)
-    active = active & (expected > _REST * opt.tolerance * (terms.size + pull.cost(state.affine)))
-    if not active.any():
-        return None
-    delta = -np.einsum("oij,oj->oi", np.where(keep, blocks.inverse(state.damping), 0.0), g)
-    go = terms.copy()
-    tried = state.affine + np.where(active[:, None], delta, 0.0)
-    revise(go, px, tried, tone.at(state.params), opt, np.flatnonzero(active))
-    better = active & (go.cost + pull.cost(tried) < here)
-    restore(go, terms, px, active & ~better)
-    damping = np.where(active, _adapt(state.damping, better), state.damping)
+    px: Pixels, state: State, terms: Terms, pull: Pull, tone: Tone, opt: FitOptions, prior: ResponsePrior, blocks: Spectrum
+) -> tuple[State, Terms, Tone] | None:
+    """One step of everything; objects that lose by theirs stay. None: it does not pay."""
+    system = arrowhead(terms, state, pull, prior, True, blocks)
+    right = -system.g_w + np.einsum("oip,oi->p", system.through, system.g)
+    new_tone = tone.at(state.params + (system.schur @ right).clip(-0.5, 0.5))
+    params = new_tone.response.params.ravel()
+    shift = params - state.params
+    delta = -np.einsum("oij,oj->oi", system.inverse, system.g) - system.through @ shift
+    tried = state.affine + delta
+    go = evaluate(px, tried, new_tone, opt, True, state.free)
+    # what staying costs under the new response, to second order: only the choice depends on it
+    stay = terms.cost + terms.g[:, PARAMETERS:] @ shift + 0.5 * terms.h[:, PARAMETERS:, PARAMETERS:] @ shift @ shift
+    better = go.cost + pull.cost(tried) < stay + pull.cost(state.affine)
     affine = np.where(better[:, None], tried, state.affine)
-    return _Moved(replace(state, affine=affine, damping=damping), go, better)
+    left = np.flatnonzero(~better)
+    if len(left):
+        go.put(evaluate(px, affine, new_tone, opt, True, state.free, left), left)
+    gained = (go.cost + pull.cost(affine) - terms.cost - pull.cost(state.affine)).sum() + prior.cost(params)
+    if not gained < prior.cost(state.params):
+        return None
+    damping, mu = _adapt(state.damping, better), float(_adapt(state.response_damping, True))
+    return replace(state, affine=affine, params=params, damping=damping, response_damping=mu), go, new_tone
 
 
-def _settle(px: Pixels, moved: _Moved, pull: Pull, tone: Tone, opt: FitOptions) -> _Moved:
-    """Further steps of the objects that still gain, a few pixels of all, with the response held."""
-    active = np.ones(px.n_objects, bool)
-    for _ in range(_ALONE):
-        here = moved.terms.cost + pull.cost(moved.state.affine)
-        further = _alone(px, moved.state, moved.terms, pull, tone, opt, active)
-        if further is None:
-            break
-        gained = here - further.terms.cost - pull.cost(further.state.affine)
-        active = further.better & (gained > _REST * opt.tolerance * further.terms.size)
-        moved = further
-        if not active.any():
-            break
-    return moved
+def _settle(px: Pixels, state: State, terms: Terms, pull: Pull, tone: Tone, opt: FitOptions, rounds: int) -> tuple[State, bool]:
+    """Steps of the objects alone, the response held; `terms` become those of where they lead. An object is left alone once
+    it is not expected to gain, or several steps did not gain, more than the tolerance; all are when six rounds together did not.
+    Also: whether it came to that."""
+    affine, damping = state.affine.copy(), state.damping.copy()
+    idle, gains = np.zeros(px.n_objects, np.int64), list[float]()
+    whole = terms.size.sum() + pull.cost(affine).sum()
+    active = np.flatnonzero(state.free.any(1))
+    for _ in range(rounds):
+        own, free = pull.only(active), state.free[active]
+        keep = free[:, :, None] & free[:, None, :]
+        blocks = object_blocks(terms.h[active], free, own)
+        g = np.where(free, terms.g[active, :PARAMETERS] + own.gradient(affine[active]), 0.0)
+        expected = 0.5 * np.einsum("oi,oij,oj->o", g, np.where(keep, blocks.inverse(), 0.0), g)
+        here = own.cost(affine[active])
+        little = opt.tolerance * (terms.size[active] + here)
+        hopeful = expected > little
+        if not hopeful.any():
+            return replace(state, affine=affine, damping=damping), True
+        delta = np.einsum("oij,oj->oi", np.where(keep, blocks.inverse(damping[active]), 0.0), g)
+        promised = np.einsum("oi,oi->o", g, delta) - 0.5 * blocks.form(delta)
+        tried = affine.copy()
+        tried[active] -= delta
+        active, here, little, promised = active[hopeful], here[hopeful], little[hopeful], promised[hopeful]
+        go = evaluate(px, tried, tone, opt, True, state.free, active)
+        gained = terms.cost[active] + here - go.cost[active] - pull.only(active).cost(tried[active])
+        better = gained > 0
+        chosen = active[better]
+        affine[chosen] = tried[chosen]
+        terms.put(go, chosen)
+        kept = better & (gained < _POOR * promised)  # at a kink, a bolder step would be refused
+        damping[active] = np.where(kept, damping[active], _adapt(damping[active], better))
+        gains.append(float(gained[better].sum()))
+        idle[active] = np.where(gained > little, 0, idle[active] + np.where(better, _PATIENCE // _QUIET, 1))
+        active = active[idle[active] < _PATIENCE]
+        if not len(active) or (len(gains) >= _PATIENCE and sum(gains[-_PATIENCE:]) <= opt.tolerance * whole):
+            return replace(state, affine=affine, damping=damping), True
+    return replace(state, affine=affine, damping=damping), False

@@ -17,9 +17,9 @@ import numpy as np
 
 from iif_core.affines.covariance import sandwich
 from iif_core.affines.descent import Pull, State, arrowhead, descend, object_blocks, response_prior
-from iif_core.affines.pixels import Pixels, evaluate, prepare, residuals
+from iif_core.affines.pixels import Pixels, evaluate, evenly, prepare, residuals
 from iif_core.affines.population import Population, before, centre_of, lean, learn, pull_of
-from iif_core.affines.problem import GAINS, IDENTITY, PARAMETERS, FitOptions, FitProblem, FitResult
+from iif_core.affines.problem import GAINS, IDENTITY, MATTE, PARAMETERS, FitOptions, FitProblem, FitResult
 from iif_core.affines.selection import (
     DISCOUNT,
     KINDS,
@@ -36,7 +36,9 @@ from iif_core.brdf import R_MIN
 from iif_core.response import Response
 
 _FEW = 300  # pixels of an object that are enough to choose a valley
+_ENOUGH = 12000  # more say no more: what their patches share is what the fit errs by
 _MANY = 1500  # that are enough to learn what objects have in common
+_LEAST = 0.02  # weight of the pixels of an object that looks like what it is not taken for
 _SHARP = 0.05  # half the distance of two points of the profile's grid: how far the profile is to be trusted
 _MOST_BIAS = 0.1  # of the sensor value, that noise of the cache may be taken to shift it
 _EARLY = 10  # steps of the descents whose end is only a start
@@ -70,6 +72,7 @@ class Fit:
     population: Population | None
     metallic: np.ndarray
     profiled: _Profiled | None = None
+    vote: np.ndarray | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -87,56 +90,62 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
         `FitResult`, always finite. The gauge is that of the given light (`gauge.pin` sets another).
     """
     opt = options or FitOptions()
-    everything, tone = prepare(problem, response)
+    everything, tone = prepare(problem, response, opt.min_pixels, _ENOUGH)
     texture_of_all = texture_of(everything, opt)
     members = np.flatnonzero(texture_of_all.enough)
     px, texture = everything.only(members), texture_of_all.only(members)
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
     fit = _begin(px, texture, start_params, opt)
     if len(members):
-        measured = px.target
-        weigh(px, measured, fit.state.affine, tone, opt)
-        fit = _descend_all(px, measured, fit, tone, texture, opt, start_params)
-    return result_of(px, fit, tone, texture, opt, start_params, members, everything.counts)
+        fit = _descend_all(px, fit, tone, texture, opt, start_params)
+    return result_of(px, fit, tone, texture, opt, start_params, members, everything.usable)
 
 
-def _descend_all(
-    px: Pixels, measured: np.ndarray, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
-) -> Fit:
-    if opt.select:
+def _descend_all(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
+    if opt.select and not opt.matte:
         fit = _select(px, fit, tone, texture, opt, start_params)
     if opt.population:
-        index = _some(px, _MANY)
+        index = evenly(px.obj, px.offsets, _MANY)
         some = px.take(index)
+        measured = some.target
         for _ in range(2):
-            state, terms = descend(some, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
-            weigh(some, measured[index], state.affine, tone.at(state.params), opt)
+            weigh(some, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
+            state, _ = descend(some, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+            terms = evaluate(some, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
             noise = row_noise(terms, some, state.free)
             mean = texture.mean[:, 3]
             population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
             fit = replace(fit, state=state, population=population)
             fit = replace(fit, pull=_pull(fit, noise, mean))
-    else:
+    measured = px.target
+    if not opt.population:
+        weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
         state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
         fit = replace(fit, state=state)
-    weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt)
+    weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
     state, _ = descend(px, fit.state, fit.pull, tone, opt, None, None, start_params)
     return replace(fit, state=state)
 
 
-def weigh(px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions) -> None:
+def weigh(
+    px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions, vote: np.ndarray | None = None
+) -> None:
     """Weights and bias that follow from the distance between the halves, at `affine`; they are held during a descent.
 
     Fireflies are three robust widths apart. The mean of a bent curve over noise is not the curve at the mean: each half's f(e L)
     is off by f'' var(e L) / 2 = (f'' / f'^2) d^2 on average, d half the distance; `measured` is moved by as much.
+
+    `vote` (O,): weight of an object's pixels beside those of the others, with which it shares the response.
     """
-    if px.shading.shape[1] < 2:
+    own = np.ones(px.n_objects) if vote is None else vote
+    if px.diffuse.shape[1] < 2:
+        px.trust = np.repeat(own, px.counts)[:, None] * np.ones((1, 3), px.trust.dtype)
         return
     px.target = measured
     errors = residuals(px, affine, tone, opt)
     apart = 0.5 * np.minimum(np.abs(errors[:, 0] - errors[:, 1]), 1e6)
     trust = 1.0 / (1.0 + (apart / (3.0 * opt.robust_width)) ** 2)
-    px.trust = np.ascontiguousarray(trust, px.trust.dtype)
+    px.trust = np.ascontiguousarray(trust * np.repeat(own, px.counts)[:, None], px.trust.dtype)
     shown = measured + errors.mean(1)
     bias = tone.bend(shown) * np.minimum(apart, opt.robust_width) ** 2
     bias = np.where(px.saturated, 0.0, np.clip(bias, -_MOST_BIAS * np.abs(measured), _MOST_BIAS * np.abs(measured)))
@@ -165,25 +174,22 @@ def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) ->
         metal = texture.enough & (texture.mean[:, 4] > opt.metallic_prior)
         free[:, 12], free[:, 13] = texture.enough & texture.varied[:, 0], texture.enough
         free[:, 14], free[:, 15] = metal & texture.varied[:, 1], metal
+    if opt.matte:
+        affine[:, 12:], free[:, 12:] = MATTE, False
     return Fit(State(affine, free, params.copy(), np.full(n, 1e-2)), pull, population, metallic)
-
-
-def _some(px: Pixels, most: int) -> np.ndarray:
-    """At most so many pixels of each object, evenly spread over its clusters."""
-    place = np.arange(len(px.obj)) - px.offsets[px.obj]
-    stride = np.maximum(1, -(-px.counts // most))
-    return np.flatnonzero(place % stride[px.obj] == 0)
 
 
 def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
     """Kind and valley of every object on a few of its pixels; then all numbers of the chosen kind are free."""
-    few = px.take(_some(px, _FEW))
+    few = px.take(evenly(px.obj, px.offsets, _FEW))
+    weigh(few, few.target, fit.state.affine, tone, opt)
     # Bounds alone cannot tell one valley from another.
     measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
-    state, terms = descend(few, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+    state, _ = descend(few, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+    terms = evaluate(few, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
     noise = row_noise(terms, few, state.free)
     pull = pull_of(before(), noise, texture.mean[:, 3], fit.metallic)
-    found = profile(few, state, pull, tone, opt, state.free, measured & texture.mixed)
+    found = profile(few, state, pull, tone.at(state.params), opt, state.free, measured & texture.mixed)
     choice = choose(found, measured)
     metallic = KINDS[choice.kind]
     affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
@@ -194,7 +200,7 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free[:, 12] = measured & texture.varied[:, 0]
     state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
     seen = _believed(few, state, pull, tone, opt, found.noise, choice)
-    fit = replace(fit, state=state, metallic=metallic, profiled=seen)
+    fit = replace(fit, state=state, metallic=metallic, profiled=seen, vote=np.maximum(choice.sure, _LEAST))
     if opt.population:
         fit = replace(fit, population=before(*choice.population))
         return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
@@ -207,8 +213,8 @@ def _believed(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions
     profile's prior, the profile's roughness has the error H noise / (H + V)^2 of the pixels, V / (H + V) of the histogram's
     width, and that of its grid; it moves with the response by - C / (H + V)."""
     albedo = state.free & (np.arange(PARAMETERS) < 12)
-    terms = evaluate(few, state.affine, tone.at(state.params), opt, True)
-    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], object_blocks(terms, albedo, pull).inverse(), 0.0)
+    terms = evaluate(few, state.affine, tone.at(state.params), opt, True, scores=True)
+    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], object_blocks(terms.h, albedo, pull).inverse(), 0.0)
     h, c = terms.h[:, 13, :PARAMETERS], terms.h[:, :, PARAMETERS:]
     row = np.einsum("oi,oij->oj", h, inverse)
     coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
@@ -241,7 +247,7 @@ def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
         return pull
     deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
     level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
-    return lean(pull, level, deviation, seen.error, seen.shared, noise, roughness, population.contrast, DISCOUNT)
+    return lean(pull, level, deviation, seen.error, seen.shared, seen.sway, noise, roughness, population.contrast, DISCOUNT)
 
 
 def result_of(
@@ -266,9 +272,9 @@ def result_of(
     if len(px.obj):
         terms = evaluate(px, state.affine, final, opt, True)
         fitted = bool(opt.free_response and tone.size)
-        blocks = object_blocks(terms, state.free, fit.pull)
+        blocks = object_blocks(terms.h, state.free, fit.pull)
         prior = response_prior(opt, len(px.obj), start_params)
-        system = arrowhead(terms, px, state, fit.pull, prior, fitted, blocks, damped=False)
+        system = arrowhead(terms, state, fit.pull, prior, fitted, blocks, damped=False)
         covariance[members], of_response = sandwich(px, state, system, fit.pull, prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0

@@ -22,15 +22,18 @@ class Pixels:
     """Sorted by (object, cluster); n pixels, C clusters.
 
     Attributes:
-        index: (n,) place in the problem; obj: (n,); base: (n, 5); shading: (n, halves, 1 + 2 J, 3) diffuse, s0, s1;
-        levels: (J,); target: (n, 3) in units of the tone; exposure: (n,); saturated: (n, 3); trust: (n, 3) weights;
-        starts: (C + 1,) first pixel of each cluster; first: (O + 1,) first cluster of each object.
+        index: (n,) place in the problem; obj: (n,); base: (n, 5); diffuse: (n, halves, 3); lobes: (n, J, 2, halves x 2 x 3) value
+            and slope in r of s0 and s1 at the levels; levels: (J,); target: (n, 3) in units of the tone; exposure: (n,);
+            saturated: (n, 3); trust: (n, 3) weights;
+        starts: (C + 1,) first pixel of each cluster; first: (O + 1,) first cluster of each object; usable: (O,) pixels of each
+            object, also those that were left out for their number.
     """
 
     index: np.ndarray
     obj: np.ndarray
     base: np.ndarray
-    shading: np.ndarray
+    diffuse: np.ndarray
+    lobes: np.ndarray
     levels: np.ndarray
     target: np.ndarray
     exposure: np.ndarray
@@ -38,6 +41,7 @@ class Pixels:
     trust: np.ndarray
     starts: np.ndarray
     first: np.ndarray
+    usable: np.ndarray
 
     @property
     def n_objects(self) -> int:
@@ -52,19 +56,22 @@ class Pixels:
     def counts(self) -> np.ndarray:
         return np.diff(self.offsets)
 
-    def take(self, index: np.ndarray) -> Pixels:
+    def take(self, index: np.ndarray | slice) -> Pixels:
         """A subset; `index` increasing. Every cluster stays, perhaps empty."""
+        begin, end = (index.start, index.stop) if isinstance(index, slice) else (0, 0)
+        starts = np.clip(self.starts, begin, end) - begin if end else np.searchsorted(index, self.starts)
         return replace(
             self,
             index=self.index[index],
             obj=self.obj[index],
             base=self.base[index],
-            shading=self.shading[index],
+            diffuse=self.diffuse[index],
+            lobes=self.lobes[index],
             target=self.target[index],
             exposure=self.exposure[index],
             saturated=self.saturated[index],
             trust=self.trust[index],
-            starts=np.searchsorted(index, self.starts),
+            starts=starts,
         )
 
     def only(self, objects: np.ndarray) -> Pixels:
@@ -75,12 +82,14 @@ class Pixels:
         number = np.full(self.n_objects, -1)
         number[objects] = np.arange(len(objects))
         index = np.flatnonzero(number[self.obj] >= 0)
-        part = self.take(index)
+        run = len(index) and index[-1] - index[0] == len(index) - 1
+        part = self.take(slice(index[0], index[-1] + 1) if run else index)  # without a copy where they come in a row
         return replace(
             part,
             obj=number[part.obj],
             starts=np.r_[0, np.cumsum(sizes)].astype(np.int64),
             first=np.r_[0, np.cumsum(counts)].astype(np.int64),
+            usable=self.usable[objects],
         )
 
     def sum_by_object(self, values: np.ndarray) -> np.ndarray:
@@ -93,29 +102,26 @@ class Terms:
 
     Attributes:
         cost: (O,); data: (O,) the data term alone; size: (O,) sum of the moduli of its terms.
-        h: (O, 16 + P, 16 + P); scores: (C, 16 + P) gradient of each cluster; shown: (n, halves, 3) e L.
+        h: (O, 16 + P, 16 + P); g: (O, 16 + P); scores: (C, 16 + P) gradient of each cluster, when asked for. What belongs to
+            numbers that the system is not wanted for is 0, but for the distance to the allowed range.
     """
 
     cost: np.ndarray
     data: np.ndarray
     size: np.ndarray
     h: np.ndarray
+    g: np.ndarray
     scores: np.ndarray
-    shown: np.ndarray
 
-    def copy(self) -> Terms:
-        """With arrays of its own."""
-        return Terms(**{name: value.copy() for name, value in self.__dict__.items()})
-
-    def gradient(self, first: np.ndarray) -> np.ndarray:
-        """(O, 16 + P)."""
-        summed = np.concatenate([np.zeros((1, self.scores.shape[1])), np.cumsum(self.scores, 0)])
-        return summed[first[1:]] - summed[first[:-1]]
+    def put(self, other: Terms, objects: np.ndarray) -> None:
+        """Take over the objective and system of some objects; gradients of clusters are not."""
+        for name in ("cost", "data", "size", "h", "g"):
+            getattr(self, name)[objects] = getattr(other, name)[objects]
 
 
-def prepare(problem: FitProblem, response: Response) -> tuple[Pixels, Tone]:
-    """Usable pixels: finite, lit, and of an object. Pixels that get next to no light have all leverage and no information
-    (METHOD H59)."""
+def prepare(problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None) -> tuple[Pixels, Tone]:
+    """Usable pixels: finite, lit, and of an object; of objects with at least `fewest`; at most `most` of each, evenly spread over
+    its clusters. Pixels that get next to no light have all leverage and no information (METHOD H59)."""
     ids = np.asarray(problem.object_id)
     use = np.isfinite(problem.base).all(1) & np.isfinite(problem.value).all(1)
     use &= np.isfinite(problem.exposure) & (problem.exposure > 1e-6) & (ids >= 0) & (ids < problem.n_objects)
@@ -125,10 +131,16 @@ def prepare(problem: FitProblem, response: Response) -> tuple[Pixels, Tone]:
         brightness = np.mean([d.sum(1, dtype=np.float64) for d in problem.diffuse], 0) * problem.exposure
     if use.any():
         use &= brightness > 1e-3 * np.median(brightness[use])
+    usable = np.bincount(ids[use], minlength=problem.n_objects)
+    use &= (usable >= fewest)[np.where(use, ids, 0)] if len(usable) else False
     index = np.flatnonzero(use)
     cluster = problem.cluster[index] if problem.cluster is not None else _runs(ids[index])
     order = np.lexsort((cluster, ids[index]))
     index, cluster = index[order], cluster[order]
+    if most is not None:
+        first = np.searchsorted(ids[index], np.arange(problem.n_objects + 1))
+        some = evenly(ids[index].astype(np.int64), first, most)
+        index, cluster = index[some], cluster[some]
     obj = ids[index].astype(np.int64)
     fresh = np.flatnonzero(np.r_[True, (np.diff(obj) != 0) | (np.diff(cluster) != 0)]) if len(index) else np.zeros(0, np.int64)
     starts = np.r_[fresh, len(index)].astype(np.int64)
@@ -137,16 +149,20 @@ def prepare(problem: FitProblem, response: Response) -> tuple[Pixels, Tone]:
     kind = np.result_type(*(np.asarray(a).dtype for a in (problem.value, problem.diffuse[0], problem.s0[0], problem.s1[0])))
     kind = np.float32 if kind == np.float32 else np.float64
     levels = np.ascontiguousarray(problem.levels, np.float64)
-    shading = np.empty((len(index), len(problem.diffuse), 1 + 2 * len(levels), 3), kind)
-    for half, (d, s0, s1) in enumerate(zip(problem.diffuse, problem.s0, problem.s1, strict=True)):
-        shading[:, half, 0] = d[index]
-        shading[:, half, 1 : 1 + len(levels)] = s0[index]
-        shading[:, half, 1 + len(levels) :] = s1[index]
+    diffuse = np.empty((len(index), len(problem.diffuse), 3), kind)
+    lobes = np.empty((len(index), len(levels), 2, len(problem.diffuse), 2, 3), kind)
+    for half, (d, *pair) in enumerate(zip(problem.diffuse, problem.s0, problem.s1, strict=True)):
+        diffuse[:, half] = d[index]
+        for at, lobe in enumerate(pair):
+            lobes[:, :, 0, half, at] = own = np.ascontiguousarray(lobe[index], kind)
+            kernels.slopes(own, levels, lobes[:, :, 1, half, at])
+    lobes = lobes.reshape(*lobes.shape[:3], 6 * len(problem.diffuse))
     pixels = Pixels(
         index,
         obj,
         np.ascontiguousarray(problem.base[index], kind),
-        shading,
+        diffuse,
+        lobes,
         levels,
         np.ascontiguousarray(tone.value(problem.value[index]), kind),
         np.ascontiguousarray(problem.exposure[index], np.float64),
@@ -154,8 +170,16 @@ def prepare(problem: FitProblem, response: Response) -> tuple[Pixels, Tone]:
         np.ones((len(index), 3), kind),
         starts,
         first,
+        usable,
     )
     return pixels, tone
+
+
+def evenly(obj: np.ndarray, offsets: np.ndarray, most: int) -> np.ndarray:
+    """Places of at most so many of the pixels of each object, in equal strides: obj (n,) sorted, offsets (O + 1,) first pixel of
+    each."""
+    place, stride = np.arange(len(obj)) - offsets[obj], np.maximum(1, -(-np.diff(offsets) // most))
+    return np.flatnonzero(place % stride[obj] == 0)
 
 
 def _runs(ids: np.ndarray) -> np.ndarray:
@@ -170,80 +194,57 @@ def _runs(ids: np.ndarray) -> np.ndarray:
     return out
 
 
-def evaluate(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, jacobian: bool) -> Terms:
-    """Objective at `affine` (O, 16), with its system if `jacobian`."""
-    return _run(px, affine, tone, opt, 1 if jacobian else 0)[0]
+def evaluate(
+    px: Pixels,
+    affine: np.ndarray,
+    tone: Tone,
+    opt: FitOptions,
+    system: bool,
+    free: np.ndarray | None = None,
+    objects: np.ndarray | None = None,
+    scores: bool = False,
+) -> Terms:
+    """Objective at `affine` (O, 16).
+
+    Args:
+        system: with its Gauss-Newton system; free: (O, 16) bool, the numbers that it is wanted for (None: all); objects: the only
+            ones that are looked at (None: all), the others have zeros; scores: with the gradients of the clusters.
+    """
+    return _run(px, affine, tone, opt, (2 if scores else 1) if system else 0, free, objects)[0]
 
 
 def residuals(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> np.ndarray:
     """f(e L) - I of each half, (n, halves, 3) float64; 0 where a bound is met."""
-    return _run(px, affine, tone, opt, 2)[1]
+    return _run(px, affine, tone, opt, 3, None, None)[1]
 
 
-def revise(terms: Terms, px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, objects: np.ndarray) -> None:
-    """Put the system of some objects (increasing) at `affine` (O, 16) in place of what `terms` has."""
-    breaks = np.flatnonzero(np.diff(objects) > 1) + 1
-    runs = [(int(run[0]), int(run[-1]) + 1) for run in np.split(objects, breaks) if len(run)]
-    for low, high in runs:
-        terms.h[low:high] = 0.0
-        terms.scores[px.first[low] : px.first[high]] = 0.0
-    _fill(terms, np.zeros((0, px.shading.shape[1], 3)), px, affine, tone, opt, 1, runs)
-
-
-def restore(terms: Terms, before: Terms, px: Pixels, objects: np.ndarray) -> None:
-    """Put what `before` has of some objects, (O,) bool, in place of what `terms` has."""
-    if not objects.any():
-        return
-    clusters, pixels = np.repeat(objects, np.diff(px.first)), np.repeat(objects, px.counts)
-    rows = {"cost": objects, "data": objects, "size": objects, "h": objects, "scores": clusters, "shown": pixels}
-    for name, which in rows.items():
-        getattr(terms, name)[which] = getattr(before, name)[which]
-
-
-def other_tone(terms: Terms, px: Pixels, tone: Tone, opt: FitOptions) -> np.ndarray:
-    """(O,) objective of `terms`, which have a system, with another response."""
-    data = np.zeros(px.n_objects)
-    curve, ends, _ = tone.tables()
-    offsets = px.offsets
-
-    def work(part: tuple[int, int]) -> None:
-        given = (px.target, px.saturated, px.trust, terms.shown, offsets, tone.knee, tone.gain, curve, ends)
-        kernels.toned(*given, opt.robust_width, *part, data)
-
-    _in_threads(work, _parts(px, opt.threads), opt.threads)
-    return terms.cost - terms.data + data
-
-
-def _run(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions, want: int) -> tuple[Terms, np.ndarray]:
-    n_objects, width, halves = px.n_objects, PARAMETERS + tone.size, px.shading.shape[1]
-    cost, data, size = (np.zeros(n_objects) for _ in range(3))
-    h = np.zeros((n_objects if want == 1 else 0, width, width))
-    scores = np.zeros((len(px.starts) - 1 if want == 1 else 0, width))
-    shown = np.zeros((len(px.obj) if want == 1 else 0, halves, 3))
-    errors = np.zeros((len(px.obj) if want == 2 else 0, halves, 3))
-    terms = Terms(cost, data, size, h, scores, shown)
-    _fill(terms, errors, px, affine, tone, opt, want, _parts(px, opt.threads))
-    return terms, errors
-
-
-def _fill(
-    terms: Terms,
-    errors: np.ndarray,
+def _run(
     px: Pixels,
     affine: np.ndarray,
     tone: Tone,
     opt: FitOptions,
     want: int,
-    parts: list[tuple[int, int]],
-) -> None:
-    """The kernel over ranges of objects; systems are added to what is there."""
+    free: np.ndarray | None,
+    objects: np.ndarray | None,
+) -> tuple[Terms, np.ndarray]:
+    n_objects, width, halves = px.n_objects, PARAMETERS + tone.size, px.diffuse.shape[1]
+    system = n_objects if want in (1, 2) else 0
+    terms = Terms(
+        *(np.zeros(n_objects) for _ in range(3)),
+        np.zeros((system, width, width)),
+        np.zeros((system, width)),
+        np.zeros((len(px.starts) - 1 if want == 2 else 0, width)),
+    )
+    errors = np.zeros((len(px.obj) if want == 3 else 0, halves, 3))
     affine = np.ascontiguousarray(affine, np.float64)
-    curve, ends, by_params = tone.tables()
+    free = np.ones((n_objects, PARAMETERS), bool) if free is None else np.ascontiguousarray(free)
+    curve, ends, by_params = tone.tables
 
-    def work(bounds: tuple[int, int]) -> None:
+    def work(part: np.ndarray) -> None:
         kernels.sums(
             px.base,
-            px.shading,
+            px.diffuse,
+            px.lobes,
             px.levels,
             px.target,
             px.exposure,
@@ -252,6 +253,7 @@ def _fill(
             px.starts,
             px.first,
             affine,
+            free,
             tone.knee,
             tone.gain,
             curve,
@@ -263,32 +265,27 @@ def _fill(
             opt.metallic_weight,
             opt.brightest,
             BOX,
-            bounds[0],
-            bounds[1],
+            part,
             want,
             terms.cost,
             terms.data,
             terms.size,
             terms.h,
+            terms.g,
             terms.scores,
             errors,
-            terms.shown,
         )
 
-    _in_threads(work, parts, opt.threads)
+    in_threads(work, px, np.arange(n_objects) if objects is None else objects, opt.threads)
+    return terms, errors
 
 
-def _in_threads(work: Callable[[tuple[int, int]], None], parts: list[tuple[int, int]], threads: int) -> None:
-    if threads > 1 and len(parts) > 1:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(work, parts))
-    else:
-        for part in parts:
-            work(part)
-
-
-def _parts(px: Pixels, threads: int) -> list[tuple[int, int]]:
-    """Ranges of objects with about as many pixels each."""
-    wanted = np.linspace(0, len(px.obj), max(threads, 1) + 1)[1:-1]
-    cuts = np.unique(np.r_[0, np.searchsorted(px.offsets, wanted), px.n_objects])
-    return list(zip(cuts[:-1].tolist(), cuts[1:].tolist(), strict=True))
+def in_threads(work: Callable[[np.ndarray], None], px: Pixels, objects: np.ndarray, threads: int) -> None:
+    """`work` on runs of `objects` (increasing) with about as many pixels each."""
+    done = np.cumsum(px.counts[objects])
+    if threads < 2 or len(objects) < 2:
+        work(objects)
+        return
+    cuts = np.searchsorted(done, np.linspace(0, done[-1], threads + 1)[1:-1])
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(work, np.split(objects, cuts)))

@@ -108,6 +108,7 @@ def lean(
     deviation: np.ndarray,
     error: np.ndarray,
     shared: np.ndarray,
+    sway: np.ndarray,
     noise: np.ndarray,
     roughness: np.ndarray,
     contrast: float,
@@ -116,7 +117,8 @@ def lean(
     """The pull with each object's own level of roughness (O,) +- `deviation` (O,) in place of the population's.
 
     `error` (O,) is the standard deviation of that level: with w the weight, its scatter is w^2 error^2. The pixels that it was
-    made of pull again by themselves: 2 w `shared` (O,) is what both have in common.
+    made of pull again by themselves: 2 w `shared` (O,) is what both have in common. `sway` (O, P): how the level moves with the
+    response.
     """
     own = np.stack([roughness, np.ones_like(roughness)], 1)
     outer = own[:, :, None] * own[:, None, :]
@@ -129,7 +131,9 @@ def lean(
     scatter[:, 12, 12] += size**2 / _DEFAULT[4] ** 2
     centre = pull.centre.copy()
     centre[:, 13] = level - contrast * roughness
-    return Pull(centre, weight, scatter)
+    drift = np.zeros((*centre.shape, sway.shape[1]))
+    drift[:, 12:14] = strength[:, None, None] * own[:, :, None] * sway[:, None]
+    return Pull(centre, weight, scatter, drift)
 
 
 def learn(
@@ -147,7 +151,7 @@ def learn(
     use = free.any(1)
     if not use.any():
         return population
-    g = np.where(free, terms.gradient(px.first)[:, :PARAMETERS], 0.0)[use]
+    g = np.where(free, terms.g[:, :PARAMETERS], 0.0)[use]
     keep = (free[:, :, None] & free[:, None, :])[use]
     h = np.where(keep, terms.h[use][:, :PARAMETERS, :PARAMETERS], 0.0)
     here, own_free, own_noise = affine[use], free[use], noise[use]

@@ -23,6 +23,8 @@ BIASES = np.array([3, 7, 11])
 CROSS = np.array([1, 2, 4, 6, 8, 9])
 ROUGHNESS = np.array([12, 13])
 METALLIC = np.array([14, 15])
+MATTE = np.array([0.0, 1.0, 0.0, 0.0])
+"""The last four numbers of a matte object."""
 LOW = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
 SOLVERS = ("direct", "sgd", "adam")
 
@@ -118,6 +120,7 @@ class FitOptions:
         select: choose dielectric or metal and the valley of the roughness by their evidence; otherwise descend from the
             identity with metalness free where it was predicted above `metallic_prior`.
         metallic_prior: see `select`.
+        matte: no gloss at all: roughness 1 and no metal, not fitted.
         texture_sigma: standard deviation (albedo) above which a direction of the texture is real (2 / 255).
         brightest: largest albedo in the fit, above 1 because the light is not known that well: a white wall in light that is a
             little too dim could show what it shows only by a gloss that it does not have. Albedos are published within [0, 1].
@@ -137,6 +140,7 @@ class FitOptions:
     ridge: float = 2e-3
     select: bool = True
     metallic_prior: float = 0.25
+    matte: bool = False
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25
     threads: int = 1

@@ -8,13 +8,14 @@ histogram over the pairs, by EM) is the prior.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.affines.descent import Pull, State, descend, spectrum
-from iif_core.affines.pixels import Pixels, Terms
+from iif_core.affines.descent import Pull, State, spectrum
+from iif_core.affines.pixels import BOX, Pixels, Terms, evaluate, in_threads
 from iif_core.affines.problem import BIASES, CROSS, GAINS, IDENTITY, METALLIC, PARAMETERS, ROUGHNESS, FitOptions
+from iif_core.affines.profile_kernels import fit_albedo
 from iif_core.affines.tone import Tone
 
 GRID = np.array([0.05, 0.13, 0.22, 0.32, 0.44, 0.57, 0.7, 0.84, 0.98])
@@ -101,7 +102,7 @@ def _centred_scores(terms: Terms, px: Pixels) -> tuple[np.ndarray, np.ndarray]:
     filled = np.diff(px.starts) > 0
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     counts = np.bincount(owner[filled], minlength=px.n_objects)
-    mean = terms.gradient(px.first) / np.maximum(counts, 1)[:, None]
+    mean = terms.g / np.maximum(counts, 1)[:, None]
     return np.where(filled[:, None], terms.scores - mean[owner], 0.0), counts
 
 
@@ -125,37 +126,76 @@ def profile(px: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, f
     n_objects = px.n_objects
     cost = np.full((n_objects, 3, len(GRID)), np.inf)
     affine = np.zeros((n_objects, 3, len(GRID), PARAMETERS))
-    noise = np.full((n_objects, 3, len(GRID)), np.inf)
-    albedo = free.copy()
-    albedo[:, 12:] = False
-    quick = replace(opt, roughness_weight=0.0, metallic_weight=0.0)
-    for kind in range(3 if mixed.any() else 2):
-        current = state.affine
-        for step, at in enumerate(range(len(GRID) - 1, -1, -1)):
-            start = current.copy()
-            start[:, 12:] = [0.0, GRID[at], *KINDS[kind]]
-            own_pull = Pull(np.concatenate([pull.centre[:, :12], start[:, 12:]], 1), pull.weight)
-            trial = State(start, albedo, state.params, np.full(n_objects, 1e-3))
-            steps = 2 * _STEPS if step == 0 else _STEPS
-            trial, terms = descend(px, trial, own_pull, tone, quick, steps, False)
-            tried = mixed if kind == 2 else np.ones(n_objects, bool)
-            cost[:, kind, at] = np.where(tried, terms.data + own_pull.cost(trial.affine), np.inf)
-            affine[:, kind, at] = trial.affine
-            noise[:, kind, at] = row_noise(terms, px, albedo)
-            current = trial.affine
-            if kind == 0 and step == 0:  # no lobe, or one so wide that it looks like none
-                cost[:, 0, at] = np.minimum(cost[:, 0, at], _without_gloss(px, trial, own_pull, tone, quick))
+    everything = np.arange(n_objects)
+    for kind in range(3):
+        tried = np.flatnonzero(mixed) if kind == 2 else everything
+        current = state.affine[:, :12].copy()
+        for at in range(len(GRID) - 1, -1, -1):
+            first = at == len(GRID) - 1
+            steps = 2 * _STEPS if first else _STEPS
+            found = _fitted(px, current, pull, tone, opt, free, KINDS[kind], GRID[at], steps, tried)
+            if kind == 0 and first:  # no lobe, or one so wide that it looks like none
+                found = np.minimum(found, _fitted(px, current.copy(), pull, tone, opt, free, KINDS[0], -1.0, steps, tried))
+            cost[tried, kind, at] = found[tried]
+            affine[:, kind, at, :12] = current
+            affine[:, kind, at, 13:] = [GRID[at], *KINDS[kind]]
     best = cost.reshape(n_objects, -1).argmin(1)
-    return Profile(cost, affine, noise.reshape(n_objects, -1)[np.arange(n_objects), best])
+    where = affine.reshape(n_objects, -1, PARAMETERS)[everything, best]
+    albedo = free & (np.arange(PARAMETERS) < 12)
+    terms = evaluate(px, where, tone, opt, True, albedo, scores=True)
+    return Profile(cost, affine, row_noise(terms, px, albedo))
 
 
-def _without_gloss(px: Pixels, start: State, pull: Pull, tone: Tone, opt: FitOptions) -> np.ndarray:
-    """(O,) cost of a surface that has no specular lobe at all; the albedo numbers that are free in `start` are fitted."""
-    shading = px.shading.copy()
-    shading[:, :, 1:] = 0.0
-    start = replace(start, damping=np.full(px.n_objects, 1e-3))
-    matte, terms = descend(replace(px, shading=shading), start, pull, tone, opt, 2 * _STEPS, False)
-    return terms.data + pull.cost(matte.affine)
+def _fitted(
+    px: Pixels,
+    affine: np.ndarray,
+    pull: Pull,
+    tone: Tone,
+    opt: FitOptions,
+    free: np.ndarray,
+    metallic: np.ndarray,
+    roughness: float,
+    steps: int,
+    objects: np.ndarray,
+) -> np.ndarray:
+    """Move the albedo numbers `affine` (O, 12) of some objects to where they fit at one roughness (negative: no lobe) and one
+    metalness; (O,) data term and pull there."""
+    cost = np.zeros(px.n_objects)
+    curve, ends, _ = tone.tables
+    weight = np.diagonal(pull.weight, axis1=1, axis2=2)[:, :12]  # before anything is known, numbers lean one by one
+
+    def work(part: np.ndarray) -> None:
+        fit_albedo(
+            px.base,
+            px.diffuse,
+            px.lobes,
+            px.levels,
+            px.target,
+            px.exposure,
+            px.saturated,
+            px.trust,
+            px.offsets,
+            tone.knee,
+            tone.gain,
+            curve,
+            ends,
+            opt.robust_width,
+            opt.brightest,
+            BOX,
+            free,
+            pull.centre,
+            weight,
+            metallic,
+            roughness,
+            steps,
+            opt.tolerance,
+            part,
+            affine,
+            cost,
+        )
+
+    in_threads(work, px, objects, opt.threads)
+    return cost
 
 
 @dataclass(frozen=True)
@@ -164,7 +204,8 @@ class Choice:
 
     Attributes:
         kind: (O,) int, row of `KINDS`; probability: (O, 3); roughness, deviation: (O,) posterior mean and standard deviation
-            given the kind; at: (O,) nearest point of `GRID`; population: mean and standard deviation of r over the objects.
+            given the kind; at: (O,) nearest point of `GRID`; population: mean and standard deviation of r over the objects;
+            sure: (O,) share of the evidence that speaks for what was not ruled out (`ROUGHEST_METAL`).
     """
 
     kind: np.ndarray
@@ -173,14 +214,18 @@ class Choice:
     deviation: np.ndarray
     at: np.ndarray
     population: tuple[float, float]
+    sure: np.ndarray
 
 
 def choose(found: Profile, counts: np.ndarray) -> Choice:
     """EM for the population's histogram, then the posterior of each object; `counts` (O,) bool, objects that have a say."""
     cost = found.cost.copy()
+    scale = DISCOUNT * found.noise[:, None, None]
+    everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _SHARES
     cost[GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
     cost[:, 1, GRID > ROUGHEST_METAL] = np.inf
-    log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / (DISCOUNT * found.noise[:, None, None])
+    sure = np.where(np.isfinite(cost), everything, 0.0).sum((1, 2)) / everything.sum((1, 2))
+    log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
     flat = _SHARES / len(GRID) * np.ones(len(GRID))
     prior = flat
@@ -199,7 +244,7 @@ def choose(found: Profile, counts: np.ndarray) -> Choice:
     at = np.abs(GRID[None] - mean[:, None]).argmin(1)
     level = float(prior.sum(0) @ GRID)
     width = float(np.sqrt(max(prior.sum(0) @ GRID**2 - level**2, 0.0)))
-    return Choice(kind, probability, mean, deviation, at, (level, width))
+    return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, sure, 1.0))
 
 
 def describe(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:

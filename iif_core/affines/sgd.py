@@ -103,13 +103,14 @@ def _batches(rng: np.random.Generator, n: int, opt: SgdOptions) -> Iterator[np.n
 
 def _gradient(px: Pixels, rows: np.ndarray, affine: np.ndarray, tone: Tone, n_objects: int) -> tuple[np.ndarray, np.ndarray]:
     """Of the reference loss over some pixels: (O, 16) and (P,)."""
-    curve, ends, by_params = tone.tables()
+    curve, ends, by_params = tone.tables
     g = np.zeros((n_objects, PARAMETERS + tone.size))
     own = reference_options()
     kernels.gradient(
         px.obj,
         px.base,
-        px.shading,
+        px.diffuse,
+        px.lobes,
         px.levels,
         px.target,
         px.exposure,

@@ -11,12 +11,13 @@ them); derivatives with respect to parameters are read linearly. Above 1 it is a
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from iif_core.response import Response
 
-NODES = 2000
+NODES = 500
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Tone:
             return self
         return replace(self, response=self.response.with_params(np.asarray(params).reshape(self.response.params.shape)))
 
+    @cached_property
     def tables(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """curve (3, NODES + 1, 2): f and df/du; ends (3, 1 + per): df/dx at 1 and its derivatives; params (3, NODES + 1, per)."""
         u = np.arange(NODES + 1) / NODES

@@ -3,8 +3,9 @@
     python tests/benchmarks/affines_twins.py --output results/studies/affines_twins.parquet
 
 The planted problem of `affines_coverage.py`. Process CPU seconds of one thread, compiled and warmed up before. `direct` is the
-default fit, `direct, reference loss` the same solver on the reference loss alone; `sgd` the published schedule (three equal
-parts, rate 10, x 0.2 after each) of so many steps of 32,768 pixels (4,848 as published), `adam` likewise.
+default fit, `direct, reference loss` the same solver on the reference loss alone, to its end and for 10 and 4 steps; `sgd` the
+published schedule (three equal parts, rate 10, x 0.2 after each) of so many steps of 32,768 pixels (4,848 as published), `adam`
+likewise.
 """
 
 from __future__ import annotations
@@ -54,6 +55,9 @@ def main() -> None:
     runs: dict[str, Callable[[], FitResult]] = {
         "direct": lambda: fit_affines(problem, start, FitOptions()),
         "direct, reference loss": lambda: fit_affines(reference_problem(problem, start), start, reference_options()),
+        "direct, the same, 4 steps": lambda: fit_affines(
+            reference_problem(problem, start), start, reference_options(iterations=4)
+        ),
     }
     runs |= {f"{method}, {steps} steps": schedule(method, steps) for method in ("sgd", "adam") for steps in arguments.steps}
     columns: dict[str, list[object]] = {name: [] for name in ("solver", "cpu_seconds", "reference_loss", "albedo_psnr", "pixels")}

@@ -50,6 +50,18 @@ def test_planted_affines_and_gamma_from_clean_ldr(halves):
     assert np.all(np.diff(out.history) <= 0)
 
 
+@pytest.mark.parametrize("plain", [True, False])
+def test_matte_fits_no_gloss(plain):
+    """What shows gloss is fitted without: roughness 1 and no metal, and the albedo still moves."""
+    problem, _ = problem_of(np.random.default_rng(2))
+    options = replace(EXACT, matte=True) if plain else FitOptions(matte=True)
+    out = fit_affines(problem, response("identity"), options)
+    assert (out.affine[:, 12:] == [0, 1, 0, 0]).all() and not out.free[:, 12:].any() and out.free[:, :12].any(1).all()
+    assert np.abs(out.affine[:, :12] - IDENTITY[:12]).max() > 0.01
+    fitted = apply_affines(out.affine, problem.object_id, problem.base)
+    assert (fitted[:, 3] == 1).all() and (fitted[:, 4] == 0).all()
+
+
 def test_calibrated_response_is_a_prior():
     """A sure prior holds the response, a vague one lets the photographs decide."""
     problem, _ = problem_of(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x))
@@ -85,7 +97,7 @@ def test_gradient_and_normal_matrix_against_differences(family):
     t[1, 13] -= 0.4  # some roughness below the range
     params = start.params.ravel() * 1.07
     terms = evaluate(px, t, tone.at(params), opt, True)
-    gradient = terms.gradient(px.first)
+    gradient = terms.g.copy()
     gradient[:, :16] += pull.gradient(t)
     assert gradient.shape == (2, 16 + tone.size)
     for o in range(2):

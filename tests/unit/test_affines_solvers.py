@@ -20,7 +20,7 @@ from iif_core.affines.sgd import _gradient
 from iif_core.errors import InputError
 from iif_core.response import response
 from tests.unit.planted_fit import problem_of
-from workflow.settings import Affines
+from workflow.settings.affines import Affines
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iif_core.color import (
-    display_exposure,
     false_colour,
     id_colours,
     linear_from_srgb,
@@ -36,16 +35,6 @@ def test_luminance():
     np.testing.assert_allclose(luminance([[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]]), [1.0, 0.2126])
     with pytest.raises(InputError, match="last axis"):
         luminance(np.ones((4, 2)))
-
-
-def test_display_exposure_ignores_invalid_and_survives_black():
-    radiance = np.full((8, 8, 3), 2.0)
-    radiance[0] = 1e6
-    valid = np.ones((8, 8), bool)
-    valid[0] = False
-    assert display_exposure(radiance, valid) == pytest.approx(0.35)
-    assert display_exposure(np.zeros((4, 4, 3))) == 1.0
-    assert display_exposure(np.full((4, 4, 3), np.nan)) == 1.0
 
 
 def test_tone_map_is_bounded():

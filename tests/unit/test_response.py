@@ -55,7 +55,7 @@ def test_derivative_against_differences(name):
 @pytest.mark.parametrize("name", ["gamma", "ggcm", "ggcm_per_channel", "spline", "spline_per_channel"])
 def test_parameter_derivatives_against_differences(name):
     f = CURVES[name]
-    exact = f.parameter_derivatives(X)
+    exact = f.evaluate(X)[2]
     for k in range(f.params.shape[-1]):
         step = np.zeros_like(f.params)
         step[..., k] = 1e-6

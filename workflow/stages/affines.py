@@ -23,6 +23,7 @@ from iif_core.affines import (
     pin,
     reference_loss,
 )
+from iif_core.affines.problem import MATTE
 from iif_core.camera_gains import CameraGains
 from iif_core.errors import InputError
 from iif_core.response import Response, response_facts, response_from_facts
@@ -36,13 +37,14 @@ from workflow.base_scene import (
     read_base_scene,
     read_gains,
     read_light,
+    sensor_bounds,
     view_pixels,
 )
+from workflow.cell_textures import CellTextures
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.recovered import write_response
 
-SATURATION = 0.99
 THIN_PIXELS = 50
 """Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
 _SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
@@ -59,23 +61,43 @@ def run(job: Job) -> None:
     problem, places = _problem(job, capture, scene, emits, read_gains(job))
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
-    solve = _solver(job, prior)
-    with job.timed("solve"):
-        free = solve(problem, start)
-    fit = pin(problem, free, find_gauge(problem, places))
+    textures = CellTextures.of(job, capture, scene)
+    fit, free = _fitted(job, problem, start, prior, places, find_gauge)
+    direct = job.settings.affines.solver == "direct"  # the twins know no fit without gloss
+    scatter = textures.scatter(fit) if textures is not None and direct else None
+    if scatter is not None and plan.gloss_is_idle(*scatter):
+        fit, free = _fitted(job, problem, start, prior, places, find_gauge, matte=True)
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
     _write_objects(job, names, fit)
     if not capture.is_hdr:
         write_response(job, fit.response)
-    _write_cells(job, fit)
-    _write_maps(job, capture, fit)
-    decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
+    albedo = textures.albedo(fit) if textures is not None else None
+    _write_cells(job, fit, albedo)
+    _write_maps(job, capture, fit, albedo)
+    decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"], scatter)
     loss = reference_loss(problem, free.affine, free.response)
     _write_facts(job, fit, loss.__dict__, decisions)
 
 
-def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[FitProblem, Response], FitResult]:
+def _fitted(
+    job: Job,
+    problem: FitProblem,
+    start: Response,
+    prior: tuple[np.ndarray, np.ndarray] | None,
+    places: _Places,
+    find_gauge: Callable[[FitProblem, _Places], Gauge],
+    matte: bool = False,
+) -> tuple[FitResult, FitResult]:
+    """The fit in its gauge, and as it came."""
+    with job.timed("solve"):
+        free = _solver(job, prior, matte)(problem, start)
+    if matte:
+        free.affine[:, 12:] = MATTE
+    return pin(problem, free, find_gauge(problem, places)), free
+
+
+def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) -> Callable[[FitProblem, Response], FitResult]:
     """The solver that the settings name; `prior`: of the response."""
     settings = job.settings.affines
     if settings.solver == "direct":
@@ -85,6 +107,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             ridge=settings.ridge,
             robust_width=settings.robust_width,
             response_prior=prior,
+            matte=matte,
             threads=job.threads,
         )
         return lambda problem, start: fit_affines(problem, start, options)
@@ -260,12 +283,9 @@ def _problem(
                 cached[half][layer].append(part if gains.is_plain else _balanced(part, factor / exposure[:, None]))
         job.progress(done + 1, len(views), "views read")
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
-    value = np.asarray(joined["value"], np.float32)
-    saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
+    value, saturated = sensor_bounds(np.asarray(joined["value"], np.float32), capture.is_hdr, job.settings.emission.saturation)
     halves = [[np.concatenate(part) for part in half] for half in cached]
     d, s0, s1 = ((halves[0][i], halves[1][i]) for i in range(3))
-    # A value at the top of the range is a bound there, whatever is stored above it.
-    value = np.minimum(value, SATURATION) if not capture.is_hdr else value
     object_id, cell = joined["object"].astype(np.int32), joined["cell"].astype(np.int64)
     # Pixels without a cell of their own are a place of their own.
     position = (
@@ -336,13 +356,15 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 
 
-def _write_cells(job: Job, fit: FitResult) -> None:
+def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     cells = job.read("base").table("cells.parquet")
     base = np.stack([cells[name] for name in MATERIAL], 1)
     deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
     spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, deviation)
+    if albedo is not None:
+        fitted[:, :3] = albedo
     columns = {
         "cell_id": cells["cell_id"],
         **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)},
@@ -350,7 +372,7 @@ def _write_cells(job: Job, fit: FitResult) -> None:
     job.writer.table("cells.parquet", {**columns, "uncertainty": spread.astype(np.float32)})
 
 
-def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
+def _write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndarray | None) -> None:
     base, segmentation = job.read("base"), job.read("segmentation")
     for done, view in enumerate(capture.views):
         file = f"maps/{view.name}.exr"
@@ -360,6 +382,9 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
         fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
         spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(deviation[:, None], 3, 1))
         seen = object_id >= 0
+        if albedo is not None:
+            cell = ids_from_disk(base.exr(file)["cell.id"]).ravel()
+            fitted[cell >= 0, :3] = albedo[cell[cell >= 0]]
         fitted[~seen], spread[~seen] = 0.0, 0.0
         shape = (view.height, view.width)
         channels = {
@@ -375,7 +400,13 @@ def _write_maps(job: Job, capture: CaptureReader, fit: FitResult) -> None:
 # --------------------------------------------------------------------------------------------------------------- plan
 
 
-def _plan(problem: FitProblem, fit: FitResult, calibration: dict[str, Any], dynamic_range: str) -> list[plan.Decision]:
+def _plan(
+    problem: FitProblem,
+    fit: FitResult,
+    calibration: dict[str, Any],
+    dynamic_range: str,
+    scatter: tuple[float, float] | None,
+) -> list[plan.Decision]:
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
     medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)
@@ -391,7 +422,7 @@ def _plan(problem: FitProblem, fit: FitResult, calibration: dict[str, Any], dyna
     return [
         plan.camera_response(dynamic_range, calibration),
         plan.metallic(metal & fit.free.any(1), medians),
-        plan.specular(glossy, metal),
+        plan.specular(glossy, metal, scatter),
         plan.affine_size(fit.model),
         plan.second_pass(gains, fit.pixels),
         plan.scale(**fit.facts["scale"]),
