@@ -52,8 +52,8 @@ class EmissionSolution:
     iterations: int
     converged: bool
 
-    def with_level_error(self, level_error: float) -> EmissionSolution:
-        """The same answer, the error of the level that all share added to every group's own."""
+    def with_level_error(self, level_error: float | np.ndarray) -> EmissionSolution:
+        """The same answer, with the error of the logarithm of the light that groups share (number or (G, 3)) in each one's."""
         return replace(self, error=np.hypot(self.error, level_error * self.radiance))
 
 

@@ -18,6 +18,8 @@ everywhere. The built-in kitchen's light comes out 11 % too dim, 5 % with the tr
 _LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried."""
 _BOUNDS = (0.1, 10.0)
+WHITE_SHARE = 0.03
+"""Share of the rows whose objects may come out brighter than white: gloss, and lamps that nobody found."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +30,16 @@ class ObjectGains:
         gain: (n_objects, 3) > 0.
         level_error: standard error of the logarithm of the level of all light (the same factor on every emitter); infinite
             where nothing tells it.
+        error_of_group: (G, 3) the same of the light of each group: 0 where it is itself seen unsaturated.
         weight: (n, 3) of the rows, relative to what they are predicted to show.
+        raised: logarithm by which all light is brighter than of least cost, for albedos of at most 1; not in the errors.
     """
 
     gain: np.ndarray
     level_error: float
+    error_of_group: np.ndarray
     weight: np.ndarray
+    raised: float = 0.0
 
 
 def object_gains(
@@ -45,6 +51,7 @@ def object_gains(
     cross: bool = True,
     rounds: int = 15,
     shrink: float = 0.05,
+    albedo: np.ndarray | None = None,
 ) -> ObjectGains:
     """Albedo gain of each object and channel that goes with the light.
 
@@ -62,7 +69,11 @@ def object_gains(
 
     The level is found from how unlike the shares of h are. What that is worth is told by the jackknife over objects (Tukey 1958):
     errors of geometry, cache and texture are shared within an object, not between objects. What all share is added
-    (`SHARED_ERROR`), in as far as the level is not that of emitters that are seen unsaturated.
+    (`SHARED_ERROR`). An emitter that is seen unsaturated is known in the units of the photographs, others are not by that: see
+    `_level_errors`.
+
+    Nothing reflects more than it receives. With `albedo`, the level is the lowest from there upwards at which the largest channel
+    of g_o albedo_o is above 1 for at most `WHITE_SHARE` of the rows.
 
     Args:
         rows, observed, initial, cross: as in `scale_rows` and `solve_emission`.
@@ -70,12 +81,13 @@ def object_gains(
         pinned: E has a scale of its own.
         rounds: of the alternation.
         shrink: pull of g to the common one (not `pinned`: to 1) relative to the rows.
+        albedo: (n_objects, 3) mean base albedo; None: no ceiling.
     """
     count = int(owner.max(initial=-1)) + 1
     gain = np.ones((count, 3))
     known = owner >= 0
     if not known.any() or rows.groups == 0:
-        return ObjectGains(gain, float("inf"), rows.weight)
+        return ObjectGains(gain, float("inf"), np.full((rows.groups, 3), np.inf), rows.weight)
     # Every row that is no object's is an anchor, its gain is 1: an object of its own at the end.
     column = np.where(known, owner, count)
     weight = rows.weight
@@ -91,14 +103,83 @@ def object_gains(
         weight = _relative_to(rows, observed, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
         profile = _Profile.of(observed, emitted, cached, used, column, count + 1, cross, shrink, pinned)
-        new = profile.gain(profile.level() if pinned else np.zeros(3))
+        level, raised = _below_white(profile, column, albedo) if pinned else (np.zeros(3), 0.0)
+        new = profile.gain(level)
         if not pinned:
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
         done = np.abs(np.log(new / gain)).max() < 1e-3
         gain = new
         if done:
             break
-    return ObjectGains(gain, profile.level_error() if pinned and profile is not None else float("inf"), weight)
+    errors = float("inf"), np.full((rows.groups, 3), np.inf)
+    if pinned:
+        errors = _level_errors(replace(rows, weight=weight), observed, cached, radiance, column, count + 1, cross, shrink)
+    return ObjectGains(gain, *errors, weight, raised)
+
+
+def _level_errors(
+    rows: EmissionRows,
+    observed: np.ndarray,
+    cached: list[np.ndarray],
+    radiance: np.ndarray,
+    column: np.ndarray,
+    count: int,
+    cross: bool,
+    shrink: float,
+) -> tuple[float, np.ndarray]:
+    """(error of the level of all light, (G, 3) of each group's).
+
+    What emitters radiate that are seen unsaturated (share phi of the light on the rows) is as good as photographed, so for the
+    level of the others it stands beside h: y = g_o (s A_free E_free + (A_seen E_seen + h)), with error e_free. Whether those
+    that are seen are emitters at all, and radiate elsewhere what they show the camera, is told by the level that objects would
+    give all light without them: its log s, as far as its own error e_all does not explain it, is theirs,
+    e_seen^2 = log^4 s / (log^2 s + e_all^2). Of all light: e^2 = ((1 - phi) e_free)^2 + (phi e_seen)^2.
+    """
+    seen = _seen(rows, column == count - 1)
+    parts = [
+        [np.einsum("ngc,gc->nc", a, np.where(which, radiance, 0.0)) for a in (rows.first, rows.second)] for which in (~seen, seen)
+    ]
+    reflects = (column < count - 1)[:, None] & ~rows.lower_bound
+    used = np.where(reflects, rows.weight, 0.0)
+
+    def profile(emitted: list[np.ndarray], known: list[np.ndarray]) -> _Profile:
+        return _Profile.of(observed, emitted, known, used, column, count, cross, shrink, True)
+
+    beside = [h + d for h, d in zip(cached, parts[1], strict=True)]
+    free_error = profile(parts[0], beside).level_error()
+    if not seen.any():
+        return free_error, np.full(seen.shape, free_error)
+    size = [float((used * observed * 0.5 * (d[0] + d[1])).sum()) for d in parts]
+    phi = float(np.clip(size[1] / max(sum(size), 1e-300), 0.0, 1.0)) if size[1] > 0 else 0.0
+    everything = profile([a + b for a, b in zip(*parts, strict=True)], cached)
+    error = everything.level_error()
+    off = float(_lowest(everything.costs().sum(2).sum(1)[:, None])[0])
+    # Objects that know less than the prior does are no witnesses.
+    seen_error = off**2 / max(np.hypot(off, error), 1e-300) if error < LEVEL_OF_PRIOR else 0.0
+    # Where nothing tells the level of the others, it is at most as uncertain as the prior's, the more so the less is seen.
+    rest = (1.0 - phi) * min(free_error, LEVEL_OF_PRIOR / phi) if phi > 0 else free_error
+    return float(np.hypot(rest, phi * seen_error)), np.where(seen, 0.0, free_error)
+
+
+def _seen(rows: EmissionRows, direct: np.ndarray) -> np.ndarray:
+    """(G, 3) bool: a row `direct` (n,) shows the group itself, and is no bound."""
+    shown = (rows.first[direct] > 0) & ~rows.lower_bound[direct][:, None] & (rows.weight[direct] > 0)[:, None]
+    return shown.any(0)
+
+
+def _below_white(profile: _Profile, owner: np.ndarray, albedo: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """(3,) log s of least cost, raised in all channels alike until albedos are possible, and by how much; not raised where no
+    level makes them so. owner: (n,), the last = anchors."""
+    best, objects = profile.level(), len(profile.yy) - 1
+    if albedo is None:
+        return best, 0.0
+    base = np.asarray(albedo, np.float64)[:objects]
+    rows = np.bincount(owner, minlength=objects + 1)[:objects].astype(np.float64)
+    for step in _LEVELS[_LEVELS >= 0.0]:
+        whitest = (profile.gain(best + step) * base).max(1)
+        if rows[whitest > 1.0].sum() <= WHITE_SHARE * rows.sum():
+            return best + step, float(step)
+    return best, 0.0
 
 
 def _relative_to(rows: EmissionRows, observed: np.ndarray, predicted: np.ndarray, reflects: np.ndarray) -> np.ndarray:
@@ -161,7 +242,7 @@ class _Profile:
         cost = self.yy[:-1] - 2 * gain * top + gain**2 * bottom + pull * (gain - common) ** 2
         return cost, gain
 
-    def _costs(self) -> np.ndarray:
+    def costs(self) -> np.ndarray:
         """(levels, O + 1, 3)."""
         s = np.exp(_LEVELS)[:, None, None]
         anchors = self.yy[-1:] - 2 * (s * self.yd + self.yh)[:, -1:] + (s * s * self.dd + 2 * s * self.dh + self.hh)[:, -1:]
@@ -173,23 +254,21 @@ class _Profile:
 
     def level(self) -> np.ndarray:
         """(3,) log s of least cost."""
-        return _lowest(self._costs().sum(1))
+        return _lowest(self.costs().sum(1))
 
     def level_error(self) -> float:
         """Standard error of one log s of all channels, objects left out in turn; see `SHARED_ERROR`."""
-        costs = self._costs().sum(2)
+        costs = self.costs().sum(2)
         there = self.yy[:-1].sum(1) > 0
         whole, n = costs.sum(1), int(there.sum())
         if n < 2:
             return float("inf")
-        without = _lowest(whole[:, None] - costs[:, :-1][:, there])
-        if np.abs(without).max() >= _LEVELS[-1]:
+        left = whole[:, None] - costs[:, :-1][:, there]
+        if not 0 < left.argmin(0).min() <= left.argmin(0).max() < len(_LEVELS) - 1:  # flat, or beyond what is tried
             return float("inf")
-        at = np.clip(whole.argmin(), 1, len(_LEVELS) - 2)
-        bend = [max(float(c[at - 1] - 2 * c[at] + c[at + 1]), 0.0) for c in (costs[:, :-1].sum(1), costs[:, -1])]
-        of_objects = bend[0] / max(sum(bend), 1e-300)  # how much of the level is theirs, and not the anchors'
+        without = _lowest(left)
         own = np.sqrt((n - 1) / n * ((without - _lowest(whole[:, None])) ** 2).sum())
-        return float(np.hypot(SHARED_ERROR * of_objects, own))
+        return float(np.hypot(SHARED_ERROR, own))
 
 
 def _lowest(costs: np.ndarray) -> np.ndarray:

@@ -48,7 +48,8 @@ class EmissionProblem:
         owner: (m,) object that reflects, -1 = an emitter's own pixels.
         anchor: (m,) bool, an emitter or the sky, seen directly.
         level_error: standard error of the logarithm of the level of all light, infinite where nothing tells it
-            (`with_gains`).
+            (`with_gains`). error_of_group: (G, 3) the same of each group's light, 0 where it is itself seen unsaturated.
+        level_raised: as `ObjectGains.raised`.
     """
 
     rows: EmissionRows
@@ -56,17 +57,23 @@ class EmissionProblem:
     owner: np.ndarray
     anchor: np.ndarray
     level_error: float = float("inf")
+    level_raised: float = 0.0
+    error_of_group: np.ndarray | None = None
 
-    def with_gains(self, initial: np.ndarray) -> EmissionProblem:
-        """Rows scaled by the albedo gains of the objects that go with the light, weighed relative to what they should show."""
+    def with_gains(self, initial: np.ndarray, albedo: np.ndarray | None = None) -> EmissionProblem:
+        """Rows scaled by the albedo gains of the objects that go with the light, weighed relative to what they should show.
+        albedo: (n_objects, 3) mean base albedo, which no gain may make whiter than white."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
         pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
-        found = object_gains(self.rows, self.observed, self.owner, initial, pinned)
+        found = object_gains(self.rows, self.observed, self.owner, initial, pinned, albedo=albedo)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0
         of_row[known] = found.gain[self.owner[known]]
         rows = replace(self.rows, weight=found.weight)
-        return replace(self, rows=scale_rows(rows, self.observed, of_row), level_error=found.level_error)
+        rows = scale_rows(rows, self.observed, of_row)
+        return replace(
+            self, rows=rows, level_error=found.level_error, level_raised=found.raised, error_of_group=found.error_of_group
+        )
 
 
 def assemble(

@@ -1,9 +1,10 @@
 """How exactly 32 planted emitter groups come back, what it costs, and what the paper's descent makes of the same rows.
 
-    python tests/benchmarks/emission_planted.py [--views 16] [--size 64] [--photo-samples 128] [--sgd]
+    python tests/benchmarks/emission_planted.py [--views 16] [--size 64] [--photo-samples 128] [--room 0] [--seed 0] [--limit]
 
 A procedural room with true materials (tests/unit/planted_room.py). Median and largest relative error of the emission of a
 group, largest false emission of the three surfaces that do not shine (true values are 3 to 20), process CPU seconds.
+`--sgd`: the twin too. `--limit`: what no unbiased estimator can be better than, from the noise as it is (`information_limit`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,58 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 
+def information_limit(scene, photographs: np.ndarray, photo_paths: int, paths: list[int]) -> list[tuple[str, float]]:
+    """Median relative error of the best unbiased estimate (Cramer-Rao) that knows emitters by their light alone.
+
+    Rows are the means of (object, view, tile), A of 1024 paths a pixel. Variance of a row from the scatter of its pixels about
+    A E, and of A E from two halves, pooled over rows of one object and like brightness (raw, it would be taken for knowledge).
+    """
+    from iif_core.emission.rows import EmissionRows, block_rows
+
+    truth, group = scene.room.truth, scene.room.group[scene.face]
+    own = (group >= 0) & truth[group].any(1)
+    halves = [sum(part) / 4 for part in zip(*[[a for a, _ in scene.halves(1000 + i, 128)] for i in range(4)], strict=True)]
+    shown = [np.einsum("ngc,gc->nc", a, truth) for a in halves]
+    # A E has noise of its own; what is left of the photographs' alone is told by the numbers of paths.
+    square = (photographs - 0.5 * (shown[0] + shown[1])) ** 2 / (1 + photo_paths / 1024)
+    key = np.stack([scene.room.object_id[scene.face], scene.view, scene.tile], 1)[~own]
+    number, block = np.unique(key, axis=0, return_inverse=True)
+
+    def means(values: np.ndarray) -> np.ndarray:
+        empty, ones, free = np.zeros((len(key), 0, 3), np.float32), np.ones((len(key), 3)), np.zeros((len(key), 3), bool)
+        return block_rows(EmissionRows(empty, empty, values[~own], values[~own], ones, free), block.ravel()).target
+
+    size = np.bincount(block.ravel())[:, None]
+    matrix = np.stack([means(0.5 * (halves[0][:, g] + halves[1][:, g])) for g in range(len(truth))], 1)
+    first, second = means(shown[0]), means(shown[1])
+    level = 0.5 * (first + second).mean(1)
+    pool = number[:, 0] * 20 + np.digitize(level, np.quantile(level, np.linspace(0.05, 0.95, 19)))
+    scale = (level[:, None] + 0.05 * np.median(level)) ** 2
+
+    def pooled(variance: np.ndarray) -> np.ndarray:
+        member = np.unique(pool, return_inverse=True)[1]
+        mean = np.stack([np.bincount(member, v) / np.bincount(member) for v in (variance / scale).T], 1)
+        return np.maximum(mean[member], 1e-9) * scale
+
+    photo, trace = pooled(means(square) / size), pooled(0.25 * (first - second) ** 2)
+    limits = []
+    for name, factor in [("exact", 0.0), *((str(n), 1024 / n) for n in paths)]:
+        variance = photo + factor * trace
+        spread = [np.diag(np.linalg.inv((a.T / v) @ a)) for a, v in zip(np.moveaxis(matrix, 2, 0), variance.T, strict=True)]
+        error = np.sqrt(sum(spread)) / np.maximum(truth.sum(1), 1e-9)
+        limits.append((name, float(0.6745 * np.median(error[truth.any(1)]))))  # median |x| of a normal x
+    return limits
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=16)
     parser.add_argument("--size", type=int, default=64)
     parser.add_argument("--photo-samples", type=int, default=128)
     parser.add_argument("--samples", type=int, nargs="+", default=[4, 16, 64], help="paths a pixel, over both halves")
+    parser.add_argument("--room", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--limit", action="store_true", help="the information limit of light alone, too")
     parser.add_argument("--sgd", action="store_true", help="the twin too")
     arguments = parser.parse_args()
     from iif_core import native
@@ -38,12 +85,15 @@ def main() -> None:
     from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
     from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 
-    scene = PlantedScene(build_room(), arguments.views, arguments.size)
-    photographs, lit = scene.photographs(0, arguments.photo_samples), scene.room.truth.any(1)
+    scene = PlantedScene(build_room(arguments.room), arguments.views, arguments.size)
+    photographs, lit = scene.photographs(arguments.seed, arguments.photo_samples), scene.room.truth.any(1)
+    limits = information_limit(scene, photographs, arguments.photo_samples, arguments.samples) if arguments.limit else []
+    for name, limit in limits:
+        print(f"no unbiased estimate from light alone is better than {limit:.3f} ({name} paths)", flush=True)
     print("| photographs | paths | solver | median | max | false | loss | trace s | solve s |\n" + 9 * "|---" + "|")
     for samples in arguments.samples:
         start = time.process_time()
-        halves = scene.halves(0, max(samples // 2, 1))
+        halves = scene.halves(arguments.seed, max(samples // 2, 1))
         traced = time.process_time() - start
         for kind in ("hdr", "hdr_hidden", "ldr", "ldr_one"):
             problem, initial = scene.problem(photographs, halves, kind)

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from iif_core.emission.direct import solve_emission, solve_families
-from iif_core.emission.gains import SHARED_ERROR, object_gains
+from iif_core.emission.gains import SHARED_ERROR, WHITE_SHARE, object_gains
 from iif_core.emission.pruning import WhiteSurface, prune_groups
 from iif_core.emission.rows import EmissionRows, block_rows, scale_rows
 from iif_core.errors import InputError
@@ -349,6 +349,34 @@ def test_level_and_its_error_from_unlike_shares_of_photographed_light():
     assert 0.5 < np.std(z) < 1.6 and abs(np.mean(z)) < 1.0
 
 
+def test_light_is_raised_until_albedos_are_possible():
+    """A base twice too bright asks for light that is too dim; nothing reflects more than it receives."""
+    rng = np.random.default_rng(12)
+    n, owner = 2000, np.repeat(np.arange(20), 100)
+    base = rng.uniform(0.3, 0.9, (20, 3))
+    a = rng.uniform(0.05, 1, (n, 3))[:, :, None] * np.ones(3)
+    h = rng.uniform(2, 20, (n, 3))  # photographed light, which holds the level at gains of 1.6
+    y = 1.6 * (np.einsum("ngc,gc->nc", a, TRUE) + h)
+    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, 1 / y**2, np.zeros(y.shape, bool))
+    plain = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6).gain
+    assert ((plain * base).max(1)[owner] > 1).mean() > 0.2
+    raised = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=base)
+    found = raised.gain
+    assert raised.raised > 0.1
+    whitest = (found * base).max(1)
+    assert (whitest[owner] > 1).mean() <= WHITE_SHARE
+    assert np.quantile(whitest, 0.97) > 0.9  # and no more than is needed
+    light = [solve_emission(scale_rows(rows, y, g[owner]), np.ones((3, 3))).radiance.sum() for g in (plain, found)]
+    assert light[0] == pytest.approx(TRUE.sum(), rel=0.05) and light[1] > 1.2 * light[0]
+    # Where albedos are possible as they are nothing changes, to the last bit.
+    dark = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=0.3 * base)
+    np.testing.assert_array_equal(dark.gain, plain)
+    assert dark.raised == 0
+    # Nor where no level makes them so: photographed light alone asks for gains of 1.6, emitters are next to nothing.
+    faint = EmissionRows(*[1e-3 * rows.first] * 2, *[1.6 * h - h] * 2, 1 / y**2, rows.lower_bound)
+    assert object_gains(faint, 1.6 * h, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=np.full((20, 3), 0.9)).raised == 0
+
+
 def test_level_without_a_witness_is_unknown():
     a, y = _random(400)
     rows, owner = _rows(a, a, y), np.repeat(np.arange(4), 100)
@@ -358,6 +386,38 @@ def test_level_without_a_witness_is_unknown():
     anchored = np.r_[owner[:-3], [-1] * 3]
     a[-3:], y[-3:] = np.eye(3)[:, :, None], TRUE
     assert object_gains(_rows(a, a, y), y, anchored, np.ones((3, 3)), True).level_error < 0.05
+
+
+def _room_with_lamps_in_sight(shown, groups, seed=15):
+    """Rows of 20 objects under `TRUE` and photographed light; one row for each of `groups`, `shown` times as bright as it is."""
+    rng = np.random.default_rng(seed)
+    n, owner = 800, np.repeat(np.arange(20), 40)
+    a = rng.uniform(0, 1, (n, 3))[:, :, None] ** 2 * np.ones(3)
+    h = rng.uniform(2, 40, (n, 3))
+    y = np.exp(0.25 * rng.standard_normal((20, 3)))[owner] * (np.einsum("ngc,gc->nc", a, TRUE) + h)
+    a, h = np.concatenate([a, np.eye(3)[groups][:, :, None] * np.ones(3)]), np.r_[h, np.zeros((len(groups), 3))]
+    y, owner = np.r_[y, shown * TRUE[groups]], np.r_[owner, np.full(len(groups), -1)]
+    weight = 1 / y**2
+    weight[n:] *= 1e6
+    emitted = [np.einsum("ngc,gc->nc", a[:n, which], TRUE[which]) for which in (groups, list(set(range(3)) - set(groups)))]
+    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, weight, np.zeros(y.shape, bool))
+    share = (emitted[0] * weight[:n] * y[:n]).sum() / (sum(emitted) * weight[:n] * y[:n]).sum()
+    return object_gains(rows, y, owner, TRUE, True), share
+
+
+def test_lamp_in_sight_is_sure_of_its_own_light_alone():
+    """What is not seen has the error that all objects share, in proportion to its share of the light."""
+    found, share = _room_with_lamps_in_sight(1.0, [2])
+    assert 0.3 < share < 0.9
+    assert (found.error_of_group[2] == 0).all() and found.error_of_group[:2] == pytest.approx(SHARED_ERROR, rel=0.2)
+    assert found.level_error == pytest.approx((1 - share) * found.error_of_group[0, 0], rel=0.1)
+    assert _room_with_lamps_in_sight(1.0, [0, 1, 2])[0].level_error < 0.02
+
+
+def test_lamps_that_show_another_light_than_the_room_are_not_trusted():
+    """All 'lamps' show twice the light that the room is lit by: a mirror image or a bright wall, say."""
+    found = _room_with_lamps_in_sight(2.0, [0, 1, 2])[0]
+    assert found.level_error == pytest.approx(np.log(2), rel=0.15)
 
 
 @pytest.mark.parametrize("pinned", [False, True])

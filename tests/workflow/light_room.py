@@ -322,5 +322,5 @@ SHADING = {
 }
 AFFINES = {
     **{"model": "objects", "solver": "direct", "response": "auto", "iterations": 60, "pixels": 200000, "population": True},
-    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "epochs": 3, "batch": 32768, "rate": None},
+    **{"ridge": 2e-3, "robust_width": 0.1, "scale": "found", "texture": "base", "epochs": 3, "batch": 32768, "rate": None},
 }
