@@ -36,6 +36,7 @@ from workflow.base_scene import (
     read_base_scene,
     read_gains,
     read_light,
+    sensor_bounds,
     view_pixels,
 )
 from workflow.denoise import denoise, require_denoiser
@@ -43,7 +44,6 @@ from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 from workflow.recovered import write_response
 
-SATURATION = 0.99
 BORDER_WEIGHT = 0.1
 BLOCK_FOOTPRINTS = 1.6
 """Edge, in median pixel footprints, of the blocks of cells that share roughness, metalness and diffuse light."""
@@ -174,7 +174,7 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
     block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
     prior = _object_means(job, capture, scene) if model == "iris" else None
     goal = prior[owner, :3] if prior is not None else None
-    views = _Pixels(job, capture, scene, block_of, len(owner))
+    views = CellPixels(job, capture, scene, block_of, len(owner))
     sums = CellSums(owner, scene.n_objects, levels)
     curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
     if goal is not None and not capture.is_hdr:
@@ -224,7 +224,7 @@ def _footprint(capture: CaptureReader) -> float:
     return float(np.median(sizes)) if sizes else 0.0
 
 
-class _Pixels:
+class CellPixels:
     """Valid pixels of surface that does not shine, view by view: rows by block, and the cell of each.
 
     Attributes:
@@ -265,14 +265,15 @@ class _Pixels:
             s0, s1 = (_lobes(channels, name, levels, pixels.index) for name in ("s0", "s1"))
             d = d if diffuse is None else diffuse[block]
             value = np.asarray(pixels.value, np.float32)
-            saturated = value >= SATURATION if not capture.is_hdr else np.zeros(value.shape, bool)
-            value = np.minimum(value, SATURATION) if not capture.is_hdr else value
+            value, saturated = sensor_bounds(value, capture.is_hdr, job.settings.emission.saturation)
             number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
             factor = np.ones((len(cell), 3)) if capture.is_hdr else pixel_gains(gains, number, view, pixels.index)
             exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
             if not gains.is_plain:
                 ratio = (factor / exposure[:, None]).astype(np.float32)
-                d, s0, s1 = d * ratio, s0 * ratio[:, None], s1 * ratio[:, None]
+                # Blocks average light before any photograph's white balance.
+                d = d if diffuse is None else d * ratio
+                s0, s1 = s0 * ratio[:, None], s1 * ratio[:, None]
             weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
             yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
             job.progress(done + 1, len(views), "views read")

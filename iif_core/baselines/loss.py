@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..brdf import F0_DIELECTRIC as F0
 from ..brdf import R_MIN
 from ..errors import InputError
 from .problem import CellProblem
 
-F0 = 0.04
 _PART_FLOOR = 1e-4  # METHOD 6.2: weight = mean specular radiance + 1e-4
 
 

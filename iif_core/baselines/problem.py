@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..color import SRGB_KNEE
 from ..errors import InputError
 from ..response import Response
 
@@ -81,7 +82,7 @@ class PixelRows:
         """
         if response.family == "identity":
             y = np.maximum(self.value.astype(np.float64), 0.0)
-            slope = np.where(y <= 0.0031308, 12.92, 1.055 / 2.4 * np.maximum(y, 0.0031308) ** (1 / 2.4 - 1))
+            slope = np.where(y <= SRGB_KNEE, 12.92, 1.055 / 2.4 * np.maximum(y, SRGB_KNEE) ** (1 / 2.4 - 1))
             return y, slope**2
         exposed = np.maximum(response.inverse(self.value.astype(np.float64)), 0.0)
         exposure = self.exposure[:, None].astype(np.float64)

@@ -44,10 +44,11 @@ class BlockLight:
 
 
 class AlbedoSums:
-    """Collects what the albedo of every cell needs, from pixels in any number of pieces; 7 numbers a cell."""
+    """Collects what the albedo of every cell needs, from pixels in any number of pieces; 8 numbers a cell."""
 
     def __init__(self, cells: int):
         self._square, self._cross, self._pixels = np.zeros((cells, 3)), np.zeros((cells, 3)), np.zeros(cells)
+        self._rest = np.zeros(cells)
 
     def add(
         self, rows: PixelRows, levels: np.ndarray, roughness: np.ndarray, metallic: np.ndarray, curve: Response, dark: float = 0.0
@@ -64,6 +65,21 @@ class AlbedoSums:
             self._square[:, c] += np.bincount(rows.cell, slope[:, c] * gain[:, c] ** 2, len(self._square))
             self._cross[:, c] += np.bincount(rows.cell, slope[:, c] * gain[:, c] * rest[:, c], len(self._cross))
         self._pixels += np.bincount(rows.cell, rows.weight, len(self._pixels))
+        self._rest += np.bincount(rows.cell, (slope * rest**2).sum(1), len(self._rest))
+
+    @property
+    def sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """sum w G^2 (C, 3), sum w G (y - h) (C, 3), sum of the pixels' weights (C,), for L = a G + h."""
+        return self._square, self._cross, self._pixels
+
+    def scatter(self, least: float = 3.0) -> float:
+        """Root mean square of y - h - a G (weighed as in the sums) at the best a of each cell, over cells of pixels of at least
+        this weight: what changes with the view beyond what the gloss h explains. 0 where there is no such cell."""
+        seen = (self._pixels >= least)[:, None] & (self._square > 0)
+        fitted = np.where(seen, self._cross**2 / np.where(seen, self._square, 1.0), 0.0).sum(1)
+        judged = seen.all(1)
+        total = float(np.maximum(self._rest - fitted, 0.0)[judged].sum())
+        return float(np.sqrt(total / max(3.0 * float(self._pixels[judged].sum()), 1e-300)))
 
     def albedo(
         self, block: np.ndarray, prior: np.ndarray | None = None, weight: float = 0.0, shrink: float = SHRINK

@@ -39,3 +39,18 @@ def test_nothing_that_is_fitted_sees_a_held_out_photograph(tmp_path):
     with pytest.raises(AssertionError, match="held out"):
         capture.photo(capture.views[3])
     assert capture.views[3].exposure == 1.0 and capture.photo(capture.views[3], held_out=True)[1].all()
+
+
+def test_rays_of_pixels_next_to_a_hole_stay_in_their_middle():
+    from workflow.normal_form import View
+    from workflow.stages.render import _steps
+
+    view = View(0, "a", 5, 4, 8.0, 8.0, 2.5, 2.0, np.eye(4))
+    face = np.zeros((4, 5), np.int32)
+    face[1, 1] = -1
+    plain, holed = _steps(view, face, False), _steps(view, face, True)
+    for one, each in zip(plain, holed, strict=True):
+        assert one.shape == (3,) and each.shape == (20, 3) and np.abs(one).max() > 0
+        still = (each == 0).all(1).reshape(4, 5)
+        np.testing.assert_array_equal(still, [[True] * 3 + [False] * 2] * 3 + [[False] * 5])
+        np.testing.assert_array_equal(each.reshape(4, 5, 3)[0, 4], one)

@@ -23,9 +23,8 @@ def _run(folder, dynamic_range, **changes):
 
 
 def _fit(folder, dynamic_range, model, **settings):
-    job = StubJob(
-        "affines", folder, {"capture": {"dynamic_range": dynamic_range}, "affines": AFFINES | {"model": model, **settings}}
-    )
+    common = {"capture": {"dynamic_range": dynamic_range}, "emission": EMISSION}
+    job = StubJob("affines", folder, {**common, "affines": AFFINES | {"model": model, **settings}})
     affines.run(job)
     job.writer.finish()
     return _reader(folder, "affines")
