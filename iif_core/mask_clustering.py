@@ -207,13 +207,13 @@ def _join(container: Array, count: int, consensus: float) -> Array:
     from scipy.sparse import csr_matrix
 
     n = len(container)
-    views = _packed(container >= 0)
+    views = packed_flags(container >= 0)
     row, view = np.nonzero(container >= 0)
     holders = csr_matrix((np.ones(len(row), np.float32), (row, container[row, view])), (n, count))
     node = np.arange(n)
     bars: list[int] | None = None
     while True:
-        first, second, supporters, observers = _pairs(holders, views)
+        first, second, supporters, observers = agreeing_pairs(holders, views)
         if bars is None:
             if not len(first):
                 return _numbered(node)
@@ -227,7 +227,7 @@ def _join(container: Array, count: int, consensus: float) -> Array:
             bars.pop(0)
         if not bars:
             return _numbered(node)
-        group = _components(len(views), first[joined], second[joined])
+        group = components(len(views), first[joined], second[joined])
         node = group[node]
         views, holders = _merged(views, holders, group)
         bars.pop(0)
@@ -235,8 +235,11 @@ def _join(container: Array, count: int, consensus: float) -> Array:
             return _numbered(node)
 
 
-def _pairs(holders: Any, views: Array) -> tuple[Array, Array, Array, Array]:
-    """Pairs of nodes i < j with a supporter: i, j, supporters, observers."""
+def agreeing_pairs(holders: Any, views: Array) -> tuple[Array, Array, Array, Array]:
+    """Pairs of nodes i < j with a supporter: i, j, supporters, observers.
+
+    holders: (n, M) csr of 0 and 1, the masks that hold a node; views: `packed_flags` of the (n, F) views that do.
+    """
     parts: list[tuple[Array, Array, Array, Array]] = []
     for rows in _blocks(holders.shape[0]):
         shared = (holders[rows] @ holders.T).tocoo()
@@ -262,7 +265,8 @@ def _merged(views: Array, holders: Any, group: Array) -> tuple[Array, Any]:
     return np.bitwise_or.reduceat(views[order], start, axis=0), union
 
 
-def _components(count: int, first: Array, second: Array) -> Array:
+def components(count: int, first: Array, second: Array) -> Array:
+    """(count,) connected component of every node of a graph with the edges (first, second)."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -270,7 +274,7 @@ def _components(count: int, first: Array, second: Array) -> Array:
     return connected_components(graph, directed=False)[1]
 
 
-def _packed(flags: Array) -> Array:
+def packed_flags(flags: Array) -> Array:
     """(n, F) bool as (n, words) uint64."""
     width = -(-flags.shape[1] // 64) * 64
     padded = np.zeros((len(flags), width), bool)

@@ -1,17 +1,27 @@
-"""Clusters of masks -> objects on faces: parts that lie apart are told apart, then the pixels of every face vote."""
+"""Clusters of masks -> objects on faces: parts that lie apart are told apart, the pixels of every face vote, and what the views
+do not hold together is parted again, what they do is joined."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from .cells import neighbour_pairs, unpack_keys
+from .mask_clustering import agreeing_pairs, components, packed_flags
 
 Array = np.ndarray
 
 PIECE_VIEWS = 3.0
 """What a piece of the mesh is worth as a whole, in views of one of its faces."""
+
+JOIN_VIEWS = 3
+JOIN_SHARE = 0.8
+"""Objects are joined if at least so many views see both, and this share of them in one mask."""
+
+TIE = 1e-6
+"""Views by which majorities of shares must differ to be told apart from rounding."""
 
 
 @dataclass(frozen=True)
@@ -133,3 +143,121 @@ def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: 
     agreeing = np.bincount(part[mine], pixels[mine], len(cluster))
     cast = np.bincount(label[face], pixels, len(cluster)) if len(face) else np.zeros(len(cluster))
     return label, bare, agreeing / np.maximum(cast, 1)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Where fragments of objects lie in masks; n rows, one a (view, fragment, mask).
+
+    view, fragment, mask: (n,) int64, masks numbered from 1 in every view; pixels: (n,) float64 > 0.
+    """
+
+    view: Array
+    fragment: Array
+    mask: Array
+    pixels: Array
+
+
+def sightings(views: Iterable[tuple[Array, Array]]) -> Sightings:
+    """Of every view the fragment and the mask of its pixels, both (p,) int, for pixels that lie in a mask."""
+    columns = []
+    for view, (fragment, mask) in enumerate(views):
+        span = int(mask.max(initial=0)) + 1
+        code, pixels = np.unique(fragment.astype(np.int64) * span + mask, return_counts=True)
+        columns.append((np.full(len(code), view, np.int64), code // span, code % span, pixels.astype(np.float64)))
+    return Sightings(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def keep_together(home: Array, seen: Sightings) -> Array:
+    """Object of every fragment, (n,) int64: `home`, or a new one if the views do not hold it together with the rest of `home`.
+
+    A fragment is what an object has of one piece of the mesh. Every object grows from its fragment of the most pixels. Of the
+    n views that see a fragment and something of the object so far, t_f is the share of the fragment's pixels in that mask of
+    view f which holds most of the object. It joins if
+
+        1 + sum t_f > (1 + n) / 2
+
+    a majority in which its election into the object counts as one view; a tie parts. When none joins, those that no view shows
+    with the object do. What then remains is one new object, which grows likewise.
+    """
+    home = np.array(home, np.int64)
+    waits, size = np.ones(len(home), bool), np.bincount(seen.fragment, seen.pixels, len(home))
+    span = int(seen.view.max(initial=0)) + 1
+    _, pair = np.unique(seen.fragment * span + seen.view, return_inverse=True)
+    share = seen.pixels / np.bincount(pair, seen.pixels)[pair]
+    waits[_largest(home, size, waits)] = False
+    while waits.any():
+        together, views = _support(home, waits, seen, share)
+        joins = waits & (views > 0) & (1 + together > 0.5 * (1 + views) + TIE)
+        if not joins.any():
+            joins = waits & (views == 0)
+        waits &= ~joins
+        if not joins.any():
+            home[waits] = int(home.max()) + 1 + np.unique(home[waits], return_inverse=True)[1]
+            waits[_largest(home, size, waits)] = False
+    return home
+
+
+def _largest(home: Array, size: Array, waits: Array) -> Array:
+    """Of every object with waiting fragments the one of the most pixels; of equals the first."""
+    rows = np.flatnonzero(waits)
+    rows = rows[np.lexsort((rows, -size[rows], home[rows]))]
+    return rows[np.unique(home[rows], return_index=True)[1]]
+
+
+def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[Array, Array]:
+    """Of every waiting fragment: sum of t_f, and the number of views that see it with its object (both 0 for others)."""
+    growing = np.zeros(int(home.max()) + 1, bool)
+    growing[home[waits]] = True
+    rows = np.flatnonzero(growing[home[seen.fragment]])
+    views = int(seen.view.max(initial=0)) + 1
+    place = home[seen.fragment[rows]] * views + seen.view[rows]
+    waiting = waits[seen.fragment[rows]]
+
+    there = rows[~waiting]
+    at, chosen, _ = _main_masks(place[~waiting], seen.mask[there], seen.pixels[there])
+    rows, place = rows[waiting], place[waiting]
+    both = np.isin(place, at)
+    rows, place = rows[both], place[both]
+    inside = seen.mask[rows] == chosen[np.searchsorted(at, place)]
+    fragment = seen.fragment[rows]
+    return np.bincount(fragment, share[rows] * inside, len(home)), np.bincount(fragment, share[rows], len(home))
+
+
+def _main_masks(place: Array, mask: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """Places (ascending), the mask that holds most pixels of each (of equals the lowest), and the share of them in it."""
+    masks = int(mask.max(initial=0)) + 1
+    held, which = np.unique(place * masks + mask, return_inverse=True)
+    count = np.bincount(which, pixels, len(held))
+    order = np.lexsort((held, -count, held // masks))
+    at, first = np.unique(held[order] // masks, return_index=True)
+    total = np.bincount(np.searchsorted(at, held // masks), count, len(at))
+    return at, held[order][first] % masks, count[order][first] / total
+
+
+def join_together(home: Array, seen: Sightings) -> Array:
+    """Object of every fragment, (n,) int64: `home`, those joined that the views hold together; the lowest number stays.
+
+    A view sees an object in the mask that holds most of it, if that is more than half. Two objects are one if at least
+    JOIN_VIEWS views see both, and JOIN_SHARE of them in the same mask; repeated with what was joined. The election tells
+    objects apart by the clusters of their masks; of small ones, and of those that were parted, the pixels know more.
+    """
+    from scipy.sparse import csr_matrix
+
+    home = np.array(home, np.int64)
+    views, masks = int(seen.view.max(initial=0)) + 1, int(seen.mask.max(initial=0)) + 1
+    while True:
+        objects, at = np.unique(home, return_inverse=True)
+        place, mask, share = _main_masks(at[seen.fragment] * views + seen.view, seen.mask, seen.pixels)
+        node, view, mask = place[share > 0.5] // views, place[share > 0.5] % views, mask[share > 0.5]
+        holders = csr_matrix((np.ones(len(node), np.float32), (node, view * masks + mask)), (len(objects), views * masks))
+        by = np.zeros((len(objects), views), bool)
+        by[node, view] = True
+        first, second, supporters, observers = agreeing_pairs(holders, packed_flags(by))
+        one = (observers >= JOIN_VIEWS) & (supporters >= JOIN_SHARE * observers - TIE)
+        if not one.any():
+            return home
+        group = components(len(objects), first[one], second[one])
+        lowest = np.full(int(group.max()) + 1, int(home.max()))
+        np.minimum.at(lowest, group, objects)
+        home = lowest[group[at]]

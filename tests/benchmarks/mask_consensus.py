@@ -6,7 +6,8 @@ Reads captures (made by `snakemake results/<scene>/capture/manifest.json`) whose
 view are spoilt (tests/unit/spoilt_masks.py: 30 % swallowed by a neighbour, 25 % cut in two), the settings are the defaults.
 Purity: share whose true instance is the most frequent one of its object, over the mesh's vertices that are seen; over points
 evenly spread on the photographed surface, as the vertices of a scan are; and over pixels. Completeness: the same with the
-roles turned, 1 = nothing is in pieces. CPU seconds of one thread: `cluster` masks to objects, `pieces` Felzenszwalb.
+roles turned, 1 = nothing is in pieces. Rand: the adjusted Rand index. CPU seconds of one thread: `cluster` masks to objects,
+`pieces` Felzenszwalb.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from iif_core.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.mask_clustering import ConsensusOptions
+from iif_core.segments import partition_agreement
 from tests.unit.spoilt_masks import purity, spoil_masks
-from workflow import settings
 from workflow.artifacts import StageReader
 from workflow.artifacts.files import write_parquet
 from workflow.normal_form import CaptureReader
 from workflow.segmentations import masks
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
+from workflow.settings.segmentation import MaskSegmentation
 
 
 def spread_faces(surface: Surface, edge: float) -> np.ndarray:
@@ -47,8 +49,9 @@ def spread_faces(surface: Surface, edge: float) -> np.ndarray:
 def measure(folder: Path, seed: int, split: float, merge: float) -> dict[str, float | int | str]:
     """One row: a scene, a seed."""
     capture = CaptureReader(StageReader(folder, "capture", folder.parent.name))
-    surface, own = Surface(capture), settings.MaskSegmentation(kind="masks")
+    surface, own = Surface(capture), MaskSegmentation(kind="masks")
     instance, pixels = capture.faces()["instance_id"], surface.pixels()
+    thing = np.unique(instance, return_inverse=True)[1]
     rng, labels, parts = np.random.default_rng(seed), {}, []
     for view in capture:
         face = capture.gbuffer(view)[1]
@@ -68,7 +71,9 @@ def measure(folder: Path, seed: int, split: float, merge: float) -> dict[str, fl
     row |= {"masks_a_view": float(np.mean(parts)), "things": len(np.unique(instance[seen]))}
     row |= {"objects": len(np.unique(found.object_of_face[seen])), "faces": len(surface.faces), "vertices_seen": len(vertex)}
     for name, at, weight in (("vertices", of_vertex, None), ("surface", spread, None), ("pixels", seen, pixels[seen])):
-        row[f"purity_{name}"], row[f"complete_{name}"] = purity(found.object_of_face[at], instance[at], weight)
+        here, true = found.object_of_face[at], thing[at]
+        row[f"purity_{name}"], row[f"complete_{name}"] = purity(here, true, weight)
+        row[f"rand_{name}"] = partition_agreement(here, true, np.ones(len(here)) if weight is None else weight)[0]
     return row | {"cpu_pieces": middle - start, "cpu_cluster": end - middle}
 
 

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import socket
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,15 +26,7 @@ HEIGHT, WIDTH = 40, 56
 EXACT = {"samples": 4, "longest_side": 64, "steps": 3}
 
 
-@pytest.fixture(autouse=True)
-def offline(monkeypatch):
-    """Whoever reaches for a network fails."""
-
-    def refuse(*_):
-        raise AssertionError("tried to reach a network")
-
-    monkeypatch.setattr(socket.socket, "connect", refuse)
-    monkeypatch.setattr(socket, "getaddrinfo", refuse)
+pytestmark = pytest.mark.usefixtures("offline")
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +45,7 @@ def copied(made, tmp_path):
 def section(kind, folder, **keys):
     """Settings of a prior as plain values, checked by the schema."""
     document = {"kind": kind, "checkpoint": str(folder), "accept_license": True, **EXACT, **keys}
-    model = {"rgbx": settings_module.RgbxPrior, "marigold": settings_module.MarigoldPrior}[kind]
+    model = settings_module.UNIONS["prior"][kind]
     return model.model_validate(document).model_dump(mode="json")
 
 
@@ -463,7 +454,7 @@ def test_where_it_is_looked_for(copied, tmp_path, monkeypatch):
     said = refusal("rgbx", tmp_path / "nowhere")
     assert said.startswith(f"{tmp_path / 'nowhere'}: not found") and "hf download zheng95z/rgb-to-x" in said and "Adobe" in said
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
-    name, wanted = "zheng95z/rgb-to-x", settings_module.RgbxPrior.model_fields["revision"].default
+    name, wanted = "zheng95z/rgb-to-x", settings_module.UNIONS["prior"]["rgbx"].model_fields["revision"].default
     assert "is not here" in refusal("rgbx", name) and f"--revision {wanted}" in refusal("rgbx", name)
     snapshots = tmp_path / "hub/models--zheng95z--rgb-to-x/snapshots"
     shutil.copytree(copied["rgbx"], snapshots / ("0" * 40))
@@ -495,4 +486,4 @@ def test_the_examples_of_the_page_are_scene_files():
     page = (Path(__file__).resolve().parents[2] / "docs/priors.md").read_text()
     examples = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)]
     kinds = [settings_module.SceneSettings.model_validate(example).prior.kind for example in examples]
-    assert set(kinds) == set(settings_module._UNIONS["prior"])
+    assert set(kinds) == set(settings_module.UNIONS["prior"])

@@ -10,11 +10,22 @@ from scipy.sparse import csr_matrix
 from iif_core import mask_clustering as mc
 from iif_core.cells import pack_keys
 from iif_core.errors import InputError
-from iif_core.mask_votes import elect, joined, label_faces, split_apart, view_votes
+from iif_core.mask_votes import (
+    Sightings,
+    elect,
+    join_together,
+    joined,
+    keep_together,
+    label_faces,
+    sightings,
+    split_apart,
+    view_votes,
+)
 from iif_core.segments import fill_within, partition_agreement
 from tests.unit import own_scene as own
 from tests.unit.spoilt_masks import purity, spoil_masks
 from workflow.artifacts import StageReader
+from workflow.segmentations import masks
 
 
 def planted(labels, visible=None):
@@ -187,6 +198,146 @@ def test_the_mesh_settles_the_rest():
     np.testing.assert_array_equal(fill_within(label, piece, closed, pairs), [4, 4, 4, 6, 6, 2, 2, 2, 5, 5])
 
 
+def seen_as(*views):
+    """Sightings of views, each a list of (fragment, mask, pixels)."""
+    return sightings(
+        tuple(np.repeat(np.array(column), [n for *_, n in rows]) for column in list(zip(*rows, strict=True))[:2])
+        for rows in views
+    )
+
+
+def test_what_most_views_hold_apart_is_parted():
+    """A thing of 4 pixels (fragment 1) on a table of 100 (fragment 0), of which fragment 2 is another piece."""
+    joint, apart = [(0, 1, 100), (2, 1, 50), (1, 1, 4)], [(0, 1, 100), (2, 1, 50), (1, 2, 4)]
+    one = np.zeros(3, int)
+    np.testing.assert_array_equal(keep_together(one, seen_as(joint, joint, apart, apart, apart)), [0, 1, 0])  # 1 + 2 to 3
+    np.testing.assert_array_equal(keep_together(one, seen_as(joint, joint, joint, apart, apart, apart)), [0, 0, 0])
+    np.testing.assert_array_equal(keep_together(one, seen_as(apart)), [0, 1, 0])
+    # Three of its four pixels with the table, in each of two views: 1 + 1.5 of 3. One of four: 1 + 0.5 of 3.
+    np.testing.assert_array_equal(keep_together(one, seen_as(*[[(0, 1, 100), (1, 1, 3), (1, 2, 1)]] * 2)), [0, 0, 0])
+    np.testing.assert_array_equal(keep_together(one, seen_as(*[[(0, 1, 100), (1, 1, 1), (1, 2, 3)]] * 2)), [0, 1, 0])
+
+
+def test_what_is_parted_stays_together_itself():
+    """Two things of two pieces each in one object, and a piece that no view shows with either."""
+    views = [[(0, 1, 90), (1, 1, 40), (2, 2, 60), (3, 2, 30)]] * 3 + [[(4, 7, 5)]]
+    np.testing.assert_array_equal(keep_together(np.full(5, 8), seen_as(*views)), [8, 8, 9, 9, 8])
+    # Piece 3 is never seen with 0 and 1, only with 2, which is parted: nobody said that 3 is.
+    views = [[(0, 1, 190), (1, 1, 40), (2, 2, 60)]] * 3 + [[(2, 4, 60), (3, 4, 30)]] * 2
+    np.testing.assert_array_equal(keep_together(np.zeros(4, int), seen_as(*views)), [0, 0, 1, 0])
+    np.testing.assert_array_equal(keep_together(np.arange(4), seen_as(*views)), np.arange(4))  # never joins objects
+
+
+def grown_by_loops(home, rows):
+    """`keep_together` as its docstring says, with dictionaries."""
+    home, waits = list(home), set(range(len(home)))
+    pixels = {}
+    for view, fragment, mask, n in rows:
+        pixels.setdefault((fragment, view), {})[mask] = n
+    size = [sum(sum(seen.values()) for (f, _), seen in pixels.items() if f == i) for i in range(len(home))]
+
+    def start():
+        for o in {home[i] for i in waits}:
+            waits.discard(min((i for i in waits if home[i] == o), key=lambda i: (-size[i], i)))
+
+    start()
+    while waits:
+        held = {}
+        for (f, view), seen in pixels.items():
+            if f not in waits:
+                for mask, n in seen.items():
+                    place = held.setdefault((home[f], view), {})
+                    place[mask] = place.get(mask, 0) + n
+        together, views = dict.fromkeys(waits, 0.0), dict.fromkeys(waits, 0)
+        for (f, view), seen in pixels.items():
+            if f in waits and (home[f], view) in held:
+                place = held[home[f], view]
+                chosen = min(place, key=lambda m: (-place[m], m))
+                together[f] += seen.get(chosen, 0) / sum(seen.values())
+                views[f] += 1
+        joins = {i for i in waits if views[i] and 1 + together[i] > (1 + views[i]) / 2 + 1e-6}
+        joins = joins or {i for i in waits if not views[i]}
+        waits -= joins
+        if not joins:
+            new = {o: max(home) + 1 + k for k, o in enumerate(sorted({home[i] for i in waits}))}
+            for i in waits:
+                home[i] = new[home[i]]
+            start()
+    return home
+
+
+def test_keeping_together_equals_loops():
+    rng = np.random.default_rng(3)
+    for count in (12, 40):
+        home = rng.integers(0, 4, count)
+        rows = [(v, f, m, rng.integers(1, 9)) for v in range(6) for f in range(count) for m in (1, 2, 3) if rng.random() < 0.25]
+        seen = Sightings(*np.array(rows, np.int64).T[:3], np.array([n for *_, n in rows], float))
+        found = keep_together(home, seen)
+        np.testing.assert_array_equal(found, grown_by_loops(home.tolist(), rows))
+        assert len(np.unique(found)) > len(np.unique(home))
+
+
+def test_what_the_views_hold_together_is_joined():
+    joint, apart = [(0, 1, 100), (1, 1, 4), (2, 2, 30)], [(0, 1, 100), (1, 3, 4), (2, 2, 30)]
+    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint)), [5, 5, 6])
+    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint)), [5, 7, 6])  # two views are too few
+    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, joint, apart)), [5, 5, 6])
+    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, apart)), [5, 7, 6])  # 0.75
+    # A view in which an object is cut in two halves, or not seen, has no opinion.
+    cut, gone = [(0, 1, 100), (1, 1, 2), (1, 3, 2), (2, 2, 30)], [(0, 1, 100), (2, 2, 30)]
+    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, cut, gone)), [5, 5, 6])
+
+
+def test_joining_goes_on_with_what_was_joined():
+    """0 and 1 share a mask in views 0-2; 2 shares it with both, but was seen with 0 twice and with 1 twice only."""
+    views = [[(0, 1, 9), (1, 1, 3)]] * 3 + [[(0, 1, 9), (2, 1, 4)]] * 2 + [[(1, 1, 3), (2, 1, 4)]] * 2
+    np.testing.assert_array_equal(join_together(np.arange(3), seen_as(*views)), [0, 0, 0])
+    np.testing.assert_array_equal(join_together(np.arange(3), seen_as(*views[2:])), [0, 1, 2])
+    np.testing.assert_array_equal(join_together(np.arange(4), seen_as(*views)), [0, 0, 0, 3])  # never seen: stays
+
+
+def test_joining_equals_loops():
+    rng = np.random.default_rng(8)
+    things = rng.integers(0, 6, 30)
+    rows = [
+        (v, f, things[f] + 1 if rng.random() < 0.9 else 9, rng.integers(1, 9))
+        for v in range(7)
+        for f in range(30)
+        if rng.random() < 0.6
+    ]
+    seen = Sightings(*np.array(rows, np.int64).T[:3], np.array([n for *_, n in rows], float))
+
+    def main(objects, view):
+        held = {}
+        for v, f, m, n in rows:
+            if v == view and f in objects:
+                held[m] = held.get(m, 0) + n
+        best = min(held, key=lambda m: (-held[m], m)) if held else None
+        return best if held and held[best] > 0.5 * sum(held.values()) else None
+
+    groups = [{f} for f in range(30)]
+    while True:
+        mains = [[main(group, v) for v in range(7)] for group in groups]
+        links = []
+        for a in range(len(groups)):
+            for b in range(a):
+                both = [(x, y) for x, y in zip(mains[a], mains[b], strict=True) if x is not None and y is not None]
+                if len(both) >= 3 and sum(x == y for x, y in both) >= 0.8 * len(both):
+                    links.append((a, b))
+        if not links:
+            break
+        owner = list(range(len(groups)))
+        for a, b in links:
+            old, new = owner[a], owner[b]
+            owner = [new if o == old else o for o in owner]
+        groups = [set().union(*(g for g, o in zip(groups, owner, strict=True) if o == k)) for k in sorted(set(owner))]
+    expected = np.empty(30, int)
+    for group in groups:
+        expected[list(group)] = min(group)
+    assert 3 < len(groups) < 25
+    np.testing.assert_array_equal(join_together(np.arange(30), seen), expected)
+
+
 # ------------------------------------------------------------------------------------------------------------- stability
 
 
@@ -265,6 +416,16 @@ def segmentation_of(root):
     return StageReader(root / "results/own/segmentation", "segmentation", "own")
 
 
+def test_what_was_parted_or_joined_is_of_masks_as_what_it_was_elected_into():
+    home = np.array([0, 0, 0, 2, 2, 5])  # 5: a piece of the mesh that no mask sees
+    label = np.array([0, 9, 9, 2, 2, 5])  # two faces of 0 were parted
+    got, voted, agreement = masks._with_origin(label, home, np.array([0, 2]), np.array([0.5, 0.0, 0.9]))
+    assert got.tolist() == [0, 3, 3, 1, 1, 2] and voted.tolist() == [True, True, False, True]
+    np.testing.assert_allclose(agreement, [0.5, 0.9, 1.0, 0.5])
+    _, voted, agreement = masks._with_origin(np.zeros(6, int), home, np.array([0, 2]), np.array([0.5, 0.0, 0.9]))
+    assert voted.tolist() == [True] and agreement[0] == pytest.approx((3 * 0.5 + 2 * 0.9 + 1) / 6)
+
+
 def test_spoilt_masks_make_pure_objects(photographed):
     root, _, things, capture = photographed
     vertices, faces = capture.mesh()
@@ -277,7 +438,7 @@ def test_spoilt_masks_make_pure_objects(photographed):
     pure, complete = purity(np.repeat(label[seen], 3), np.repeat(things[seen], 3))
     assert pure >= 0.95 and complete >= 0.9
     document = reader.json("segmentation.json")
-    assert document["masks_undersegmented"] > 0 and document["objects_from_masks"] >= 9
+    assert document["masks_undersegmented"] > 0 and document["objects_from_masks"] >= 9 and document["objects_parted"] >= 0
     assert 0.6 < document["stability"] <= 1 and len(document["stability_runs"]) == 3
     (item,) = document["plan"]
     assert item["component"] == "objects (masks)" and item["value"] == document["stability"]

@@ -33,12 +33,30 @@ _STEM = {"text_encoder": "model", "unet": "diffusion_pytorch_model", "vae": "dif
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
-@dataclass(frozen=True)
-class Recipe:
+@dataclass(frozen=True, kw_only=True)
+class Origin:
+    """Where a model comes from.
+
+    Attributes:
+        repository: where its authors publish it; licence: in words.
+        section: of the settings, that names the checkpoint; index: file that says what lies in its folder; layout: of that
+            folder, in words; page: of the documents.
+    """
+
+    repository: str
+    licence: str
+    section: str = "prior"
+    index: str = "model_index.json"
+    layout: str = "diffusers' layout"
+    page: str = "docs/priors.md"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recipe(Origin):
     """What the checkpoint of a prior must be, and how it is asked.
 
     Attributes:
-        kind: of the prior; repository: where its authors publish it; licence: in words.
+        kind: of the prior.
         pipeline: class in model_index.json.
         targets: of the document model_index.json, how many latent images the U-Net predicts at once (raises InputError).
         prompts: one pass of the U-Net each; fill_prompts: padded to the length that the text encoder was trained with.
@@ -47,8 +65,6 @@ class Recipe:
     """
 
     kind: str
-    repository: str
-    licence: str
     pipeline: str
     targets: Callable[[dict[str, Any]], int]
     prompts: tuple[str, ...]
@@ -59,7 +75,8 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checked folder. revision: 40 hexadecimal digits, None where nothing tells; weights: file of each component."""
+    """A checked folder. revision: 40 hexadecimal digits, None where nothing tells; index: the document that says what it is;
+    weights: file of each component."""
 
     folder: Path
     revision: str | None
@@ -78,95 +95,110 @@ def check(prior: dict[str, Any], recipe: Recipe) -> Checkpoint:
     Raises:
         InputError: a package, the folder or a file of it missing; another model or revision; licence not accepted.
     """
-    require_packages(recipe.kind)
-    _require_device(prior["device"])
-    folder, revision = _locate(prior["checkpoint"], prior["revision"], recipe)
-    index = _json(folder / "model_index.json")
+    require_packages(f"`prior: {{kind: {recipe.kind}}}`", PACKAGES)
+    require_device(prior["device"], recipe)
+    folder, revision = locate(prior["checkpoint"], prior["revision"], recipe)
+    index = read_json(folder / "model_index.json", recipe)
     _check_classes(folder, index, recipe)
-    weights = {component: _weights(folder / component, stem) for component, stem in _STEM.items()}
-    headers = {component: _header(path) for component, path in weights.items()}
+    weights = {component: weights_in(folder / component, stem) for component, stem in _STEM.items()}
+    headers = {component: header(path) for component, path in weights.items()}
     try:
         targets = recipe.targets(index)
     except InputError as error:
         raise InputError(f"{folder / 'model_index.json'}: {error}") from None
-    _check_channels(folder, targets, headers["unet"])
-    if not prior["accept_license"]:
-        raise InputError(
-            f"`prior.accept_license`: found false. {recipe.repository} comes under {recipe.licence}; {_terms(folder)}"
-            " and, if you may use it, set `prior: {accept_license: true}`"
-        )
+    _check_channels(folder, targets, headers["unet"], recipe)
+    require_accepted(prior["accept_license"], folder, recipe)
     files = [folder / "model_index.json", *weights.values()]
     for component in COMPONENTS:
         files += [path for path in (folder / component).iterdir() if path.suffix in (".json", ".txt")]
     return Checkpoint(folder, revision, index, weights, tuple(sorted(files)))
 
 
-def require_packages(kind: str) -> None:
+def require_packages(setting: str, names: tuple[str, ...]) -> None:
     """Refuse while planning what would fail with an ImportError in the job."""
-    missing = [name for name in PACKAGES if find_spec(name) is None]
+    missing = [name for name in names if find_spec(name) is None]
     if missing:
+        raise InputError(f"{setting} needs {', '.join(missing)}, which this Python lacks; run `bash envs/setup.sh`")
+
+
+def require_accepted(accepted: bool, folder: Path, origin: Origin) -> None:
+    """Refuse weights whose licence the user has not accepted."""
+    if not accepted:
         raise InputError(
-            f"`prior: {{kind: {kind}}}` needs {', '.join(missing)}, which this Python lacks; run `bash envs/setup.sh`"
+            f"`{origin.section}.accept_license`: found false. {origin.repository} comes under {origin.licence}; {_terms(folder)}"
+            f" and, if you may use it, set {written(origin.section, 'accept_license: true')}"
         )
 
 
-def _require_device(device: str) -> None:
+def written(section: str, setting: str) -> str:
+    """`prior: {device: auto}` of "prior" and "device: auto"; sections may be nested: "segmentation.sam2"."""
+    text = setting
+    for name in reversed(section.split(".")):
+        text = f"{name}: {{{text}}}"
+    return f"`{text}`"
+
+
+def require_device(device: str, origin: Origin) -> None:
+    """Refuse a GPU where torch was built without."""
     torch = importlib.metadata.version("torch")
     if device == "cuda" and "+cpu" in torch:
         raise InputError(
-            f"`prior.device`: found cuda, but torch is the CPU build {torch}; envs/README.md says how to install a CUDA build,"
-            " or set `prior: {device: auto}`"
+            f"`{origin.section}.device`: found cuda, but torch is the CPU build {torch}; envs/README.md says how to install a"
+            f" CUDA build, or set {written(origin.section, 'device: auto')}"
         )
 
 
 # ----------------------------------------------------------------------------------------------------------------- where
 
 
-def _locate(checkpoint: str, revision: str | None, recipe: Recipe) -> tuple[Path, str | None]:
+def locate(checkpoint: str, revision: str | None, origin: Origin) -> tuple[Path, str | None]:
+    """Folder of a checkpoint, given by its path or by the name of a repository in the local cache, and its revision, if known."""
     folder = Path(checkpoint).expanduser()
     if folder.is_dir():
-        found = _revision_of(folder)
+        found = _revision_of(folder, origin.index)
         if revision and found and not found.startswith(revision):
             raise InputError(
-                f"{folder}: revision {found}, needed {revision} (`prior.revision`); download that one, or set"
-                f" `prior: {{revision: {found}}}` if this one is meant"
+                f"{folder}: revision {found}, needed {revision} (`{origin.section}.revision`); download that one, or set"
+                f" {written(origin.section, f'revision: {found}')} if this one is meant"
             )
         return folder, found
     if _REPOSITORY.fullmatch(checkpoint) is None:
-        raise InputError(f"{folder}: not found; `prior.checkpoint` is a folder in diffusers' layout. {_get_it(recipe)}")
-    return _in_cache(checkpoint, revision, recipe)
+        raise InputError(f"{folder}: not found; `{origin.section}.checkpoint` is a folder in {origin.layout}. {_get_it(origin)}")
+    return _in_cache(checkpoint, revision, origin)
 
 
-def _in_cache(repository: str, revision: str | None, recipe: Recipe) -> tuple[Path, str]:
+def _in_cache(repository: str, revision: str | None, origin: Origin) -> tuple[Path, str]:
     """Snapshot of a repository in the local cache of huggingface_hub, as `hf download` leaves it."""
     from huggingface_hub.constants import HF_HUB_CACHE
 
     snapshots = Path(HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}" / "snapshots"
     present = sorted(path.name for path in snapshots.iterdir()) if snapshots.is_dir() else []
     if revision is None and present:
-        raise InputError(f"`prior.revision`: missing; of {repository} the cache holds {', '.join(present)}. Name the one to use")
+        raise InputError(
+            f"`{origin.section}.revision`: missing; of {repository} the cache holds {', '.join(present)}. Name the one to use"
+        )
     found = [name for name in present if name.startswith(revision or "")]
     if len(found) != 1:
         holds = f"the cache {snapshots.parents[1]} holds {', '.join(present) if present else 'nothing of it'}"
         wanted = f" at revision {revision}" if revision else ""
         raise InputError(
-            f"`prior.checkpoint`: {repository}{wanted} is not here ({holds}). {_get_it(recipe, repository, revision)}"
+            f"`{origin.section}.checkpoint`: {repository}{wanted} is not here ({holds}). {_get_it(origin, repository, revision)}"
         )
     return snapshots / found[0], found[0]
 
 
-def _revision_of(folder: Path) -> str | None:
+def _revision_of(folder: Path, index: str) -> str | None:
     """What the downloader left beside a folder (`hf download --local-dir`), or the name of a snapshot in the cache."""
-    note = folder / ".cache/huggingface/download/model_index.json.metadata"
+    note = folder / f".cache/huggingface/download/{index}.metadata"
     first = note.read_text().split("\n", 1)[0].strip() if note.is_file() else folder.resolve().name
     return first if re.fullmatch(r"[0-9a-f]{40}", first) else None
 
 
-def _get_it(recipe: Recipe, repository: str | None = None, revision: str | None = None) -> str:
-    which = f"{repository or recipe.repository}{f' --revision {revision}' if revision else ''}"
+def _get_it(origin: Origin, repository: str | None = None, revision: str | None = None) -> str:
+    which = f"{repository or origin.repository}{f' --revision {revision}' if revision else ''}"
     return (
-        f"It comes under {recipe.licence}: if you may use it, `.venv/bin/hf download {which}` puts it into the cache,"
-        f" with `--local-dir <folder>` into a folder (docs/priors.md)"
+        f"It comes under {origin.licence}: if you may use it, `.venv/bin/hf download {which}` puts it into the cache,"
+        f" with `--local-dir <folder>` into a folder ({origin.page})"
     )
 
 
@@ -190,11 +222,16 @@ def _check_classes(folder: Path, index: dict[str, Any], recipe: Recipe) -> None:
             raise InputError(f"{folder / component}: not found; the checkpoint is incomplete, download it again")
 
 
-def _check_channels(folder: Path, targets: int, unet: dict[str, Any]) -> None:
-    _require(folder / "unet/config.json", "in_channels", (1 + targets) * LATENT)
-    _require(folder / "unet/config.json", "out_channels", targets * LATENT)
-    _require(folder / "vae/config.json", "latent_channels", LATENT)
-    _require(folder / "scheduler/scheduler_config.json", "prediction_type", "v_prediction")
+def _check_channels(folder: Path, targets: int, unet: dict[str, Any], recipe: Recipe) -> None:
+    for path, key, needed in (
+        ("unet/config.json", "in_channels", (1 + targets) * LATENT),
+        ("unet/config.json", "out_channels", targets * LATENT),
+        ("vae/config.json", "latent_channels", LATENT),
+        ("scheduler/scheduler_config.json", "prediction_type", "v_prediction"),
+    ):
+        found = read_json(folder / path, recipe).get(key)
+        if found != needed:
+            raise InputError(f"{folder / path}: `{key}` is {found}, needed {needed}: this is another model")
     stored = unet.get("conv_in.weight", {}).get("shape", [0, 0])[1]
     if stored != (1 + targets) * LATENT:
         raise InputError(
@@ -203,13 +240,8 @@ def _check_channels(folder: Path, targets: int, unet: dict[str, Any]) -> None:
         )
 
 
-def _require(path: Path, key: str, needed: Any) -> None:
-    found = _json(path).get(key)
-    if found != needed:
-        raise InputError(f"{path}: `{key}` is {found}, needed {needed}: this is another model")
-
-
-def _weights(folder: Path, stem: str) -> Path:
+def weights_in(folder: Path, stem: str) -> Path:
+    """The safetensors file of a folder."""
     names = (f"{stem}.safetensors", f"{stem}.fp16.safetensors")
     for name in names:
         if (folder / name).is_file():
@@ -219,7 +251,7 @@ def _weights(folder: Path, stem: str) -> Path:
     raise InputError(f"{folder}: no {' or '.join(names)}{why}; download the checkpoint with its safetensors files")
 
 
-def _header(path: Path) -> dict[str, Any]:
+def header(path: Path) -> dict[str, Any]:
     """Names, types and shapes of the tensors in a safetensors file, of which the size must be what they say."""
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -234,21 +266,24 @@ def _header(path: Path) -> dict[str, Any]:
             )
             raise InputError(f"{path}: {size} bytes, {why}")
         try:
-            header = json.loads(file.read(length))
-            header.pop("__metadata__", None)
-            needed = 8 + length + max(entry["data_offsets"][1] for entry in header.values())
+            tensors = json.loads(file.read(length))
+            tensors.pop("__metadata__", None)
+            needed = 8 + length + max(entry["data_offsets"][1] for entry in tensors.values())
         except (ValueError, KeyError, TypeError, AttributeError):
             raise InputError(f"{path}: not a safetensors file; download it again") from None
     if size != needed:
         raise InputError(f"{path}: {size} bytes, its header says {needed}: cut short, download it again")
-    return header
+    return tensors
 
 
-def _json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, origin: Origin) -> dict[str, Any]:
+    """A document of a checkpoint."""
     try:
         document = json.loads(path.read_text())
     except FileNotFoundError:
-        raise InputError(f"{path}: not found; `prior.checkpoint` needs a folder in diffusers' layout (docs/priors.md)") from None
+        raise InputError(
+            f"{path}: not found; `{origin.section}.checkpoint` needs a folder in {origin.layout} ({origin.page})"
+        ) from None
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not readable as JSON ({error}); download the checkpoint again") from None
     if not isinstance(document, dict):

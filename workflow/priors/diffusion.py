@@ -10,9 +10,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +22,7 @@ from torch.nn.functional import interpolate
 
 from iif_core.errors import InputError
 from workflow.priors.checkpoint import PACKAGES, Checkpoint, Recipe, check
+from workflow.priors.loading import device_named, exact, network, quiet
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 OVERLAP = 0.25
@@ -106,15 +106,15 @@ class Model:
     def __init__(self, recipe: Recipe, prior: SimpleNamespace):
         """`prior`: the settings' section; its checkpoint is checked again."""
         self.recipe, self.checkpoint = recipe, check(vars(prior), recipe)
-        self.device = _device(prior.device)
+        self.device = device_named(prior.device, recipe)
         self.dtype = _precision(prior.precision, self.device)
         self.workers = 1 if self.device.type == "cuda" else torch.get_num_threads()
         self.batch = prior.batch or (1 if self.device.type == "cpu" else 4)
-        with _quiet():
+        with quiet("diffusers", "transformers"):
             import diffusers
 
-            self.unet = _network(self.checkpoint, "unet", diffusers.UNet2DConditionModel).to(self.device, self.dtype)
-            self.vae = _network(self.checkpoint, "vae", diffusers.AutoencoderKL).to(self.device)
+            self.unet = network(self.checkpoint, "unet", diffusers.UNet2DConditionModel).to(self.device, self.dtype)
+            self.vae = network(self.checkpoint, "vae", diffusers.AutoencoderKL).to(self.device)
             stored = diffusers.DDIMScheduler.load_config(self.checkpoint.folder / "scheduler")
             self.scheduler = diffusers.DDIMScheduler.from_config(stored, **dict(recipe.scheduler))
             self.text = [text.to(self.device, self.dtype) for text in _embeddings(self.checkpoint, recipe)]
@@ -128,7 +128,7 @@ class Model:
     def encode(self, image: np.ndarray) -> torch.Tensor:
         """(1, 4, h, w) latent of a picture (H, W, 3) in [0, 1] with sides that are multiples of `multiple`: the mode of the
         VAE's posterior times its scaling factor."""
-        with _exact(self.device):
+        with exact(self.device):
             planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(self.device, torch.float32)
             return self.vae.encode(planes * 2 - 1).latent_dist.mode() * self.vae.config.scaling_factor
 
@@ -142,7 +142,7 @@ class Model:
             with torch.inference_mode():
                 return np.concatenate([self._decode(self._denoise(condition, text, batch)) for text in self.text], 1)
 
-        with _exact(self.device), ThreadPoolExecutor(self.workers) as pool:
+        with exact(self.device), ThreadPoolExecutor(self.workers) as pool:
             return np.concatenate(list(pool.map(one, batches)))
 
     def _denoise(self, condition: torch.Tensor, text: torch.Tensor, seeds: list[int]) -> torch.Tensor:
@@ -224,35 +224,11 @@ def loaded(recipe: Recipe, prior: str) -> Model:
 # ---------------------------------------------------------------------------------------------------------------- loading
 
 
-def _network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> torch.nn.Module:
-    """A network with every one of its weights from the checkpoint; from_pretrained alone would draw missing ones at random."""
-    folder = checkpoint.folder / component
-    try:
-        network, info = kind.from_pretrained(
-            folder,
-            variant=checkpoint.variant(component),
-            use_safetensors=True,
-            local_files_only=True,
-            output_loading_info=True,
-            **more,
-        )
-    except Exception as error:  # the libraries raise what they meet, of a dozen types
-        first = str(error).strip().split("\n", 1)[0]
-        raise InputError(f"{folder}: not loaded as {kind.__name__} ({type(error).__name__}: {first})") from error
-    lost = [*info["missing_keys"], *(str(entry[0]) for entry in info["mismatched_keys"])]
-    if lost:
-        raise InputError(
-            f"{folder}: {len(lost)} weights missing or of another shape, such as {sorted(lost)[0]}; config.json and weights do"
-            " not belong together, download the checkpoint again"
-        )
-    return network.eval().requires_grad_(False)
-
-
 def _embeddings(checkpoint: Checkpoint, recipe: Recipe) -> list[torch.Tensor]:
     """(1, tokens, channels) of each prompt; the text encoder is not kept."""
     from transformers import CLIPTextModel, CLIPTokenizer
 
-    encoder = _network(checkpoint, "text_encoder", CLIPTextModel, dtype=torch.float32)
+    encoder = network(checkpoint, "text_encoder", CLIPTextModel, dtype=torch.float32)
     try:
         tokenizer = CLIPTokenizer.from_pretrained(checkpoint.folder / "tokenizer", local_files_only=True)
     except Exception as error:  # as in _network
@@ -266,47 +242,9 @@ def _embeddings(checkpoint: Checkpoint, recipe: Recipe) -> list[torch.Tensor]:
     return out
 
 
-def _device(name: str) -> torch.device:
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError("`prior.device`: found cuda, but torch sees no CUDA device here; set `prior: {device: auto}`")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
-
-
 def _precision(name: str, device: torch.device) -> torch.dtype:
     if name == "auto":
         return torch.float16 if device.type == "cuda" else torch.float32
     if name == "float16" and device.type == "cpu":
         raise InputError("`prior.precision`: found float16, which is for GPUs, and the device is a CPU; set `precision: auto`")
     return PRECISIONS[name]
-
-
-@contextmanager
-def _exact(device: torch.device) -> Iterator[None]:
-    """No gradients, no choice of kernels by timing. On a CPU one thread a batch: how many threads share a convolution
-    decides its last bits, so batches are what runs side by side."""
-    threads = torch.get_num_threads()
-    if device.type == "cpu":
-        torch.set_num_threads(1)
-    try:
-        with torch.inference_mode(), torch.backends.cudnn.flags(True, False, deterministic=True, allow_tf32=False):
-            yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Progress bars and advice of the libraries stay out of the log; errors do not."""
-    import diffusers.utils.logging as diffusers_log
-    import transformers.utils.logging as transformers_log
-
-    logs = (diffusers_log, transformers_log)
-    levels = [log.get_verbosity() for log in logs]
-    for log in logs:
-        log.set_verbosity_error()
-        log.disable_progress_bar()
-    try:
-        yield
-    finally:
-        for log, level in zip(logs, levels, strict=True):
-            log.set_verbosity(level)

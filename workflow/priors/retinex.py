@@ -15,11 +15,10 @@ from iif_core.gathering import LightField, SurfaceCellsBuilder, Trace, with_ligh
 from iif_core.mesh import face_geometry
 from iif_core.retinex import albedo_level, retinex_predictions
 from workflow.normal_form import CaptureReader, View
+from workflow.priors.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
 
-GAMMA = 2.2
-"""Stands for the unknown inverse response of an LDR photograph, as in the reference's prior (METHOD 1.3)."""
 SATURATED = 0.99
 CELL_FOOTPRINTS = 6.0
 """Edge of a surface cell in median pixel footprints."""

@@ -160,7 +160,8 @@ def _refuse_unknown(folder: Path, found: set[str], views: set[str]) -> None:
         shown = ", ".join(unknown[:3]) + (f" and {len(unknown) - 3} more" if len(unknown) > 3 else "")
         raise InputError(
             f"{folder}: {shown}: no view of that name; views are called like their photographs without extension, such as"
-            f" {sorted(views)[0]}. Rename or remove"
+            f" {sorted(views)[0]}. Rename or remove; masks of what counts (`mask_path`) and masks of objects need folders of"
+            " their own: `segmentation: {path: ...}`"
         )
 
 

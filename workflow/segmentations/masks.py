@@ -12,9 +12,11 @@ import numpy as np
 from iif_core.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.errors import InputError
 from iif_core.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
-from iif_core.mask_votes import joined, label_faces, view_votes
+from iif_core.mask_votes import join_together, joined, keep_together, label_faces, sightings, view_votes
 from iif_core.segments import fill_within
+from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
+from workflow.segmentations import sam2
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.mask_files import MaskFiles, mask_files
 from workflow.segmentations.surface import Objects, Surface
@@ -33,22 +35,30 @@ Load = Callable[[View], np.ndarray]
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Every mask file that this scene reads.
+    """Every mask file that this scene reads, or the files of the model that makes them.
 
     Raises:
-        InputError: no folder, nothing in it, names that are no view's, sizes that are not the photographs'.
+        InputError: no folder, nothing in it, names that are no view's, sizes that are not the photographs'; no such model.
     """
+    if document["segmentation"]["sam2"] is not None:
+        return sam2.raw_inputs(document["segmentation"]["sam2"])
     return mask_files(document["segmentation"], document["source"], document["capture"]).files()
+
+
+def prepare(job: Job, surface: Surface) -> None:
+    """Let the model make the masks that the settings ask it for."""
+    if job.settings.segmentation.sam2 is not None:
+        surface.kept["labels"] = sam2.label_maps(job, surface.capture)
 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
     """Objects from the masks; where there are none, pieces of the mesh."""
     own = settings.segmentation
-    files = MaskFiles.of_capture(settings, surface.capture)
+    files = None if own.sam2 is not None else MaskFiles.of_capture(settings, surface.capture)
     options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
     if "piece" not in surface.kept:
-        surface.kept |= {"piece": pieces(surface, own), "labels": {}}
-    kept = surface.kept["labels"]
+        surface.kept["piece"] = pieces(surface, own)
+    kept = surface.kept.setdefault("labels", {})
 
     def load(view: View) -> np.ndarray:
         if view.name not in kept:
@@ -86,20 +96,54 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
     size = np.bincount(cluster[known], np.asarray(masks.in_mask.sum(1)).ravel()[known], count) / np.maximum(number, 1)
     votes = joined(_votes(surface, views, load, masks, cluster, max(GAP, GAP_POINTS * edge)))
     label, bare, agreeing = label_faces(votes, size, number, piece)
-    label = fill_within(label, piece, bare, surface.pairs)
-    kept, label = np.unique(label, return_inverse=True)
-    voted = kept < len(agreeing)
-    agreement = np.ones(len(kept))
-    agreement[voted] = agreeing[kept[voted]]
+    elected = np.unique(label[label >= 0])
+    home = fill_within(label, piece, bare, surface.pairs)
+    label, parted, united = _judged(surface, views, load, home, piece)
+    label, voted, agreement = _with_origin(label, home, elected, agreeing)
     facts = {
         "masks": len(cluster),
         "masks_undersegmented": int((~known).sum()),
         "clusters": count,
         "objects_from_masks": int(voted.sum()),
         "objects_from_shape": int((~voted).sum()),
+        "objects_parted": parted,
+        "objects_joined": united,
     }
     names = [f"{'object' if v else 'piece'} {i}" for i, v in enumerate(voted)]
     return Objects(label.astype(np.int32), names, agreement, facts)
+
+
+def _with_origin(
+    label: np.ndarray, home: np.ndarray, elected: np.ndarray, agreeing: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels (F,) renumbered from 0, and of every object whether masks made it and how far pixels agree (1 where none did).
+
+    An object that was parted or joined has both from what its faces were elected into: `home` (F,), which is of masks if
+    among `elected`, and then agrees as `agreeing[home]` says; mean over the faces.
+    """
+    label = np.unique(label, return_inverse=True)[1]
+    by_masks = np.isin(home, elected)
+    own = np.where(by_masks, agreeing[np.where(by_masks, home, 0)], 1.0)
+    return label, np.bincount(label, by_masks) > 0, np.bincount(label, own) / np.bincount(label)
+
+
+def _judged(surface: Surface, views: list[View], load: Load, label: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Labels of faces with what the views do not hold together as objects of its own, numbered after the others, and what they
+    do as one; how many more and how many fewer objects that made."""
+    pieces_in_all = int(piece.max()) + 1
+    code, fragment = np.unique(label.astype(np.int64) * pieces_in_all + piece, return_inverse=True)
+
+    def pixels(view: View) -> tuple[np.ndarray, np.ndarray]:
+        labels, face = load(view), surface.capture.gbuffer(view)[1]
+        masked = (face >= 0) & (labels > 0)
+        return fragment[face[masked]], labels[masked]
+
+    seen = sightings(pixels(view) for view in views)
+    elected = code // pieces_in_all
+    parted = keep_together(elected, seen)
+    united = join_together(parted, seen)
+    before, between, after = (len(np.unique(objects)) for objects in (elected, parted, united))
+    return united[fragment], between - before, between - after
 
 
 def surface_points(capture: CaptureReader, views: list[View], edge: float) -> np.ndarray:

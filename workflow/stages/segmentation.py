@@ -28,6 +28,9 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     surface = Surface(capture)
     kind = importlib.import_module(f"workflow.segmentations.{job.settings.segmentation.kind}")
+    if hasattr(kind, "prepare"):
+        with job.timed("masks"):
+            kind.prepare(job, surface)
     with job.timed("objects"):
         objects = kind.segment(surface, job.settings)
     with job.timed("stability"):

@@ -1,0 +1,228 @@
+"""Masks by SAM 2 (Ravi et al. 2024) for segmentation `masks`, through transformers; the weights are the user's.
+
+A grid of points is put to the model, which answers each with three masks: what it lies on, a part, a part of that. What the
+model trusts and what does not hang on the threshold stays, of nearly equal masks the surest; small masks lie on large ones
+(docs/segmentation.md). transformers' image processor and mask pipeline need torchvision, which the environment does not have;
+what they would do, scaling and the choice of masks, is done here and in `iif_core.mask_proposals`.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.mask_clustering import flatten_masks
+from iif_core.mask_proposals import point_grid, suppressed, threshold_stability
+from workflow.artifacts.files import read_exr
+from workflow.job import Job
+from workflow.normal_form import CaptureReader, View
+from workflow.priors.checkpoint import (
+    Checkpoint,
+    Origin,
+    header,
+    locate,
+    read_json,
+    require_accepted,
+    require_device,
+    require_packages,
+    weights_in,
+)
+from workflow.priors.photograph import seen
+
+ORIGIN = Origin(
+    repository="facebook/sam2.1-hiera-large",
+    licence="the Apache License 2.0",
+    section="segmentation.sam2",
+    index="config.json",
+    layout="transformers' layout",
+    page="docs/segmentation.md",
+)
+PACKAGES = ("transformers", "safetensors", "torch")
+KINDS = ("sam2", "sam2_video")
+"""`model_type` of the published checkpoints: the one for video holds the one for pictures."""
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Of ImageNet's pictures, by which SAM 2 normalises its input."""
+POINTS_AT_ONCE, MASKS_AT_ONCE = 64, 16
+
+Row = tuple[int, int, int, str]
+"""view_id, masks that the thresholds let through, masks of the view, what went wrong."""
+
+
+def check(own: dict[str, Any]) -> Checkpoint:
+    """The checkpoint that the settings' section names.
+
+    Raises:
+        InputError: a package, the folder or a file of it missing; another model or revision; licence not accepted.
+    """
+    require_packages("`segmentation: {kind: masks, sam2: {...}}`", PACKAGES)
+    require_device(own["device"], ORIGIN)
+    folder, revision = locate(own["checkpoint"], own["revision"], ORIGIN)
+    config = read_json(folder / "config.json", ORIGIN)
+    if config.get("model_type") not in KINDS:
+        raise InputError(
+            f"{folder / 'config.json'}: `model_type` is {config.get('model_type')}, needed {' or '.join(KINDS)}: this is another"
+            f" model. {ORIGIN.repository} and its smaller versions are meant"
+        )
+    weights = weights_in(folder, "model")
+    header(weights)
+    require_accepted(own["accept_license"], folder, ORIGIN)
+    return Checkpoint(folder, revision, config, {"": weights}, (folder / "config.json", weights))
+
+
+def raw_inputs(own: dict[str, Any]) -> list[Path]:
+    """The files of the checkpoint, checked; raises InputError."""
+    return list(check(own).files)
+
+
+class Generator:
+    """The loaded model, float32."""
+
+    def __init__(self, own: SimpleNamespace):
+        """`own`: the settings' section; its checkpoint is checked again."""
+        from workflow.priors.loading import device_named, network, quiet
+
+        self.own, self.checkpoint = own, check(vars(own))
+        self.device = device_named(own.device, ORIGIN)
+        with quiet("transformers"):
+            import torch
+            from transformers import Sam2Model
+
+            self.model = network(self.checkpoint, "", Sam2Model, dtype=torch.float32).to(self.device)
+        self.side = self.model.config.prompt_encoder_config.image_size
+
+    def labels(self, picture: np.ndarray) -> tuple[np.ndarray, int, str]:
+        """(H, W) int32 label map, 0 = no mask, of a picture (H, W, 3) in [0, 1] as it is displayed; how many masks the thresholds
+        let through; what went wrong."""
+        masks, score, lost = self.proposals(picture)
+        kept = suppressed(masks, score, self.own.overlap)
+        if not len(kept):
+            wrong = f"{lost} answers are not finite" if lost else "no mask passed confidence and stability"
+            return np.zeros(picture.shape[:2], np.int32), 0, wrong
+        wrong = f"{lost} answers are not finite" if lost else ""
+        return flatten_masks(list(masks[kept])), len(masks), wrong
+
+    def proposals(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+        """Masks (n, H, W) bool that pass confidence and stability, their confidence (n,), and answers that are not finite."""
+        import torch
+
+        from workflow.priors.loading import exact
+
+        masks, scores, lost = [np.zeros((0, *picture.shape[:2]), bool)], [np.zeros(0, np.float32)], 0
+        points = torch.from_numpy(point_grid(self.own.points_per_side) * self.side).to(self.device)
+        try:
+            with exact(self.device):
+                embedding = self.model.get_image_embeddings(self._seen(picture))
+                for some in points.split(POINTS_AT_ONCE):
+                    answer = self.model(
+                        image_embeddings=embedding,
+                        input_points=some[None, :, None],
+                        input_labels=torch.ones((1, len(some), 1), dtype=torch.int, device=self.device),
+                    )
+                    logits, score = answer.pred_masks[0].flatten(0, 1), answer.iou_scores[0].flatten()
+                    finite = score.isfinite() & logits.isfinite().all(-1).all(-1)
+                    lost += int((~finite).sum())
+                    sure = finite & (score > self.own.confidence)
+                    if not sure.any():
+                        continue
+                    for part, its in zip(logits[sure].split(MASKS_AT_ONCE), score[sure].split(MASKS_AT_ONCE), strict=True):
+                        found, stable = self._masks(part, picture.shape[:2])
+                        masks.append(found[stable])
+                        scores.append(its.cpu().numpy()[stable])
+        except torch.OutOfMemoryError:
+            raise InputError(
+                f"the GPU's memory does not hold SAM 2 with {POINTS_AT_ONCE} points at once: set"
+                " `segmentation: {sam2: {device: cpu}}`, or use a smaller version of the model"
+            ) from None
+        return np.concatenate(masks), np.concatenate(scores), lost
+
+    def _seen(self, picture: np.ndarray) -> Any:
+        """(1, 3, side, side): squeezed to the model's square, low-pass filtered where it shrinks, normalised."""
+        import torch
+
+        planes = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None]
+        square = torch.nn.functional.interpolate(planes, (self.side,) * 2, mode="bilinear", antialias=True)
+        mean, deviation = (torch.tensor(values)[:, None, None] for values in (MEAN, DEVIATION))
+        return ((square - mean) / deviation).to(self.device)
+
+    def _masks(self, logits: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Masks (n, H, W) of logits (n, h, w), and which of them are stable and not empty."""
+        import torch
+
+        large = torch.nn.functional.interpolate(logits[None], shape, mode="bilinear")[0].cpu().numpy()
+        masks = large > 0
+        return masks, (threshold_stability(large) >= self.own.stability) & masks.any((1, 2))
+
+
+def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
+    """Label map (H, W) of every photograph that is used, by name; written as masks/<view>.exr, with masks.parquet and model.json.
+
+    A job that was killed goes on after the last view that it finished, as long as settings, photographs, weights and code are
+    the same.
+
+    Raises:
+        InputError: the checkpoint cannot be used; not a single mask in any view.
+    """
+    own, views = job.settings.segmentation.sam2, capture.used
+    generator: Generator | None = None
+    rows, labels = [], {}
+    for done, view in enumerate(views):
+        job.progress(done, len(views), "views cut into masks")
+        row = _kept(job, view)
+        if row is None:
+            generator = generator or Generator(own)
+            row = _made(job, capture, view, generator)
+        rows.append(row)
+        stored = read_exr(job.writer.directory / f"masks/{view.name}.exr")["mask.id"]
+        labels[view.name] = stored.astype(np.int32 if stored.max(initial=0) >= 2**16 else np.uint16)
+    ids, proposals, masks, wrong = (list(column) for column in zip(*rows, strict=True))
+    if not any(masks):
+        raise InputError(
+            f"SAM 2 found no mask in any of {len(views)} views ({wrong[0]}); lower `segmentation.sam2.confidence` or `stability`,"
+            " or check the checkpoint"
+        )
+    if any(wrong):
+        job.log.warning("%d of %d views have no masks, or lack some (see masks.parquet)", sum(map(bool, wrong)), len(views))
+    job.writer.table(
+        "masks.parquet",
+        {
+            "view_id": np.array(ids, np.int32),
+            "proposals": np.array(proposals, np.int32),
+            "masks": np.array(masks, np.int32),
+            "reason": np.array(wrong, object),
+        },
+    )
+    job.writer.json("model.json", _described(own))
+    return labels
+
+
+def _made(job: Job, capture: CaptureReader, view: View, generator: Generator) -> Row:
+    labels, proposals, wrong = generator.labels(seen(view, capture, linear=False))
+    name = f"masks/{view.name}.exr"
+    job.writer.exr(name, {"mask.id": labels.astype(np.uint32)})
+    row = view.view_id, proposals, len(np.unique(labels[labels > 0])), wrong
+    job.writer.note(f"unfinished/{view.name}.json", {"by": job.fingerprint, "row": row, "file": job.writer.files[name]})
+    return row
+
+
+def _kept(job: Job, view: View) -> Row | None:
+    """Row of a view that an interrupted run of this very job has finished."""
+    done = job.writer.noted(f"unfinished/{view.name}.json")
+    if done is None or done.get("by") != job.fingerprint or not job.writer.keep(f"masks/{view.name}.exr", done["file"]):
+        return None
+    return tuple(done["row"])
+
+
+def _described(own: SimpleNamespace) -> dict[str, Any]:
+    checkpoint = check(vars(own))
+    return {
+        "checkpoint": own.checkpoint,
+        "published_as": ORIGIN.repository,
+        "revision": checkpoint.revision,
+        "licence": ORIGIN.licence,
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+    }
