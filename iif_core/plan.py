@@ -66,6 +66,25 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
 
 
+def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:
+    """Corrected poses and intrinsics, and photographs that are better left out (`iif_core.registration`).
+
+    Args:
+        gain, error: fall of the loss on held-out texture, and its standard error; edges of the mesh decide where it does not.
+        moved: pixels of the photographs as given, median over the views.
+    """
+    measure = "fall of the loss on texture that the fit did not see, in standard errors"
+    value = gain / error if error > 0 else 0.0
+    done = (
+        f"photographs moved by {moved:.1f} of their own pixels (median)"
+        if accepted
+        else f"moving them by {moved:.1f} pixels would not pay"
+    )
+    by = "texture" if gain > SIGNIFICANT * error else "edges of the mesh"
+    reason = f"{done}{f', which {by} spoke for' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
+    return _decision("registration", accepted, measure, value, SIGNIFICANT, reason)
+
+
 def segmentation(kind: str, objects: int, stability: float | None, perturbed: str, facts: dict[str, Any]) -> Decision:
     """Objects: where they come from, and how far they depend on the choice of photographs and thresholds.
 
@@ -167,8 +186,22 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
     return _decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
 
 
-def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
-    """Specular lobe: some object is glossier than 0.85 in 5 % of its cells, or metallic."""
+def gloss_is_idle(glossy: float, matte: float) -> bool:
+    """Whether the views of a cell, all of one albedo of its own, differ no less with the fitted gloss than with none; not where
+    no cell can tell (0)."""
+    return 0 < glossy and matte <= glossy
+
+
+def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
+    """Specular lobe: some object is glossier than 0.85 in 5 % of its cells, or metallic.
+
+    Args:
+        scatter: where gloss had to pay first, by how much the views of a cell differed with it and with none.
+    """
+    if scatter is not None and gloss_is_idle(*scatter):
+        measure = "how much more the views of a cell differ without gloss than with it (root mean square)"
+        reason = f"they differ by {scatter[0]:.4f} with the gloss that was fitted, by {scatter[1]:.4f} with none: fitted without"
+        return _decision("specular", False, measure, scatter[1] - scatter[0], 0.0, reason)
     value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
     needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
     reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
@@ -194,7 +227,7 @@ def scale(kind: str, factor: float, relative_error: float) -> Decision:
         "lamp": "the given radiance of a lamp",
     }
     reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
-    return _decision("scale", kind != "found", "factor on the light that the fit was given", factor, 1.0, reason)
+    return _decision("scale", abs(factor - 1.0) > 1e-3, "factor on the light that the fit was given", factor, 1.0, reason)
 
 
 def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
@@ -210,7 +243,7 @@ def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
     cumulative = np.cumsum(weights[order])
     value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
     reason = (
-        "would change the light, but every further pass multiplies the bias of the overall scale: left out"
+        "light solved again with the fitted materials would change, but its overall level drifts from pass to pass: left out"
         if value > SECOND_PASS_GAIN
         else "light would hardly change"
     )

@@ -27,8 +27,7 @@ from workflow.artifacts.files import sha256_of
 TABLE = Path("config/batch.tsv")
 PAGE = Path(__file__).parent / "report/batch.html.j2"
 COLUMNS = ("name", "source", "path", "base", "overrides")
-RESERVED = ("batch", "studies", "weights")  # folders of results/ that are no scene's
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
+_NAME = re.compile(settings_module.SCENE_NAME)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
 _SHOWN = 20  # problems in one message
 
@@ -143,7 +142,7 @@ def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
         return where + "empty; every scene needs a name"
     if not _NAME.fullmatch(name) or "--" in name:
         return where + f"found {name!r}; allowed are letters, digits, _ and single -, the first no sign"
-    if name in RESERVED:
+    if name in settings_module.RESERVED:
         return where + f"found {name!r}, which results/ uses otherwise; choose another name"
     if name in earlier:
         return where + f"{name!r} stands in line {earlier[name].number} already; names must differ"

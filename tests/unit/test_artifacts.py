@@ -78,6 +78,23 @@ def test_damage_is_found_and_named(stage, tmp_path, name, harm):
     assert len(lines) == 1 and name in lines[0]
 
 
+def test_what_repairs_it_keeps_the_quality(tmp_path):
+    writer = StageWriter(tmp_path / "results/s/base", {**provenance(), "quality": "paper"})
+    writer.json("base.json", {"edge": 0.01})
+    writer.finish()
+    (tmp_path / "results/s/base/base.json").write_text("{}")
+    (line,) = damaged(tmp_path)
+    assert line.endswith("snakemake --cores 2 scenes/s --forcerun base --config quality=paper")
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "[1]", "3"])
+def test_manifest_that_is_none_is_named(stage, tmp_path, text):
+    folder, _, _ = stage
+    (folder / "manifest.json").write_text(text)
+    (line,) = damaged(tmp_path)
+    assert "results/s/base/manifest.json: " in line and "--forcerun base" in line
+
+
 def test_unknown_schema_is_refused(stage):
     manifest = stage[0] / "manifest.json"
     document = json.loads(manifest.read_text()) | {"schema": "iif.stage/99"}

@@ -9,8 +9,8 @@ import pytest
 from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
-from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, transforms
+from workflow.sources.folder_scene.inputs import find_inputs
 
 CAPTURE = {"width": 320, "height": 320}
 
@@ -36,7 +36,7 @@ def scene(path, room, views, subfolder=""):
 
 def listed(path, capture=None, points=False, **source):
     document = own.settings_of(path, source, {**CAPTURE, **(capture or {})})
-    return folder.find_inputs(document["source"], document["capture"], points).transforms
+    return find_inputs(document["source"], document["capture"], points).transforms
 
 
 def refused(path, **keys):

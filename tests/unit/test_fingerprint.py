@@ -10,7 +10,7 @@ import textwrap
 import pytest
 
 from workflow import fingerprint as fp
-from workflow.registry import STAGES, downstream_order
+from workflow.registry import STAGES
 
 SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n"
 
@@ -44,7 +44,7 @@ def changed(before, after):
 
 def below(stage):
     out = {stage}
-    for name in downstream_order():
+    for name in STAGES:
         if out & set(STAGES[name].upstream):
             out.add(name)
     return out

@@ -13,7 +13,6 @@ from workflow.sources import fipt
 W, H, ANGLE = 64, 48, 1.2
 FOCAL = 0.5 * W / np.tan(0.5 * ANGLE)
 CAMERA = own.Pinhole(FOCAL, FOCAL, W / 2, H / 2, W, H)
-COUNTS = {"train": 3, "val": 2}
 EXPOSURES = {"train": [0.5, 1.0, 2.0], "val": [4.0, 0.25]}
 
 

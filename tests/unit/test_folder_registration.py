@@ -50,6 +50,8 @@ def test_blurred_and_badly_posed_views_are_named(found):
 def test_cameras_are_corrected_and_read_back(found):
     frames, poses, out = found
     assert out.facts["accepted"] and "moved by" in out.notes[0]
+    (decision,) = out.plan
+    assert decision["included"] and decision["value"] > decision["threshold"] and "photographs moved by" in decision["reason"]
     json.dumps(out.facts, allow_nan=False)
     for frame, pose in zip(out.frames[:-1], out.poses[:-1], strict=True):
         np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 0.001), pose, atol=1e-9)

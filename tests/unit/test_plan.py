@@ -40,6 +40,8 @@ KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
         (plan.specular(np.array([0.9, 0.95]), np.zeros(2, bool)), False),
         (plan.specular(np.array([0.9, 0.4]), np.zeros(2, bool)), True),
         (plan.specular(np.zeros(0), np.zeros(0, bool)), False),
+        (plan.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.03, 0.04)), True),
+        (plan.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.04, 0.03)), False),
         (plan.affine_size(["full, roughness", "gain", "identity (3 pixels)"]), True),
         (plan.affine_size([]), False),
         (plan.second_pass(np.array([1.5, 1.0]), np.array([10, 1])), False),

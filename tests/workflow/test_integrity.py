@@ -79,30 +79,45 @@ def test_edited_deliverable_is_found(workflow):
     assert verify.returncode != 0 and "scenes/tiny/plan.yaml" in verify.stdout + verify.stderr
 
 
-def test_killed_job_resumes_to_the_same_result(finished, tmp_path):
-    """kill -9 on a running job; the same command then completes, and every manifest equals the undisturbed run's."""
+def test_killed_run_resumes_to_the_same_result(finished, tmp_path):
+    """kill -9 on a running job, then on a job and Snakemake itself: the same command completes, every manifest equals the
+    undisturbed run's. A Snakemake that could not clean up leaves its lock; it says so, and that --unlock removes it."""
     workflow = type(finished)(finished.repository, tmp_path / "run")
     workflow.write("tiny", (finished.folder / "config/scenes/tiny.yaml").read_text())
-    process = subprocess.Popen(workflow.command("scenes/tiny"), stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 600
-    victim = None
-    while victim is None and time.monotonic() < deadline:
-        out = subprocess.run(["pgrep", "-f", "--", "-m workflow (shading|affines|base) tiny"], capture_output=True, text=True)
-        mine = [int(pid) for pid in out.stdout.split() if _works_in(int(pid), workflow.folder)]
-        victim = mine[0] if mine else None
-        time.sleep(0.02)
-    assert victim, "no job was seen running"
-    os.kill(victim, signal.SIGKILL)
+    process, job = _running(workflow, "segmentation|base")
+    os.kill(job, signal.SIGKILL)
     process.communicate()
-    assert process.returncode != 0
+    assert process.returncode not in (0, -signal.SIGKILL)
+    process, job = _running(workflow, "shading|affines")
+    os.kill(process.pid, signal.SIGKILL)
+    os.kill(job, signal.SIGKILL)
+    process.communicate()
+    locked = workflow.run("scenes/tiny")
+    assert locked.returncode and "--unlock" in locked.stderr
+    assert workflow.run("scenes/tiny", "--unlock").returncode == 0
     again = workflow.run("scenes/tiny")
     assert again.returncode == 0, again.stderr[-2000:]
     assert manifests(workflow.folder) == manifests(finished.folder)
 
 
+def _running(workflow, stages):
+    """Snakemake, and the id of a job of one of the stages that it has just started."""
+    process = subprocess.Popen(workflow.command("scenes/tiny"), stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 600
+    while time.monotonic() < deadline:
+        out = subprocess.run(["pgrep", "-f", "--", f"-m workflow ({stages}) tiny"], capture_output=True, text=True)
+        mine = [int(pid) for pid in out.stdout.split() if _works_in(int(pid), workflow.folder)]
+        if mine:
+            return process, mine[-1]
+        time.sleep(0.02)
+    raise AssertionError("no job was seen running")
+
+
 def _works_in(pid, folder):
+    """Whether a process is a Python (not the shell that starts it) in a folder."""
     try:
-        return os.path.realpath(f"/proc/{pid}/cwd") == os.path.realpath(folder)
+        python = "python" in os.path.basename(os.path.realpath(f"/proc/{pid}/exe"))
+        return python and os.path.realpath(f"/proc/{pid}/cwd") == os.path.realpath(folder)
     except OSError:
         return False
 

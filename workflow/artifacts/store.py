@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +15,18 @@ SCHEMA = "iif.stage/1"
 MANIFEST = "manifest.json"
 
 
+def command(scene: str, stage: str, quality: str | None) -> str:
+    """What makes a stage of a scene again as it was made; `draft` needs no word."""
+    chosen = f" --config quality={quality}" if quality not in (None, "draft") else ""
+    return f"snakemake --cores 2 scenes/{scene} --forcerun {stage}{chosen}"
+
+
 class DamagedArtefact(InputError):
     """A file on disk is not what its stage wrote: missing, changed, of another schema, or not finite."""
 
-    def __init__(self, path: Path, stage: str, scene: str, problem: str, unfinished: bool = False):
+    def __init__(self, path: Path, stage: str, scene: str, problem: str, quality: str | None = None, unfinished: bool = False):
         self.path, self.stage, self.scene = path, stage, scene
-        cure = f"It was made by rule {stage}; rebuild with: snakemake --cores 2 scenes/{scene} --forcerun {stage}"
+        cure = f"It was made by rule {stage}; rebuild with: {command(scene, stage, quality)}"
         if unfinished:
             cure = f"Make it with: snakemake --cores 2 {path}"
         super().__init__(f"{path}: {problem}. {cure}")
@@ -62,11 +67,6 @@ class StageWriter:
     def bytes(self, name: str, data: bytes) -> None:
         """Write a file of any other kind."""
         io.write_atomically(self.directory / name, lambda temporary: _write_bytes(temporary, data))
-        self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
-
-    def foreign(self, name: str, write: Callable[[Path], None]) -> None:
-        """Let a library write a file: `write(temporary_path)`."""
-        io.write_atomically(self.directory / name, write)
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
     def note(self, name: str, document: Any) -> None:
@@ -121,16 +121,21 @@ class StageReader:
         if not path.is_file():
             raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
         try:
-            self.manifest: dict[str, Any] = json.loads(path.read_text())
-        except ValueError as error:
+            self.manifest: dict[str, Any] = dict(json.loads(path.read_text()))
+        except (ValueError, TypeError) as error:
             raise DamagedArtefact(path, stage, scene, f"not readable as JSON ({error})") from None
         found = self.manifest.get("schema")
         if found != SCHEMA:
-            raise DamagedArtefact(path, stage, scene, f"schema {found!r}, this version reads {SCHEMA!r}")
+            raise DamagedArtefact(
+                path, stage, scene, f"schema {found!r}, this version reads {SCHEMA!r}", self.manifest.get("quality")
+            )
 
     @property
     def fingerprint(self) -> str:
         return self.manifest["fingerprint"]
+
+    def _damaged(self, path: Path, problem: str) -> DamagedArtefact:
+        return DamagedArtefact(path, self.stage, self.scene, problem, self.manifest.get("quality"))
 
     def has(self, name: str) -> bool:
         """Whether the stage wrote this file."""
@@ -146,14 +151,14 @@ class StageReader:
         path = self.directory / name
         if facts is None:
             known = ", ".join(list(self.manifest["files"])[:8])
-            raise DamagedArtefact(path, self.stage, self.scene, f"not in the manifest (it lists {known}, ...)")
+            raise self._damaged(path, f"not in the manifest (it lists {known}, ...)")
         if not path.is_file():
-            raise DamagedArtefact(path, self.stage, self.scene, "missing")
+            raise self._damaged(path, "missing")
         size = path.stat().st_size
         if size != facts["bytes"]:
-            raise DamagedArtefact(path, self.stage, self.scene, f"{size} bytes on disk, {facts['bytes']} were written")
+            raise self._damaged(path, f"{size} bytes on disk, {facts['bytes']} were written")
         if io.sha256_of(path) != facts["sha256"]:
-            raise DamagedArtefact(path, self.stage, self.scene, "its content changed since it was written (sha256 differs)")
+            raise self._damaged(path, "its content changed since it was written (sha256 differs)")
         return path
 
     def exr(self, name: str) -> dict[str, np.ndarray]:
@@ -162,10 +167,10 @@ class StageReader:
         facts = self.manifest["files"][name]
         for channel, array in channels.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
-                raise DamagedArtefact(self.directory / name, self.stage, self.scene, f"channel {channel} is not finite")
+                raise self._damaged(self.directory / name, f"channel {channel} is not finite")
             if list(array.shape) != facts["shape"]:
                 problem = f"channel {channel} has shape {array.shape}, manifest says {facts['shape']}"
-                raise DamagedArtefact(self.directory / name, self.stage, self.scene, problem)
+                raise self._damaged(self.directory / name, problem)
         return channels
 
     def table(self, name: str) -> dict[str, np.ndarray]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
-from workflow.artifacts.store import MANIFEST, StageReader
+from workflow.artifacts.store import MANIFEST, StageReader, command
 
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
@@ -41,17 +41,18 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
         yield from _deliverable(manifest, scene, scene in upstream)
     for folder in sorted(root.glob("scenes/*")):
         if folder.is_dir() and (not scenes or folder.name in scenes) and not (folder / MANIFEST).is_file():
-            yield f"{folder / MANIFEST}: missing; rebuild with: snakemake --cores 2 scenes/{folder.name} --forcerun publish"
+            yield f"{folder / MANIFEST}: missing; rebuild with: {command(folder.name, 'publish', None)}"
 
 
 def _deliverable(manifest: Path, scene: str, damaged_results: bool) -> Iterator[str]:
     first = "repair results/ first (the lines above), then " if damaged_results else ""
-    again = first + f"rebuild with: snakemake --cores 2 scenes/{scene} --forcerun publish"
     try:
-        listed = json.loads(manifest.read_text())["files"]
-    except (ValueError, KeyError) as error:
-        yield f"{manifest}: not readable ({error}); {again}"
+        document = json.loads(manifest.read_text())
+        listed = document["files"]
+    except (ValueError, KeyError, TypeError) as error:
+        yield f"{manifest}: not readable ({error}); {first}rebuild with: {command(scene, 'publish', None)}"
         return
+    again = f"{first}rebuild with: {command(scene, 'publish', document.get('quality'))}"
     for name, facts in sorted(listed.items()):
         path = manifest.parent / name
         if not path.is_file():

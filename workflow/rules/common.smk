@@ -1,4 +1,5 @@
 # Shared by all rules: the import path, the fingerprint of a stage, and the command of a job. Nothing is computed here.
+import os
 import sys
 
 sys.path.insert(0, workflow.basedir)
@@ -6,7 +7,7 @@ sys.path.insert(0, workflow.basedir)
 from iif_core import native
 from iif_core.errors import InputError
 from workflow import fingerprint as fingerprints
-from workflow.settings import QUALITIES
+from workflow.settings import QUALITIES, SCENE_NAME, scene_file
 
 native.process_environment()
 
@@ -15,6 +16,14 @@ def stop(message):
     """End with one message for the user instead of a traceback through Snakemake."""
     print(f"\nerror: {message}\n", file=sys.stderr)
     sys.exit(1)
+
+
+for place in (".", "results", "scenes", ".snakemake"):
+    if os.path.exists(place) and not os.access(place, os.W_OK):
+        stop(
+            f"{os.path.realpath(place)}: not writable for you; results and records are written there."
+            " Give yourself the right, or work in a copy of the checkout."
+        )
 
 
 QUALITY = str(config.get("quality", "draft"))
@@ -30,7 +39,7 @@ if set(config) - {"quality"}:
 
 
 wildcard_constraints:
-    scene=r"[A-Za-z0-9][A-Za-z0-9_-]*",
+    scene=SCENE_NAME,
 
 
 def manifest(stage, scene):
@@ -52,6 +61,14 @@ def upstream(stage):
         ]
 
     return inputs
+
+
+def unknown(wildcards):
+    """Ends with what is wrong about a scene that can have no file."""
+    try:
+        return str(scene_file(wildcards.name))
+    except InputError as error:
+        stop(error)
 
 
 def job(stage):

@@ -20,6 +20,7 @@ from iif_core.errors import InputError
 from workflow.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, mesh, transforms
+from workflow.sources.folder_scene.inputs import Inputs
 
 LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Camera axes of the synthetic scenes (x left, y up, z forward) to OpenCV's."""
@@ -55,7 +56,7 @@ def capture(job: Job) -> None:
     folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture)))
 
 
-def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inputs:
+def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
     """The checked scene: cameras of OpenCV axes, and the files that belong to them."""
     home = transforms.folder_at(source, "scene.obj")
     encoded = settings["dynamic_range"] == "ldr"
@@ -75,7 +76,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> folder.Inpu
     truth = _truth(found, {f.name: at[f.name] for f in posed})
     instances, lists = _ids(found, source["ids"], {f.name: at[f.name] for f in posed})
     frames = replace(frames, frames=posed, axes="opencv", known=True, notes=tuple(found.notes), also=tuple(found.also))
-    return folder.Inputs(
+    return Inputs(
         frames,
         mesh.find(home, source["mesh"]),
         instances=instances,

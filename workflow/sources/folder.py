@@ -6,8 +6,7 @@ reduces the photographs, traces the mesh and measures whether the two belong tog
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,42 +19,14 @@ from iif_core.errors import InputError
 from iif_core.registration import Photo
 from workflow.job import Job
 from workflow.normal_form import CaptureWriter, Truth, View
-from workflow.sources.folder_scene import alignment, colmap, exposure, images, mesh, registration, transforms
+from workflow.sources.folder_scene import alignment, exposure, images, mesh, registration, transforms
+from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01
 """A view whose rays hit the mesh less often than this looks at nothing."""
 SQUARE_PIXELS = 0.1
 """|log(fl_x / fl_y)| above which a note asks whether that is right: real lenses stay below 0.01."""
-TRUTH = ("albedo", "roughness", "metallic", "emission")
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Every file that the capture of this scene reads."""
-
-    transforms: transforms.Transforms
-    mesh: Path
-    exposures: Path | None = None
-    instances: dict[str, Path] = field(default_factory=dict)
-    truth: dict[str, dict[str, Path]] = field(default_factory=dict)
-    metres: float = 1.0
-    gains: tuple[float, ...] | None = None
-    """Exposures of the frames that the source itself knows."""
-    of_vertices: Callable[[], mesh.VertexIds] | None = None
-    """Object ids of the mesh's vertices."""
-    load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
-    response: np.ndarray | None = None
-    """True camera response, (3, 101)."""
-    also: tuple[Path, ...] = ()
-    """Further files that are read."""
-
-    def files(self) -> list[Path]:
-        out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
-        for frame in self.transforms.frames:
-            out += [path for path in (frame.image, frame.depth, frame.mask) if path]
-        out += [path for maps in self.truth.values() for path in maps.values()]
-        return [*out, *self.transforms.also, *self.also]
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -65,66 +36,6 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
         InputError: what is missing or does not fit, by name.
     """
     return find_inputs(document["source"], document["capture"]).files()
-
-
-def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
-    """The checked scene: cameras, and the files that belong to them. points: read a model's sparse points too (slow)."""
-    metres = transforms.metres_per_unit(source["unit"])
-    folder = transforms.folder_at(source, "transforms.json or a COLMAP model")
-    stated = source["cameras"]
-    model = None
-    if not (str(stated).endswith(".json") or (stated is None and (folder / "transforms.json").is_file())):
-        model = colmap.find(folder, stated)
-    listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
-    if capture["test_every"] == 1:
-        raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
-    mesh_path = mesh.find(folder, source.get("mesh"))
-    exposures = folder / "exposures.json"
-    has_exposures = exposures.is_file()
-    if has_exposures:
-        exposure.read_given(exposures, [(f.name, f.file_path) for f in listed.frames])
-    return Inputs(
-        listed,
-        mesh_path,
-        exposures if has_exposures else None,
-        _instances(folder, listed.frames),
-        _truth(folder, listed.frames),
-        metres,
-    )
-
-
-def _instances(folder: Path, frames: tuple[Frame, ...]) -> dict[str, Path]:
-    here = folder / "instances"
-    if not here.is_dir():
-        return {}
-    out = {}
-    for frame in frames:
-        found = [path for suffix in (".png", ".exr") if (path := here / f"{frame.name}{suffix}").is_file()]
-        if len(found) > 1:
-            raise InputError(f"{here}: {found[0].name} and {found[1].name} are the same view; remove one")
-        if found:
-            out[frame.name] = found[0]
-    if not out:
-        raise InputError(f"{here}: no file for any view; expected names such as {frames[0].name}.png")
-    return out
-
-
-def _truth(folder: Path, frames: tuple[Frame, ...]) -> dict[str, dict[str, Path]]:
-    here = folder / "truth"
-    if not here.is_dir():
-        return {}
-    out = {frame.name: {kind: here / kind / f"{frame.name}.exr" for kind in TRUTH} for frame in frames}
-    missing = [path for maps in out.values() for path in maps.values() if not path.is_file()]
-    if missing:
-        raise InputError(
-            f"{missing[0]}: not found ({len(missing)} of {4 * len(frames)} truth maps are missing); truth needs"
-            f" {', '.join(TRUTH)} for every view, or no `truth` folder"
-        )
-    for frame in frames:
-        radiance = here / "radiance" / f"{frame.name}.exr"
-        if radiance.is_file():
-            out[frame.name]["radiance"] = radiance
-    return out
 
 
 def capture(job: Job) -> None:
@@ -214,6 +125,7 @@ class _Capture:
             "dropped_views": dropped,
             "left_out_views": found.left_out,
             "registration": found.facts,
+            "plan": found.plan,
             "exposure_estimated": self.settings.exposure == "estimate",
         }
         has_truth = bool(self.inputs.truth)
@@ -261,7 +173,7 @@ class _Capture:
     ) -> tuple[tuple[Frame, ...], list[np.ndarray], registration.Registered]:
         """Frames and poses as the mesh and the other photographs speak for."""
         if self.source.registration == "off":
-            return frames, poses, registration.Registered(list(frames), poses, {}, {}, [])
+            return frames, poses, registration.Registered(list(frames), poses, {}, {}, [], [])
         counts, notes, photos = dict(self.counts), list(self.notes), []
         for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
             full = self._target(frame)

@@ -21,6 +21,7 @@ from iif_core.errors import InputError
 from workflow.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, mesh, transforms
+from workflow.sources.folder_scene.inputs import Inputs
 
 MESH_FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """Rows 0, 1 change places, row 2 turns its sign: a rotation and its own inverse."""
@@ -47,7 +48,7 @@ def capture(job: Job) -> None:
     folder.capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
 
 
-def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> folder.Inputs:
+def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> Inputs:
     """The checked scene: cameras in the mesh's frame, and the files that belong to them. points: read the sparse points of
     colmap/ too (slow), for the check of the mesh."""
     home = transforms.folder_at(source, "dslr/ and scans/")
@@ -74,7 +75,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     if of_vertices is None:
         notes.append("no segments.json and segments_anno.json: the scene comes without object ids")
     listed = replace(listed, known=True, notes=tuple(notes), also=(*lists, *also, *annotation))
-    return folder.Inputs(listed, mesh_path, of_vertices=of_vertices)
+    return Inputs(listed, mesh_path, of_vertices=of_vertices)
 
 
 def _entries(

@@ -1,1 +1,2 @@
-"""Parts of the `folder` source: `transforms` (cameras), `images`, `mesh`, `alignment`, `exposure`."""
+"""Parts of the `folder` source: `inputs` (which files), `transforms` and `colmap` (cameras), `images`, `mesh`, `alignment`,
+`registration`, `exposure`."""

@@ -355,7 +355,8 @@ class Alignment:
             return (
                 "photographs and mesh may not be aligned: their edges do not lie on each other (correlation"
                 f" {now:.3f}, {best:.3f} when shifted by {shift / EDGE_WIDTH:.1%} of the picture); look at the"
-                " overlay in the report, check `source.axes`, `source.unit` and that mesh and poses share a frame"
+                " overlay in the report, check `source.axes`, `source.unit`, that mesh and poses share a frame, and that every"
+                " photograph stands with its own pose"
             )
         return ""
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core import plan
 from iif_core.registration import MIN_VIEWS, Photo, Registration, register
 from workflow.sources.folder_scene.transforms import Frame
 
@@ -23,13 +24,14 @@ LEFT_OUT = 1 / 3
 
 @dataclass(frozen=True)
 class Registered:
-    """Frames with corrected cameras, their poses, why some are better left out (by name), and the numbers."""
+    """Frames with corrected cameras, their poses, why some are better left out (by name), numbers, and what plan.yaml says."""
 
     frames: list[Frame]
     poses: list[np.ndarray]
     left_out: dict[str, str]
     facts: dict[str, Any]
     notes: list[str]
+    plan: list[plan.Decision]
 
 
 def registered(
@@ -38,7 +40,7 @@ def registered(
     """Photographs (None: sees nothing) registered with the mesh and with each other."""
     seen = [i for i, photo in enumerate(photos) if photo is not None]
     if len(seen) < 2:
-        return Registered(list(frames), list(poses), {}, {}, [])
+        return Registered(list(frames), list(poses), {}, {}, [], [])
     plain = all(frames[i].lens.is_identity for i in seen)
     found = register([photos[i] for i in seen], points=max(2000, ROWS // len(seen)), intrinsics=plain)
     scale = frames[seen[0]].camera.width / photos[seen[0]].image.shape[1]
@@ -48,7 +50,10 @@ def registered(
         for pose, i in zip(found.pose, seen, strict=True):
             new_poses[i] = pose
             new_frames[i] = replace(frames[i], camera=_camera(frames[i], found), matrix=_matrix(pose, axes, metres))
-    return Registered(new_frames, new_poses, left_out, _facts(frames, seen, found, scale), _words(found, scale, plain))
+    moved = float(np.median(found.moved) * scale)
+    decision = plan.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(seen))
+    facts, words = _facts(frames, seen, found, scale), _words(found, moved, plain)
+    return Registered(new_frames, new_poses, left_out, facts, words, [decision])
 
 
 def _camera(frame: Frame, found: Registration) -> Any:
@@ -100,8 +105,7 @@ def _facts(frames: Sequence[Frame], seen: list[int], found: Registration, scale:
     return {**finite, "views": views}
 
 
-def _words(found: Registration, scale: float, plain: bool) -> list[str]:
-    moved = float(np.median(found.moved) * scale)
+def _words(found: Registration, moved: float, plain: bool) -> list[str]:
     numbers = (
         f"on surface that the fit did not see, texture of views differs by {found.held_out[1]:.3f} instead of"
         f" {found.held_out[0]:.3f} (loss {found.gain:+.4f} +- {found.error:.4f}), photograph edges at mesh edges"

@@ -7,6 +7,7 @@ entries and pass the same checks (`frames_of`).
 
 from __future__ import annotations
 
+import difflib
 import fnmatch
 import json
 import math
@@ -24,6 +25,25 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0
 PERSPECTIVE = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_angle_y")
+KEYS = (
+    *INTRINSICS,
+    *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye", "pixel_centres_at"),
+    *(
+        "frames",
+        "file_path",
+        "transform_matrix",
+        "mask_path",
+        "depth_file_path",
+        "applied_transform",
+        "applied_scale",
+        "train_filenames",
+        "val_filenames",
+        "test_filenames",
+    ),
+)
+"""What is read of a transforms.json; other keys are other tools' and are ignored."""
+NEAR = 0.85
+"""Similarity (difflib) from which a key that is not read is a misspelt one that is."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 RIGID_TOLERANCE = 5e-3
 """Largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not."""
@@ -135,6 +155,7 @@ def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     """
     path = folder_at(source, "transforms.json") / (source["cameras"] or "transforms.json")
     document = load(path)
+    _refuse_misspelt(path, document)
     entries = _listed_splits(path, document, entries_of(path, document))
     for entry in entries:
         if entry.get("mask_path"):
@@ -262,6 +283,18 @@ def load(path: Path) -> dict[str, Any]:
     return document
 
 
+def _refuse_misspelt(path: Path, document: dict[str, Any]) -> None:
+    """Keys that are all but one that is read and that is missing beside them: a mask or a focal length would be lost silently."""
+    frames = document.get("frames")
+    places = [("", document)]
+    places += [(f"frames[{i}]: ", f) for i, f in enumerate(frames if isinstance(frames, list) else []) if isinstance(f, dict)]
+    for where, place in places:
+        for key in place:
+            near = difflib.get_close_matches(key, KEYS, 1, NEAR) if key not in KEYS and key != "pixel_centers_at" else []
+            if near and near[0] not in place:
+                raise InputError(f"{path}: {where}`{key}`: unknown key. Did you mean `{near[0]}`? Rename or remove it")
+
+
 def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
     frames = document.get(key)
     if not isinstance(frames, list) or not frames:
@@ -351,7 +384,7 @@ def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
 
 def _pixel_offset(path: Path, document: dict[str, Any], setting: str) -> float:
     """What is added to cx, cy so that pixel centres lie at +0.5."""
-    stated = document.get("pixel_centres_at")
+    stated = document.get("pixel_centres_at", document.get("pixel_centers_at"))
     if setting != "auto":
         return 0.5 if setting == "integer" else 0.0
     if stated is None:
