@@ -187,7 +187,8 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
     exposure = [view.exposure for view, *_ in seen]
     gains = {"exposure": exposure, "gain": [[e] * 3 for e in exposure], "vignetting": [0.0, 0.0]}
-    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], **gains})
+    escape = {"primary": 0.0, "secondary": 0.0}
+    job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "escape_share": escape, **gains})
     job.writer.finish()
 
     job = FakeJob("shading", root)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
+from iif_core import plan
 from iif_core.camera import direction_derivatives, pixel_directions
 from iif_core.consistency import held_out_gain
 from iif_core.errors import InputError
@@ -36,10 +38,12 @@ def run(job: Job) -> None:
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
     found: dict[int, np.ndarray] = {}
+    through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > plan.ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")
         eye = view.world_from_camera[:3, 3]
+        _, face_id = capture.gbuffer(view)
         radiance = render(
             geometry,
             material,
@@ -49,11 +53,10 @@ def run(job: Job) -> None:
             job.settings.render.samples,
             job.settings.render.max_bounces,
             seed=((job.seed << 32) | _SEEDS) << 32 | view.view_id,
-            jitter=direction_derivatives(view.fx, view.fy, view.world_from_camera),
+            jitter=_steps(view, face_id, through_holes),
         ).reshape(view.height, view.width, 3)
         if not np.isfinite(radiance).all():
             raise InputError(f"view {view.name}: re-rendered radiance is not finite; please report it with the scene")
-        _, face_id = capture.gbuffer(view)
         fitted = _fitted(job, view)
         if job.settings.render.denoise:
             radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
@@ -94,6 +97,16 @@ def _without_emitters(fitted: dict[str, np.ndarray], emits: np.ndarray) -> dict[
         name: np.where(emits, np.float16(values[name]), channel) if name in values else channel
         for name, channel in fitted.items()
     }
+
+
+def _steps(view: View, face_id: np.ndarray, holes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What a pixel's rays move by, to the right and down: (3,) each. Behind the holes of an open mesh (`holes`) are the
+    directions that light it, not what the camera would see, so there pixels next to a miss, (n, 3), stay in their middle."""
+    steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+    if not holes:
+        return steps
+    whole = minimum_filter(face_id >= 0, 3, mode="nearest").reshape(-1, 1)
+    return steps[0] * whole, steps[1] * whole
 
 
 def _guides(

@@ -36,7 +36,7 @@ def run(job: Job) -> None:
     page = Page(
         scene=job.scene,
         credit=job.settings.report.credit or str(capture.facts.get("credit", "")),
-        headline=_headline(summary, capture),
+        headline=_headline(summary, capture, recovered),
         facts=_facts(job, capture, recovered),
         notes=[str(note) for note in capture.facts.get("notes", [])] + [str(n) for n in emission.get("notes", [])],
         plan=plan,
@@ -84,7 +84,7 @@ def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
     return reader.json(name) if reader.has(name) else {}
 
 
-def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
+def _headline(summary: dict[str, Any], capture: CaptureReader, recovered: Recovered) -> str:
     means = summary["means"].get("result", {})
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
     text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
@@ -94,12 +94,16 @@ def _headline(summary: dict[str, Any], capture: CaptureReader) -> str:
     gains = summary.get("gain_over_raw_predictions", {})
     gain = gains.get("albedo", {}).get("scaled", {}).get("psnr_db")
     if gain is not None:
-        text += f" Against ground truth, albedo up to scale gains {gain:+.1f} dB over the raw predictions of the prior."
+        raw = means.get("albedo", {}).get("raw", {}).get("psnr", {}).get("mean")
+        as_it_is = f"albedo has {raw:.1f} dB as it is; " if raw is not None else ""
+        text += f" Against ground truth, {as_it_is}up to scale it gains {gain:+.1f} dB over the raw predictions of the prior."
         plain = summary["means"].get("object_mean", {}).get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         own = means.get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         if plain is not None and own is not None:
             text += f" Scaled albedo: {own:.1f} dB; the mean prediction of each object, painted flat, has {plain:.1f} dB."
-    elif not capture.has_truth:
+    if not np.any(recovered.light.emits):
+        text += " No lamp was found, so relighting has none to switch off."
+    if gain is None and not capture.has_truth:
         text += " There is no ground truth for this scene: materials are judged by re-rendering alone."
     return text.strip()
 
@@ -154,6 +158,7 @@ def _objects_fact(job: Job, count: int) -> str:
 
 def _tables(summary: dict[str, Any]) -> list[Table]:
     means = summary["means"]
+    any_held_out = "rgb_held_out" in means.get("result", {})
     materials = [("albedo", "raw", m) for m in ("l2", "psnr", "ssim", "flip")]
     materials += [("albedo", "scaled", m) for m in ("l2", "psnr", "ssim")]
     materials += [(q, "raw", m) for q in ("roughness", "metallic") for m in ("l2", "psnr", "ssim")]
@@ -173,8 +178,8 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
             means,
             [("rgb_held_out", "raw", m) for m in ("l2", "psnr", "ssim", "flip")]
             + [("albedo", "raw", m) for m in ("shading_left", "shading_slope", "view_spread")],
-            "Held-out photographs: one exposure gain each where it is estimated. Shading left: correlation, inside objects, of"
-            " log albedo with the log of the diffuse light that was found; 0 is none.",
+            ("Held-out photographs: one exposure gain each where it is estimated. " if any_held_out else "")
+            + "Shading left: correlation, inside objects, of log albedo with the log of the light that was found; 0 is none.",
         ),
         score_table("Light and re-rendering", means, light, "rgb: sensor values; its log L2: radiance, where known."),
         score_table(
@@ -214,86 +219,101 @@ def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emissio
     file = f"maps/{view.name}.exr"
     photo, valid = capture.photo(view, held_out=True)
     depth, face_id = capture.gbuffer(view)
-    hit = face_id >= 0
+    counted = valid & (face_id >= 0)
     rendered = job.read("render").exr(file)
     sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
-    show = (lambda image: pic.linear(image)) if capture.is_hdr else pic.encoded
-
-    def tile(title: str, image: np.ndarray, note: str = "", lossless: bool = False) -> Picture:
-        return Picture(title, pic.data_uri(image, lossless), note)
-
-    def materials(maps: dict[str, np.ndarray]) -> list[Picture | None]:
-        return [
-            tile("albedo", pic.linear(maps["albedo"])),
-            tile("roughness", pic.grey(maps["roughness"])),
-            tile("metallic", pic.grey(maps["metallic"])),
-        ]
-
-    strips = []
-    gaps: list[Picture | None] = [None, None, None]
+    show = pic.linear if capture.is_hdr else pic.encoded
     result = material_maps(rendered) if "albedo.R" in rendered else None
-    strips.append(
+    strips = [
         Strip(
             "result",
             [
-                tile("re-rendering", show(rgb(rendered, "ldr"))),
-                *(materials(result) if result else gaps),
-                tile("emission", pic.linear(rgb(rendered, "emission"), emission_exposure)),
-                tile(
+                _tile("re-rendering", show(rgb(rendered, "ldr"))),
+                *(_materials(result) if result else [None, None, None]),
+                _tile("emission", pic.linear(rgb(rendered, "emission"), emission_exposure)),
+                _tile(
                     "re-rendering error",
-                    pic.difference(rgb(rendered, "ldr"), sensor, valid & hit),
+                    pic.difference(rgb(rendered, "ldr"), sensor, counted),
                     f"0 (dark) to {ERROR_RANGE} in sensor units",
                 ),
             ],
         )
-    )
-    photograph = tile("photograph", show(sensor))
+    ]
+    photograph = _tile("photograph", show(sensor))
     if capture.has_truth:
-        truth = capture.truth(view)
-        maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
-        emission = tile("emission", pic.linear(truth.emission, emission_exposure), "same exposure as the result's")
-        error = None
-        if result:
-            picture = pic.difference(result["albedo"], truth.albedo, truth.valid & hit & ~(truth.emission > 0).any(-1))
-            error = tile("albedo error", picture, f"0 to {ERROR_RANGE}, linear")
-        strips.append(Strip("truth", [photograph, *materials(maps), emission, error]))
+        strips.append(_truth(capture, view, photograph, result, face_id >= 0, emission_exposure))
     predictions = job.read("prior").exr(file) if job.read("prior").has(file) else {}
-    numbers = prediction_numbers(predictions)
-    if numbers:
-        first = materials(material_maps(predictions, f"prior.{numbers[0]:03d}."))
-        spread = np.std([rgb(predictions, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
-        spread_tile = tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
-        strips.append(Strip("raw prediction", [None if capture.has_truth else photograph, *first, spread_tile]))
+    if prediction_numbers(predictions):
+        strips.append(_prediction(predictions, None if capture.has_truth else photograph))
     elif not capture.has_truth:
         strips.append(Strip("photograph", [photograph]))
-    strips.append(Strip("checks", _checks(job, view, file, sensor, depth, valid & hit, tile)))
+    strips.append(Strip("checks", _checks(job, file, sensor, depth, counted)))
     captions = [f"{view.width} x {view.height}", f"exposure {exposure:.3g}"]
     if view.split == "test":
         captions.append("held out: not used in the reconstruction")
     return ViewRows(view.name, ", ".join(captions), strips)
 
 
-def _checks(job: Job, view: View, file: str, sensor, depth, counted, tile) -> list[Picture | None]:
+def _tile(title: str, image: np.ndarray, note: str = "", lossless: bool = False) -> Picture:
+    return Picture(title, pic.data_uri(image, lossless), note)
+
+
+def _materials(maps: dict[str, np.ndarray]) -> list[Picture | None]:
+    return [
+        _tile("albedo", pic.linear(maps["albedo"])),
+        _tile("roughness", pic.grey(maps["roughness"])),
+        _tile("metallic", pic.grey(maps["metallic"])),
+    ]
+
+
+def _truth(
+    capture: CaptureReader,
+    view: View,
+    photograph: Picture,
+    result: dict[str, np.ndarray] | None,
+    hit: np.ndarray,
+    emission_exposure: float,
+) -> Strip:
+    truth = capture.truth(view)
+    maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
+    emission = _tile("emission", pic.linear(truth.emission, emission_exposure), "same exposure as the result's")
+    error = None
+    if result:
+        picture = pic.difference(result["albedo"], truth.albedo, truth.valid & hit & ~(truth.emission > 0).any(-1))
+        error = _tile("albedo error", picture, f"0 to {ERROR_RANGE}, linear")
+    return Strip("truth", [photograph, *_materials(maps), emission, error])
+
+
+def _prediction(channels: dict[str, np.ndarray], photograph: Picture | None) -> Strip:
+    """The first prediction, and how far the predictions are apart."""
+    numbers = prediction_numbers(channels)
+    first = _materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
+    spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
+    apart = _tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
+    return Strip("raw prediction", [photograph, *first, apart])
+
+
+def _checks(job: Job, file: str, sensor: np.ndarray, depth: np.ndarray, counted: np.ndarray) -> list[Picture | None]:
     """Alignment, objects, selected prediction, uncertainty and base texture of a view, as far as they exist."""
     out: list[Picture | None] = []
     if job.read("segmentation").has(file):
         channels = job.read("segmentation").exr(file)
         object_id, segment_id = ids_from_disk(channels["object.id"]), ids_from_disk(channels["segment.id"])
-        out.append(tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
-        out.append(tile("objects", pic.overlay(sensor, object_id), "one colour an object, over the photograph"))
+        out.append(_tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
+        out.append(_tile("objects", pic.overlay(sensor, object_id), "one colour an object, over the photograph"))
         table = job.read("base").table("selection.parquet")
         if len(table["k"]):
             k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
-            out.append(tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
+            out.append(_tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
     if job.read("affines").has(file):
         uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
         note = f"claimed for the albedo, 0 to {UNCERTAINTY_RANGE}; errors that all predictions share cannot be seen in it"
-        out.append(tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
+        out.append(_tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
     if job.read("base").has(file):
         base = job.read("base").exr(file)
-        out.append(tile("base albedo", pic.linear(rgb(base, "albedo")), "before the fit"))
+        out.append(_tile("base albedo", pic.linear(rgb(base, "albedo")), "before the fit"))
         note = f"weighted pixels of the surface cell, 0 (filled in) to {COVERAGE_RANGE:g}"
-        out.append(tile("coverage", pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted), note))
+        out.append(_tile("coverage", pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted), note))
     return out
 
 
