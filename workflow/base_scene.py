@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,6 +46,13 @@ class BaseScene:
     cell_object: np.ndarray
     cell_values: np.ndarray
     object_values: np.ndarray
+
+    def with_gains(self, gain: np.ndarray) -> BaseScene:
+        """The scene with the albedos of its objects multiplied by gain (n_objects, 3), at most 1."""
+        cells, objects = self.cell_values.copy(), self.object_values.copy()
+        objects[:, :3] = np.minimum(objects[:, :3] * gain, 1.0)
+        cells[:, :3] = np.minimum(cells[:, :3] * gain[self.cell_object], 1.0)
+        return replace(self, cell_values=cells, object_values=objects)
 
     def traceable(
         self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
@@ -233,6 +240,14 @@ def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.
     lit = texels["emitter_id"] >= 0
     out[texels["row"][lit], texels["column"][lit]] = by_id[texels["emitter_id"][lit]]
     return out
+
+
+def read_object_gains(job: Job, n_objects: int) -> np.ndarray:
+    """(n_objects, 3) factors on the base albedo that go with the light. Needs emission upstream."""
+    table = job.read("emission").table("object_gains.parquet")
+    gain = np.ones((n_objects, 3), np.float32)
+    gain[table["object_id"]] = np.stack([table[f"gain_{c}"] for c in "rgb"], 1)
+    return gain
 
 
 def read_gains(job: Job) -> CameraGains:

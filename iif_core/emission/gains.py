@@ -52,6 +52,7 @@ def object_gains(
     rounds: int = 15,
     shrink: float = 0.05,
     albedo: np.ndarray | None = None,
+    n_objects: int = 0,
 ) -> ObjectGains:
     """Albedo gain of each object and channel that goes with the light.
 
@@ -82,8 +83,9 @@ def object_gains(
         rounds: of the alternation.
         shrink: pull of g to the common one (not `pinned`: to 1) relative to the rows.
         albedo: (n_objects, 3) mean base albedo; None: no ceiling.
+        n_objects: at least so many gains come back; an object without rows has what all have in common.
     """
-    count = int(owner.max(initial=-1)) + 1
+    count = max(int(owner.max(initial=-1)) + 1, n_objects)
     gain = np.ones((count, 3))
     known = owner >= 0
     if not known.any() or rows.groups == 0:

@@ -49,7 +49,7 @@ class EmissionProblem:
         anchor: (m,) bool, an emitter or the sky, seen directly.
         level_error: standard error of the logarithm of the level of all light, infinite where nothing tells it
             (`with_gains`). error_of_group: (G, 3) the same of each group's light, 0 where it is itself seen unsaturated.
-        level_raised: as `ObjectGains.raised`.
+        level_raised: as `ObjectGains.raised`. gain: as `ObjectGains.gain`.
     """
 
     rows: EmissionRows
@@ -59,20 +59,27 @@ class EmissionProblem:
     level_error: float = float("inf")
     level_raised: float = 0.0
     error_of_group: np.ndarray | None = None
+    gain: np.ndarray | None = None
 
-    def with_gains(self, initial: np.ndarray, albedo: np.ndarray | None = None) -> EmissionProblem:
+    def with_gains(self, initial: np.ndarray, albedo: np.ndarray | None = None, n_objects: int = 0) -> EmissionProblem:
         """Rows scaled by the albedo gains of the objects that go with the light, weighed relative to what they should show.
-        albedo: (n_objects, 3) mean base albedo, which no gain may make whiter than white."""
+        albedo: (n_objects, 3) mean base albedo, which no gain may make whiter than white.
+        n_objects: as in `object_gains`."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
         pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
-        found = object_gains(self.rows, self.observed, self.owner, initial, pinned, albedo=albedo)
+        found = object_gains(self.rows, self.observed, self.owner, initial, pinned, albedo=albedo, n_objects=n_objects)
         of_row = np.ones(self.observed.shape)
         known = self.owner >= 0
         of_row[known] = found.gain[self.owner[known]]
         rows = replace(self.rows, weight=found.weight)
         rows = scale_rows(rows, self.observed, of_row)
         return replace(
-            self, rows=rows, level_error=found.level_error, level_raised=found.raised, error_of_group=found.error_of_group
+            self,
+            rows=rows,
+            level_error=found.level_error,
+            level_raised=found.raised,
+            error_of_group=found.error_of_group,
+            gain=found.gain,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,8 @@ METAL = 0.9
 
 
 def run(job: Job) -> None:
-    """Write emitters.parquet, emitter_faces.parquet, radiance_cache.parquet, environment_texels.parquet and emission.json."""
+    """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
+    and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     views = capture.used
     notes: list[str] = []
@@ -66,16 +68,20 @@ def run(job: Job) -> None:
             f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
         )
     certain = CERTAIN_OPEN if outside is not None and outside.is_unseen else CERTAIN
-    pruned = _trial(photos, groups, cache, outside, certain)
+    pruned, gain = _trial(photos, groups, cache, outside, certain)
+    # Surface that no photograph shows reflects on the way with the albedos of the trial: the base's would lose light there.
+    photos = replace(photos, albedo_gain=gain)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
     reasons = [reason for reason, keep in zip(pruned.reason, pruned.kept, strict=True) if not keep]
     groups = groups.select(lit)
     if left_out.size:
         cache = radiance_cache(photos, groups)[0]
-    solution, loss, level_error, raised = _solve(photos, groups, cache, outside)
+    solution, loss, level_error, raised, gain = _solve(photos, groups, cache, outside)
     table = _table(groups, left_out, reasons, solution, outside)
     _write(job, groups, table, cache, outside)
+    gains = {f"gain_{c}": gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
+    job.writer.table("object_gains.parquet", {"object_id": np.arange(len(gain), dtype=np.int32), **gains})
     kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
     job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
     for why in sorted({reason for _, _, reason in groups.dropped}):
@@ -116,8 +122,10 @@ def run(job: Job) -> None:
 # -------------------------------------------------------------------------------------------------------------- solve
 
 
-def _trial(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float) -> PrunedEmission:
-    """Which groups shine, from half of the rows."""
+def _trial(
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float
+) -> tuple[PrunedEmission, np.ndarray]:
+    """Which groups shine, and the albedo gains of objects (n_objects, 3), from half of the rows."""
     pixels, base, rows = choose_rows(photos, groups, 2)
     own = rows.group >= 0
     halves = _trace(photos, pixels, base, groups, voxels, sky, 0)
@@ -125,11 +133,13 @@ def _trial(photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, s
     white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1)
     seen, initial = _initial(photos, groups, rows, sky)
     n_groups = len(initial)
-    trial = assemble(rows, halves, n_groups, white, sky).with_gains(initial, _not_above_white(photos, sky))
+    trial = assemble(rows, halves, n_groups, white, sky).with_gains(
+        initial, _not_above_white(photos, sky), photos.scene.n_objects
+    )
     area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
-    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain)
+    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), trial.gain
 
 
 def _not_above_white(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
@@ -148,12 +158,14 @@ def _initial(photos: Photographs, groups: EmitterGroups, rows: PixelRows, sky: S
 
 def _solve(
     photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None
-) -> tuple[EmissionSolution, float, float, float]:
-    """Emission of the groups that shine, which are black from here on, and of the environment; its loss; error of its level."""
+) -> tuple[EmissionSolution, float, float, float, np.ndarray]:
+    """Emission of the groups that shine, which are black from here on, and of the environment; its loss; error of its level; by
+    how much it was raised; and the gains of objects that go with it, as those of the trial."""
     pixels, base, rows = choose_rows(photos, groups)
     halves = _trace(photos, pixels, base, groups, voxels, sky, 3)
     initial = _initial(photos, groups, rows, sky)[1]
-    problem = assemble(rows, halves, len(initial), None, sky).with_gains(initial, _not_above_white(photos, sky))
+    problem = assemble(rows, halves, len(initial), None, sky)
+    problem = problem.with_gains(initial, _not_above_white(photos, sky), photos.scene.n_objects)
     # Parts of one object shine alike, more or less; the environment knows no such thing.
     face = np.flatnonzero(groups.of_face >= 0)
     family = -1 - np.arange(len(initial))
@@ -170,7 +182,7 @@ def _solve(
     else:
         solution = solve_families(problem.rows, initial, family, width=width)
     solution = solution.with_level_error(np.minimum(problem.error_of_group, LEVEL_OF_PRIOR))
-    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised
+    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised, problem.gain
 
 
 def _trace(

@@ -13,7 +13,16 @@ from iif_core.cells import grid_origin
 from iif_core.errors import InputError
 from iif_core.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells, joined
 from workflow.artifacts.store import split_rgb
-from workflow.base_scene import BaseScene, Light, ViewPixels, read_base_scene, read_light, read_radiance_cache, view_pixels
+from workflow.base_scene import (
+    BaseScene,
+    Light,
+    ViewPixels,
+    read_base_scene,
+    read_light,
+    read_object_gains,
+    read_radiance_cache,
+    view_pixels,
+)
 from workflow.job import Job
 from workflow.normal_form import CaptureReader, View
 
@@ -49,7 +58,8 @@ def run(job: Job) -> None:
     levels = roughness_levels(job.settings.shading.levels)
     light = read_light(job, len(scene.faces))
     cells = _cells(job, capture, scene)
-    geometry, material = scene.traceable(light.emits)
+    # What no photograph shows reflects as the light has it: with the base albedos a room loses some per cent of its light there.
+    geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
     decision = _indirect(job, geometry, cache, light, cells)
     world = _World(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
