@@ -61,22 +61,26 @@ class BaseScene:
 
         extra: vertices (v, 3) and faces (f, 3) of a black thing to add; its faces come last.
         """
-        import mitsuba
-
-        mitsuba.set_variant("llvm_ad_rgb")
-        from iif_core.transport import CellMaterials, build_geometry
+        material = self.materials()
+        from iif_core.transport import build_geometry
 
         object_id = self.object_id if black is None else np.where(black, self.n_objects, self.object_id)
-        object_values = np.concatenate([self.object_values, np.float32([BLACK])])
-        material = CellMaterials(
-            self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object, self.cell_values, object_values
-        )
         if extra is None:
             return build_geometry(self.vertices, self.faces, object_id), material
         vertices = np.concatenate([self.vertices, extra[0]])
         faces = np.concatenate([self.faces, extra[1] + len(self.vertices)])
         object_id = np.concatenate([object_id, np.full(len(extra[1]), self.n_objects, np.int32)])
         return build_geometry(vertices, faces, object_id), material
+
+    def materials(self) -> CellMaterials:
+        """On the device; object n_objects is black."""
+        import mitsuba
+
+        mitsuba.set_variant("llvm_ad_rgb")
+        from iif_core.transport import CellMaterials
+
+        object_values = np.concatenate([self.object_values, np.float32([BLACK])])
+        return CellMaterials(self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object, self.cell_values, object_values)
 
 
 def read_base_scene(job: Job) -> BaseScene:

@@ -48,7 +48,6 @@ class Photographs:
     views: list[View]
     sensor: Sensor
     gains: CameraGains  # of the views of the capture, in order
-    albedo_gain: np.ndarray | None = None  # (n_objects, 3) of what paths meet
 
     def pixels(self, view: View) -> ViewPixels:
         return view_pixels(self.job, self.capture, self.scene, view)
@@ -56,8 +55,7 @@ class Photographs:
     @cached_property
     def world(self) -> tuple[Geometry, CellMaterials]:
         """Geometry and materials on the device, made once."""
-        scene = self.scene if self.albedo_gain is None else self.scene.with_gains(self.albedo_gain)
-        return scene.traceable()
+        return self.scene.traceable()
 
     def number(self, view: View) -> int:
         """Place of a view in the capture."""

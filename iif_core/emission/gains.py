@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from .direct import solve_emission
-from .rows import EmissionRows, scale_rows
+from .rows import EmissionRows, GlossRows, scale_rows
 
 LEVEL_OF_PRIOR = 0.35
 """Standard deviation of the logarithm of the level that the mean albedo of the base texture gives the light: it is off by
@@ -18,6 +18,10 @@ everywhere. The built-in kitchen's light comes out 11 % too dim, 5 % with the tr
 _LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried."""
 _BOUNDS = (0.1, 10.0)
+_GLOSS_BOUNDS = (0.0, 3.0)
+GLOSS_ROWS = 30.0
+"""The predicted strength of an object's gloss is off by 100 %, say, and that is held against this many rows: so many of an object
+may err together (design effects, docs/emission.md)."""
 WHITE_SHARE = 0.03
 """Share of the rows whose objects may come out brighter than white: gloss, and lamps that nobody found."""
 
@@ -33,6 +37,7 @@ class ObjectGains:
         error_of_group: (G, 3) the same of the light of each group: 0 where it is itself seen unsaturated.
         weight: (n, 3) of the rows, relative to what they are predicted to show.
         raised: logarithm by which all light is brighter than of least cost, for albedos of at most 1; not in the errors.
+        gloss_gain: (n_objects,) >= 0 strength of the specular lobe relative to the predicted one; 1 without `gloss`.
     """
 
     gain: np.ndarray
@@ -40,6 +45,7 @@ class ObjectGains:
     error_of_group: np.ndarray
     weight: np.ndarray
     raised: float = 0.0
+    gloss_gain: np.ndarray = field(default_factory=lambda: np.ones(0))
 
 
 def object_gains(
@@ -53,6 +59,7 @@ def object_gains(
     shrink: float = 0.05,
     albedo: np.ndarray | None = None,
     n_objects: int = 0,
+    gloss: GlossRows | None = None,
 ) -> ObjectGains:
     """Albedo gain of each object and channel that goes with the light.
 
@@ -73,6 +80,10 @@ def object_gains(
     (`SHARED_ERROR`). An emitter that is seen unsaturated is known in the units of the photographs, others are not by that: see
     `_level_errors`.
 
+    With `gloss`, what the specular lobe reflects has a factor t_o of its own, common to the channels (F_0 of a dielectric does
+    not follow its albedo), y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s), leaning on 1 (`GLOSS_ROWS`). Predicted gloss is often
+    wrong: plaster with lobes shows lamps that the photographs do not, and the light comes out too dim (8 % in the kitchen).
+
     Nothing reflects more than it receives. With `albedo`, the level is the lowest from there upwards at which the largest channel
     of g_o albedo_o is above 1 for at most `WHITE_SHARE` of the rows.
 
@@ -84,29 +95,35 @@ def object_gains(
         shrink: pull of g to the common one (not `pinned`: to 1) relative to the rows.
         albedo: (n_objects, 3) mean base albedo; None: no ceiling.
         n_objects: at least so many gains come back; an object without rows has what all have in common.
+        gloss: the specular part of the rows.
     """
     count = max(int(owner.max(initial=-1)) + 1, n_objects)
-    gain = np.ones((count, 3))
+    gain, gloss_gain = np.ones((count, 3)), np.ones(count)
     known = owner >= 0
     if not known.any() or rows.groups == 0:
-        return ObjectGains(gain, float("inf"), np.full((rows.groups, 3), np.inf), rows.weight)
+        nothing = np.full((rows.groups, 3), np.inf)
+        return ObjectGains(gain, float("inf"), nothing, rows.weight, gloss_gain=gloss_gain)
     # Every row that is no object's is an anchor, its gain is 1: an object of its own at the end.
     column = np.where(known, owner, count)
     weight = rows.weight
-    cached = [observed - rows.target, observed - rows.target_second]
+    parts = _Parts(rows, [observed - rows.target, observed - rows.target_second], gloss, column, count + 1, cross, shrink, pinned)
+    doubt = np.zeros(count)
     share = _by_object(np.where(rows.lower_bound, 0.0, weight) * observed**2, column, count + 1)[:count]
     profile = None
     for _ in range(rounds):
-        of_row = np.concatenate([gain, np.ones((1, 3))])[column]
-        weighed = replace(rows, weight=weight)
-        radiance = solve_emission(scale_rows(weighed, observed, of_row), initial, cross, max_rounds=5).radiance
-        emitted = [np.einsum("ngc,gc->nc", a, radiance) for a in (rows.first, rows.second)]
-        predicted = of_row * 0.5 * (emitted[0] + emitted[1] + cached[0] + cached[1])
+        of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
+        weighed = scale_rows(replace(rows, weight=weight), observed, of_row, gloss, gloss_of_row)
+        radiance = solve_emission(weighed, initial, cross, max_rounds=5).radiance
+        mean_a, mean_h = 0.5 * (weighed.first + weighed.second), observed - weighed.mean_target
+        predicted = np.einsum("ngc,gc->nc", mean_a, radiance) + mean_h
         weight = _relative_to(rows, observed, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
-        profile = _Profile.of(observed, emitted, cached, used, column, count + 1, cross, shrink, pinned)
+        if gloss is not None:  # what an object's rows leave unexplained, a row
+            left = _by_object(used * (observed - predicted) ** 2, column, count + 1)[:count].sum(1)
+            doubt = GLOSS_ROWS * left / np.maximum(3 * np.bincount(column, minlength=count + 1)[:count], 1)
+        profile = parts.profile(observed, used, doubt, radiance)
         level, raised = _below_white(profile, column, albedo) if pinned else (np.zeros(3), 0.0)
-        new = profile.gain(level)
+        new, gloss_gain = profile.gain(level)
         if not pinned:
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
         done = np.abs(np.log(new / gain)).max() < 1e-3
@@ -115,19 +132,12 @@ def object_gains(
             break
     errors = float("inf"), np.full((rows.groups, 3), np.inf)
     if pinned:
-        errors = _level_errors(replace(rows, weight=weight), observed, cached, radiance, column, count + 1, cross, shrink)
-    return ObjectGains(gain, *errors, weight, raised)
+        errors = _level_errors(replace(rows, weight=weight), parts, observed, doubt, radiance)
+    return ObjectGains(gain, *errors, weight, raised, gloss_gain)
 
 
 def _level_errors(
-    rows: EmissionRows,
-    observed: np.ndarray,
-    cached: list[np.ndarray],
-    radiance: np.ndarray,
-    column: np.ndarray,
-    count: int,
-    cross: bool,
-    shrink: float,
+    rows: EmissionRows, parts: _Parts, observed: np.ndarray, doubt: np.ndarray, radiance: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """(error of the level of all light, (G, 3) of each group's).
 
@@ -137,23 +147,17 @@ def _level_errors(
     give all light without them: its log s, as far as its own error e_all does not explain it, is theirs,
     e_seen^2 = log^4 s / (log^2 s + e_all^2). Of all light: e^2 = ((1 - phi) e_free)^2 + (phi e_seen)^2.
     """
-    seen = _seen(rows, column == count - 1)
-    parts = [
-        [np.einsum("ngc,gc->nc", a, np.where(which, radiance, 0.0)) for a in (rows.first, rows.second)] for which in (~seen, seen)
-    ]
-    reflects = (column < count - 1)[:, None] & ~rows.lower_bound
-    used = np.where(reflects, rows.weight, 0.0)
-
-    def profile(emitted: list[np.ndarray], known: list[np.ndarray]) -> _Profile:
-        return _Profile.of(observed, emitted, known, used, column, count, cross, shrink, True)
-
-    beside = [h + d for h, d in zip(cached, parts[1], strict=True)]
-    free_error = profile(parts[0], beside).level_error()
+    anchor = parts.column == parts.count - 1
+    seen = _seen(rows, anchor)
+    used = np.where(anchor[:, None] | rows.lower_bound, 0.0, rows.weight)
+    free, shown = (np.where(which, radiance, 0.0) for which in (~seen, seen))
+    free_error = parts.profile(observed, used, doubt, free, beside=shown).level_error()
     if not seen.any():
         return free_error, np.full(seen.shape, free_error)
-    size = [float((used * observed * 0.5 * (d[0] + d[1])).sum()) for d in parts]
+    mean = 0.5 * (rows.first + rows.second)
+    size = [float((used * observed * np.einsum("ngc,gc->nc", mean, e)).sum()) for e in (free, shown)]
     phi = float(np.clip(size[1] / max(sum(size), 1e-300), 0.0, 1.0)) if size[1] > 0 else 0.0
-    everything = profile([a + b for a, b in zip(*parts, strict=True)], cached)
+    everything = parts.profile(observed, used, doubt, radiance)
     error = everything.level_error()
     off = float(_lowest(everything.costs().sum(2).sum(1)[:, None])[0])
     # Objects that know less than the prior does are no witnesses.
@@ -172,13 +176,13 @@ def _seen(rows: EmissionRows, direct: np.ndarray) -> np.ndarray:
 def _below_white(profile: _Profile, owner: np.ndarray, albedo: np.ndarray | None) -> tuple[np.ndarray, float]:
     """(3,) log s of least cost, raised in all channels alike until albedos are possible, and by how much; not raised where no
     level makes them so. owner: (n,), the last = anchors."""
-    best, objects = profile.level(), len(profile.yy) - 1
+    best, objects = profile.level(), profile.objects
     if albedo is None:
         return best, 0.0
     base = np.asarray(albedo, np.float64)[:objects]
     rows = np.bincount(owner, minlength=objects + 1)[:objects].astype(np.float64)
     for step in _LEVELS[_LEVELS >= 0.0]:
-        whitest = (profile.gain(best + step) * base).max(1)
+        whitest = (profile.gain(best + step)[0] * base).max(1)
         if rows[whitest > 1.0].sum() <= WHITE_SHARE * rows.sum():
             return best + step, float(step)
     return best, 0.0
@@ -197,62 +201,128 @@ def _by_object(values: np.ndarray, owner: np.ndarray, count: int) -> np.ndarray:
 
 
 @dataclass(frozen=True)
+class _Parts:
+    """The rows as objects see them: `column` (n,) is the object, count - 1 that of the anchors, whose gains are 1."""
+
+    rows: EmissionRows
+    cached: list[np.ndarray]
+    gloss: GlossRows | None
+    column: np.ndarray
+    count: int
+    cross: bool
+    shrink: float
+    pinned: bool
+
+    def profile(
+        self, y: np.ndarray, weight: np.ndarray, doubt: np.ndarray, radiance: np.ndarray, beside: np.ndarray | None = None
+    ) -> _Profile:
+        """Costs at all levels of the light `radiance` (G, 3), with `beside` (G, 3) of a level that is known; weight (n, 3)."""
+
+        def lobe(matrices: list[np.ndarray], cached: list[np.ndarray]) -> tuple[_Halves, _Halves]:
+            emitted = [np.einsum("ngc,gc->nc", a, radiance) for a in matrices]
+            known = [np.einsum("ngc,gc->nc", a, beside) for a in matrices] if beside is not None else (0.0, 0.0)
+            constant = [h + k for h, k in zip(cached, known, strict=True)]
+            if not self.cross:
+                emitted, constant = ([0.5 * (a + b)] * 2 for a, b in (emitted, constant))
+            return tuple(emitted), tuple(constant)
+
+        def sums(values: np.ndarray) -> np.ndarray:
+            return _by_object(weight * values, self.column, self.count)
+
+        def both(a: _Halves, b: _Halves) -> np.ndarray:  # the two traces share no noise
+            return sums(0.5 * (a[0] * b[1] + a[1] * b[0]))
+
+        d, h = lobe([self.rows.first, self.rows.second], self.cached)
+        if self.gloss is None:
+            e, k, holds = d, h, None
+            zero = np.zeros((self.count, 3))
+            lobes = zero, zero, (zero,) * 3, (zero,) * 3
+        else:
+            e, k = lobe([self.gloss.first, self.gloss.second], [self.gloss.cached, self.gloss.cached_second])
+            d, h = (tuple(whole - part for whole, part in zip(*pair, strict=True)) for pair in ((d, e), (h, k)))
+            holds = doubt
+            crossed = both(d, e), both(d, k) + both(h, e), both(h, k)
+            lobes = (
+                sums(y * 0.5 * (e[0] + e[1])),
+                sums(y * 0.5 * (k[0] + k[1])),
+                crossed,
+                (both(e, e), 2 * both(e, k), both(k, k)),
+            )
+        return _Profile(
+            sums(y * y),
+            sums(y * 0.5 * (d[0] + d[1])),
+            sums(y * 0.5 * (h[0] + h[1])),
+            (both(d, d), 2 * both(d, h), both(h, h)),
+            *lobes,
+            holds,
+            self.shrink,
+            self.pinned,
+        )
+
+
+_Halves = tuple[np.ndarray, np.ndarray]
+_Quadratic = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
 class _Profile:
-    """sum w (y - g_o (s d + h))^2 as quadratic forms of (1, s), each (O + 1, 3); the last object's gain is 1."""
+    """sum w (y - g_o (s d + h) - t_o (s e + k))^2 as polynomials in s, coefficients (O + 1, 3); the last object's g and t are 1.
+
+    yy; yd, yh, ye, yk: products with y; xx, xz, zz: of x = s d + h and z = s e + k, from s^2 to 1. doubt: (O,) weight of
+    (t - 1)^2, None: there is no e and k."""
 
     yy: np.ndarray
     yd: np.ndarray
     yh: np.ndarray
-    dd: np.ndarray
-    dh: np.ndarray
-    hh: np.ndarray
+    xx: _Quadratic
+    ye: np.ndarray
+    yk: np.ndarray
+    xz: _Quadratic
+    zz: _Quadratic
+    doubt: np.ndarray | None
     shrink: float
     pinned: bool
 
-    @classmethod
-    def of(
-        cls,
-        y: np.ndarray,
-        emitted: list[np.ndarray],
-        cached: list[np.ndarray],
-        weight: np.ndarray,
-        owner: np.ndarray,
-        count: int,
-        cross: bool,
-        shrink: float,
-        pinned: bool,
-    ) -> _Profile:
-        """With `cross`, products of the two traces, which share no noise."""
-        (d1, d2), (h1, h2) = emitted, cached
-        d, h = 0.5 * (d1 + d2), 0.5 * (h1 + h2)
-        if not cross:
-            d1 = d2 = d
-            h1 = h2 = h
-        products = (y * y, y * d, y * h, d1 * d2, 0.5 * (d1 * h2 + d2 * h1), h1 * h2)
-        return cls(*[_by_object(weight * p, owner, count) for p in products], shrink, pinned)
+    @property
+    def objects(self) -> int:
+        return len(self.yy) - 1
 
-    def _solve(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(cost, gain) of all but the last object, at log s (..., 1 or 3): (..., O, 3)."""
+    def _at(self, level: np.ndarray) -> tuple[np.ndarray, ...]:
+        """y x, y z, x x, x z, z z at log s (..., 1 or 3): (..., O + 1, 3)."""
         s = np.exp(level)[..., None, :]
-        top = (s * self.yd + self.yh)[..., :-1, :]
-        bottom = np.maximum((s * s * self.dd + 2 * s * self.dh + self.hh)[..., :-1, :], 0.0)
-        floor = 1e-9 * np.maximum(bottom.max((-2, -1), keepdims=True), 1e-300)
-        pull = self.shrink * bottom + floor
-        total, below = top.sum(-2, keepdims=True), bottom.sum(-2, keepdims=True)
+        linear = [s * a + b for a, b in ((self.yd, self.yh), (self.ye, self.yk))]
+        return *linear, *(s * s * q[0] + s * q[1] + q[2] for q in (self.xx, self.xz, self.zz))
+
+    def _solve(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(cost, g, t) of all but the last object, at log s (..., 1 or 3): (..., O, 3) twice and (..., O)."""
+        yx, yz, xx, xz, zz = (part[..., :-1, :] for part in self._at(level))
+        xx, zz = np.maximum(xx, 0.0), np.maximum(zz, 0.0)
+        floor = 1e-9 * np.maximum(xx.max((-2, -1), keepdims=True), 1e-300)
+        pull = self.shrink * xx + floor
+        total, below = (yx - xz).sum(-2, keepdims=True), xx.sum(-2, keepdims=True)
         common = np.clip((total + floor) / (below + floor), *_BOUNDS) if self.pinned else 1.0
-        gain = np.clip((top + pull * common) / (bottom + pull), *_BOUNDS)
-        cost = self.yy[:-1] - 2 * gain * top + gain**2 * bottom + pull * (gain - common) ** 2
-        return cost, gain
+        t, held = np.ones(xx.shape[:-1]), 0.0
+        if self.doubt is not None:
+            # g eliminated, then t; noise may make the rest negative, which then knows nothing.
+            held = self.doubt + self.shrink * zz.sum(-1) + floor[..., 0]
+            knows = np.maximum((zz - xz**2 / (xx + pull)).sum(-1), 0.0)
+            asks = (yz - xz * (yx + pull * common) / (xx + pull)).sum(-1)
+            t = np.clip(np.where(knows > 0, (asks + held) / (knows + held), 1.0), *_GLOSS_BOUNDS)
+        of_all = t[..., None]
+        gain = np.clip((yx - of_all * xz + pull * common) / (xx + pull), *_BOUNDS)
+        cost = self.yy[:-1] - 2 * gain * yx - 2 * of_all * yz + gain**2 * xx + 2 * gain * of_all * xz + of_all**2 * zz
+        cost = cost + pull * (gain - common) ** 2 + (held * (t - 1) ** 2)[..., None] / 3
+        return cost, gain, t
 
     def costs(self) -> np.ndarray:
         """(levels, O + 1, 3)."""
-        s = np.exp(_LEVELS)[:, None, None]
-        anchors = self.yy[-1:] - 2 * (s * self.yd + self.yh)[:, -1:] + (s * s * self.dd + 2 * s * self.dh + self.hh)[:, -1:]
+        yx, yz, xx, xz, zz = (part[:, -1:] for part in self._at(_LEVELS[:, None]))
+        anchors = self.yy[-1:] - 2 * yx - 2 * yz + xx + 2 * xz + zz
         return np.concatenate([self._solve(_LEVELS[:, None])[0], anchors], 1)
 
-    def gain(self, level: np.ndarray) -> np.ndarray:
-        """(O, 3) at log s (3,)."""
-        return self._solve(level)[1]
+    def gain(self, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(g (O, 3), t (O,)) at log s (3,)."""
+        return self._solve(level)[1:]
 
     def level(self) -> np.ndarray:
         """(3,) log s of least cost."""

@@ -9,7 +9,7 @@ import numpy as np
 from .environment import Sky
 from .gains import object_gains
 from .pruning import WhiteSurface
-from .rows import EmissionRows, block_rows, scale_rows
+from .rows import EmissionRows, GlossRows, block_rows, scale_rows
 
 ANCHOR_WEIGHT = 100.0
 """Weight of what is directly seen of a group relative to everything that its light does elsewhere: a face that is
@@ -43,7 +43,7 @@ class EmissionProblem:
     """Averaged rows, m of them.
 
     Attributes:
-        rows: the system.
+        rows: the system. gloss: its specular part; None: the same gain holds for both lobes.
         observed: (m, 3) radiance.
         owner: (m,) object that reflects, -1 = an emitter's own pixels.
         anchor: (m,) bool, an emitter or the sky, seen directly.
@@ -60,6 +60,7 @@ class EmissionProblem:
     level_raised: float = 0.0
     error_of_group: np.ndarray | None = None
     gain: np.ndarray | None = None
+    gloss: GlossRows | None = None
 
     def with_gains(self, initial: np.ndarray, albedo: np.ndarray | None = None, n_objects: int = 0) -> EmissionProblem:
         """Rows scaled by the albedo gains of the objects that go with the light, weighed relative to what they should show.
@@ -67,12 +68,16 @@ class EmissionProblem:
         n_objects: as in `object_gains`."""
         # Cached radiance (h) is measured, so the light has a scale even where no emitter is seen unsaturated.
         pinned = bool(np.any(self.rows.target < self.observed)) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
-        found = object_gains(self.rows, self.observed, self.owner, initial, pinned, albedo=albedo, n_objects=n_objects)
-        of_row = np.ones(self.observed.shape)
+        # Without a scale the two lobes would fix one by how unlike they are, which the predicted gloss is not good for.
+        gloss = self.gloss if pinned else None
+        found = object_gains(
+            self.rows, self.observed, self.owner, initial, pinned, albedo=albedo, n_objects=n_objects, gloss=gloss
+        )
+        of_row, gloss_of_row = np.ones(self.observed.shape), np.ones(len(self.observed))
         known = self.owner >= 0
-        of_row[known] = found.gain[self.owner[known]]
+        of_row[known], gloss_of_row[known] = found.gain[self.owner[known]], found.gloss_gain[self.owner[known]]
         rows = replace(self.rows, weight=found.weight)
-        rows = scale_rows(rows, self.observed, of_row)
+        rows = scale_rows(rows, self.observed, of_row, gloss, gloss_of_row)
         return replace(
             self,
             rows=rows,
@@ -80,6 +85,7 @@ class EmissionProblem:
             level_raised=found.raised,
             error_of_group=found.error_of_group,
             gain=found.gain,
+            gloss=None,
         )
 
 
@@ -89,6 +95,7 @@ def assemble(
     n_groups: int,
     white: Halves | None = None,
     sky: Sky | None = None,
+    gloss: Halves | None = None,
 ) -> EmissionProblem:
     """Averages over (view, tile, object) with their weights; directly seen emitters and sky as rows of their own.
 
@@ -102,6 +109,7 @@ def assemble(
         halves: two independent estimates of (A (n, G, 3), h (n, 3)) of the pixels.
         white: the same of the pixels on emitters (in their order) with a white material.
         sky: the last groups are its, each with one more row: the mean of the camera rays that see it.
+        gloss: the part of the halves that the specular lobe reflects.
     """
     own = pixels.group >= 0
     direct = np.zeros((len(own), n_groups, 3), np.float32)
@@ -121,18 +129,28 @@ def assemble(
         rows = [[np.concatenate([a, -direct[clear]]) for a in matrices], [np.r_[t, -radiance[clear]] for t in targets]]
         radiance, bound = np.r_[radiance, -radiance[clear]], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
-    problem = _blocks(EmissionRows(*rows[0], *rows[1], np.ones(radiance.shape), bound), radiance, key)
+    specular = None
+    if gloss is not None:
+        parts = [[np.where(own.reshape(-1, *[1] * (x.ndim - 1)), 0.0, x) for x in pair] for pair in zip(*gloss, strict=True)]
+        more = len(radiance) - len(own)  # what was added to tell emitters has no part in it
+        specular = GlossRows(*(np.concatenate([x, np.zeros((more, *x.shape[1:]), x.dtype)]) for pair in parts for x in pair))
+    problem = _blocks(EmissionRows(*rows[0], *rows[1], np.ones(radiance.shape), bound), radiance, key, specular)
     if sky is not None and sky.pixels.any():
         problem = _with_sky(problem, n_groups, sky)
     return problem if white is not None else replace(problem, rows=_strengthened(problem.rows, problem.anchor))
 
 
-def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray) -> EmissionProblem:
+def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray, gloss: GlossRows | None) -> EmissionProblem:
     """Averages of rows with the same key (owner, group, view, tile), weighted for relative noise."""
     keys, block = np.unique(key, axis=0, return_inverse=True)
     block, ones, empty = block.ravel(), rows.weight, rows.first[:, :0]
     out = block_rows(rows, block)
-    # The same blocks again for y itself, and for the number of the block.
+    # The same blocks again for gloss, for y itself, and for the number of the block.
+    if gloss is not None:
+        mean = block_rows(
+            EmissionRows(gloss.first, gloss.second, gloss.cached, gloss.cached_second, rows.weight, rows.lower_bound), block
+        )
+        gloss = GlossRows(mean.first, mean.second, mean.target, mean.target_second)
     seen = block_rows(EmissionRows(empty, empty, radiance, radiance, ones, rows.lower_bound), block)
     number = np.repeat(block.astype(np.float64)[:, None], 3, 1)
     label = block_rows(EmissionRows(empty, empty, number, number, ones, rows.lower_bound), block).target[:, 0]
@@ -148,7 +166,8 @@ def _blocks(rows: EmissionRows, radiance: np.ndarray, key: np.ndarray) -> Emissi
     # What an emitter shows itself has next to no noise.
     noise = np.where(owner >= 0, 1.0, 1e-3) * scale[:, 0]
     cluster = np.where(owner >= 0, owner * (int(key[:, 2].max(initial=0)) + 1) + key[:, 2], -1)
-    return EmissionProblem(replace(out, weight=weight, cluster=cluster, noise=noise), seen.target, owner, key[:, 1] >= 0)
+    rows = replace(out, weight=weight, cluster=cluster, noise=noise)
+    return EmissionProblem(rows, seen.target, owner, key[:, 1] >= 0, gloss=gloss)
 
 
 def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProblem:
@@ -169,7 +188,13 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
         np.r_[old.noise, 1e-3 * level],
     )
     owner, anchor = np.r_[problem.owner, np.full(count, -1)], np.r_[problem.anchor, np.ones(count, bool)]
-    return EmissionProblem(added, np.concatenate([problem.observed, seen]), owner, anchor)
+    gloss = problem.gloss
+    if gloss is not None:
+        gloss = GlossRows(
+            *(np.concatenate([x, np.zeros((count, *x.shape[1:]), x.dtype)]) for x in (gloss.first, gloss.second)),
+            *(np.concatenate([x, np.zeros((count, 3), x.dtype)]) for x in (gloss.cached, gloss.cached_second)),
+        )
+    return EmissionProblem(added, np.concatenate([problem.observed, seen]), owner, anchor, gloss=gloss)
 
 
 def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:

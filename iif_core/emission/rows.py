@@ -94,17 +94,38 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
     )
 
 
-def scale_rows(rows: EmissionRows, observed: np.ndarray, gain: np.ndarray) -> EmissionRows:
+@dataclass(frozen=True)
+class GlossRows:
+    """The part of A and h (as in `EmissionRows`, n rows in the same order) that the specular lobe reflects.
+
+    Attributes:
+        first, second: (n, G, 3); cached, cached_second: (n, 3).
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    cached: np.ndarray
+    cached_second: np.ndarray
+
+
+def scale_rows(
+    rows: EmissionRows,
+    observed: np.ndarray,
+    gain: np.ndarray,
+    gloss: GlossRows | None = None,
+    gloss_gain: np.ndarray | None = None,
+) -> EmissionRows:
     """The system for materials that reflect `gain` times as much: A and h are scaled, the observation is not.
 
     Args:
         observed: (n, 3) radiance y, so that h = y - target; gain: (n, 3) > 0.
+        gloss: this part is scaled by gloss_gain (n,) instead.
     """
     factor = gain[:, None].astype(np.float32)
-    return replace(
-        rows,
-        first=rows.first * factor,
-        second=rows.second * factor,
-        target=observed - gain * (observed - rows.target),
-        target_second=observed - gain * (observed - rows.target_second),
-    )
+    first, second = rows.first * factor, rows.second * factor
+    cached, cached_second = gain * (observed - rows.target), gain * (observed - rows.target_second)
+    if gloss is not None and gloss_gain is not None:
+        more = gloss_gain[:, None] - gain
+        first, second = (a + more[:, None].astype(np.float32) * s for a, s in ((first, gloss.first), (second, gloss.second)))
+        cached, cached_second = cached + more * gloss.cached, cached_second + more * gloss.cached_second
+    return replace(rows, first=first, second=second, target=observed - cached, target_second=observed - cached_second)

@@ -143,6 +143,16 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     return LightSample(valid, face, on_sky, texel, radiance, wi, pdf)
 
 
+def light_by_lobe(
+    world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
+) -> tuple[LightSample, Any, Any]:
+    """(sample, diffuse weight, specular weight) of next-event estimation at a vertex."""
+    light = sample_light(world, rng, point, normal, active)
+    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness, specular_chance(kd, ks, normal, wo))
+    share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
+    return light, kd * diffuse * share, reflectance(0, ks, 0, spec, fc) * share
+
+
 def direct_light(
     world: World,
     rng: Any,
@@ -158,21 +168,27 @@ def direct_light(
     """Gain of next-event estimation at a vertex whose path weight so far is `weight`."""
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
-    light = sample_light(world, rng, point, normal, active)
-    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness, specular_chance(kd, ks, normal, wo))
-    f = reflectance(kd, ks, diffuse, spec, fc)
-    share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
-    return light.gain(world, weight * f * share)
+    light, diffuse, specular = light_by_lobe(world, rng, point, normal, wo, kd, ks, roughness, active)
+    return light.gain(world, weight * (diffuse + specular))
 
 
-def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-    """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
+def scatter_by_lobe(
+    rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
+) -> tuple[Any, Any, Any, Any, Any]:
+    """(goes_on, wi, diffuse f cos / pdf, specular f cos / pdf, pdf): the direction in which a path continues."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
     chance = specular_chance(kd, ks, normal, wo)
     wi = sample_lobe(choice < chance, u1, u2, wo, normal, roughness)
     diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness, chance)
     goes_on = active & (dr.dot(normal, wi) > 0) & (pdf > 0)
-    return goes_on, wi, dr.select(goes_on, reflectance(kd, ks, diffuse, spec, fc) / pdf, 0), pdf
+    lobes = kd * diffuse / pdf, reflectance(0, ks, 0, spec, fc) / pdf
+    return goes_on, wi, *(dr.select(goes_on, lobe, 0) for lobe in lobes), pdf
+
+
+def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+    """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
+    goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, normal, wo, kd, ks, roughness, active)
+    return goes_on, wi, diffuse + specular, pdf
 
 
 def roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, Any]:

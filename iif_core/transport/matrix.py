@@ -1,4 +1,5 @@
-"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one path set."""
+"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one path set, by the lobe of the
+point that reflects it."""
 
 from __future__ import annotations
 
@@ -16,7 +17,7 @@ from .arrays import batches, rows_of, to_numpy
 from .cache import RadianceCache
 from .emitters import Emitters, share_of_environment
 from .geometry import Geometry, offset_from
-from .kernels import World, direct_light, incoming, scatter
+from .kernels import World, incoming, light_by_lobe, scatter_by_lobe
 from .render import check_counts
 from .shading import surface_points
 
@@ -24,7 +25,8 @@ Array = np.ndarray
 
 
 class _ColumnCollector:
-    """Deposits path weights in the row of the lane and the column of the emitter's group.
+    """Deposits path weights in the row of the lane and the column of the emitter's group: first all diffuse columns of the
+    lane, then all specular ones. `specular` (Color3f) is the share of the specular lobe at the first vertex of the path.
 
     Only cached light is returned. A lane writes to its own row alone, so plain (non-atomic) additions are
     safe and their order is fixed.
@@ -33,6 +35,7 @@ class _ColumnCollector:
     def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, group_of_texel: Any):
         self.rows, self.lane, self.groups = rows, lane, groups
         self.group_of_face, self.group_of_texel = group_of_face, group_of_texel
+        self.specular: Any = None
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
         group = dr.gather(mi.Int32, self.group_of_face, face, active)
@@ -45,16 +48,17 @@ class _ColumnCollector:
         return self._deposit(mi.UInt32(group), weight, active & (group >= 0))
 
     def _deposit(self, group: Any, weight: Any, active: Any) -> Any:
-        entry = (self.lane * self.groups + group) * 3
-        for channel in range(3):
-            dr.scatter_reduce(
-                dr.ReduceOp.Add,
-                self.rows,
-                weight[channel],
-                entry + channel,
-                active,
-                mode=dr.ReduceMode.NoConflicts,
-            )
+        for lobe, share in enumerate((1 - self.specular, self.specular)):
+            entry = ((self.lane * 2 + lobe) * self.groups + group) * 3
+            for channel in range(3):
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    self.rows,
+                    weight[channel] * share[channel],
+                    entry + channel,
+                    active,
+                    mode=dr.ReduceMode.NoConflicts,
+                )
         return mi.Color3f(0)
 
 
@@ -72,16 +76,29 @@ def _deposit_paths(
     end: Any,
     max_bounces: Any,
 ) -> Any:
-    cached = mi.Color3f(0)
+    diffuse_cached = mi.Color3f(0)
+    specular_cached = mi.Color3f(0)
     origin = offset_from(point, normal)
     visible = dr.dot(normal, wo) > 0
     while sample < end:
-        cached += direct_light(world, rng, origin, normal, wo, kd, ks, roughness, mi.Color3f(1), visible)
-        goes_on, wi, factor, pdf = scatter(rng, normal, wo, kd, ks, roughness, visible)
-        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, goes_on, factor)
-        cached += gain
+        if world.emitters.can_be_sampled:
+            light, diffuse, specular = light_by_lobe(world, rng, origin, normal, wo, kd, ks, roughness, visible)
+            world.collector.specular = _share(specular, diffuse)
+            light.gain(world, diffuse + specular)
+        goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, normal, wo, kd, ks, roughness, visible)
+        share = _share(specular, diffuse)
+        world.collector.specular = share
+        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, goes_on, diffuse + specular)
+        diffuse_cached += gain * (1 - share)
+        specular_cached += gain * share
         sample += 1
-    return cached
+    return diffuse_cached, specular_cached
+
+
+def _share(part: Any, rest: Any) -> Any:
+    """part / (part + rest) a channel, 0 where both are 0."""
+    whole = part + rest
+    return dr.select(whole > 0, part / whole, 0)
 
 
 def transport_matrix(
@@ -104,8 +121,8 @@ def transport_matrix(
     sampling_weight: ArrayLike | None = None,
     chunk: int | None = None,
 ) -> tuple[Array, Array]:
-    """(A (n, G, 3), h (n, 3)) float32: radiance reflected at each point is A @ E + h for emitter radiances E
-    (G, 3).
+    """(A (n, 2, G, 3), h (n, 2, 3)) float32: radiance that each point reflects by its diffuse lobe (0) and by its specular lobe
+    (1) is A @ E + h for emitter radiances E (G, 3). A.sum(1), h.sum(1): all that it reflects.
 
     points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own
     materials; `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in
@@ -136,7 +153,7 @@ def transport_matrix(
             f"environment_columns has shape {columns.shape} and values up to {columns.max(initial=-1)}; expected "
             f"(height, width) in -1 ... {n_groups - 1}"
         )
-    matrix, cached = np.zeros((count, n_groups, 3), np.float32), np.zeros((count, 3), np.float32)
+    matrix, cached = np.zeros((count, 2, n_groups, 3), np.float32), np.zeros((count, 2, 3), np.float32)
     if max_bounces == 0 or n_groups == 0 and cache is None:
         return matrix, cached
     if sampling_weight is None:
@@ -145,11 +162,11 @@ def transport_matrix(
     group_of_face = mi.Int32(groups)
     group_of_texel = None if columns is None else mi.Int32(columns.ravel())
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
-    width = 3 * n_groups
+    width = 6 * n_groups
     for batch in batches(count, samples, width, chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
         collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, group_of_texel)
-        gain = _deposit_paths(
+        gains = _deposit_paths(
             World(geometry, material, emitters, cache, collector),
             batch.streams(seed),
             batch.spread(mi.Point3f, points),
@@ -161,10 +178,11 @@ def transport_matrix(
             *batch.samples(samples),
             dr.opaque(mi.UInt32, max_bounces),
         )
-        dr.eval(gain, rows)
-        cached[batch.part] = batch.collect(gain) / samples
+        dr.eval(gains, rows)
+        for lobe, gain in enumerate(gains):
+            cached[batch.part, lobe] = batch.collect(gain) / samples
         if n_groups:
-            matrix[batch.part] = to_numpy(rows).reshape(-1, batch.split, n_groups, 3).sum(axis=1) / samples
+            matrix[batch.part] = to_numpy(rows).reshape(-1, batch.split, 2, n_groups, 3).sum(axis=1) / samples
     return matrix, cached
 
 

@@ -151,10 +151,11 @@ class PlantedScene:
         base = self.room.material[self.face]
         surface = (self.points, self.normals, -self.directions, base[:, :3], base[:, 3], base[:, 4])
         columns = (self.room.group, len(self.room.truth), self.side)
-        return [
+        by_lobe = (
             transport_matrix(self.geometry, self.material, *surface, *columns, samples, BOUNCES, 7919 * seed + 11 + half)
             for half in range(2)
-        ]
+        )
+        return [(matrix.sum(1), cached.sum(1)) for matrix, cached in by_lobe]
 
     def problem(
         self, photographs: np.ndarray, halves: list[tuple[np.ndarray, np.ndarray]], kind: str

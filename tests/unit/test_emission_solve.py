@@ -7,7 +7,7 @@ from scipy.optimize import lsq_linear
 from iif_core.emission.direct import solve_emission, solve_families
 from iif_core.emission.gains import SHARED_ERROR, WHITE_SHARE, object_gains
 from iif_core.emission.pruning import WhiteSurface, prune_groups
-from iif_core.emission.rows import EmissionRows, block_rows, scale_rows
+from iif_core.emission.rows import EmissionRows, GlossRows, block_rows, scale_rows
 from iif_core.errors import InputError
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
@@ -456,3 +456,81 @@ def test_light_and_object_gains_together(pinned):
 def test_gains_without_reflecting_rows():
     a, y = _random(10)
     assert object_gains(_rows(a, a, y), y, np.full(10, -1), np.ones((3, 3)), False).gain.shape == (0, 3)
+
+
+def _glossy_room(strength, seed=16, n=3000, objects=6, noise=0.0):
+    """Rows whose gloss is `strength` (objects,) times as strong as predicted; (rows, y, owner, gloss)."""
+    rng = np.random.default_rng(seed)
+    owner = np.repeat(np.arange(objects), n // objects)
+    diffuse, glossy = rng.random((n, 3)) ** 2, rng.random((n, 3)) ** 6  # highlights are small
+    h, k = rng.uniform(2, 20, (n, 3)), rng.uniform(0, 4, (n, 1)) * np.ones(3)
+    diffuse, glossy = (x[:, :, None] * np.ones(3) for x in (diffuse, glossy))
+    gain = np.exp(0.3 * rng.standard_normal((objects, 3)))
+    light = [np.einsum("ngc,gc->nc", x, TRUE) for x in (diffuse, glossy)]
+    y = gain[owner] * (light[0] + h) + strength[owner, None] * (light[1] + k)
+    weight = 1 / y**2
+    y = y * (1 + noise * rng.standard_normal(y.shape))
+    whole, cached = (diffuse + glossy).astype(np.float32), h + k
+    rows = EmissionRows(whole, whole, y - cached, y - cached, weight, np.zeros(y.shape, bool))
+    return rows, y, owner, GlossRows(*[glossy.astype(np.float32)] * 2, k, k), gain
+
+
+def test_gloss_of_another_strength_than_predicted_does_not_dim_the_light():
+    """Plaster predicted as glossy shows no lamps: with one gain for both lobes the light has to give way."""
+    strength = np.array([0.0, 0.0, 0.1, 0.0, 1.0, 2.0])
+    rows, y, owner, gloss, gain = _glossy_room(strength, noise=0.05)
+    light = {}
+    for part in (None, gloss):
+        found = object_gains(rows, y, owner, np.ones((3, 3)), True, rounds=100, shrink=1e-6, gloss=part)
+        scaled = scale_rows(rows, y, found.gain[owner], part, found.gloss_gain[owner])
+        light[part is gloss] = solve_emission(scaled, np.ones((3, 3))).radiance.sum() / TRUE.sum()
+        if part is None:
+            assert (found.gloss_gain == 1).all()
+    assert light[False] < 0.9 and light[True] == pytest.approx(1, abs=0.03)
+    np.testing.assert_allclose(found.gloss_gain, strength, atol=0.1)
+    np.testing.assert_allclose(found.gain, gain, rtol=0.05)
+
+
+def test_gloss_that_few_rows_tell_stays_as_predicted():
+    """Ten rows an object are not worth doubting the prediction; as is an object whose rows have no gloss."""
+    strength = np.zeros(6)
+    rows, y, owner, gloss, _ = _glossy_room(strength, n=60, noise=0.3)
+    few = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss).gloss_gain
+    rows, y, owner, gloss, _ = _glossy_room(strength, n=6000, noise=0.3)
+    many = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss).gloss_gain
+    assert few.min() > 0.4 and many.max() < 0.2
+    none = GlossRows(*(np.zeros_like(x) for x in (gloss.first, gloss.second, gloss.cached, gloss.cached_second)))
+    matte, plain = (object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=part) for part in (none, None))
+    np.testing.assert_allclose(matte.gain, plain.gain, rtol=1e-9)
+    assert (matte.gloss_gain == 1).all() and matte.level_error == pytest.approx(plain.level_error, rel=1e-9)
+
+
+def test_gains_of_both_lobes_against_a_dense_solution():
+    """At the level that was found, g and t of an object are the least-squares solution of its rows (4 unknowns)."""
+    strength = np.array([0.5, 1.5, 0.8, 0.2, 1.0, 2.0])
+    rows, y, owner, gloss, _ = _glossy_room(strength, noise=0.1)
+    found = object_gains(rows, y, owner, np.ones((3, 3)), True, rounds=300, shrink=1e-9, gloss=gloss)
+    scaled = scale_rows(replace(rows, weight=found.weight), y, found.gain[owner], gloss, found.gloss_gain[owner])
+    light = solve_emission(scaled, np.ones((3, 3)), max_rounds=5).radiance
+    e, k = np.einsum("ngc,gc->nc", gloss.first, light), gloss.cached
+    z = e + k
+    x = np.einsum("ngc,gc->nc", rows.first, light) - e + (y - rows.target) - k
+    for o in range(6):
+        own = owner == o
+        design = np.zeros((own.sum(), 3, 4))
+        design[:, range(3), range(3)], design[:, :, 3] = x[own], z[own]
+        root = np.sqrt(found.weight[own])[:, :, None]
+        answer = np.linalg.lstsq((design * root).reshape(-1, 4), (y[own, :, None] * root).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(np.r_[found.gain[o], found.gloss_gain[o]], answer, rtol=0.05)
+
+
+def test_objects_without_rows_have_the_common_gain():
+    a, y = _random(300)
+    y = 1.4 * y
+    h = np.full(y.shape, 0.5)
+    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y] * 2, np.ones(y.shape), np.zeros(y.shape, bool))
+    rows = replace(rows, target=y - h, target_second=y - h)
+    found = object_gains(rows, y, np.repeat([0, 1, 4], 100), np.ones((3, 3)), True, n_objects=7)
+    assert found.gain.shape == (7, 3) and found.gloss_gain.shape == (7,)
+    np.testing.assert_allclose(found.gain[[2, 3, 5, 6]], np.tile(found.gain[[2]], (4, 1)))
+    assert found.gain[2].min() >= found.gain[[0, 1, 4]].min() and found.gain[2].max() <= found.gain[[0, 1, 4]].max()

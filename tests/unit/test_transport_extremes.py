@@ -73,6 +73,7 @@ def reflected(T, geometry, material, emitters, rough, metal, color, wo=(0.6, 0, 
         **options,
     )
     check((matrix, h))
+    matrix, h = matrix.sum(1), h.sum(1)
     return composed, matrix
 
 
