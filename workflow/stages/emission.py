@@ -146,7 +146,7 @@ def _not_above_white(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
     """(objects, 3) base albedos that no gain may bring above 1, for light from where no camera sees: its level is least known.
 
     In a closed room the gains of single objects are less sure than the light: gloss and texture would raise that of Country
-    Kitchen by 40 %, which is 6 % too dim without."""
+    Kitchen by 40 %, which is 5 % too dim without."""
     return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
 
 
