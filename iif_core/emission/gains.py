@@ -120,7 +120,7 @@ def object_gains(
         used = np.where(rows.lower_bound, 0.0, weight)
         if gloss is not None:  # what an object's rows leave unexplained, a row
             left = _by_object(used * (observed - predicted) ** 2, column, count + 1)[:count].sum(1)
-            doubt = GLOSS_ROWS * left / np.maximum(3 * np.bincount(column, minlength=count + 1)[:count], 1)
+            doubt = GLOSS_ROWS * left / np.maximum(np.bincount(column, (used > 0).sum(1), count + 1)[:count], 1)
         profile = parts.profile(observed, used, doubt, radiance)
         level, raised = _below_white(profile, column, albedo) if pinned else (np.zeros(3), 0.0)
         new, gloss_gain = profile.gain(level)
@@ -299,15 +299,20 @@ class _Profile:
         xx, zz = np.maximum(xx, 0.0), np.maximum(zz, 0.0)
         floor = 1e-9 * np.maximum(xx.max((-2, -1), keepdims=True), 1e-300)
         pull = self.shrink * xx + floor
-        total, below = (yx - xz).sum(-2, keepdims=True), xx.sum(-2, keepdims=True)
-        common = np.clip((total + floor) / (below + floor), *_BOUNDS) if self.pinned else 1.0
+
+        def common_gain(t: np.ndarray) -> np.ndarray | float:
+            total, below = (yx - t[..., None] * xz).sum(-2, keepdims=True), xx.sum(-2, keepdims=True)
+            return np.clip((total + floor) / (below + floor), *_BOUNDS) if self.pinned else 1.0
+
         t, held = np.ones(xx.shape[:-1]), 0.0
+        common = common_gain(t)
         if self.doubt is not None:
             # g eliminated, then t; noise may make the rest negative, which then knows nothing.
             held = self.doubt + self.shrink * zz.sum(-1) + floor[..., 0]
             knows = np.maximum((zz - xz**2 / (xx + pull)).sum(-1), 0.0)
             asks = (yz - xz * (yx + pull * common) / (xx + pull)).sum(-1)
             t = np.clip(np.where(knows > 0, (asks + held) / (knows + held), 1.0), *_GLOSS_BOUNDS)
+            common = common_gain(t)
         of_all = t[..., None]
         gain = np.clip((yx - of_all * xz + pull * common) / (xx + pull), *_BOUNDS)
         cost = self.yy[:-1] - 2 * gain * yx - 2 * of_all * yz + gain**2 * xx + 2 * gain * of_all * xz + of_all**2 * zz

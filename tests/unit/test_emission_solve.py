@@ -505,6 +505,37 @@ def test_gloss_that_few_rows_tell_stays_as_predicted():
     assert (matte.gloss_gain == 1).all() and matte.level_error == pytest.approx(plain.level_error, rel=1e-9)
 
 
+def test_objects_without_rows_have_the_common_gain_that_goes_with_the_gloss_found():
+    """Gloss is a twentieth of the predicted one and strong: subtracted as predicted it would leave objects in the dark."""
+    rows, y, owner, gloss, _ = _glossy_room(np.full(6, 0.05), n=6000)
+    gloss = replace(gloss, cached=2.5 * gloss.cached, cached_second=2.5 * gloss.cached_second)
+    more = 1.5 / 2.5 * gloss.cached  # of it in h, a twentieth of it in y
+    rows = replace(rows, target=rows.target - 0.95 * more, target_second=rows.target_second - 0.95 * more)
+    y = y + 0.05 * more
+    found = object_gains(rows, y, owner, np.ones((3, 3)), True, n_objects=8, gloss=gloss)
+    assert found.gain[7].min() > 0.9 * found.gain[:6].min(0).min() and (found.gain[6] == found.gain[7]).all()
+
+
+def test_saturated_rows_do_not_loosen_the_gloss():
+    """Rows that say nothing are no witnesses for it."""
+    rows, y, owner, gloss, _ = _glossy_room(np.zeros(6), n=120, noise=0.3)
+    one = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss)
+
+    def often(x):
+        return np.concatenate([x] * 10)
+
+    bound = np.concatenate([rows.lower_bound, np.ones((9 * len(y), 3), bool)])
+    parts = {k: often(getattr(rows, k)) for k in ("first", "second", "target", "target_second", "weight")}
+    parts["target"][len(y) :] -= 100.0  # bounds that are met
+    parts["target_second"][len(y) :] -= 100.0
+    many = EmissionRows(**parts, lower_bound=bound)
+    glosses = GlossRows(*(often(x) for x in (gloss.first, gloss.second, gloss.cached, gloss.cached_second)))
+    seen = often(y)
+    seen[len(y) :] -= 100.0
+    ten = object_gains(many, seen, often(owner), np.ones((3, 3)), True, gloss=glosses)
+    np.testing.assert_allclose(ten.gloss_gain, one.gloss_gain, atol=0.1)
+
+
 def test_gains_of_both_lobes_against_a_dense_solution():
     """At the level that was found, g and t of an object are the least-squares solution of its rows (4 unknowns)."""
     strength = np.array([0.5, 1.5, 0.8, 0.2, 1.0, 2.0])

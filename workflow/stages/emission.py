@@ -185,7 +185,8 @@ def _solve(
     else:
         solution = solve_families(problem.rows, initial, family, width=width)
     solution = solution.with_level_error(np.minimum(problem.error_of_group, LEVEL_OF_PRIOR))
-    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised, problem.gain
+    gain = problem.gain if len(initial) else gain  # without emitters the trial's stay
+    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised, gain
 
 
 def _trace(
