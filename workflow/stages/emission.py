@@ -15,7 +15,7 @@ from iif_core.emission.environment import Sky
 from iif_core.emission.gains import LEVEL_OF_PRIOR
 from iif_core.emission.groups import EmitterGroups, group_emitters
 from iif_core.emission.loss import reference_loss
-from iif_core.emission.problem import Halves, PixelRows, assemble, initial_radiance, white_surface
+from iif_core.emission.problem import EmissionProblem, Halves, PixelRows, assemble, initial_radiance, white_surface
 from iif_core.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
 from iif_core.emission.sensor import Sensor
 from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
@@ -139,7 +139,12 @@ def _trial(
     area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
-    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), trial.gain
+    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), _known(trial)
+
+
+def _known(problem: EmissionProblem) -> np.ndarray:
+    """(n_objects, 3) gains of objects; 1 where the level of the light, and so theirs, is known no better than by the prior."""
+    return problem.gain if problem.level_error < LEVEL_OF_PRIOR else np.ones_like(problem.gain)
 
 
 def _not_above_white(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
@@ -185,7 +190,7 @@ def _solve(
     else:
         solution = solve_families(problem.rows, initial, family, width=width)
     solution = solution.with_level_error(np.minimum(problem.error_of_group, LEVEL_OF_PRIOR))
-    gain = problem.gain if len(initial) else gain  # without emitters the trial's stay
+    gain = _known(problem) if len(initial) else gain  # without emitters the trial's stay
     return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised, gain
 
 
