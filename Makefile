@@ -39,7 +39,7 @@ test: setup
 
 # Needs nothing installed: it tells what is missing.
 doctor:
-	@if [ -x $(PYTHON_BIN) ]; then $(PYTHON_BIN) -m workflow.doctor; else python3 -m workflow.doctor; fi
+	@if [ -x $(PYTHON_BIN) ]; then $(PYTHON_BIN) -m workflow.runtime.doctor; else python3 -m workflow.runtime.doctor; fi
 
 lint: setup
 	$(PYTHON_BIN) -m ruff check .

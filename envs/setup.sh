@@ -118,5 +118,5 @@ if [ $installed = no ]; then
 fi
 
 # ---- check ----------------------------------------------------------------------------------------------------------
-"$venv/bin/python" -m workflow.doctor >&2 || fail "the environment is installed but does not work: see FAIL above"
+"$venv/bin/python" -m workflow.runtime.doctor >&2 || fail "the environment is installed but does not work: see FAIL above"
 echo checked >>$stamp

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from iif_core import native
 from iif_core.errors import InputError
+from workflow.runtime import native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 THREADS = 2

@@ -68,8 +68,8 @@ def _guarded(what: str, run: Callable[[], None], failed: Callable[[str], None] =
 
 
 def _run_stage(arguments: argparse.Namespace) -> int:
-    from workflow.job import run_stage
-    from workflow.outcome import Outcome
+    from workflow.runtime.job import run_stage
+    from workflow.runtime.job_state import Outcome
 
     note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
     note.parent.mkdir(parents=True, exist_ok=True)
@@ -87,11 +87,11 @@ def _run_stage(arguments: argparse.Namespace) -> int:
 
 
 def _batch(arguments: argparse.Namespace) -> int:
-    from workflow import batch_summary
+    from workflow.batch import summary
 
     if arguments.refused:
-        return _guarded("batch", lambda: batch_summary.refuse(arguments.quality))
-    return _guarded("batch", lambda: batch_summary.write_summary(arguments.quality, arguments.fingerprint))
+        return _guarded("batch", lambda: summary.refuse(arguments.quality))
+    return _guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint))
 
 
 def main() -> int:
@@ -99,7 +99,7 @@ def main() -> int:
     arguments = _arguments()
     if arguments.command == "verify":
         return _verify(arguments.scenes)
-    from iif_core import native
+    from workflow.runtime import native
 
     try:  # before NumPy is imported: a BLAS that has started keeps its threads
         native.prepare()
@@ -107,15 +107,15 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    from workflow.job import configure_logging
+    from workflow.runtime.job import configure_logging
 
     configure_logging(arguments.log)
     if arguments.command == "study":
-        from workflow.study_table import write_study
+        from workflow.studies.table import write_study
 
         return _guarded(f"study {arguments.study}", lambda: write_study(arguments.study, arguments.quality))
     if arguments.command == "lpips_vgg":
-        from workflow.weights import fetch_vgg
+        from workflow.models.lpips import fetch_vgg
 
         return _guarded("fetching VGG16", fetch_vgg)
     if arguments.command == "batch":

@@ -22,9 +22,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.affines import IDENTITY, FitOptions, FitProblem, FitResult, apply_affines, fit_affines, patches
-from iif_core.affines.problem import BIASES, CROSS, GAINS
-from iif_core.response import response
+from iif_core.camera.response import response
+from iif_core.fitting.clusters import patches
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.problem import BIASES, CROSS, GAINS, IDENTITY, FitOptions, FitProblem, FitResult, apply_affines
 from tests.unit.planted_fit import LEVELS, radiance_of, shading_of
 
 

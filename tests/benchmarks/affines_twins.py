@@ -20,18 +20,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.affines import (
-    FitOptions,
-    FitResult,
-    SgdOptions,
-    apply_affines,
-    fit_affines,
-    fit_affines_sgd,
-    reference_loss,
-    reference_options,
-    reference_problem,
-)
-from iif_core.response import response
+from iif_core.camera.response import response
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.problem import FitOptions, FitResult, apply_affines
+from iif_core.fitting.reference_loss import reference_loss, reference_options, reference_problem
+from iif_core.fitting.sgd import SgdOptions, fit_affines_sgd
 from tests.benchmarks.affines_coverage import planted
 
 

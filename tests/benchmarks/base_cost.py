@@ -18,9 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.base.direct import solve_base
-from iif_core.base.options import BaseOptions
-from iif_core.base.problem import BaseProblem
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.problem import BaseProblem
 
 VIEWS = 8
 OBJECTS = 64

@@ -3,7 +3,7 @@
     python tests/benchmarks/emission_coverage.py [--seeds 20] [--views 8] [--size 40] [--photo-samples 64] [--samples 32]
 
 Two planted rooms (tests/unit/planted_room.py) with true materials; `hdr_hidden` and `ldr_one`, in which emitters are known
-by their light alone. Nothing is fitted to the rooms: the errors are the sandwich of `iif_core.emission.direct`.
+by their light alone. Nothing is fitted to the rooms: the errors are the sandwich of `iif_core.light.emission.direct`.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=32)
     parser.add_argument("--fine", action="store_true", help="32 groups, most of which only their family determines")
     arguments = parser.parse_args()
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     import mitsuba
 
     mitsuba.set_variant("llvm_ad_rgb")
     native.limit_threads(1)
-    from iif_core.emission.direct import solve_families
+    from iif_core.light.emission.direct import solve_families
     from tests.unit.planted_room import PlantedScene, build_room
 
     print("| room | photographs | inside 68 % | inside 95 % | rms of (E - truth) / error | median relative error | cpu s |")

@@ -25,7 +25,7 @@ def information_limit(scene, photographs: np.ndarray, photo_paths: int, paths: l
     Rows are the means of (object, view, tile), A of 1024 paths a pixel. Variance of a row from the scatter of its pixels about
     A E, and of A E from two halves, pooled over rows of one object and like brightness (raw, it would be taken for knowledge).
     """
-    from iif_core.emission.rows import EmissionRows, block_rows
+    from iif_core.light.emission.rows import EmissionRows, block_rows
 
     truth, group = scene.room.truth, scene.room.group[scene.face]
     own = (group >= 0) & truth[group].any(1)
@@ -73,16 +73,16 @@ def main() -> None:
     parser.add_argument("--limit", action="store_true", help="the information limit of light alone, too")
     parser.add_argument("--sgd", action="store_true", help="the twin too")
     arguments = parser.parse_args()
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     import mitsuba
 
     mitsuba.set_variant("llvm_ad_rgb")
     native.limit_threads(1)
-    from iif_core.emission.direct import solve_emission, solve_families
-    from iif_core.emission.loss import reference_loss
-    from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
+    from iif_core.light.emission.direct import solve_emission, solve_families
+    from iif_core.light.emission.loss import reference_loss
+    from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
     from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 
     scene = PlantedScene(build_room(arguments.room), arguments.views, arguments.size)

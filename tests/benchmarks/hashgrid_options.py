@@ -1,7 +1,7 @@
 """The other ways to run a hash-grid texture that `hashgrid.py` measures: each a function that makes one iteration.
 
 `OPTIONS[name](options, batches, threads)` returns `iterate(i)`: forward, mean |sigmoid(y) - 0.5|, backward, Adam on
-batch i. All have the levels, the network and the loss of `iif_core.hashgrid`; Dr.Jit places its vertices its own way.
+batch i. All have the levels, the network and the loss of `iif_core.fusion.hashgrid`; Dr.Jit places its vertices its own way.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
-from iif_core.hashgrid import HashGridOptions, HashGridTexture, layout
+from iif_core.fusion.hashgrid.levels import HashGridOptions, layout
+from iif_core.fusion.hashgrid.texture import HashGridTexture
 
 RATE = 1e-2
 Iterate = Callable[[int], None]
@@ -202,7 +203,7 @@ def _sparse(table, network):
 
 def _drjit(half: bool):
     def make(options: HashGridOptions, batches: list, threads: int) -> Iterate:
-        from iif_core import native
+        from workflow.runtime import native
 
         native.prepare()
         import drjit as dr

@@ -21,13 +21,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.cells import grid_origin, pack_keys, voxel_indices
-from iif_core.mask_clustering import ConsensusOptions
-from iif_core.segments import partition_agreement
+from iif_core.objects.mask_clustering import ConsensusOptions
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.surface.segments import partition_agreement
 from tests.unit.spoilt_masks import purity, spoil_masks
 from workflow.artifacts import StageReader
 from workflow.artifacts.files import write_parquet
-from workflow.normal_form import CaptureReader
+from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations import masks
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface

@@ -21,14 +21,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.calibration import CANDIDATES, calibrate_response
-from iif_core.cells import grid_origin
-from iif_core.mesh import face_geometry
-from iif_core.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
-from iif_core.photography import expose, response_curve
-from iif_core.response import Response, response
+from iif_core.camera.calibration.choice import CANDIDATES, calibrate_response
+from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
+from iif_core.camera.response import Response, response
+from iif_core.camera.simulation import expose, response_curve
+from iif_core.surface.cells import grid_origin
+from iif_core.surface.mesh import face_geometry
 from workflow.artifacts import StageReader
-from workflow.normal_form import CaptureReader
+from workflow.scene.normal_form import CaptureReader
 
 Curve = Callable[[np.ndarray], np.ndarray]
 CURVES: dict[str, Curve] = {

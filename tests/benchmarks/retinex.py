@@ -22,11 +22,11 @@ SETTINGS = SimpleNamespace(prior=SimpleNamespace(samples=8, mean_albedo=0.4), so
 
 
 def table(folder: Path, every: int) -> dict[str, tuple[float, float]]:
-    from iif_core import metrics
-    from iif_core.consistency import ShadingLeft
+    from iif_core.evaluation import metrics
+    from iif_core.evaluation.consistency import ShadingLeft
     from workflow.artifacts.store import StageReader
-    from workflow.normal_form import CaptureReader
     from workflow.priors.retinex import GAMMA, _scene, predict
+    from workflow.scene.normal_form import CaptureReader
 
     capture = CaptureReader(StageReader(folder, "capture", folder.parent.name))
     group = _scene(capture, 0.4, 0).group
@@ -62,7 +62,7 @@ def main(folders: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     native.limit_threads(1)

@@ -24,10 +24,10 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core import native
-from iif_core.distortion import Distortion, Pinhole, pinhole_inside, undistort, undistort_image
+from iif_core.camera.distortion import Distortion, Pinhole, pinhole_inside, undistort, undistort_image
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
+from workflow.runtime import native
 
 STAGES = ("capture", "prior", "segmentation", "base", "emission", "shading", "affines")
 
@@ -44,8 +44,9 @@ def directions(camera: Pinhole, lens: Distortion, pose: np.ndarray) -> np.ndarra
 
 def photographs(room, count: int, camera: Pinhole, lens: Distortion, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """(pose, picture in [0, 1]) with one exposure for all views."""
-    from iif_core.photography import expose, response_curve
-    from iif_core.transport import Emitters, render
+    from iif_core.camera.simulation import expose, response_curve
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.render import render
 
     geometry = mini.geometry(room)
     native.limit_threads(1)
@@ -80,7 +81,7 @@ def pinhole_folder(path: Path, room, views, camera: Pinhole) -> None:
 @contextmanager
 def noise_under_masks() -> Iterator[None]:
     """The capture writes noise, instead of 0, where pixels do not count."""
-    from workflow.normal_form import CaptureWriter
+    from workflow.scene.normal_form import CaptureWriter
 
     write = CaptureWriter.photo
 

@@ -10,8 +10,7 @@ import sys
 
 import pytest
 
-from iif_core import native
-from workflow import doctor
+from workflow.runtime import doctor, native
 
 pytestmark = pytest.mark.front_door
 
@@ -120,7 +119,7 @@ def test_no_network(copy, stand_in, clean_environment):
 
 def test_doctor_passes_here(repository, clean_environment):
     """In an empty environment; every line has the promised form."""
-    result = run([sys.executable, "-m", "workflow.doctor"], repository, clean_environment)
+    result = run([sys.executable, "-m", "workflow.runtime.doctor"], repository, clean_environment)
     lines = result.stdout.splitlines()
     assert result.returncode == 0, result.stdout + result.stderr
     assert all(line[:6] in ("ok    ", "warn  ") and ": " in line for line in lines)
@@ -141,7 +140,7 @@ def test_doctor_passes_here(repository, clean_environment):
 
 def test_doctor_names_a_bad_llvm(repository, clean_environment):
     result = run(
-        [sys.executable, "-m", "workflow.doctor"],
+        [sys.executable, "-m", "workflow.runtime.doctor"],
         repository,
         clean_environment,
         **{native.LLVM_VARIABLE: "/nowhere.so"},

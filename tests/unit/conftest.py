@@ -7,8 +7,8 @@ import pytest
 
 @pytest.fixture(scope="session")
 def T(llvm):
-    """`iif_core.transport`, imported after Mitsuba's variant is set."""
-    from iif_core import transport
+    """`iif_core.light.transport`, imported after Mitsuba's variant is set."""
+    from iif_core.light import transport
 
     return transport
 

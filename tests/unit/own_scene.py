@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from iif_core.camera import look_at, pixel_directions
-from iif_core.distortion import Distortion, Pinhole, undistort
+from iif_core.camera.distortion import Distortion, Pinhole, undistort
+from iif_core.camera.pinhole import look_at, pixel_directions
 
 # Not at the origin: a turned or scaled frame must not fit by chance.
 ROOM = ((1.0, -2.0, 0.5), (5.0, 1.0, 3.0))
@@ -43,14 +43,14 @@ def poses(count):
 
 
 def geometry():
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     import mitsuba as mi
 
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
-    from iif_core.transport import build_geometry
+    from iif_core.light.transport.geometry import build_geometry
 
     vertices, faces, thing = room_mesh()
     return build_geometry(vertices, faces, thing.astype(np.int32))
@@ -65,7 +65,7 @@ def pattern(points):
 
 def shoot(geometry, pose, camera=CAMERA, lens=None):
     """Picture, z-depth and face ids as this camera sees them, through a lens if given."""
-    from iif_core.transport import trace
+    from iif_core.light.transport.geometry import trace
 
     directions = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose)
     if lens is not None:
@@ -206,7 +206,7 @@ def project(root, source=None, capture=None, segmentation=None, scene="own"):
 @contextmanager
 def working_in(root):
     """Run stages in `root`, with no settings remembered from another test."""
-    from workflow import fingerprint
+    from workflow.runtime import fingerprint
 
     before = os.getcwd()
     os.chdir(root)
@@ -223,8 +223,8 @@ def working_in(root):
 def run(root, *stages, scene="own"):
     """Run stages of the scene and return a reader of the capture."""
     from workflow.artifacts import StageReader
-    from workflow.job import run_stage
-    from workflow.normal_form import CaptureReader
+    from workflow.runtime.job import run_stage
+    from workflow.scene.normal_form import CaptureReader
 
     with working_in(root):
         for stage in stages:

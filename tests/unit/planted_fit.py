@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from iif_core.affines import IDENTITY, FitProblem, apply_affines, interpolate_levels
+from iif_core.fitting.levels import interpolate_levels
+from iif_core.fitting.problem import IDENTITY, FitProblem, apply_affines
 
 LEVELS = np.linspace(0.02, 1.0, 10)
 

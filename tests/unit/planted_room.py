@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.camera import look_at, pixel_directions
-from iif_core.emission.problem import EmissionProblem, PixelRows, assemble, initial_radiance
-from iif_core.emission.sensor import Sensor
-from iif_core.response import response
+from iif_core.camera.pinhole import look_at, pixel_directions
+from iif_core.camera.response import response
+from iif_core.light.emission.problem import EmissionProblem, PixelRows, assemble, initial_radiance
+from iif_core.light.emission.sensor import Sensor
 
 SIZE = np.array([5.0, 4.0, 2.7])
 WINDOW, CEILING, LAMP, NONE = 24, 4, 1, 3
@@ -107,7 +107,9 @@ class PlantedScene:
     """Views of a room: surface points once, photographs and traces with noise of their own by seed."""
 
     def __init__(self, room: Room, views: int = 8, size: int = 48):
-        from iif_core.transport import Emitters, FaceMaterials, build_geometry, trace
+        from iif_core.light.transport.emitters import Emitters
+        from iif_core.light.transport.geometry import build_geometry, trace
+        from iif_core.light.transport.materials import FaceMaterials
 
         self.room, self.size = room, size
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
@@ -139,14 +141,14 @@ class PlantedScene:
 
     def photographs(self, seed: int, samples: int) -> np.ndarray:
         """(n, 3) radiance with the noise of `samples` paths."""
-        from iif_core.transport import render
+        from iif_core.light.transport.render import render
 
         arguments = (self.geometry, self.material, self.emitters, self.origins, self.directions)
         return render(*arguments, samples, BOUNCES, 7919 * seed + 1).astype(np.float64)
 
     def halves(self, seed: int, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Two independent traces of `samples` paths a pixel each; emitters do not reflect, so their rows are 0."""
-        from iif_core.transport import transport_matrix
+        from iif_core.light.transport.matrix import transport_matrix
 
         base = self.room.material[self.face]
         surface = (self.points, self.normals, -self.directions, base[:, :3], base[:, 3], base[:, 4])

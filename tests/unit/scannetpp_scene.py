@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from iif_core.distortion import Distortion, Pinhole
+from iif_core.camera.distortion import Distortion, Pinhole
 from tests.unit import own_scene as own
 
 CAMERA = Pinhole(65.8, 66.1, 72.4, 48.9, 146, 97)
@@ -34,14 +34,14 @@ def room():
 
 
 def geometry(of_room):
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     import mitsuba as mi
 
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
-    from iif_core.transport import build_geometry
+    from iif_core.light.transport.geometry import build_geometry
 
     return build_geometry(of_room.vertices, of_room.faces, of_room.object_id)
 
@@ -147,7 +147,7 @@ def colmap_text(folder, of_room, poses, prefix=""):
 
 def visible(shape, pose, points):
     """(n,) bool: nothing is before the point."""
-    from iif_core.transport import trace
+    from iif_core.light.transport.geometry import trace
 
     away = (points - pose[:3, 3]).astype(np.float32)
     face, t = trace(shape, pose[:3, 3], away)

@@ -3,22 +3,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.affines import (
-    IDENTITY,
-    FitOptions,
-    FitProblem,
-    Gauge,
-    albedo_uncertainty,
-    apply_affines,
-    fit_affines,
-    interpolate_levels,
-    pin,
-)
-from iif_core.affines.descent import Pull
-from iif_core.affines.pixels import evaluate, prepare
-from iif_core.emission.gains import LEVEL_OF_PRIOR
+from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.response import response
+from iif_core.fitting.descent import Pull
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.gauge import Gauge, pin
+from iif_core.fitting.levels import interpolate_levels
+from iif_core.fitting.pixels import evaluate, prepare
+from iif_core.fitting.problem import IDENTITY, FitOptions, FitProblem, albedo_uncertainty, apply_affines
+from iif_core.light.emission.gains import LEVEL_OF_PRIOR
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(

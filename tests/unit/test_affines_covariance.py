@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from iif_core.affines import FitOptions, fit_affines
-from iif_core.affines.covariance import _grown
-from iif_core.affines.descent import State, arrowhead, descend, object_blocks, response_prior
-from iif_core.affines.pixels import evaluate, prepare
-from iif_core.affines.population import before, lean, pull_of
-from iif_core.affines.problem import IDENTITY
-from iif_core.affines.selection import GRID, KINDS, profile
-from iif_core.response import response
+from iif_core.camera.response import response
+from iif_core.fitting.covariance import _grown
+from iif_core.fitting.descent import State, arrowhead, descend, object_blocks, response_prior
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.pixels import evaluate, prepare
+from iif_core.fitting.population import before, lean, pull_of
+from iif_core.fitting.problem import IDENTITY, FitOptions
+from iif_core.fitting.selection import GRID, KINDS, profile
 from tests.benchmarks.affines_coverage import FAMILIES, planted
 from tests.unit.planted_fit import problem_of
 

@@ -5,8 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.affines import IDENTITY, FitOptions, FitProblem, Gauge, apply_affines, fit_affines, fit_affines_sgd, pin
-from iif_core.response import response
+from iif_core.camera.response import response
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.gauge import Gauge, pin
+from iif_core.fitting.problem import IDENTITY, FitOptions, FitProblem, apply_affines
+from iif_core.fitting.sgd import fit_affines_sgd
 from tests.unit.planted_fit import LEVELS, planted, problem_of, radiance_of, shading_of
 
 
@@ -149,7 +152,7 @@ def test_any_number_of_threads_gives_the_same_bytes():
 
 
 def test_diverging_sgd_is_a_named_result():
-    from iif_core.affines import SgdOptions
+    from iif_core.fitting.sgd import SgdOptions
 
     problem, _ = problem_of(np.random.default_rng(10), 3, 200, truth=planted(np.random.default_rng(0), 3))
     with np.errstate(all="ignore"):

@@ -3,22 +3,14 @@
 import numpy as np
 import pytest
 
-from iif_core.affines import (
-    IDENTITY,
-    FitOptions,
-    SgdOptions,
-    apply_affines,
-    fit_affines,
-    fit_affines_sgd,
-    patches,
-    reference_loss,
-    reference_options,
-    reference_problem,
-)
-from iif_core.affines.pixels import prepare
-from iif_core.affines.sgd import _gradient
+from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.response import response
+from iif_core.fitting.clusters import patches
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.pixels import prepare
+from iif_core.fitting.problem import IDENTITY, FitOptions, apply_affines
+from iif_core.fitting.reference_loss import reference_loss, reference_options, reference_problem
+from iif_core.fitting.sgd import SgdOptions, _gradient, fit_affines_sgd
 from tests.unit.planted_fit import problem_of
 from workflow.settings.affines import Affines
 
@@ -31,7 +23,7 @@ def ldr():
 
 def test_reference_loss_by_hand(ldr):
     """METHOD 2.8, written out once more with plain arrays."""
-    from iif_core.affines import interpolate_levels
+    from iif_core.fitting.levels import interpolate_levels
 
     affine = np.tile(IDENTITY, (4, 1)) * 0.9
     curve = response("gamma")

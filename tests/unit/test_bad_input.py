@@ -14,7 +14,8 @@ from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 from tests.unit import test_colmap, test_fipt
-from workflow import fingerprint, settings
+from workflow import settings
+from workflow.runtime import fingerprint
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
 PENDING = {"no emitter seen"}

@@ -10,14 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iif_core import laplace, metrics, simulate
-from iif_core.base.direct import solve_base
-from iif_core.base.gauge import covisible_parts
-from iif_core.base.options import VARIANTS, BaseOptions
-from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem, object_means, prediction_faults
-from iif_core.base.selection import selection_weights
 from iif_core.errors import InputError
-from iif_core.segments import interior, segment_table
+from iif_core.evaluation import metrics
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.gauge import covisible_parts
+from iif_core.fusion.options import VARIANTS, BaseOptions
+from iif_core.fusion.problem import LOWEST, NEUTRAL, BaseProblem, object_means, prediction_faults
+from iif_core.fusion.selection import selection_weights
+from iif_core.numerics import laplace
+from iif_core.priors import simulate
+from iif_core.surface.segments import interior, segment_table
 
 SIZE = 40
 OBJECTS = 4

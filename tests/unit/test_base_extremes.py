@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.direct import solve_base
-from iif_core.base.options import BaseOptions
-from iif_core.base.problem import LOWEST, BaseProblem, one_segment_per_view
-from iif_core.base.selection import selection_weights
-from iif_core.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.errors import InputError
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.problem import LOWEST, BaseProblem, one_segment_per_view
+from iif_core.fusion.selection import selection_weights
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from tests.unit.test_base import finite, oracle_psnr, simulated
 
 

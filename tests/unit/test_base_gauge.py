@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from iif_core import cells
-from iif_core.base.direct import solve_base
-from iif_core.base.gauge import Parts, anchor_shifts, seam_shifts
-from iif_core.base.options import BaseOptions
-from iif_core.base.problem import BaseProblem
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.gauge import Parts, anchor_shifts, seam_shifts
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.problem import BaseProblem
+from iif_core.surface import cells
 
 
 def two_sides(level=(0.4, 0.6), size=20, spread=0.15, k=6):

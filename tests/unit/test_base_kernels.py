@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iif_core import laplace
-from iif_core.base import kernels
-from iif_core.base.problem import LOWEST
+from iif_core.fusion import kernels
+from iif_core.fusion.problem import LOWEST
+from iif_core.numerics import laplace
 
 NONE = np.zeros((0, 0), bool)
 

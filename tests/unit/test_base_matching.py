@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from iif_core.base.direct import describe_fit, solve_base
-from iif_core.base.matching import identity_penalty, penalised_affine, penalised_gain
-from iif_core.base.options import BaseOptions
-from iif_core.base.reference_loss import loss_of_result
-from iif_core.base.sgd import converged, sgd_options, solve_base_sgd
 from iif_core.errors import InputError
+from iif_core.fusion.direct import describe_fit, solve_base
+from iif_core.fusion.matching import identity_penalty, penalised_affine, penalised_gain
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.reference_loss import loss_of_result
+from iif_core.fusion.sgd.options import sgd_options
+from iif_core.fusion.sgd.solve import converged, solve_base_sgd
 from tests.unit.test_base import simulated
 
 

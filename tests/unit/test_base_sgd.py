@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.direct import solve_base
-from iif_core.base.kernels import IDENTITY, as_words
-from iif_core.base.options import BaseOptions
-from iif_core.base.problem import LOWEST, NEUTRAL, BaseProblem
-from iif_core.base.reference_loss import loss_of_result, reference_loss
-from iif_core.base.sgd import SgdOptions, converged, kernels, numba_engine, sgd_options, solve_base_sgd, torch_engine
-from iif_core.base.sgd import pool as sgd_pool
 from iif_core.errors import InputError
-from iif_core.hashgrid import HashGridOptions
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.hashgrid.levels import HashGridOptions
+from iif_core.fusion.kernels import IDENTITY, as_words
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.problem import LOWEST, NEUTRAL, BaseProblem
+from iif_core.fusion.reference_loss import loss_of_result, reference_loss
+from iif_core.fusion.sgd import kernels, numba_engine, torch_engine
+from iif_core.fusion.sgd import pool as sgd_pool
+from iif_core.fusion.sgd.options import SgdOptions, sgd_options
+from iif_core.fusion.sgd.solve import converged, solve_base_sgd
 from tests.unit.test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
 torch = pytest.importorskip("torch")

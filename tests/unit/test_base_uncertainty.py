@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base import uncertainty
-from iif_core.base.direct import solve_base
-from iif_core.base.selection import effective_number, margin
-from iif_core.base.uncertainty import LEVELS, Calibration, coverage, fit_calibration, gauge_free_error, interval
 from iif_core.errors import InputError
+from iif_core.fusion import uncertainty
+from iif_core.fusion.direct import solve_base
+from iif_core.fusion.selection import effective_number, margin
+from iif_core.fusion.uncertainty import LEVELS, Calibration, coverage, fit_calibration, gauge_free_error, interval
 from tests.unit.test_base import simulated
 
 

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.affines import interpolate_levels
-from iif_core.baselines import loss as judge
-from iif_core.baselines.adam import AdamOptions, gradient, solve_adam
-from iif_core.baselines.camera import fit_camera
-from iif_core.baselines.direct import METALNESS, solve_direct
-from iif_core.baselines.loss import FIPT, IRIS, CellFit, CellOptions
-from iif_core.baselines.problem import CellSums, PixelRows
-from iif_core.baselines.texture import AlbedoSums, BlockLight, blocks_of
+from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.response import response
+from iif_core.fitting.baselines import loss as judge
+from iif_core.fitting.baselines.adam import AdamOptions, gradient, solve_adam
+from iif_core.fitting.baselines.camera import fit_camera
+from iif_core.fitting.baselines.direct import METALNESS, solve_direct
+from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, CellOptions
+from iif_core.fitting.baselines.problem import CellSums, PixelRows
+from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
+from iif_core.fitting.levels import interpolate_levels
 
 LEVELS = np.array([0.02, 0.2, 0.5, 0.8, 1.0])
 FREE = CellOptions(regulariser=0.0, propagation=0.0)

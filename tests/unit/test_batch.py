@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow import batch, batch_summary, settings
-from workflow import fingerprint as fp
+from workflow import settings
 from workflow.artifacts.files import write_exr, write_json, write_parquet
-from workflow.outcome import Outcome
+from workflow.batch import plan as batch_plan
+from workflow.batch import summary
+from workflow.runtime import fingerprint as fp
+from workflow.runtime.job_state import Outcome
+from workflow.settings import batch_table
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
 BASE = "source: {kind: folder, path: data/tpl, unit: mm}\nprior: {kind: retinex, samples: 5}\nseed: 4\n"
@@ -25,7 +28,7 @@ def project(tmp_path, monkeypatch):
     (tmp_path / "config/scenes").mkdir(parents=True)
     (tmp_path / "config/scenes/tpl.yaml").write_text(BASE)
     monkeypatch.chdir(tmp_path)
-    caches = (fp.resolved, fp.fingerprint, batch.plan)
+    caches = (fp.resolved, fp.fingerprint, batch_plan.plan)
     for cache in caches:
         cache.cache_clear()
 
@@ -46,7 +49,7 @@ def project(tmp_path, monkeypatch):
 
 def test_columns_may_come_in_any_order_and_cells_may_be_missing(project):
     project("# remark\n\n x \t data/with space \n0a5c\n", header="name\tpath\tsource\n")
-    lines = batch.read_table()
+    lines = batch_table.read_table()
     assert [(line.number, line.name, line.path, line.source, line.is_plain) for line in lines] == [
         (4, "x", "data/with space", "", False),
         (5, "0a5c", "", "", True),
@@ -57,12 +60,12 @@ def test_columns_may_come_in_any_order_and_cells_may_be_missing(project):
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 def test_what_spreadsheets_write_is_read(project, end, mark):
     project(mark + f"name\tbase{end}a\ttpl{end}b\ttpl{end}".encode())
-    assert [(line.number, line.name, line.base) for line in batch.read_table()] == [(2, "a", "tpl"), (3, "b", "tpl")]
+    assert [(line.number, line.name, line.base) for line in batch_table.read_table()] == [(2, "a", "tpl"), (3, "b", "tpl")]
 
 
 def test_without_a_table_every_scene_file_counts(project, tmp_path):
     (tmp_path / "config/scenes/other.yaml").write_text(BASE)
-    assert [line.name for line in batch.read_table()] == ["other", "tpl"]
+    assert [line.name for line in batch_table.read_table()] == ["other", "tpl"]
 
 
 @pytest.mark.parametrize(
@@ -88,7 +91,7 @@ def test_without_a_table_every_scene_file_counts(project, tmp_path):
 def test_mistakes_about_which_scenes_there_are(project, table, words):
     project(table if isinstance(table, bytes) else table.encode())
     with pytest.raises(InputError) as caught:
-        batch.read_table()
+        batch_table.read_table()
     assert str(caught.value).startswith("config/batch.tsv")
     for word in words:
         assert word in str(caught.value)
@@ -97,7 +100,7 @@ def test_mistakes_about_which_scenes_there_are(project, table, words):
 def test_all_mistakes_of_a_table_come_at_once(project):
     project("a b c\nok\ttpl\nd/e\n" + "".join(f"x{i}/\n" for i in range(30)))
     with pytest.raises(InputError) as caught:
-        batch.read_table()
+        batch_table.read_table()
     assert "line 2," in str(caught.value) and "line 4," in str(caught.value) and "... and 12 more" in str(caught.value)
 
 
@@ -105,7 +108,7 @@ def test_all_mistakes_of_a_table_come_at_once(project):
 
 
 def test_overrides_are_yaml_values_under_dotted_keys():
-    got = batch.parse_overrides("capture.views=24; prior.samples = 8;base.flag=true;a.b.c=[1, 2];seed=0;x.path=data/a=b;")
+    got = batch_table.parse_overrides("capture.views=24; prior.samples = 8;base.flag=true;a.b.c=[1, 2];seed=0;x.path=data/a=b;")
     assert got == {
         "capture": {"views": 24},
         "prior": {"samples": 8},
@@ -131,7 +134,7 @@ def test_overrides_are_yaml_values_under_dotted_keys():
 )
 def test_mistakes_in_overrides(text, words):
     with pytest.raises(InputError) as caught:
-        batch.parse_overrides(text, "here")
+        batch_table.parse_overrides(text, "here")
     assert str(caught.value).startswith("here: ")
     for word in words:
         assert word in str(caught.value)
@@ -201,7 +204,7 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
     from workflow.sources import mitsuba
 
     monkeypatch.setattr(mitsuba, "raw_inputs", lambda document: 1 / 0)
-    plan = batch.plan("draft")
+    plan = batch_plan.plan("draft")
     assert list(plan.ready) == ["good"] and list(plan.refused) == ["key", "data", "gone", "disk"]
     assert "line 3, column overrides" in plan.refused["key"]
     assert plan.refused["data"].startswith("config/batch.tsv, line 4: no/where: not found; `source.path` must be a folder")
@@ -214,7 +217,7 @@ def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
     marks = []
     for overrides in ("seed=1", "seed=2", "seeds=2", "seedz=2"):
         project(f"a\tbuiltin\t\t\tsource.scene=tiny;prior.kind=simulated;{overrides}\n")
-        marks.append(batch.fingerprint("draft"))
+        marks.append(batch_plan.fingerprint("draft"))
     assert len(set(marks)) == 4
 
 
@@ -225,12 +228,12 @@ def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
 def five(project, monkeypatch):
     """Five scenes that ended differently, without running them."""
     names = ("done", "refused", "failed", "killed", "idle")
-    lines = tuple(batch.Line(i + 2, name, "builtin") for i, name in enumerate(names))
+    lines = tuple(batch_table.Line(i + 2, name, "builtin") for i, name in enumerate(names))
     monkeypatch.setattr(fp, "fingerprint", lambda stage, scene, quality: f"{stage} of {scene}")
     monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps({"source": {"kind": "builtin"}}))
     reason = "config/batch.tsv, line 3: <script>bad\tdata</script>\nsecond line"
-    plan = batch.Plan(lines, {n: f"publish of {n}" for n in names if n != "refused"}, {"refused": reason})
-    monkeypatch.setattr(batch, "plan", lambda quality: plan)
+    plan = batch_plan.Plan(lines, {n: f"publish of {n}" for n in names if n != "refused"}, {"refused": reason})
+    monkeypatch.setattr(batch_plan, "plan", lambda quality: plan)
 
     write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
     view = ["000", "001", "000", "000"]
@@ -258,7 +261,7 @@ def five(project, monkeypatch):
 
 
 def test_every_scene_has_a_row_that_says_how_it_ended(five):
-    batch_summary.write_summary("draft")
+    summary.write_summary("draft")
     with open("results/batch/summary.tsv", newline="") as file:
         rows = {row["scene"]: row for row in csv.DictReader(file, delimiter="\t")}
     assert {name: row["status"] for name, row in rows.items()} == {
@@ -278,7 +281,7 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
     import pyarrow.parquet as pq
 
     table = pq.read_table("results/batch/summary.parquet")
-    assert table.column_names == list(batch_summary.COLUMNS)
+    assert table.column_names == list(summary.COLUMNS)
     assert table["rgb_psnr"].to_pylist() == [30.0, None, None, None, None]
 
 
@@ -294,7 +297,7 @@ class _Addresses(HTMLParser):
 
 
 def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
-    batch_summary.write_summary("draft")
+    summary.write_summary("draft")
     text = Path("results/batch/report.html").read_text()
     page = _Addresses(text)
     assert "script" not in page.tags and "&lt;script&gt;" in text
@@ -310,7 +313,7 @@ def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
 
 def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
     Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
-    batch_summary.write_summary("draft")
+    summary.write_summary("draft")
     assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
 
 
@@ -321,7 +324,7 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
 
     from PIL import Image
 
-    from workflow.report.batch_page import thumbnails
+    from workflow.batch.page import thumbnails
 
     flat = {c: np.full((4, 300), 0.4, np.float32) for c in "RGB"}
     channels = {f"ldr.{c}": np.full((4, 300), 0.2, np.float32) for c in "RGB"}
@@ -342,19 +345,19 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
 
 
 def test_only_a_finished_plan_counts_as_complete(five):
-    batch_summary.write_summary("draft", "mark")
+    summary.write_summary("draft", "mark")
     assert Path("results/batch/complete").read_text() == "mark\n"
-    batch_summary.write_summary("draft")
+    summary.write_summary("draft")
     assert not Path("results/batch/complete").exists()
 
 
 def test_refusing_names_every_scene(five):
     with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
-        batch_summary.refuse("draft")
+        summary.refuse("draft")
 
 
 def test_the_shipped_table_can_be_read(repository):
-    lines = batch.read_table(repository)
+    lines = batch_table.read_table(repository)
     assert [line.name for line in lines if line.is_plain] and all(
         settings.load(line.name, quality, repository) for line in lines for quality in settings.QUALITIES
     )

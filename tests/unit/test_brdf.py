@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from iif_core import brdf, native
-from iif_core.xp import NUMPY
+from iif_core.numerics.xp import NUMPY
+from iif_core.reflectance import brdf
+from workflow.runtime import native
 
 RNG = np.random.default_rng(7)
 Z = (0.0, 0.0, 1.0)
@@ -200,7 +201,7 @@ def test_three_libraries_agree():
     import torch
     from drjit.llvm import Float
 
-    from iif_core.xp import DRJIT, TORCH
+    from iif_core.numerics.xp import DRJIT, TORCH
 
     wo, wi = unit_vectors(3000, np.float32), unit_vectors(3000, np.float32)
     r = (0.02 + 0.98 * RNG.random(3000)).astype(np.float32)
@@ -232,7 +233,7 @@ def test_three_libraries_agree():
 
 def test_torch_gradients_are_finite_at_the_edges():
     torch = pytest.importorskip("torch")
-    from iif_core.xp import TORCH
+    from iif_core.numerics.xp import TORCH
 
     r = torch.tensor([0.02, 0.02, 1.0, 1.0], requires_grad=True)
     NoL = torch.tensor([0.0, 1.0, 0.0, 1.0])

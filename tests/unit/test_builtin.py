@@ -10,9 +10,9 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from iif_core.camera import look_at
+from iif_core.camera.pinhole import look_at
 from iif_core.errors import InputError
-from iif_core.xp import NUMPY
+from iif_core.numerics.xp import NUMPY
 from workflow.sources import rooms
 from workflow.sources.rooms import patterns, shapes
 from workflow.sources.rooms.coverage import seen_from, surface_points
@@ -40,7 +40,7 @@ def kitchen():
 
 @pytest.fixture(scope="module")
 def traced(llvm, room):
-    from iif_core.transport import build_geometry
+    from iif_core.light.transport.geometry import build_geometry
 
     return build_geometry(room.vertices, room.faces, room.object_id)
 
@@ -185,7 +185,7 @@ def _random_rays(room, per_camera, cameras=50, seed=0):
 
 def test_no_ray_escapes_and_nobody_sees_a_back_side(room, traced):
     """20 000 rays from 50 cameras; a camera inside an object would see nothing but back sides."""
-    from iif_core.transport import trace
+    from iif_core.light.transport.geometry import trace
 
     origin, direction = _random_rays(room, 400)
     face, t = trace(traced, origin, direction)
@@ -198,7 +198,7 @@ def test_no_ray_escapes_and_nobody_sees_a_back_side(room, traced):
 
 def test_no_two_surfaces_lie_in_one_plane(room, traced):
     """Behind no visible point is another parallel surface nearer than 0.3 mm."""
-    from iif_core.transport import trace
+    from iif_core.light.transport.geometry import trace
 
     origin, direction = _random_rays(room, 2000, seed=1)
     face, t = trace(traced, origin, direction)
@@ -248,7 +248,7 @@ def test_free_means_outside_of_everything(kitchen):
 
 
 def test_first_views_cover_the_kitchen(llvm, kitchen):
-    from iif_core.transport import build_geometry
+    from iif_core.light.transport.geometry import build_geometry
 
     geometry = build_geometry(kitchen.vertices, kitchen.faces, kitchen.object_id)
     points = surface_points(kitchen, 2500)
@@ -261,7 +261,7 @@ def test_first_views_cover_the_kitchen(llvm, kitchen):
 
 
 def test_seen_from_knows_front_behind_and_hidden(llvm):
-    from iif_core.transport import build_geometry
+    from iif_core.light.transport.geometry import build_geometry
 
     wall = shapes.sheet((-5, 2, -5), (10, 0, 0), (0, 0, 10))
     geometry = build_geometry(*wall, np.zeros(len(wall[1]), int))
@@ -334,8 +334,8 @@ def test_unknown_kind_is_refused():
 
 def test_textures_survive_a_draft_pixel(llvm, kitchen):
     """Truth at the pixel centre is near the mean over the pixel: detail is coarser than its footprint."""
-    from iif_core.camera import pixel_directions
-    from iif_core.transport import build_geometry, trace
+    from iif_core.camera.pinhole import pixel_directions
+    from iif_core.light.transport.geometry import build_geometry, trace
 
     geometry = build_geometry(kitchen.vertices, kitchen.faces, kitchen.object_id)
     width, fine = 160, 3
@@ -367,10 +367,10 @@ seed: %d
 
 
 def _run(folder, monkeypatch, dynamic_range="ldr", seed=0):
-    from workflow import fingerprint
     from workflow.artifacts import StageReader
-    from workflow.job import run_stage
-    from workflow.normal_form import CaptureReader
+    from workflow.runtime import fingerprint
+    from workflow.runtime.job import run_stage
+    from workflow.scene.normal_form import CaptureReader
 
     (folder / "config/scenes").mkdir(parents=True)
     (folder / "config/scenes/tiny.yaml").write_text(SCENE % (dynamic_range, seed))
@@ -414,7 +414,7 @@ def test_another_seed_gives_other_noise_alone(captured, tmp_path, monkeypatch):
 
 
 def test_photographs_are_what_the_camera_made_of_the_radiance(captured):
-    from iif_core.photography import expose, response_curve
+    from iif_core.camera.simulation import expose, response_curve
 
     assert captured.has_truth and not captured.is_hdr
     assert captured.facts["source"] == "builtin"

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iif_core import camera
+from iif_core.camera import pinhole
 from iif_core.errors import InputError
 
 coordinate = st.floats(-50, 50)
@@ -19,12 +19,12 @@ triple = st.tuples(coordinate, coordinate, coordinate)
 def test_point_on_pixel_ray_projects_to_the_pixel_centre(origin, target, up, depth):
     if np.linalg.norm(np.subtract(origin, target)) < 1e-3:
         return
-    pose = camera.look_at(origin, target, up)
+    pose = pinhole.look_at(origin, target, up)
     np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-9)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
-    d = camera.pixel_directions(50, 60, 3.2, 2.1, 7, 5, pose)
+    d = pinhole.pixel_directions(50, 60, 3.2, 2.1, 7, 5, pose)
     assert d.shape == (5, 7, 3) and d.dtype == np.float32
-    u, v, z = camera.project(pose[:3, 3] + depth * d.astype(np.float64), 50, 60, 3.2, 2.1, pose)
+    u, v, z = pinhole.project(pose[:3, 3] + depth * d.astype(np.float64), 50, 60, 3.2, 2.1, pose)
     columns, rows = np.meshgrid(np.arange(7) + 0.5, np.arange(5) + 0.5)
     np.testing.assert_allclose(u, columns, atol=1e-3)
     np.testing.assert_allclose(v, rows, atol=1e-3)
@@ -32,36 +32,36 @@ def test_point_on_pixel_ray_projects_to_the_pixel_centre(origin, target, up, dep
 
 
 def test_axes_x_right_y_down_z_forward():
-    pose = camera.look_at((0, 0, 0), (0, 0, -5), (0, 1, 0))
+    pose = pinhole.look_at((0, 0, 0), (0, 0, -5), (0, 1, 0))
     np.testing.assert_allclose(pose[:3, :3], [[1, 0, 0], [0, -1, 0], [0, 0, -1]], atol=1e-12)
-    u, v, z = camera.project([[1, 2, -4]], 100, 100, 50, 50, pose)
+    u, v, z = pinhole.project([[1, 2, -4]], 100, 100, 50, 50, pose)
     assert (u[0], v[0], z[0]) == pytest.approx((75, 0, 4))  # right of the centre, above it
 
 
 def test_target_is_in_the_centre_and_up_is_up():
-    pose = camera.look_at((1, 2, 3), (4, -1, 2), (0, 0, 1))
-    u, v, _ = camera.project([[4, -1, 2], [4, -1, 2.5]], 80, 80, 32, 24, pose)
+    pose = pinhole.look_at((1, 2, 3), (4, -1, 2), (0, 0, 1))
+    u, v, _ = pinhole.project([[4, -1, 2], [4, -1, 2.5]], 80, 80, 32, 24, pose)
     assert (u[0], v[0]) == pytest.approx((32, 24))
     assert u[1] == pytest.approx(32) and v[1] < 24
 
 
 def test_derivatives_are_pixel_steps():
-    pose = camera.look_at((0, 1, 2), (3, 4, 1), (0, 0, 1))
-    d = camera.pixel_directions(50, 70, 4, 4, 8, 8, pose)
-    du, dv = camera.direction_derivatives(50, 70, pose)
+    pose = pinhole.look_at((0, 1, 2), (3, 4, 1), (0, 0, 1))
+    d = pinhole.pixel_directions(50, 70, 4, 4, 8, 8, pose)
+    du, dv = pinhole.direction_derivatives(50, 70, pose)
     np.testing.assert_allclose(d[3, 5] - d[3, 4], du, atol=1e-6)
     np.testing.assert_allclose(d[4, 4] - d[3, 4], dv, atol=1e-6)
 
 
 def test_behind_the_camera_is_nan_and_bad_input_is_named():
-    pose = camera.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0))
-    u, v, z = camera.project([[0, 0, -1], [0, 0, 1]], 10, 10, 5, 5, pose)
+    pose = pinhole.look_at((0, 0, 0), (0, 0, 1), (0, -1, 0))
+    u, v, z = pinhole.project([[0, 0, -1], [0, 0, 1]], 10, 10, 5, 5, pose)
     assert np.isnan([u[0], v[0]]).all() and z[0] == -1 and u[1] == 5
-    assert np.isfinite(camera.look_at((0, 0, 0), (0, 0, 1), (0, 0, 1))).all()
+    assert np.isfinite(pinhole.look_at((0, 0, 0), (0, 0, 1), (0, 0, 1))).all()
     with pytest.raises(InputError, match="origin and target"):
-        camera.look_at((1, 1, 1), (1, 1, 1), (0, 0, 1))
+        pinhole.look_at((1, 1, 1), (1, 1, 1), (0, 0, 1))
     with pytest.raises(InputError, match="positive"):
-        camera.pixel_directions(0, 1, 0, 0, 4, 4, np.eye(4))
+        pinhole.pixel_directions(0, 1, 0, 0, 4, 4, np.eye(4))
     with pytest.raises(InputError, match="world_from_camera"):
-        camera.pixel_directions(1, 1, 0, 0, 4, 4, np.full((4, 4), np.nan))
-    assert camera.pixel_directions(1, 1, 0.5, 0.5, 1, 1, np.eye(4)).tolist() == [[[0.0, 0.0, 1.0]]]
+        pinhole.pixel_directions(1, 1, 0, 0, 4, 4, np.full((4, 4), np.nan))
+    assert pinhole.pixel_directions(1, 1, 0.5, 0.5, 1, 1, np.eye(4)).tolist() == [[[0.0, 0.0, 1.0]]]

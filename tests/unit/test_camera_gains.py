@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iif_core.calibration import calibrate_response
-from iif_core.camera_gains import CameraGains, GainRows, choose_gains, estimate, falloff, follow, radius_squared
+from iif_core.camera.calibration.choice import calibrate_response
+from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, follow, radius_squared
+from iif_core.camera.overlap import PatchRows
+from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.overlap import PatchRows
-from iif_core.response import response
 
 VIEWS = 10
 VIGNETTING = np.array([-0.35, -0.12])

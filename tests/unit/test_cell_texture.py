@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from iif_core.affines.cell_texture import slow_part, smooth_light, textured_albedo
-from iif_core.cells import neighbour_pairs, pack_keys
+from iif_core.fitting.cell_texture import slow_part, smooth_light, textured_albedo
+from iif_core.surface.cells import neighbour_pairs, pack_keys
 
 
 def _plane(side=60, edge=0.01):

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iif_core import cells
 from iif_core.errors import InputError
+from iif_core.surface import cells
 
 index = st.integers(0, cells.INDEX_LIMIT - 1)
 key_parts = st.tuples(index, index, index, st.integers(-1, cells.INDEX_LIMIT - 2))

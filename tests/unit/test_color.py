@@ -3,16 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iif_core.color import (
-    false_colour,
-    id_colours,
-    linear_from_srgb,
-    luminance,
-    srgb_from_linear,
-    to_uint8,
-    tone_map,
-)
 from iif_core.errors import InputError
+from iif_core.numerics.color import false_colour, id_colours, linear_from_srgb, luminance, srgb_from_linear, to_uint8, tone_map
 
 
 def test_srgb_known_values():

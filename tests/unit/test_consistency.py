@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core.consistency import ShadingLeft, ViewSpread, held_out_gain
-from iif_core.response import response
+from iif_core.camera.response import response
+from iif_core.evaluation.consistency import ShadingLeft, ViewSpread, held_out_gain
 
 
 def surface(n=4000, seed=0):

@@ -11,13 +11,14 @@ import pytest
 import torch
 import yaml
 
-from iif_core.color import key_exposure, linear_from_srgb, luminance, srgb_from_linear
 from iif_core.errors import InputError
+from iif_core.numerics.color import key_exposure, linear_from_srgb, luminance, srgb_from_linear
 from tests.unit import tiny_diffusion
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
-from workflow.normal_form import View
-from workflow.priors import checkpoint, diffusion, marigold, photograph, rgbx
+from workflow.models import checkpoint
+from workflow.priors import diffusion, marigold, photograph, rgbx
+from workflow.scene.normal_form import View
 from workflow.stages import prior as stage
 from workflow.stages.base import _read_predictions
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iif_core.distortion import Distortion, Pinhole, distort, pinhole_inside, undistort, undistort_image
+from iif_core.camera.distortion import Distortion, Pinhole, distort, pinhole_inside, undistort, undistort_image
 from iif_core.errors import InputError
 
 BARREL = Distortion("radial_tangential", (-0.28, 0.07, -0.004, 0.0), (6e-4, -3e-4))

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from iif_core.emission.direct import solve_emission
-from iif_core.emission.environment import HEIGHT, WIDTH, Sky, SkySums, cosine_directions, texels
-from iif_core.emission.problem import PixelRows, assemble
-from iif_core.environment import direction_in, solid_angles
-from iif_core.xp import NUMPY
+from iif_core.light.emission.direct import solve_emission
+from iif_core.light.emission.environment import HEIGHT, WIDTH, Sky, SkySums, cosine_directions, texels
+from iif_core.light.emission.problem import PixelRows, assemble
+from iif_core.light.environment import direction_in, solid_angles
+from iif_core.numerics.xp import NUMPY
 
 
 def _middles():

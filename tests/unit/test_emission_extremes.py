@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from iif_core.emission.candidates import emitter_candidates, face_statistics, radiance_threshold
-from iif_core.emission.direct import solve_emission, solve_families
-from iif_core.emission.groups import group_emitters
-from iif_core.emission.loss import reference_loss
-from iif_core.emission.problem import PixelRows, assemble, initial_radiance, white_surface
-from iif_core.emission.pruning import prune_groups
-from iif_core.emission.rows import EmissionRows
-from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
-from iif_core.segments import face_adjacency
+from iif_core.light.emission.candidates import emitter_candidates, face_statistics, radiance_threshold
+from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.groups import group_emitters
+from iif_core.light.emission.loss import reference_loss
+from iif_core.light.emission.problem import PixelRows, assemble, initial_radiance, white_surface
+from iif_core.light.emission.pruning import prune_groups
+from iif_core.light.emission.rows import EmissionRows
+from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.surface.segments import face_adjacency
 
 
 def _rows(a, target, bound=None):

@@ -3,12 +3,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.emission.cache import RadianceSums
-from iif_core.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, radiance_threshold
-from iif_core.emission.groups import group_emitters
 from iif_core.errors import InputError
-from iif_core.mesh import face_geometry
-from iif_core.segments import face_adjacency
+from iif_core.light.emission.cache import RadianceSums
+from iif_core.light.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, radiance_threshold
+from iif_core.light.emission.groups import group_emitters
+from iif_core.surface.mesh import face_geometry
+from iif_core.surface.segments import face_adjacency
 
 
 def _strip(n, start=(0.0, 0.0, 0.0)):

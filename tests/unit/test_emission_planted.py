@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from iif_core.emission.direct import solve_emission, solve_families
-from iif_core.emission.loss import reference_loss
-from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.loss import reference_loss
+from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from iif_core.emission.direct import solve_emission, solve_families
-from iif_core.emission.gains import SHARED_ERROR, WHITE_SHARE, object_gains
-from iif_core.emission.pruning import WhiteSurface, prune_groups
-from iif_core.emission.rows import EmissionRows, GlossRows, block_rows, scale_rows
 from iif_core.errors import InputError
+from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.gains import SHARED_ERROR, WHITE_SHARE, object_gains
+from iif_core.light.emission.pruning import WhiteSurface, prune_groups
+from iif_core.light.emission.rows import EmissionRows, GlossRows, block_rows, scale_rows
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 

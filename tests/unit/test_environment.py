@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from iif_core import environment
 from iif_core.errors import InputError
-from iif_core.xp import NUMPY
+from iif_core.light import environment
+from iif_core.numerics.xp import NUMPY
 
 H, W = 16, 32
 
@@ -171,7 +171,7 @@ def test_drawing_the_sky_changes_the_noise_alone(T, roughness):
 
 
 def test_caches_and_matrix_see_the_same_sky(T):
-    from iif_core import brdf
+    from iif_core.reflectance import brdf
 
     scene, light, n, bounces = Terrace(T), sky(), 2000, 3
     emitters, points = scene.emitters(T, light), scene.points(n)
@@ -222,7 +222,7 @@ def test_only_the_environment_and_any_chunk(T):
 
 
 def test_texel_table_becomes_a_map():
-    from workflow.base_scene import _environment
+    from workflow.scene.base_scene import _environment
 
     row, column = (index.ravel() for index in np.indices((4, 8)))
     owner = np.full(32, -1)

@@ -12,20 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from iif_core import native
-from iif_core.camera import direction_derivatives, look_at, pixel_directions
+from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.errors import InputError
 from workflow.exporters.glb import glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
-from workflow.exporters.surface import (
-    RecoveredScene,
-    build_parts,
-    seen_sides,
-    subdivide,
-    up_axis,
-    vertex_normals,
-)
-from workflow.normal_form import View
+from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, subdivide, up_axis, vertex_normals
+from workflow.runtime import native
+from workflow.scene.normal_form import View
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
 OUTWARD = np.array(
@@ -375,7 +368,10 @@ def test_names_that_clash_on_disk():
 
 def own_render(parts, camera, samples):
     """The same parts in the workflow's renderer, one material a face."""
-    from iif_core.transport import Emitters, FaceMaterials, build_geometry, render
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import build_geometry
+    from iif_core.light.transport.materials import FaceMaterials
+    from iif_core.light.transport.render import render
 
     offset, vertices, faces, values, radiance = 0, [], [], [], []
     for part in parts:
@@ -473,8 +469,8 @@ def test_mitsuba_environment(mi, tmp_path):
 def test_mitsuba_environment_map_keeps_its_directions(mi, tmp_path):
     import drjit as dr
 
-    from iif_core.environment import direction_in
-    from iif_core.xp import NUMPY
+    from iif_core.light.environment import direction_in
+    from iif_core.numerics.xp import NUMPY
 
     sky = np.random.default_rng(0).uniform(0, 1, (16, 32, 3)).astype(np.float32)
     parts = [part for name, part in parts_of(room()).items() if name.startswith("white")]

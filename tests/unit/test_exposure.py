@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from iif_core.camera.exposure import estimate_gains
 from iif_core.errors import InputError
-from iif_core.exposure import estimate_gains
 
 
 def _scene(rng, n_views=6, n_cells=300, pixels=8000, noise=0.0):

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.errors import InputError
-from iif_core.felzenszwalb import (
+from iif_core.objects.felzenszwalb import (
     edge_weights,
     face_normals,
     filtered_normals,
@@ -14,7 +14,7 @@ from iif_core.felzenszwalb import (
     segment_mesh,
     smooth_over_faces,
 )
-from iif_core.segments import face_adjacency
+from iif_core.surface.segments import face_adjacency
 
 
 def sheet(n, place):

@@ -9,8 +9,8 @@ import textwrap
 
 import pytest
 
-from workflow import fingerprint as fp
 from workflow.registry import STAGES
+from workflow.runtime import fingerprint as fp
 
 SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n"
 
@@ -53,7 +53,7 @@ def below(stage):
 def test_code_edit_changes_only_the_stage_and_below(checkout):
     code, run = checkout
     before = fingerprints(code, run)
-    metrics = code / "iif_core/metrics.py"
+    metrics = code / "iif_core/evaluation/metrics.py"
     metrics.write_text(metrics.read_text() + "\nEXTRA = 1\n")
     after = fingerprints(code, run)
     assert "metrics" in changed(before, after)
@@ -117,7 +117,7 @@ def test_closure_covers_what_a_stage_really_imports(repository):
 
 def test_function_level_imports_are_in_the_closure():
     """The static walk sees imports inside functions, which a runtime probe of module imports would not."""
-    assert "iif_core.camera" in fp.import_closure("workflow.normal_form")
+    assert "iif_core.camera.pinhole" in fp.import_closure("workflow.scene.normal_form")
 
 
 def test_raw_digest_follows_content_not_time(tmp_path, monkeypatch):

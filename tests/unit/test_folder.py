@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from iif_core.distortion import Distortion, pinhole_inside
+from iif_core.camera.distortion import Distortion, pinhole_inside
 from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
@@ -484,7 +484,7 @@ def test_agreement_of_a_few_pixels_by_chance_does_not_count():
 
 def test_depth_of_another_camera(tmp_path):
     """A depth sensor 5 cm to the side with other intrinsics: compared where it looks, not pixel by pixel."""
-    from iif_core.distortion import Pinhole
+    from iif_core.camera.distortion import Pinhole
 
     path = own.project(tmp_path)
     document, shots = own.photographed(path)

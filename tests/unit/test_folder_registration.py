@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter
 
-from iif_core.distortion import Distortion, Pinhole
+from iif_core.camera.distortion import Distortion, Pinhole
 from tests.unit.painted_room import FOCAL, HEIGHT, WIDTH, look, posed, room, twisted
 from workflow.sources.folder_scene.registration import registered
 from workflow.sources.folder_scene.transforms import Frame, opencv_pose

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from iif_core import gathering
 from iif_core.errors import InputError
-from iif_core.gathering import SurfaceCellsBuilder, fit_light, gather, residual_light, with_light
+from iif_core.light import irradiance
+from iif_core.light.irradiance import SurfaceCellsBuilder, fit_light, gather, residual_light, with_light
 
 EDGE = 0.125
 N = 8
@@ -103,14 +103,14 @@ def test_form_factor_of_a_far_patch():
     def trace(origins, directions):
         return np.zeros(len(origins), int), np.full(len(origins), 1.0)
 
-    found = gathering._form_factor(cells, np.array([lamp]), cells.points, trace, np.random.default_rng(0))
+    found = irradiance._form_factor(cells, np.array([lamp]), cells.points, trace, np.random.default_rng(0))
     assert found[floor] == pytest.approx(0.01 / (np.pi * 4), rel=1e-3)
     assert found[lamp] == 0
 
     def blocked(origins, directions):
         return np.zeros(len(origins), int), np.full(len(origins), 0.5)
 
-    assert not gathering._form_factor(cells, np.array([lamp]), cells.points, blocked, np.random.default_rng(0)).any()
+    assert not irradiance._form_factor(cells, np.array([lamp]), cells.points, blocked, np.random.default_rng(0)).any()
 
 
 def test_rays_that_leave_and_unseen_surface_are_unknown_light():
@@ -151,7 +151,7 @@ def test_cells_do_not_depend_on_how_pixels_come_and_grow_when_there_are_many(mon
     first, second = whole.finish(), parts.finish()
     np.testing.assert_allclose(first.log_radiance, second.log_radiance, atol=1e-12)
     np.testing.assert_array_equal(first.voxel_key, second.voxel_key)
-    monkeypatch.setattr(gathering, "MAX_CELLS", 120)
+    monkeypatch.setattr(irradiance, "MAX_CELLS", 120)
     small = SurfaceCellsBuilder(np.array([[0, 0, 0], [1, 1, 1.0]]), EDGE)
     small.add(points, normals, wall, radiance, dark, 1.0)
     cells = small.finish()

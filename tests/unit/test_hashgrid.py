@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from iif_core.errors import InputError
-from iif_core.hashgrid import HashGridOptions, HashGridTexture, layout, numba_engine, parameter_counts
-from iif_core.hashgrid.levels import ROWS
+from iif_core.fusion.hashgrid import numba_engine
+from iif_core.fusion.hashgrid.levels import ROWS, HashGridOptions, layout, parameter_counts
+from iif_core.fusion.hashgrid.texture import HashGridTexture
 
 # direct levels (7, 11 vertices: 343, 1331 entries) and hashed ones; odd sizes everywhere, collisions
 SMALL = HashGridOptions(
@@ -390,6 +391,6 @@ def test_fits_a_function():
 
 
 def test_import_is_light():
-    code = "import sys, iif_core.hashgrid; print([m for m in ('torch', 'numba') if m in sys.modules])"
+    code = "import sys, iif_core.fusion.hashgrid; print([m for m in ('torch', 'numba') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

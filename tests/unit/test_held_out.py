@@ -42,7 +42,7 @@ def test_nothing_that_is_fitted_sees_a_held_out_photograph(tmp_path):
 
 
 def test_rays_of_pixels_next_to_a_hole_stay_in_their_middle():
-    from workflow.normal_form import View
+    from workflow.scene.normal_form import View
     from workflow.stages.render import _steps
 
     view = View(0, "a", 5, 4, 8.0, 8.0, 2.5, 2.0, np.eye(4))

@@ -5,7 +5,7 @@ import os
 
 import pytest
 
-from workflow import input_digests
+from workflow.runtime import input_digests
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 
-from iif_core import laplace
 from iif_core.errors import InputError
+from iif_core.numerics import laplace
 
 CHECKED = [(0.3, 0.1, 0.2, 1.2180407), (0.05, 0.3, 0.1, 0.9408329), (0.0, 0.1, 0.1, 0.0)]
 

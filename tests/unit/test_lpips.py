@@ -6,10 +6,10 @@ import pickle
 import numpy as np
 import pytest
 
-from iif_core import metrics
 from iif_core.errors import InputError
-from iif_core.lpips import lpips
-from workflow import weights as shipped
+from iif_core.evaluation import metrics
+from iif_core.evaluation.lpips import lpips
+from workflow.models import lpips as shipped
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def test_vgg_layers_by_shape(vgg):
 
 def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
     """VGG: albedo of result, base and first prediction, raw and scaled; the result alone has AlexNet everywhere."""
-    from workflow.scores import MATERIALS, MaterialTruth
+    from workflow.scoring.scores import MATERIALS, MaterialTruth
     from workflow.stages.metrics import _scores
 
     truth, mask, objects = image(1), np.ones(image(1).shape[:2], bool), np.zeros(image(1).shape[:2], int)

@@ -7,10 +7,9 @@ import pytest
 from PIL import Image
 from scipy.sparse import csr_matrix
 
-from iif_core import mask_clustering as mc
-from iif_core.cells import pack_keys
 from iif_core.errors import InputError
-from iif_core.mask_votes import (
+from iif_core.objects import mask_clustering as mc
+from iif_core.objects.mask_votes import (
     Sightings,
     elect,
     join_together,
@@ -21,7 +20,8 @@ from iif_core.mask_votes import (
     split_apart,
     view_votes,
 )
-from iif_core.segments import fill_within, partition_agreement
+from iif_core.surface.cells import pack_keys
+from iif_core.surface.segments import fill_within, partition_agreement
 from tests.unit import own_scene as own
 from tests.unit.spoilt_masks import purity, spoil_masks
 from workflow.artifacts import StageReader
@@ -471,7 +471,7 @@ def test_binary_masks_say_the_same_as_a_label_map(photographed, tmp_path):
 
 def test_masks_follow_the_lens(tmp_path, monkeypatch):
     """What the camera saw through the lens fits what the mesh shows without it, better than ids resampled twice (capture)."""
-    from iif_core.distortion import Distortion
+    from iif_core.camera.distortion import Distortion
     from workflow.segmentations.mask_files import mask_files
 
     path = own.project(tmp_path, capture={"width": 64, "height": 48})
@@ -525,7 +525,7 @@ def test_what_is_refused(tmp_path, spoil, message):
     with pytest.raises(InputError, match=message):
         files = mask_files({"path": None}, settings["source"], settings["capture"])
         for name in files.maps:  # what only pixels can tell
-            from workflow.normal_form import View
+            from workflow.scene.normal_form import View
 
             files.labels(View(0, name, 64, 48, 60.0, 62.0, 33.0, 23.0, np.eye(4)))
 

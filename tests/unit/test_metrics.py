@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from iif_core import flip
-from iif_core import metrics as m
 from iif_core.errors import InputError
+from iif_core.evaluation import flip
+from iif_core.evaluation import metrics as m
 
 ALL = np.ones((24, 32), bool)
 

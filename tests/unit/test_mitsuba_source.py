@@ -399,14 +399,14 @@ def test_mesh_attributes_reach_the_truth(load, tmp_path):
 
 
 def trace_of(mesh):
-    from iif_core.transport.geometry import build_geometry, trace
+    from iif_core.light.transport.geometry import build_geometry, trace
 
     geometry = build_geometry(mesh.vertices, mesh.faces, mesh.shape)
     return lambda origins, directions: trace(geometry, origins, directions)
 
 
 def plan(mesh, count: int, seed: int = 0, start=(1.0, 1.0, 1.5), unit: float = 1.0):
-    from iif_core.camera import look_at
+    from iif_core.camera.pinhole import look_at
     from workflow.sources.mitsuba_scene import path
 
     start = np.array(start) * unit
@@ -504,7 +504,7 @@ def test_the_lazy_greedy_choice_is_the_greedy_choice():
 
 
 def view_of(size: int, pose: np.ndarray, fov: float = 70.0):
-    from workflow.normal_form import View
+    from workflow.scene.normal_form import View
 
     focal = size / 2 / np.tan(np.radians(fov / 2))
     return View(0, "000", size, size, focal, focal, size / 2, size / 2, pose)
@@ -514,7 +514,7 @@ def test_our_rays_make_the_picture_that_mitsuba_makes_of_the_sensor(load):
     """Orientation, field of view and pixel grid against `mi.render` with the scene's own sensor and film."""
     import mitsuba as mi
 
-    from iif_core.camera import look_at
+    from iif_core.camera.pinhole import look_at
     from workflow.sources.mitsuba_scene import render
 
     loaded, mesh, _ = load(ROOM + TABLE)
@@ -531,7 +531,7 @@ def test_our_rays_make_the_picture_that_mitsuba_makes_of_the_sensor(load):
 def test_rendering_is_the_same_to_the_last_bit_and_balancing_lights_keeps_the_mean(load):
     import drjit as dr
 
-    from iif_core.camera import look_at
+    from iif_core.camera.pinhole import look_at
     from workflow.sources.mitsuba_scene import render
 
     small = LAMP.replace('id="lamp"', 'id="small"').replace('value="0.4"', 'value="0.05"').replace('x="2"', 'x="1"')
@@ -552,7 +552,7 @@ def test_rendering_is_the_same_to_the_last_bit_and_balancing_lights_keeps_the_me
 def test_denoising_needs_its_package(monkeypatch):
     import sys
 
-    from workflow.denoise import require_denoiser
+    from workflow.models.denoise import require_denoiser
 
     require_denoiser()
     monkeypatch.setitem(sys.modules, "pyoidn", None)
@@ -565,10 +565,10 @@ def test_denoising_needs_its_package(monkeypatch):
 
 def capture(folder: Path, monkeypatch, body: str, capture: str = "", extra: str = "", sensor: str | None = None):
     """Run the stage in `folder` on a scene of `body`; returns its CaptureReader."""
-    from workflow import fingerprint
     from workflow.artifacts import StageReader
-    from workflow.job import run_stage
-    from workflow.normal_form import CaptureReader
+    from workflow.runtime import fingerprint
+    from workflow.runtime.job import run_stage
+    from workflow.scene.normal_form import CaptureReader
 
     folder.mkdir(parents=True, exist_ok=True)
     write(folder, body, sensor)
@@ -627,7 +627,7 @@ def test_capture_of_a_tiny_scene(llvm, tmp_path, monkeypatch):
 
     photo, valid = reader.photo(views[0])
     assert valid.all() and photo.min() >= 0 and photo.max() <= 1 and photo.std() > 0.02
-    from iif_core.photography import expose, response_curve
+    from iif_core.camera.simulation import expose, response_curve
 
     assert np.allclose(photo, expose(truth.radiance, views[0].exposure, response_curve()), atol=1e-6)
 
@@ -716,7 +716,7 @@ def test_modern_hall_path(llvm, test_scene):
     from workflow.sources.mitsuba_scene import flatten, scene
 
     mesh = flatten.flatten(scene.load(test_scene("modern-hall") / "scene.xml"))
-    from iif_core.camera import look_at
+    from iif_core.camera.pinhole import look_at
     from workflow.sources.mitsuba_scene import path
 
     given = look_at([6.91182, 1.65163, 2.55414], [6.0, 1.65163, 2.12], [0, 1, 0])

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from iif_core import native
 from iif_core.errors import InputError
+from workflow.runtime import native
 
 
 @pytest.fixture
@@ -167,7 +167,7 @@ def test_process_environment_of_an_empty_environment(repository):
         "native.process_environment(); once = dict(os.environ); native.process_environment()\n"
         "assert dict(os.environ) == once\n"
         "os.chdir('/')\n"
-        "print(subprocess.check_output(['python', '-c', 'import sys, os, iif_core.native, numpy;'\n"
+        "print(subprocess.check_output(['python', '-c', 'import sys, os, workflow.runtime.native, numpy;'\n"
         '      \'print(sys.prefix, os.environ["PATH"], os.environ.get("HOME"), sep=chr(10))\'], text=True))'
     )
     child = python(code, repository, PATH=f"/usr/bin:{Path(sys.executable).parent}:/bin")

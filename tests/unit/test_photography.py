@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from iif_core import response as families
+from iif_core.camera import response as families
+from iif_core.camera.simulation import STOPS, ResponseCurve, expose, exposures, response_curve
 from iif_core.errors import InputError
-from iif_core.photography import STOPS, ResponseCurve, expose, exposures, response_curve
 
 CURVES = ("filmic", "soft", "srgb", "linear")
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])

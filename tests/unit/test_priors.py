@@ -6,12 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from iif_core.color import linear_from_srgb
 from iif_core.errors import InputError
-from iif_core.filters import fill_from_neighbours
+from iif_core.numerics.color import linear_from_srgb
+from iif_core.numerics.filters import fill_from_neighbours
 from workflow.artifacts.files import write_exr
-from workflow.normal_form import View
 from workflow.priors import files, retinex, simulated
+from workflow.scene.normal_form import View
 
 HEIGHT, WIDTH = 12, 16
 

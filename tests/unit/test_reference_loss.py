@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from iif_core.base.problem import LOWEST, BaseProblem, usable_pixels
-from iif_core.base.reference_loss import identity_regulariser, reference_loss
 from iif_core.errors import InputError
+from iif_core.fusion.problem import LOWEST, BaseProblem, usable_pixels
+from iif_core.fusion.reference_loss import identity_regulariser, reference_loss
 
 LOW = LOWEST.astype(np.float64)
 
@@ -124,7 +124,7 @@ def test_textures_by_pixel_equal_textures_by_cell():
 
 
 def test_pieces_of_a_view_sum_to_the_whole(monkeypatch):
-    from iif_core.base import reference_loss as module
+    from iif_core.fusion import reference_loss as module
 
     state = random_state()
     a = reference_loss(*state)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
+from iif_core.camera.registration import Photo, register
 from iif_core.errors import InputError
-from iif_core.registration import Photo, register
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
 

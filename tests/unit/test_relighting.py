@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from iif_core.camera import look_at
-from iif_core.environment import resample
+from iif_core.camera.pinhole import look_at
 from iif_core.errors import InputError
-from iif_core.relighting import axes_of_map, camera_path, ease, exposure_for, frame_times, sphere_mesh
+from iif_core.light.environment import resample
+from iif_core.light.relighting import axes_of_map, camera_path, ease, exposure_for, frame_times, sphere_mesh
 from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb

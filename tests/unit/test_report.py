@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 import yaml
 
-from iif_core.camera import direction_derivatives, look_at, pixel_directions
-from iif_core.cells import grid_origin, voxel_indices
+from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.errors import InputError
+from iif_core.surface.cells import grid_origin, voxel_indices
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import read_exr, read_parquet
 from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
-from workflow.normal_form import CaptureReader, CaptureWriter, Truth, View
-from workflow.recovered import read_recovered, read_response, response_samples
 from workflow.registry import STAGES
 from workflow.report import pictures as pic
 from workflow.report.page import number, score_table
+from workflow.runtime.timings import read_timings
+from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
+from workflow.scene.recovered import read_recovered, read_response, response_samples
 from workflow.stages import export, metrics, publish, render, report
-from workflow.timings import read_timings
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
 OUTWARD = np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
@@ -76,7 +76,10 @@ def material_channels(values, shape, prefix=""):
 
 def make_scene(root, truth=True, dynamic_range="ldr"):
     """Every artefact that the last stages read, of a room with a box and a lamp; the base is 20 % too dark."""
-    from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import build_geometry, trace
+    from iif_core.light.transport.materials import FaceMaterials
+    from iif_core.light.transport.render import render
 
     rng = np.random.default_rng(0)
     quad = np.array([[1.0, 0.7, 2.4], [2.0, 0.7, 2.4], [2.0, 1.3, 2.4], [1.0, 1.3, 2.4]])

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from iif_core.camera.response import project, response, response_facts, response_from_facts, sampled_response
 from iif_core.errors import InputError
-from iif_core.response import project, response, response_facts, response_from_facts, sampled_response
 
 CURVES = {
     "identity": response("identity"),

@@ -5,11 +5,11 @@ import pyarrow
 import pyarrow.parquet
 import pytest
 
+from iif_core.camera.simulation import response_curve
 from iif_core.errors import InputError
-from iif_core.photography import response_curve
 from workflow import settings
-from workflow.fingerprint import raw_inputs
-from workflow.response_file import read_response_file
+from workflow.runtime.fingerprint import raw_inputs
+from workflow.scene.response_file import read_response_file
 
 GRID = np.linspace(0, 1, 1024)
 CURVE = response_curve("filmic").samples(1024)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core import retinex
 from iif_core.errors import InputError
+from iif_core.priors import retinex
 
 
 def patches(smooth_light=True):

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from iif_core.errors import InputError
-from iif_core.mask_proposals import point_grid, suppressed, threshold_stability
+from iif_core.objects.mask_proposals import point_grid, suppressed, threshold_stability
 from tests.unit import own_scene as own
 from tests.unit import tiny_sam2
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader
-from workflow.priors import checkpoint
+from workflow.models import checkpoint
 from workflow.segmentations import masks, sam2
 
 THRESHOLDS = {"points_per_side": 6, "confidence": 0.3, "stability": 0.2, "overlap": 0.5}

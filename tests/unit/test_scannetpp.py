@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 
-from iif_core.distortion import pinhole_inside
+from iif_core.camera.distortion import pinhole_inside
 from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from iif_core import segments
 from iif_core.errors import InputError
+from iif_core.surface import segments
 
 
 def test_segments_are_numbered_by_view_then_object():

@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.shading_cells import REPRESENTATIVES, ShadingCellBuilder, diffuse_of_cells, joined, normal_bin, relative_error
+from iif_core.surface.shading_cells import (
+    REPRESENTATIVES,
+    ShadingCellBuilder,
+    diffuse_of_cells,
+    joined,
+    normal_bin,
+    relative_error,
+)
 
 EDGE = 0.5
 UP, SIDE = np.float32([0, 0, 1]), np.float32([1, 0, 0])
@@ -140,7 +147,10 @@ def test_normals_of_every_direction_have_a_bin():
 
 def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
     """A floor under a lamp: the mean over a cell's pixels, traced from a few of them."""
-    from iif_core.transport import Emitters, FaceMaterials, build_geometry, shading_caches
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import build_geometry
+    from iif_core.light.transport.materials import FaceMaterials
+    from iif_core.light.transport.shading import shading_caches
 
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     vertices = np.concatenate([square * 2, square * 0.6 + np.float32([0.5, 0.5, 1.0])])

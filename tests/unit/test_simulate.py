@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core import simulate
 from iif_core.errors import InputError
+from iif_core.priors import simulate
 
 
 def room(height=64, width=96, seed=0):

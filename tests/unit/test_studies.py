@@ -8,13 +8,16 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from iif_core.base.uncertainty import CALIBRATION
 from iif_core.errors import InputError
-from workflow import fingerprint as fp
-from workflow import scores, settings, studies, study_table
+from iif_core.fusion.uncertainty import CALIBRATION
+from workflow import settings
 from workflow.artifacts import StageWriter
-from workflow.job import Job
-from workflow.timings import read_parts
+from workflow.runtime import fingerprint as fp
+from workflow.runtime.job import Job
+from workflow.runtime.timings import read_parts
+from workflow.scoring import scores
+from workflow.settings import study_files
+from workflow.studies import table as study_table
 
 SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, strength: 0.5}\ncapture: {views: 9, width: 32}\n"
 SHARED = "t: {capture: {width: 64}, prior: {samples: 4}}\n"
@@ -36,25 +39,25 @@ def folder(tmp_path, monkeypatch):
         path = tmp_path / "config" / f"{name}.yaml"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, studies._load_study):
+        for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study):
             cached.cache_clear()
 
     write("scenes/t", SCENE)
     write("studies/scenes", SHARED)
     write("studies/a", STUDY)
     yield write
-    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, studies._load_study):
+    for cached in (fp.resolved, fp.fingerprint, fp.home, study_table.plan, study_files._load_study):
         cached.cache_clear()
 
 
 def test_names_come_apart_as_they_were_put_together(folder):
-    assert studies.derived("t--a-mean-2-s17") == ("t", "a", "mean-2", 17)
-    assert studies.derived(studies.scene_of("a", "my-room", "sgd-s3", 0)) == ("my-room", "a", "sgd-s3", 0)
-    assert studies.derived("t--s3") == ("t", "", "", 3)
+    assert study_files.derived("t--a-mean-2-s17") == ("t", "a", "mean-2", 17)
+    assert study_files.derived(study_files.scene_of("a", "my-room", "sgd-s3", 0)) == ("my-room", "a", "sgd-s3", 0)
+    assert study_files.derived("t--s3") == ("t", "", "", 3)
     for plain in ("t", "t--", "t--a", "t--s03", "t--a-full", "t--A-full-s0"):
-        assert studies.derived(plain) is None
+        assert study_files.derived(plain) is None
     folder("scenes/t--s3", SCENE)  # a scene of that name goes first
-    assert studies.derived("t--s3") is None and studies.bases("t--s3") == []
+    assert study_files.derived("t--s3") is None and study_files.bases("t--s3") == []
 
 
 def test_layers_lie_over_one_another(folder):
@@ -195,15 +198,15 @@ def test_table_of_the_result_reads_the_row_of_each_variant(folder, tmp_path):
 
 
 def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_number():
-    study = studies.Study(
+    study = study_files.Study(
         title="T",
         scenes=["t", "u"],
         seeds=[0],
         scores="metrics",
         costs=["affines"],
         protocols=["raw", "scaled"],
-        variants={"a": studies.Variant(label="first")},
-        paper={"a": studies.Paper(protocol="scaled", values={"albedo/psnr": 20.0, "roughness/l2": 0.5})},
+        variants={"a": study_files.Variant(label="first")},
+        paper={"a": study_files.Paper(protocol="scaled", values={"albedo/psnr": 20.0, "roughness/l2": 0.5})},
         show=["albedo/psnr", "roughness/l2"],
     )
     row = {"variant": "a", "seed": 0, "cpu_seconds": 1.0, "status": "ok"}
@@ -231,8 +234,12 @@ def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_numbe
 
 
 def test_page_says_by_how_much_the_reference_moves():
-    study = studies.Study(
-        title="T", scenes=["t"], reference="a", variants={"a": studies.Variant(), "b": studies.Variant()}, show=["albedo/psnr"]
+    study = study_files.Study(
+        title="T",
+        scenes=["t"],
+        reference="a",
+        variants={"a": study_files.Variant(), "b": study_files.Variant()},
+        show=["albedo/psnr"],
     )
     rows = [("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 24.0, 1.0), ("b", 0, "psnr", 21.0, 1.0), ("b", 1, "psnr", 27.0, 1.0)]
     lines = study_table.page(study, frame_of(rows), {}).splitlines()
@@ -248,7 +255,7 @@ def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):
 
 def test_grids_are_variants(folder):
     folder("studies/a", "title: x\nscenes: [t]\ngrids: [{base.ridge: [0.1, 1.0e-3], base.variant: [full, uniform]}]\n")
-    variants = studies.load_study("a").variants
+    variants = study_files.load_study("a").variants
     assert list(variants) == ["0_1-full", "0_1-uniform", "0_001-full", "0_001-uniform"]
     assert variants["0_001-uniform"].overrides == {"base": {"ridge": 0.001, "variant": "uniform"}}
     assert settings.load("t--a-0_001-uniform-s2").base.ridge == 0.001
@@ -278,7 +285,7 @@ def test_grids_are_variants(folder):
 def test_mistakes_in_a_study(folder, text, words):
     folder("studies/a", text)
     with pytest.raises(InputError) as caught:
-        studies.load_study("a")
+        study_files.load_study("a")
     for word in words:
         assert word in str(caught.value)
 
@@ -316,16 +323,16 @@ def test_unlisted_scenes(folder):
         settings.load("u--a-full-s0")
     folder("studies/scenes", SHARED + "kitchn: {}\n")
     with pytest.raises(InputError, match="kitchn: no such scene"):
-        studies.load_study("a")
+        study_files.load_study("a")
 
 
 def test_shipped_studies_are_sound(repository, monkeypatch):
     monkeypatch.chdir(repository)
-    for name in studies.study_names():
-        study = studies.load_study(name)
+    for name in study_files.study_names():
+        study = study_files.load_study(name)
         for scene in study.scenes:
             for variant in study.variants:
-                settings.load(studies.scene_of(name, scene, variant, study.seeds[0]))
+                settings.load(study_files.scene_of(name, scene, variant, study.seeds[0]))
 
 
 def test_parts_of_a_job_are_timed(folder):
@@ -369,12 +376,12 @@ def test_front_is_of_means_over_seeds_and_knows_which_way_is_better():
 
 
 def test_page_shows_both_and_the_paper():
-    study = studies.Study(
+    study = study_files.Study(
         title="T",
         scenes=["t"],
         seeds=[0, 1],
-        variants={"a": studies.Variant(label="first"), "b": studies.Variant()},
-        paper={"b": studies.Paper(protocol="oracle_affine", values={"albedo/psnr": 30.794})},
+        variants={"a": study_files.Variant(label="first"), "b": study_files.Variant()},
+        paper={"b": study_files.Paper(protocol="oracle_affine", values={"albedo/psnr": 30.794})},
         show=["albedo/psnr", "albedo/lpips_vgg"],
     )
     frame = frame_of([("a", 0, "psnr", 20.0, 1.0), ("a", 1, "psnr", 22.0, 3.0), ("b", 0, "psnr", 24.0, 2.0)])
@@ -396,16 +403,16 @@ def test_table_on_disk_keeps_what_is_unknown_unknown(tmp_path):
 
 
 def test_every_kind_of_picture_is_drawn(tmp_path):
-    from workflow.study_plots import draw
+    from workflow.studies.plots import draw
 
-    variants = {str(k): studies.Variant(overrides={"base": {"sweeps": k, "variant": "full"}}) for k in (1, 2, 4)}
-    paper = {"2": studies.Paper(protocol="raw", values={"albedo/psnr": 21.0})}
+    variants = {str(k): study_files.Variant(overrides={"base": {"sweeps": k, "variant": "full"}}) for k in (1, 2, 4)}
+    paper = {"2": study_files.Paper(protocol="raw", values={"albedo/psnr": 21.0})}
     frame = frame_of([(name, s, "psnr", 20.0 + s + int(name), 1.0 * int(name)) for name in variants for s in (0, 1)])
     frame["pareto"] = study_table._pareto(frame)
     histories = {study_table.Cell("t", name, 0, ""): [{"entropy": 2.0}, {"entropy": 1.0}] for name in variants}
     for kind in ("bars", "line", "pareto", "history"):
-        plot = studies.Plot(kind=kind, x="base.sweeps", group=["base.variant"], log=True)
-        study = studies.Study(title="T", scenes=["t"], variants=variants, paper=paper, show=["albedo/psnr"], plot=plot)
+        plot = study_files.Plot(kind=kind, x="base.sweeps", group=["base.variant"], log=True)
+        study = study_files.Study(title="T", scenes=["t"], variants=variants, paper=paper, show=["albedo/psnr"], plot=plot)
         draw(study, frame, histories, tmp_path / f"{kind}.png")
         assert (tmp_path / f"{kind}.png").stat().st_size > 5000
         draw(study, frame[:0], {}, tmp_path / "empty.png")

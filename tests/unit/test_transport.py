@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core import brdf
-from iif_core.xp import NUMPY
+from iif_core.numerics.xp import NUMPY
+from iif_core.reflectance import brdf
 from tests.unit.transport_rooms import assert_mean, box, lambertian, merge, quad, repeated
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iif_core import brdf
+from iif_core.reflectance import brdf
 
 
 def quad(corner, edge1, edge2):

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core import brdf, cells
+from iif_core.reflectance import brdf
+from iif_core.surface import cells
 from tests.unit.transport_rooms import constant_cache, merge, quad, repeated
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from iif_core import brdf, cells
+from iif_core.reflectance import brdf
+from iif_core.surface import cells
 from tests.unit.transport_rooms import ROOM_RADIANCE, assert_mean, bias_over, box, constant_cache, lambertian, merge, quad
 
 

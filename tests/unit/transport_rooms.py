@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iif_core import camera
+from iif_core.camera import pinhole
 
 
 def quad(corner, edge1, edge2):
@@ -71,8 +71,8 @@ class Room:
         self.radiance = np.where(self.group[:, None] >= 0, ROOM_RADIANCE[self.group], 0)
         self.side = np.where(self.group >= 0, 1, 0).astype(np.int8)
         self.emitters = T.Emitters(self.geometry, self.radiance, self.side)
-        pose = camera.look_at((2, 0.2, 1.3), (2, 2.2, 0.9), (0, 0, 1))
-        self.directions = camera.pixel_directions(26, 26, 24, 24, 48, 48, pose).reshape(-1, 3)
+        pose = pinhole.look_at((2, 0.2, 1.3), (2, 2.2, 0.9), (0, 0, 1))
+        self.directions = pinhole.pixel_directions(26, 26, 24, 24, 48, 48, pose).reshape(-1, 3)
         self.origin = pose[:3, 3].astype(np.float32)
         self.face, depth = T.trace(self.geometry, self.origin, self.directions)
         keep = (self.face >= 0) & (self.group[self.face] < 0)

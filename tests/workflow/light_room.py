@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.camera import look_at, pixel_directions
-from iif_core.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
-from iif_core.photography import response_curve
+from iif_core.camera.pinhole import look_at, pixel_directions
+from iif_core.camera.simulation import response_curve
+from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_to_disk, split_rgb
-from workflow.normal_form import CaptureWriter, Truth, View
 from workflow.registry import STAGES
+from workflow.scene.normal_form import CaptureWriter, Truth, View
 
 SIZE = (4.0, 3.0, 2.4)
 LAMP, BULB = 8.0, 20.0
@@ -170,7 +170,10 @@ def build(
 
     `sky`: radiance of what is outside the mesh; `retouch(view, image)`: the photograph as it is stored.
     """
-    from iif_core.transport import Emitters, FaceMaterials, build_geometry, render, trace
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import build_geometry, trace
+    from iif_core.light.transport.materials import FaceMaterials
+    from iif_core.light.transport.render import render
 
     room = room or Room(seed)
     room.emission *= brightness

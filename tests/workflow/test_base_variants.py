@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow import fingerprint, settings
+from workflow import settings
 from workflow.artifacts import StageReader
 from workflow.artifacts.store import ids_from_disk, rgb
-from workflow.job import run_stage
+from workflow.runtime import fingerprint
+from workflow.runtime.job import run_stage
 
 VARIANTS = {
     "full": "{}",

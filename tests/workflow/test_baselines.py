@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from light_room import AFFINES, EMISSION, SHADING, StubJob, build
 
-from workflow.normal_form import CaptureReader
+from workflow.scene.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
 MODELS = ("base", "object_mean", "texture_average", "fipt", "iris")

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, StubJob, _box, _join, _quad, build
 
-from iif_core.camera import look_at
+from iif_core.camera.pinhole import look_at
 from workflow.stages import affines, emission, export, metrics, render, report, shading
 
 STAGES = {

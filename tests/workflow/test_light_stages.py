@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
 
-from iif_core.photography import response_curve
-from workflow.normal_form import CaptureReader
+from iif_core.camera.simulation import response_curve
+from workflow.scene.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
 TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB]])

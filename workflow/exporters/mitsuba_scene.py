@@ -17,7 +17,7 @@ import numpy as np
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
 from workflow.exporters.surface import Part
-from workflow.normal_form import View
+from workflow.scene.normal_form import View
 
 _NOTE = """
   Recovered by Intrinsic Image Fusion. Lengths in metres, all values linear, roughness perceptual (alpha = roughness^2).
@@ -48,7 +48,7 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
 
     Args:
         views: at least one; each becomes a sensor. Mitsuba's cameras have square pixels: fy is taken to be fx.
-        environment: (3,) constant radiance around the scene or (H, W, 3), a map as in `iif_core.environment`; 0 = none.
+        environment: (3,) constant radiance around the scene or (H, W, 3), a map as in `iif_core.light.environment`; 0 = none.
         max_depth: path length; 1 = emitters only.
     """
     files: dict[str, bytes] = {}

@@ -32,7 +32,7 @@ class RecoveredScene:
         object_values: (objects, 5), for surface without cells.
         emitter_id: (m,) of each face, -1 = none; emitter_side: (m,) +1 front, -1 back, 0 both.
         emitter_radiance: (emitters, 3), one row per emitter id.
-        environment: (3,) or (H, W, 3) radiance of what the mesh does not cover, as in `iif_core.environment`.
+        environment: (3,) or (H, W, 3) radiance of what the mesh does not cover, as in `iif_core.light.environment`.
         seen_front, seen_back: (m,) pixels that saw each side of a face.
         up: (3,) unit vector.
     """

@@ -21,8 +21,8 @@ import torch
 from torch.nn.functional import interpolate
 
 from iif_core.errors import InputError
-from workflow.priors.checkpoint import PACKAGES, Checkpoint, Recipe, check
-from workflow.priors.loading import device_named, exact, network, quiet
+from workflow.models.checkpoint import PACKAGES, Checkpoint, Recipe, check
+from workflow.models.loading import device_named, exact, network, quiet
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 OVERLAP = 0.25

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.color import linear_from_srgb
 from iif_core.errors import InputError
-from workflow.normal_form import CaptureReader, View
+from iif_core.numerics.color import linear_from_srgb
+from workflow.scene.normal_form import CaptureReader, View
 from workflow.sources.folder_scene import images
 
 PROPERTIES = ("albedo", "roughness", "metallic")

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.color import linear_from_srgb
 from iif_core.errors import InputError
-from workflow.normal_form import CaptureReader, View
-from workflow.priors.checkpoint import Recipe, check
+from iif_core.numerics.color import linear_from_srgb
+from workflow.models.checkpoint import Recipe, check
+from workflow.scene.normal_form import CaptureReader, View
 
 REPOSITORY = "prs-eth/marigold-iid-appearance-v1-1"
 MAPS = {"albedo": 3, "roughness": 1, "metallicity": 1}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from iif_core.color import key_exposure, srgb_from_linear
-from iif_core.filters import fill_from_neighbours
-from workflow.normal_form import CaptureReader, View
+from iif_core.numerics.color import key_exposure, srgb_from_linear
+from iif_core.numerics.filters import fill_from_neighbours
+from workflow.scene.normal_form import CaptureReader, View
 
 GAMMA = 2.2
 """Stands for the unknown inverse response of an LDR photograph, as in the reference's prior (METHOD 1.3)."""

@@ -11,11 +11,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.gathering import LightField, SurfaceCellsBuilder, Trace, with_light
-from iif_core.mesh import face_geometry
-from iif_core.retinex import albedo_level, retinex_predictions
-from workflow.normal_form import CaptureReader, View
+from iif_core.light.irradiance import LightField, SurfaceCellsBuilder, Trace, with_light
+from iif_core.priors.retinex import albedo_level, retinex_predictions
+from iif_core.surface.mesh import face_geometry
 from workflow.priors.photograph import GAMMA
+from workflow.scene.normal_form import CaptureReader, View
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
 
@@ -138,7 +138,7 @@ def _tracer(vertices: np.ndarray, faces: np.ndarray) -> Trace:
     import mitsuba
 
     mitsuba.set_variant("llvm_ad_rgb")
-    from iif_core.transport import build_geometry, trace
+    from iif_core.light.transport.geometry import build_geometry, trace
 
     geometry = build_geometry(vertices, faces, np.full(len(faces), -1, np.int32))
     return lambda origins, directions: trace(geometry, origins, directions)

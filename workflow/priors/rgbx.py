@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from workflow.normal_form import CaptureReader, View
-from workflow.priors.checkpoint import Recipe, check
+from workflow.models.checkpoint import Recipe, check
+from workflow.scene.normal_form import CaptureReader, View
 
 RECIPE = Recipe(
     kind="rgbx",

@@ -1,4 +1,4 @@
-"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (iif_core.simulate)."""
+"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (iif_core.priors.simulate)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.simulate import shading_proxy, simulate_predictions
-from workflow.normal_form import CaptureReader, View
+from iif_core.priors.simulate import shading_proxy, simulate_predictions
+from workflow.scene.normal_form import CaptureReader, View
 
 _NO_TRUTH = (
     "`prior: {kind: simulated}` spoils ground truth, and this capture has none;"

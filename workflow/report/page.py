@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import jinja2
 
-TEMPLATE = "page.html.j2"
+TEMPLATE = Path(__file__).with_name("page.html.j2")
 
 VARIANT_NAMES = {
     "prior_k0": "raw prediction (first)",
@@ -89,19 +89,19 @@ def render_page(page: Page) -> str:
     return template(TEMPLATE).render(page=page)
 
 
-def template(name: str) -> jinja2.Template:
-    """A template of this folder; it escapes every text, and a name that it lacks is an error."""
+def template(path: Path) -> jinja2.Template:
+    """The template in a file; it escapes every text, and a name that it lacks is an error."""
     import jinja2
 
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        loader=jinja2.FileSystemLoader(path.parent),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters["number"] = number
-    return environment.get_template(name)
+    return environment.get_template(path.name)
 
 
 def number(value: Any, digits: int = 3) -> str:

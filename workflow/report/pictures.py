@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from iif_core import color
+from iif_core.numerics import color
 
 Array = np.ndarray
 

@@ -3,7 +3,7 @@
 # Snakemake ends with an error when the others are done.
 import subprocess
 
-from workflow import batch as batch_table
+from workflow.batch import plan as batch_table
 
 batch_asked = []
 

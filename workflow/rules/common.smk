@@ -4,9 +4,9 @@ import sys
 
 sys.path.insert(0, workflow.basedir)
 
-from iif_core import native
 from iif_core.errors import InputError
-from workflow import fingerprint as fingerprints
+from workflow.runtime import fingerprint as fingerprints
+from workflow.runtime import native
 from workflow.settings import QUALITIES, SCENE_NAME, scene_file
 
 native.process_environment()

@@ -1,11 +1,12 @@
-# Studies: variants are derived scenes that the ordinary rules make (workflow/studies.py); a study collects their scores.
-from workflow import studies, study_table
+# Studies: variants are derived scenes that the ordinary rules make (workflow/studies/files.py); a study collects their scores.
+from workflow.settings import study_files
+from workflow.studies import table as study_table
 
 BENCHMARKS = "hashgrid|base_cost"
 
 
 wildcard_constraints:
-    study=rf"(?!(?:{BENCHMARKS})\.){studies.STUDY}",
+    study=rf"(?!(?:{BENCHMARKS})\.){study_files.STUDY}",
     benchmark=BENCHMARKS,
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.felzenszwalb import segment_mesh, smooth_over_faces
+from iif_core.objects.felzenszwalb import segment_mesh, smooth_over_faces
 from workflow.segmentations.surface import FOLDS, Objects, Surface
 
 PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"

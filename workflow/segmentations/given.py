@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.segments import vote_faces
+from iif_core.surface.segments import vote_faces
 from workflow.segmentations.surface import Objects, Surface
 
 PERTURBED = "every third photograph's ids left out"

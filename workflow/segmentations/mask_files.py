@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.distortion import Distortion, Pinhole, distort
+from iif_core.camera.distortion import Distortion, Pinhole, distort
 from iif_core.errors import InputError
-from iif_core.mask_clustering import flatten_masks
-from workflow.normal_form import CaptureReader, View
+from iif_core.objects.mask_clustering import flatten_masks
+from workflow.scene.normal_form import CaptureReader, View
 from workflow.sources.folder_scene import images
 
 SHAPE_TOLERANCE = 0.02

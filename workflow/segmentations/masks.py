@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.errors import InputError
-from iif_core.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
-from iif_core.mask_votes import join_together, joined, keep_together, label_faces, sightings, view_votes
-from iif_core.segments import fill_within
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
+from iif_core.objects.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
+from iif_core.objects.mask_votes import join_together, joined, keep_together, label_faces, sightings, view_votes
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.surface.segments import fill_within
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
 from workflow.segmentations import sam2
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.mask_files import MaskFiles, mask_files

@@ -3,7 +3,7 @@
 A grid of points is put to the model, which answers each with three masks: what it lies on, a part, a part of that. What the
 model trusts and what does not hang on the threshold stays, of nearly equal masks the surest; small masks lie on large ones
 (docs/segmentation.md). transformers' image processor and mask pipeline need torchvision, which the environment does not have;
-what they would do, scaling and the choice of masks, is done here and in `iif_core.mask_proposals`.
+what they would do, scaling and the choice of masks, is done here and in `iif_core.objects.mask_proposals`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.mask_clustering import flatten_masks
-from iif_core.mask_proposals import point_grid, suppressed, threshold_stability
+from iif_core.objects.mask_clustering import flatten_masks
+from iif_core.objects.mask_proposals import point_grid, suppressed, threshold_stability
 from workflow.artifacts.files import read_exr
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.priors.checkpoint import (
+from workflow.models.checkpoint import (
     Checkpoint,
     Origin,
     header,
@@ -33,6 +31,8 @@ from workflow.priors.checkpoint import (
     weights_in,
 )
 from workflow.priors.photograph import seen
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
 
 ORIGIN = Origin(
     repository="facebook/sam2.1-hiera-large",
@@ -84,7 +84,7 @@ class Generator:
 
     def __init__(self, own: SimpleNamespace):
         """`own`: the settings' section; its checkpoint is checked again."""
-        from workflow.priors.loading import device_named, network, quiet
+        from workflow.models.loading import device_named, network, quiet
 
         self.own, self.checkpoint = own, check(vars(own))
         self.device = device_named(own.device, ORIGIN)
@@ -110,7 +110,7 @@ class Generator:
         """Masks (n, H, W) bool that pass confidence and stability, their confidence (n,), and answers that are not finite."""
         import torch
 
-        from workflow.priors.loading import exact
+        from workflow.models.loading import exact
 
         masks, scores, lost = [np.zeros((0, *picture.shape[:2]), bool)], [np.zeros(0, np.float32)], 0
         points = torch.from_numpy(point_grid(self.own.points_per_side) * self.side).to(self.device)

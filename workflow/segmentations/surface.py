@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.segments import face_adjacency
-from workflow.normal_form import CaptureReader, View
+from iif_core.surface.segments import face_adjacency
+from workflow.scene.normal_form import CaptureReader, View
 
 FOLDS = 3
 """Perturbed runs: each leaves out every third photograph."""

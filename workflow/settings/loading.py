@@ -7,46 +7,14 @@ import re
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import ValidationError
 
 from iif_core.errors import InputError
+from workflow.settings import batch_table, study_files
 from workflow.settings.explain import explain
+from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.scene import SceneSettings
-
-QUALITIES = ("draft", "standard", "paper")
-SCENE_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
-"""What a scene may be called: its name is a folder, a target of Snakemake and part of the names of variants."""
-RESERVED = ("batch", "studies", "weights")
-"""Folders of results/ that are no scene's."""
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a key that stands twice in one mapping is an error, not a silent choice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
-        for key, (key_node, _) in zip(keys, node.value, strict=True):
-            if keys.count(key) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"key `{key}` stands twice", key_node.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A file of `key: value` lines; an `InputError` names file and line."""
-    try:
-        document = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise InputError(f"{path}{where}: not valid YAML ({getattr(error, 'problem', error)})") from None
-    if document is None:
-        return {}
-    if not isinstance(document, dict):
-        raise InputError(f"{path}: found {type(document).__name__}, expected `key: value` lines; see config/scenes/kitchen.yaml")
-    return document
+from workflow.settings.yaml_file import read_yaml
 
 
 def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
@@ -62,14 +30,8 @@ def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def scene_names(root: Path = Path(".")) -> list[str]:
-    """Every scene that has a file."""
-    return sorted(path.stem for path in (root / "config/scenes").glob("*.yaml"))
-
-
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
     """Path of a scene's file, of a study's derived scene its parent's; an unknown scene is an error with the nearest name."""
-    from workflow import batch, studies  # they need this module first
 
     if (root / "config/scenes" / f"{scene}.yaml").is_file():
         if not re.fullmatch(SCENE_NAME, scene):
@@ -79,15 +41,15 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
             )
         if scene in RESERVED:
             raise InputError(f"config/scenes/{scene}.yaml: results/ uses {scene!r} otherwise; rename the file")
-    parts = studies.derived(scene, root)
+    parts = study_files.derived(scene, root)
     scene = parts.scene if parts else scene
     path = root / "config/scenes" / f"{scene}.yaml"
     if not path.is_file():
         files = scene_names(root)
-        listed = [line.name for line in batch.read_table(root) if line.name not in files]
+        listed = [line.name for line in batch_table.read_table(root) if line.name not in files]
         near = difflib.get_close_matches(scene, files + listed, 1)
         hint = f" Did you mean scenes/{near[0]}?" if near else ""
-        more = f" and {len(listed)} of {batch.TABLE}" if listed else ""
+        more = f" and {len(listed)} of {batch_table.TABLE}" if listed else ""
         raise InputError(
             f"config/scenes/{scene}.yaml: not found.{hint} Known scenes: {', '.join(files) or 'none'}{more}."
             " Add a file there to add a scene (docs/own-data.md)."
@@ -96,10 +58,9 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
 
 
 def scene_origin(scene: str, root: Path = Path(".")) -> str:
-    """Where a scene is described, for messages: its file, or its line of the batch table."""
-    from workflow import batch
+    """Where a scene is described, for messages: its file, or its line of the batch batch_table."""
 
-    line = batch.find(scene, root)
+    line = batch_table.find(scene, root)
     return line.at() if line else str(scene_file(scene, root))
 
 
@@ -107,21 +68,20 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
     """Settings of `scene` at `quality`; an `InputError` names file, key, what was found and what is allowed."""
     if quality not in QUALITIES:
         raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
-    from workflow import batch, studies
 
     preset_file = root / "config/quality" / f"{quality}.yaml"
     preset = read_yaml(preset_file) if preset_file.is_file() else {}
-    if line := batch.find(scene, root):
-        layers = [(f"config/quality/{quality}.yaml", preset), *batch.layers(line, root)]
+    if line := batch_table.find(scene, root):
+        layers = [(f"config/quality/{quality}.yaml", preset), *batch_table.layers(line, root)]
         try:
             return SceneSettings.model_validate(_merged(layers))
         except ValidationError as error:
-            raise InputError(explain(error, batch.blame(line, layers))) from None
+            raise InputError(explain(error, batch_table.blame(line, layers))) from None
     path = scene_file(scene, root)
     shown = path.relative_to(root) if path.is_absolute() else path
     layers = [("", preset), (str(shown), read_yaml(path))]
-    if parts := studies.derived(scene, root):
-        layers += studies.layers(parts, root)
+    if parts := study_files.derived(scene, root):
+        layers += study_files.layers(parts, root)
     try:
         return SceneSettings.model_validate(_merged(layers))
     except ValidationError:

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from workflow.denoise import NOTE, denoise, require_denoiser
-from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.models.denoise import NOTE, denoise, require_denoiser
+from workflow.scene.normal_form import CaptureWriter, Truth, View
 
 if TYPE_CHECKING:
-    from workflow.job import Job
+    from workflow.runtime.job import Job
     from workflow.sources.rooms.room import Room
 
 Array = np.ndarray
@@ -36,7 +36,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Build the room, photograph it, and write the normal form with truth."""
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     import mitsuba as mi
@@ -55,7 +55,8 @@ class _Capture:
     """One capture: the room on the device, its views, and what is to be said about them."""
 
     def __init__(self, job: Job, room: Room):
-        from iif_core.transport import Emitters, build_geometry
+        from iif_core.light.transport.emitters import Emitters
+        from iif_core.light.transport.geometry import build_geometry
 
         self.job, self.settings, self.room = job, job.settings.capture, room
         self.writer = CaptureWriter(job.writer)
@@ -101,8 +102,9 @@ class _Capture:
 
     def _view(self, view: View, radiance: Array) -> tuple[Array, Array]:
         """Write G-buffer and truth, fill in `radiance`; radiance and mask of the pixels for metering."""
-        from iif_core.camera import direction_derivatives, pixel_directions
-        from iif_core.transport import render, trace
+        from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+        from iif_core.light.transport.geometry import trace
+        from iif_core.light.transport.render import render
 
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
@@ -142,7 +144,7 @@ class _Capture:
 
     def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
         """Write the photographs; the views with their exposures."""
-        from iif_core.photography import expose, exposures, response_curve
+        from iif_core.camera.simulation import expose, exposures, response_curve
 
         self.response = None
         if self.settings.dynamic_range == "hdr":

@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from iif_core import native
-from iif_core.color import linear_from_srgb
-from iif_core.distortion import Pinhole, pinhole_inside, undistort_image
+from iif_core.camera.distortion import Pinhole, pinhole_inside, undistort_image
+from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
-from iif_core.registration import Photo
-from workflow.job import Job
-from workflow.normal_form import CaptureWriter, Truth, View
+from iif_core.numerics.color import linear_from_srgb
+from workflow.runtime import native
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureWriter, Truth, View
 from workflow.sources.folder_scene import alignment, exposure, images, mesh, registration, transforms
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.transforms import Frame
@@ -140,7 +140,7 @@ class _Capture:
         if mi.variant() is None:
             mi.set_variant("llvm_ad_rgb")
         native.limit_threads(self.job.threads)
-        from iif_core.transport import build_geometry
+        from iif_core.light.transport.geometry import build_geometry
 
         no_object = np.full(len(self.mesh.faces), -1, np.int32)
         self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, no_object)
@@ -198,7 +198,7 @@ class _Capture:
 
     def _trace(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """z-depth (0 = miss) and face ids of a view."""
-        from iif_core.transport import trace
+        from iif_core.light.transport.geometry import trace
 
         rays = alignment.directions(_pinhole(view), view.world_from_camera)
         face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
@@ -342,7 +342,7 @@ class _Capture:
 
     def _surface_along(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """z-depth (h, w) with 0 = miss, and normals (h, w, 3)."""
-        from iif_core.transport import trace
+        from iif_core.light.transport.geometry import trace
 
         face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
         normal = np.where(face[:, None] >= 0, self.normals[face], 0)

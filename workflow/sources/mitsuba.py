@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.denoise import NOTE, denoise, require_denoiser
-from workflow.normal_form import CaptureWriter, Truth, View
+from workflow.models.denoise import NOTE, denoise, require_denoiser
+from workflow.scene.normal_form import CaptureWriter, Truth, View
 from workflow.sources.mitsuba_scene.document import referenced_files
 
 if TYPE_CHECKING:
-    from workflow.job import Job
+    from workflow.runtime.job import Job
 
 Array = np.ndarray
 
@@ -41,7 +41,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Write the whole capture of the scene that `source.path` names."""
-    from iif_core import native
+    from workflow.runtime import native
 
     native.prepare()
     from workflow.sources.mitsuba_scene import scene
@@ -120,7 +120,7 @@ class _Capture:
 
     def _plan(self, solid_mesh: Any, glass: bool) -> list[View]:
         """Geometry for tracing, and the views."""
-        from iif_core.transport.geometry import build_geometry, trace
+        from iif_core.light.transport.geometry import build_geometry, trace
         from workflow.sources.mitsuba_scene import path
 
         self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, self.mesh.shape)
@@ -162,7 +162,7 @@ class _Capture:
         """(world_from_camera, tangent of half the horizontal field of view) of the XML's perspective sensors."""
         import mitsuba as mi
 
-        from iif_core.camera import look_at
+        from iif_core.camera.pinhole import look_at
 
         out = []
         for sensor in self.loaded.scene.sensors():
@@ -210,8 +210,8 @@ class _Capture:
 
     def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
         """z-depth, face ids and material truth at the pixel centres (radiance still to come)."""
-        from iif_core.camera import pixel_directions
-        from iif_core.transport.geometry import trace
+        from iif_core.camera.pinhole import pixel_directions
+        from iif_core.light.transport.geometry import trace
         from workflow.sources.mitsuba_scene import materials, render
 
         origin = view.world_from_camera[:3, 3]
@@ -250,7 +250,7 @@ class _Capture:
 
     def _normals(self, view: View, face: Array) -> Array:
         """World normals towards the camera (H, W, 3), 0 where nothing is hit."""
-        from iif_core.camera import pixel_directions
+        from iif_core.camera.pinhole import pixel_directions
 
         rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
@@ -258,7 +258,7 @@ class _Capture:
 
     def _photographs(self, views: list[View], radiance: Array) -> list[View]:
         """Sensor values (LDR) or radiance (HDR) of every view; the views with their exposures."""
-        from iif_core.photography import expose, exposures, response_curve
+        from iif_core.camera.simulation import expose, exposures, response_curve
         from workflow.sources.folder_scene.exposure import SharedSurface
 
         encoded = self.settings.dynamic_range == "ldr"
@@ -278,8 +278,8 @@ class _Capture:
         return self._estimated(shared, views) if self.settings.exposure == "estimate" else views
 
     def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
-        from iif_core.camera import pixel_directions
-        from iif_core.transport.geometry import trace
+        from iif_core.camera.pinhole import pixel_directions
+        from iif_core.light.transport.geometry import trace
 
         rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
         face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from workflow.job import Job
+from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, mesh, transforms
 from workflow.sources.folder_scene.inputs import Inputs

@@ -8,28 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from iif_core import plan
-from iif_core.affines import (
-    FitOptions,
-    FitProblem,
-    FitResult,
-    Gauge,
-    SgdOptions,
-    albedo_uncertainty,
-    apply_affines,
-    fit_affines,
-    fit_affines_sgd,
-    patches,
-    pin,
-    reference_loss,
-)
-from iif_core.affines.problem import MATTE
-from iif_core.camera_gains import CameraGains
+from iif_core.camera.gains import CameraGains
+from iif_core.camera.response import Response, response_facts, response_from_facts
 from iif_core.errors import InputError
-from iif_core.response import Response, response_facts, response_from_facts
-from workflow import baselines
+from iif_core.fitting.clusters import patches
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.gauge import Gauge, pin
+from iif_core.fitting.problem import MATTE, FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines
+from iif_core.fitting.reference_loss import reference_loss
+from iif_core.fitting.sgd import SgdOptions, fit_affines_sgd
+from workflow import decisions
 from workflow.artifacts.store import ids_from_disk, split_rgb
-from workflow.base_scene import (
+from workflow.fitting import baselines
+from workflow.fitting.cell_textures import CellTextures
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import (
     MATERIAL,
     BaseScene,
     base_maps,
@@ -40,10 +33,8 @@ from workflow.base_scene import (
     sensor_bounds,
     view_pixels,
 )
-from workflow.cell_textures import CellTextures
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.recovered import write_response
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.recovered import write_response
 
 THIN_PIXELS = 50
 """Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
@@ -65,7 +56,7 @@ def run(job: Job) -> None:
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
     direct = job.settings.affines.solver == "direct"  # the twins know no fit without gloss
     scatter = textures.scatter(fit) if textures is not None and direct else None
-    if scatter is not None and plan.gloss_is_idle(*scatter):
+    if scatter is not None and decisions.gloss_is_idle(*scatter):
         fit, free = _fitted(job, problem, start, prior, places, find_gauge, matte=True)
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
@@ -75,9 +66,9 @@ def run(job: Job) -> None:
     albedo = textures.albedo(fit) if textures is not None else None
     _write_cells(job, fit, albedo)
     _write_maps(job, capture, fit, albedo)
-    decisions = _plan(problem, fit, calibration, capture.facts["dynamic_range"], scatter)
+    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], scatter)
     loss = reference_loss(problem, free.affine, free.response)
-    _write_facts(job, fit, loss.__dict__, decisions)
+    _write_facts(job, fit, loss.__dict__, plan)
 
 
 def _fitted(
@@ -115,7 +106,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
     return lambda problem, start: fit_affines_sgd(problem, start, own)
 
 
-def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], decisions: list[plan.Decision]) -> None:
+def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[decisions.Decision]) -> None:
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
     job.writer.json(
@@ -132,7 +123,7 @@ def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], decisions: li
             "pixels": int(fit.pixels.sum()),
             "residual": float(np.sqrt(np.average(fit.residual**2, weights=weight))) if len(fit.pixels) else 0.0,
             "response": {**response_facts(fit.response), "std": spread.tolist(), "covariance": fit.response_covariance.tolist()},
-            "plan": decisions,
+            "plan": plan,
         },
     )
 
@@ -406,7 +397,7 @@ def _plan(
     calibration: dict[str, Any],
     dynamic_range: str,
     scatter: tuple[float, float] | None,
-) -> list[plan.Decision]:
+) -> list[decisions.Decision]:
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
     medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)
@@ -420,10 +411,10 @@ def _plan(
             gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
     metal = np.any(fit.affine[:, 14:] != 0, 1)  # of an object that keeps its prediction too, which is not fitted
     return [
-        plan.camera_response(dynamic_range, calibration),
-        plan.metallic(metal & fit.free.any(1), medians),
-        plan.specular(glossy, metal, scatter),
-        plan.affine_size(fit.model),
-        plan.second_pass(gains, fit.pixels),
-        plan.scale(**fit.facts["scale"]),
+        decisions.camera_response(dynamic_range, calibration),
+        decisions.metallic(metal & fit.free.any(1), medians),
+        decisions.specular(glossy, metal, scatter),
+        decisions.affine_size(fit.model),
+        decisions.second_pass(gains, fit.pixels),
+        decisions.scale(**fit.facts["scale"]),
     ]

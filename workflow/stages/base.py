@@ -7,13 +7,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.base.direct import describe_fit, solve_base
-from iif_core.base.matching import REGULARISER
-from iif_core.base.options import BaseOptions
-from iif_core.base.problem import CHANNELS, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, one_segment_per_view
-from iif_core.base.reference_loss import loss_of_result
-from iif_core.base.sgd import SgdFit, converged, sgd_options, solve_base_sgd
-from iif_core.cells import (
+from iif_core.errors import InputError
+from iif_core.fusion.direct import describe_fit, solve_base
+from iif_core.fusion.hashgrid.levels import HashGridOptions
+from iif_core.fusion.matching import REGULARISER
+from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.problem import CHANNELS, NEUTRAL, PROPERTIES, BaseProblem, BaseResult, one_segment_per_view
+from iif_core.fusion.reference_loss import loss_of_result
+from iif_core.fusion.sgd.options import sgd_options
+from iif_core.fusion.sgd.solve import SgdFit, converged, solve_base_sgd
+from iif_core.surface.cells import (
     COARSE_SHIFT,
     INDEX_LIMIT,
     coarse_cells,
@@ -23,12 +26,10 @@ from iif_core.cells import (
     unpack_keys,
     voxel_indices,
 )
-from iif_core.errors import InputError
-from iif_core.hashgrid import HashGridOptions
-from iif_core.mesh import face_geometry
+from iif_core.surface.mesh import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
 
 FOOTPRINT_WEIGHTS = (0.05, 4.0)
 """Smallest and largest weight by footprint."""

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-from iif_core import metrics
 from iif_core.errors import InputError
-from workflow import scores as scoring
-from workflow.job import Job
-from workflow.normal_form import CaptureReader
+from iif_core.evaluation import metrics
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader
+from workflow.scoring import scores as scoring
 
 
 def run(job: Job) -> None:

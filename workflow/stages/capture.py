@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 
-from workflow.job import Job
+from workflow.runtime.job import Job
 
 
 def run(job: Job) -> None:

@@ -6,25 +6,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from iif_core import plan
-from iif_core.calibration import calibration_facts
-from iif_core.emission.cache import RadianceVoxels
-from iif_core.emission.candidates import emitter_candidates
-from iif_core.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
-from iif_core.emission.environment import Sky
-from iif_core.emission.gains import LEVEL_OF_PRIOR
-from iif_core.emission.groups import EmitterGroups, group_emitters
-from iif_core.emission.loss import reference_loss
-from iif_core.emission.problem import EmissionProblem, Halves, PixelRows, assemble, initial_radiance, white_surface
-from iif_core.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
-from iif_core.emission.sensor import Sensor
-from iif_core.emission.sgd import SgdOptions, solve_emission_sgd
-from iif_core.response import response, response_facts
-from iif_core.segments import face_adjacency
-from workflow.base_scene import ViewPixels, read_base_scene
-from workflow.job import Job
-from workflow.normal_form import CaptureReader
-from workflow.photographs import (
+from iif_core.camera.calibration.choice import calibration_facts
+from iif_core.camera.response import response, response_facts
+from iif_core.light.emission.cache import RadianceVoxels
+from iif_core.light.emission.candidates import emitter_candidates
+from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
+from iif_core.light.emission.environment import Sky
+from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.light.emission.groups import EmitterGroups, group_emitters
+from iif_core.light.emission.loss import reference_loss
+from iif_core.light.emission.problem import EmissionProblem, Halves, PixelRows, assemble, initial_radiance, white_surface
+from iif_core.light.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
+from iif_core.light.emission.sensor import Sensor
+from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.surface.segments import face_adjacency
+from workflow import decisions
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import ViewPixels, read_base_scene
+from workflow.scene.emission_pixels import (
     SEEDS,
     Photographs,
     calibrated,
@@ -35,9 +34,10 @@ from workflow.photographs import (
     statistics_of_faces,
     view_exposures,
 )
+from workflow.scene.normal_form import CaptureReader
 
 if TYPE_CHECKING:
-    from iif_core.transport import CellMaterials
+    from iif_core.light.transport.materials import CellMaterials
 
 WHITE = (1.0, 1.0, 1.0, 1.0, 0.0)
 """Base material of the brightest surface that only reflects."""
@@ -62,8 +62,8 @@ def run(job: Job) -> None:
     job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
     cache, sums, escape, brightness = radiance_cache(photos, groups)
     secondary = escaping_share(photos)
-    environment = plan.environment(job.settings.emission.environment, escape, secondary, brightness)
-    is_open = secondary > plan.ESCAPE_OPEN
+    environment = decisions.environment(job.settings.emission.environment, escape, secondary, brightness)
+    is_open = secondary > decisions.ESCAPE_OPEN
     outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
     if outside is not None and is_open:
         notes.append(
@@ -93,7 +93,7 @@ def run(job: Job) -> None:
         notes.append(
             f"light raised {np.exp(raised):.2f} times so that albedos are at most 1; the error of its level does not contain that"
         )
-    decisions = [environment, *gain_plan(capture, photos.gains), plan.emitters(kept, candidates - kept, candidates)]
+    plan = [environment, *gain_plan(capture, photos.gains), decisions.emitters(kept, candidates - kept, candidates)]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",
@@ -113,7 +113,7 @@ def run(job: Job) -> None:
             "gain": photos.gains.gain.tolist(),
             "vignetting": photos.gains.vignetting.tolist(),
             "response": {**response_facts(camera.response), "calibration": calibration_facts(camera)},
-            "plan": decisions,
+            "plan": plan,
             "notes": notes,
         },
     )
@@ -210,7 +210,8 @@ def _trace(
     job, settings = photos.job, photos.job.settings.emission
     geometry, material = photos.world
     material = material if met is None else met
-    from iif_core.transport import RadianceCache, transport_matrix
+    from iif_core.light.transport.cache import RadianceCache
+    from iif_core.light.transport.matrix import transport_matrix
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)

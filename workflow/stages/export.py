@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.environment import as_map, solid_angles
 from iif_core.errors import InputError
+from iif_core.light.environment import as_map, solid_angles
 from workflow.exporters.glb import glb_bytes
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, up_axis
-from workflow.job import Job
-from workflow.normal_form import CaptureReader
-from workflow.recovered import Recovered, read_recovered
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader
+from workflow.scene.recovered import Recovered, read_recovered
 
 VERTEX_SPACING = 0.05
 """Edges are halved until they are this short (metres), or two cells where cells are larger."""

@@ -8,12 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from iif_core import metrics
-from iif_core.lpips import Weights
+from iif_core.evaluation import metrics
+from iif_core.evaluation.lpips import Weights
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.scores import (
+from workflow.models.lpips import FETCH_VGG
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scoring.no_reference import truth_free_scores
+from workflow.scoring.scores import (
     MATERIALS,
     UNITS,
     MaterialTruth,
@@ -23,8 +25,6 @@ from workflow.scores import (
     perceptual_networks,
     prediction_numbers,
 )
-from workflow.truth_free import truth_free_scores
-from workflow.weights import FETCH_VGG
 
 BASELINES = {
     "prior_k0": "the first prediction of each view, as the prior gave it",

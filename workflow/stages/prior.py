@@ -7,12 +7,12 @@ from types import ModuleType
 
 import numpy as np
 
-from iif_core.base.problem import prediction_faults
 from iif_core.errors import InputError
-from iif_core.filters import fill_from_neighbours
+from iif_core.fusion.problem import prediction_faults
+from iif_core.numerics.filters import fill_from_neighbours
 from workflow.artifacts.store import split_rgb
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
 
 Row = tuple[int, int, bool, str]
 """view_id, k, whether the prediction is used, why not (or what was done to it)."""

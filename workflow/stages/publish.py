@@ -11,8 +11,8 @@ import numpy as np
 
 from workflow.artifacts.files import sha256_of, write_json, write_parquet
 from workflow.artifacts.store import StageReader
-from workflow.job import Job, library_versions
-from workflow.timings import read_timings
+from workflow.runtime.job import Job, library_versions
+from workflow.runtime.timings import read_timings
 
 SCHEMA = "iif.scene/1"
 TIMING_COLUMNS: dict[str, Any] = {

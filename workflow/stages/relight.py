@@ -9,20 +9,20 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.camera import direction_derivatives, pixel_directions
-from iif_core.color import to_uint8
-from iif_core.environment import as_map, resample
+from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+from iif_core.camera.response import Response, response
 from iif_core.errors import InputError
-from iif_core.relighting import axes_of_map, camera_path, exposure_for, frame_times, sphere_mesh
-from iif_core.response import Response, response
+from iif_core.light.environment import as_map, resample
+from iif_core.light.relighting import axes_of_map, camera_path, exposure_for, frame_times, sphere_mesh
+from iif_core.numerics.color import to_uint8
 from workflow.artifacts.files import read_exr
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.base_scene import Light
-from workflow.denoise import denoise, require_denoiser
 from workflow.exporters.surface import up_axis
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.recovered import Recovered, read_recovered, read_response
+from workflow.models.denoise import denoise, require_denoiser
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import Light
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.recovered import Recovered, read_recovered, read_response
 from workflow.settings import require_relighting
 
 _SEEDS = 0x72656C69  # keeps the random streams of this stage apart from those of others
@@ -172,7 +172,7 @@ def _world(scene: Recovered, light: Light, wanted: SimpleNamespace, time: float)
 
 def _frame(world: tuple, camera: _Camera, pose: np.ndarray, wanted: SimpleNamespace, seed: int) -> np.ndarray:
     """(H, W, 3) float32 radiance."""
-    from iif_core.transport import first_hits, render
+    from iif_core.light.transport.render import first_hits, render
 
     geometry, material, emitters = world
     shape, eye = (camera.height, camera.width, 3), pose[:3, 3]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import minimum_filter
 
-from iif_core import plan
-from iif_core.camera import direction_derivatives, pixel_directions
-from iif_core.consistency import held_out_gain
+from iif_core.camera.pinhole import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
+from iif_core.evaluation.consistency import held_out_gain
+from workflow import decisions
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.base_scene import BLACK, pixel_gains, read_gains
-from workflow.denoise import denoise, require_denoiser
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.recovered import Recovered, read_recovered, read_response
+from workflow.models.denoise import denoise, require_denoiser
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import BLACK, pixel_gains, read_gains
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.recovered import Recovered, read_recovered, read_response
 
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
 
@@ -30,7 +30,7 @@ def run(job: Job) -> None:
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, gains = read_response(job.read("affines")), read_gains(job)
     geometry, material = scene.surface.traceable(scene.light.emits)
-    from iif_core.transport import render
+    from iif_core.light.transport.render import render
 
     if job.settings.render.denoise:
         require_denoiser()
@@ -38,7 +38,7 @@ def run(job: Job) -> None:
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
     found: dict[int, np.ndarray] = {}
-    through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > plan.ESCAPE_OPEN
+    through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > decisions.ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views re-rendered")

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import yaml
 
-from iif_core import color
+from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, rgb
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
-from workflow.recovered import Recovered, read_recovered, response_samples
 from workflow.report import pictures as pic
 from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
+from workflow.runtime.job import Job
+from workflow.runtime.timings import read_timings
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.recovered import Recovered, read_recovered, response_samples
 from workflow.stages.metrics import material_maps, prediction_numbers
-from workflow.timings import read_timings
 
 PLAN_KEYS = ("component", "included", "measure", "value", "threshold", "reason")
 ERROR_RANGE = 0.25

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from iif_core import plan
 from iif_core.errors import InputError
-from iif_core.mesh import face_geometry
-from iif_core.segments import interior, partition_agreement, segment_table
+from iif_core.surface.mesh import face_geometry
+from iif_core.surface.segments import interior, partition_agreement, segment_table
+from workflow import decisions
 from workflow.artifacts.store import ids_to_disk
-from workflow.job import Job
-from workflow.normal_form import CaptureReader
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface
 
 
@@ -121,5 +121,5 @@ def _document(job: Job, kind: ModuleType, objects: Objects, stability: Stability
         "stability": None if stability.value is None else round(stability.value, 6),
         "stability_runs": [round(value, 6) for value in stability.runs],
         "perturbed": kind.PERTURBED,
-        "plan": [plan.segmentation(own, seen, stability.value, kind.PERTURBED, objects.facts)],
+        "plan": [decisions.segmentation(own, seen, stability.value, kind.PERTURBED, objects.facts)],
     }

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from iif_core import plan
-from iif_core.cells import grid_origin
 from iif_core.errors import InputError
-from iif_core.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells, joined
+from iif_core.surface.cells import grid_origin
+from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells, joined
+from workflow import decisions
 from workflow.artifacts.store import split_rgb
-from workflow.base_scene import (
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import (
     BaseScene,
     Light,
     ViewPixels,
@@ -23,11 +24,13 @@ from workflow.base_scene import (
     read_radiance_cache,
     view_pixels,
 )
-from workflow.job import Job
-from workflow.normal_form import CaptureReader, View
+from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
-    from iif_core.transport import CellMaterials, Emitters, Geometry, RadianceCache
+    from iif_core.light.transport.cache import RadianceCache
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import Geometry
+    from iif_core.light.transport.materials import CellMaterials
 
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
 COVERAGE_RAYS = 8192
@@ -80,9 +83,9 @@ def _cells(job: Job, capture: CaptureReader, scene: BaseScene) -> ShadingCells:
     return builder.finish()
 
 
-def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, cells: ShadingCells) -> plan.Decision:
+def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, cells: ShadingCells) -> decisions.Decision:
     """Whether the radiance cache stands for indirect light: by how much of what the surface sees it knows."""
-    from iif_core.transport import cosine_directions, trace
+    from iif_core.light.transport.geometry import cosine_directions, trace
 
     rng = np.random.default_rng([job.seed, _SEEDS])
     share = cells.pixels / cells.pixels.sum()
@@ -93,7 +96,7 @@ def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, 
     hit = (face >= 0) & ~light.emits[np.maximum(face, 0)]
     covered = cache.covers((origin + t[:, None] * way)[hit]) if hit.any() else np.zeros(0, bool)
     censored = job.read("emission").table("radiance_cache.parquet")["censored"].astype(bool)
-    return plan.radiance_cache(
+    return decisions.radiance_cache(
         job.settings.shading.indirect,
         float(covered.mean()) if covered.size else 0.0,
         float(censored.mean()) if censored.size else 0.0,
@@ -101,7 +104,7 @@ def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, 
 
 
 def _diffuse(job: Job, world: _World, cells: ShadingCells) -> DiffuseShading:
-    from iif_core.transport import shading_caches
+    from iif_core.light.transport.shading import shading_caches
 
     settings = job.settings.shading
 
@@ -166,7 +169,7 @@ def _views(
 
 def _traced(job: Job, world: _World, levels: np.ndarray, view: View, pixels: ViewPixels) -> tuple[np.ndarray, ...]:
     """Diffuse (2, n, 3) and specular (2, n, J, 3) twice of the pixels of a view, two independent halves."""
-    from iif_core.transport import shading_caches
+    from iif_core.light.transport.shading import shading_caches
 
     settings = job.settings.shading
     halves = [

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.camera import pixel_directions, project
-from iif_core.distortion import Pinhole, undistort
+from iif_core.camera.distortion import Pinhole, undistort
+from iif_core.camera.pinhole import pixel_directions, project
 from iif_core.errors import InputError
 from workflow.sources.folder_scene import images
 from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.distortion import distort
+from iif_core.camera.distortion import distort
 from iif_core.errors import InputError
 from workflow.sources.folder_scene import transforms
 from workflow.sources.folder_scene.images import EXTENSIONS

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from iif_core.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.camera.exposure import ExposureGains, estimate_gains
+from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.exposure import ExposureGains, estimate_gains
-from iif_core.response import response
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 
 SAMPLES = 2_000_000
 """Pixels of all views together that the estimate uses."""

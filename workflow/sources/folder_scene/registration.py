@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from iif_core import plan
-from iif_core.registration import MIN_VIEWS, Photo, Registration, register
+from iif_core.camera.registration import MIN_VIEWS, Photo, Registration, register
+from workflow import decisions
 from workflow.sources.folder_scene.transforms import Frame
 
 WIDTH = 200
@@ -31,7 +31,7 @@ class Registered:
     left_out: dict[str, str]
     facts: dict[str, Any]
     notes: list[str]
-    plan: list[plan.Decision]
+    decisions: list[decisions.Decision]
 
 
 def registered(
@@ -51,7 +51,7 @@ def registered(
             new_poses[i] = pose
             new_frames[i] = replace(frames[i], camera=_camera(frames[i], found), matrix=_matrix(pose, axes, metres))
     moved = float(np.median(found.moved) * scale)
-    decision = plan.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(seen))
+    decision = decisions.registration(found.accepted, found.gain, found.error, moved, len(left_out), len(seen))
     facts, words = _facts(frames, seen, found, scale), _words(found, moved, plain)
     return Registered(new_frames, new_poses, left_out, facts, words, [decision])
 

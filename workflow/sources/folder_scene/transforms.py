@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.distortion import Distortion, Pinhole
+from iif_core.camera.distortion import Distortion, Pinhole
 from iif_core.errors import InputError
 from workflow.sources.folder_scene import images
 

@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from iif_core.errors import InputError
-
-from .scene import LoadedScene, Shape, children
+from workflow.sources.mitsuba_scene.scene import LoadedScene, Shape, children
 
 Array = np.ndarray
 

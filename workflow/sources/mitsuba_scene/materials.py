@@ -20,8 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .flatten import FlatMesh
-from .scene import Shape, children, parameter
+from workflow.sources.mitsuba_scene.flatten import FlatMesh
+from workflow.sources.mitsuba_scene.scene import Shape, children, parameter
 
 Array = np.ndarray
 

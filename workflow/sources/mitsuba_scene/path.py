@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.camera import look_at
+from iif_core.camera.pinhole import look_at
 
 Array = np.ndarray
 Trace = Callable[[Array, Array], tuple[Array, Array]]

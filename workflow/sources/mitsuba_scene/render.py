@@ -13,11 +13,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from iif_core.camera import direction_derivatives, pixel_directions
-from workflow.normal_form import View
-
-from .flatten import texture_at
-from .scene import children
+from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+from workflow.scene.normal_form import View
+from workflow.sources.mitsuba_scene.flatten import texture_at
+from workflow.sources.mitsuba_scene.scene import children
 
 Array = np.ndarray
 

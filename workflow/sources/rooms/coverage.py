@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from iif_core.camera import project
+from iif_core.camera.pinhole import project
 
 if TYPE_CHECKING:
-    from iif_core.transport import Geometry
+    from iif_core.light.transport.geometry import Geometry
     from workflow.sources.rooms.room import Room
 
 _SAME = 2e-3
@@ -28,7 +28,7 @@ def surface_points(room: Room, count: int, seed: int = 0) -> np.ndarray:
 
 def seen_from(geometry: Geometry, points: np.ndarray, field_of_view: float, aspect: float, pose: np.ndarray) -> np.ndarray:
     """(n,) bool: the points a camera sees. `field_of_view` horizontal, degrees; `aspect` height / width."""
-    from iif_core.transport import trace
+    from iif_core.light.transport.geometry import trace
 
     focal = 0.5 / np.tan(np.radians(field_of_view / 2))
     u, v, z = project(points, focal, focal, 0.5, 0.5 * aspect, pose)

@@ -42,21 +42,7 @@ from workflow.sources.rooms.palette import (
 )
 from workflow.sources.rooms.patterns import Material
 from workflow.sources.rooms.room import Room, RoomBuilder
-from workflow.sources.rooms.shapes import (
-    Shape,
-    arc,
-    box,
-    cylinder,
-    lathe,
-    mm,
-    move,
-    ring,
-    sheet,
-    sphere,
-    tub,
-    tube,
-    wedge,
-)
+from workflow.sources.rooms.shapes import Shape, arc, box, cylinder, lathe, mm, move, ring, sheet, sphere, tub, tube, wedge
 
 LAMP = (1.75, 1.75)
 

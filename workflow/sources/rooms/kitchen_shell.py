@@ -4,20 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from workflow.sources.rooms.palette import (
-    BRASS,
-    FLOOR,
-    MARBLE,
-    WHITE_PAINT,
-    plain,
-)
+from workflow.sources.rooms.palette import BRASS, FLOOR, MARBLE, WHITE_PAINT, plain
 from workflow.sources.rooms.room import RoomBuilder
-from workflow.sources.rooms.shapes import (
-    box,
-    grid_sheet,
-    sheet,
-    tube,
-)
+from workflow.sources.rooms.shapes import box, grid_sheet, sheet, tube
 
 SIZE = (5.0, 4.0, 2.7)
 WINDOW = (1.55, 2.95, 1.03, 2.17)  # y0, y1, z0, z1 of the hole in the east wall

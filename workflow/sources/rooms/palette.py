@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from iif_core.color import linear_from_srgb
+from iif_core.numerics.color import linear_from_srgb
 from workflow.sources.rooms.patterns import Colour, Material, facing
 
 UP, EAST, NORTH = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Solid textures, written once for NumPy (truth maps) and Dr.Jit (renderer) on `iif_core.xp`.
+"""Solid textures, written once for NumPy (truth maps) and Dr.Jit (renderer) on `iif_core.numerics.xp`.
 
 An object's material is a row of numbers. A pattern makes two blends (t, s) of a point in the object's frame:
 
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.xp import Namespace
+from iif_core.numerics.xp import Namespace
 
 Colour = tuple[float, float, float]
 KINDS = (
@@ -120,7 +120,7 @@ class MaterialTable:
 
     def numpy(self, points: np.ndarray, object_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Albedo (n, 3) linear, roughness (n,), metallic (n,) float32 at points (n, 3) of objects (n,)."""
-        from iif_core.xp import NUMPY
+        from iif_core.numerics.xp import NUMPY
 
         points = np.asarray(points, np.float32).reshape(-1, 3)
         albedo, roughness, metallic = evaluate(NUMPY, points.T, lambda name: self._columns[name][object_id])
@@ -131,7 +131,7 @@ class MaterialTable:
         import drjit as dr
         import mitsuba as mi
 
-        from iif_core.xp import DRJIT
+        from iif_core.numerics.xp import DRJIT
 
         # Rows padded to whole groups of four: one aligned read fetches four entries.
         width = -(-len(_COLUMNS) // 4)

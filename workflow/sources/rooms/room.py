@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.camera import look_at
+from iif_core.camera.pinhole import look_at
 from iif_core.errors import InputError
 from workflow.sources.rooms.patterns import Material, MaterialTable
 from workflow.sources.rooms.shapes import Shape, merge

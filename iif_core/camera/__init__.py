@@ -1,0 +1,1 @@
+"""Cameras: pinhole projection, lens distortion, registration, response, exposure, and simulated photographs."""

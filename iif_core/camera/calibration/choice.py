@@ -1,0 +1,265 @@
+"""Which family of curves, and what is known then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.camera.calibration.likelihood import maximise
+from iif_core.camera.calibration.rows import DARK, FIT_ROWS, Channel, channel_rows, joined, log_factor
+from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate
+from iif_core.camera.overlap import PatchRows
+from iif_core.camera.response import START, Response, response
+
+CANDIDATES = ("srgb", "gamma", "ggcm", "spline")
+"""What `auto` chooses from, smallest first."""
+GAUGE = (
+    "exposures were found together with the response: any power p of the exposures goes with f(x^(1 / p)) and fits as well;"
+    " the power is the one of a curve near sRGB"
+)
+_SIGNIFICANT = 2.0
+_PRIOR = 1.0  # standard deviation of a parameter around its start
+_CHANNEL_PRIOR = 0.05  # and of a channel around the curve of all channels
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One candidate.
+
+    Attributes:
+        response: parameters (3, P), one row a channel.
+        covariance: (3 P, 3 P) of the parameters row by row.
+        score: log likelihood less the price of the parameters (Takeuchi), in units of independent rows.
+        clusters: (L,) the score's parts, whose spread says what a difference is worth.
+        width: robust spread of n.
+    """
+
+    response: Response
+    covariance: np.ndarray
+    score: float
+    clusters: np.ndarray
+    width: float
+
+
+@dataclass(frozen=True)
+class CalibratedResponse:
+    """Result of `calibrate_response`.
+
+    Attributes:
+        response: chosen curve, (3, P); the start where the data say nothing.
+        covariance: (3 P, 3 P) of its parameters; the prior's where the data say nothing.
+        exposure: (V,) of the views: the given ones, or those found with the curve (mean over the channels).
+        gains: exposure, white balance and vignetting found with the curve; None where exposures are given.
+        gauge: what cannot be known, in words; empty with given exposures.
+        stops: largest difference of exposure within a patch, in stops.
+        rows: (patch, view, channel) rows used.
+        before, after: robust spread of log radiance within patches with the starting curve and with the chosen one.
+        candidates: {family, parameters, score, behind, error} each: `behind` the best by so much, +- `error`.
+        reason: the choice in words.
+    """
+
+    response: Response
+    covariance: np.ndarray
+    stops: float
+    rows: int
+    before: float
+    after: float
+    candidates: list[dict[str, object]]
+    reason: str
+    exposure: np.ndarray
+    gauge: str = ""
+    gains: CameraGains | None = None
+
+
+def calibrate_response(
+    rows: PatchRows,
+    exposure: np.ndarray,
+    families: Sequence[str] = CANDIDATES,
+    saturation: float = 0.99,
+    min_stops: float = 1.0,
+    min_rows: int = 200,
+    given: bool = True,
+) -> CalibratedResponse:
+    """The smallest of `families` that no other beats significantly, fitted.
+
+    Significantly: its score is behind the best one's by more than two standard errors of the difference, which the
+    spread over clusters gives.
+
+    Args:
+        rows: `overlap.patch_rows` of all views; exposure: (V,) of the views, known up to one factor.
+        families: candidates, smallest first; one = no choice. Families without parameters are compared as they are.
+        saturation: sensor values from here on are bounds.
+        min_stops, min_rows: below, the start of the first family comes back.
+        given: exposures are known. Otherwise they are found together with each candidate; `exposure` gives their mean.
+    """
+    if not needs_rows(families):
+        start = response(families[0])
+        reason = "photographs are linear radiance" if start.family == "identity" else "set to srgb"
+        return given_response(start, reason, exposure)
+    gains = CameraGains.plain(exposure)
+    if not given:
+        gains = _gains(rows, response(families[0]), gains)
+    channels = [channel_rows(rows, c, gains, saturation, min_stops) for c in range(3)]
+    enough = [c for c in range(3) if len(channels[c].cell) >= min_rows]
+    stops = max(channel.stops for channel in channels)
+    if not enough:
+        gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
+        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, gains, given)
+    common = joined([channel_rows(rows, c, gains, saturation, min_stops, FIT_ROWS // len(enough)) for c in enough])
+    if not given:
+        # Which terms it takes is asked of the richest curve, fitted with one gain a view: under a wrong curve, channels of
+        # different brightness seem to need gains of their own.
+        rich = _fit(families[-1], common, channels, enough).response
+        gains = _gains(rows, rich, gains, choose=True)
+        logs = log_factor(rows, gains)
+        common, channels = common.exposed(logs), [channel.exposed(logs) for channel in channels]
+    fits, found = [], []
+    for family in families:
+        fit, views = _fit(family, common, channels, enough), gains
+        if not given:  # the gains that go with this curve, and the curve that goes with them
+            views = _gains(rows, fit.response, gains)
+            logs = log_factor(rows, views)
+            fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
+        fits.append(fit)
+        found.append(views)
+    table, best = _compared(families, fits)
+    chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
+    before = maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
+    used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
+    views = found[chosen]
+    return CalibratedResponse(
+        fits[chosen].response,
+        fits[chosen].covariance,
+        stops,
+        used,
+        before.width,
+        fits[chosen].width,
+        table,
+        _because(table, chosen, best, used, stops),
+        views.exposure,
+        "" if given else GAUGE,
+        None if given else views,
+    )
+
+
+def candidates(setting: str, dynamic_range: str) -> tuple[str, ...]:
+    """Families that a setting allows: `identity` for HDR whatever is set; `auto` is any of `CANDIDATES` for LDR."""
+    if dynamic_range == "hdr":
+        return ("identity",)
+    return CANDIDATES if setting == "auto" else (setting,)
+
+
+def needs_rows(families: Sequence[str]) -> bool:
+    """Whether there is anything to choose or to fit."""
+    return len(families) > 1 or bool(START[families[0]])
+
+
+def given_response(curve: Response, reason: str, exposure: np.ndarray) -> CalibratedResponse:
+    """A response that is not to be fitted."""
+    size = curve.params.size
+    return CalibratedResponse(curve, np.zeros((size, size)), 0.0, 0, 0.0, 0.0, [], reason, np.asarray(exposure, np.float64))
+
+
+def calibration_facts(found: CalibratedResponse) -> dict[str, object]:
+    """What is known about the choice, as plain values for a JSON file."""
+    names = ("stops", "rows", "before", "after", "candidates", "reason", "gauge")
+    return {"covariance": found.covariance.tolist(), **{name: getattr(found, name) for name in names}}
+
+
+def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
+    """The rows as `camera_gains` wants them: linear under a curve, unsaturated, not dark."""
+    values = curve.inverse(np.where(rows.clipped | ~(rows.value > DARK), np.nan, rows.value))
+    radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
+    return GainRows(rows.patch.astype(np.int64), rows.view, values, radius2, rows.block)
+
+
+def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False) -> CameraGains:
+    """Gains that a curve implies where views overlap, their mean that of `start`: with the terms that `start` was found to
+    need (exposure and vignetting if nobody asked), or, to `choose`, those that held-out surface speaks for.
+
+    The power that is open is one for all channels: white balance is taken as uncorrelated with exposure.
+    """
+    linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
+    if choose:
+        found = choose_gains(linear, n_views)
+    else:
+        terms = {name: entry.included for name, entry in start.evidence.items()} or {"white_balance": False}
+        found = replace(estimate(linear, n_views, **terms), evidence=start.evidence)
+    found = replace(found, gain=_without_powers(found.gain, found.estimated))
+    known = start.exposure[np.isfinite(start.exposure) & (start.exposure > 0)]
+    mean = float(np.exp(np.mean(np.log(known)))) if len(known) else 1.0
+    return replace(found, gain=found.gain * mean)
+
+
+def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(V, 3) gains whose chroma does not go with exposure."""
+    logs = np.log(gain)
+    level = logs.mean(1, keepdims=True)
+    chroma, x = logs - level, np.where(seen[:, None], level - level[seen].mean() if seen.any() else 0.0, 0.0)
+    return np.exp(level + chroma - x * (x * chroma).sum(0) / max(float((x**2).sum()), 1e-12))
+
+
+def _unknown(
+    family: str, stops: float, rows: int, min_stops: float, min_rows: int, gains: CameraGains, given: bool
+) -> CalibratedResponse:
+    start = response(family)
+    start = start.with_params(np.tile(start.params, (3, 1)))
+    if stops < min_stops:
+        reason = f"exposures differ by less than {min_stops:g} stop where photographs overlap: taken as {family}"
+    else:
+        reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
+    covariance = _PRIOR**2 * np.eye(start.params.size)
+    return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
+
+
+def _compared(families: Sequence[str], fits: Sequence[Fitted]) -> tuple[list[dict[str, object]], int]:
+    """What each family is behind the best one, +- a standard error from the spread over the clusters; and the best."""
+    scores = np.array([fit.score for fit in fits])
+    best = int(scores.argmax())
+    table: list[dict[str, object]] = []
+    for family, fit in zip(families, fits, strict=True):
+        error = float(np.sqrt(((fit.clusters - fits[best].clusters) ** 2).sum()))
+        size = int(fit.response.params.size)
+        behind = float(scores[best] - fit.score)
+        table.append({"family": family, "parameters": size, "score": fit.score, "behind": behind, "error": error})
+    return table, best
+
+
+def _because(table: list[dict[str, object]], chosen: int, best: int, rows: int, stops: float) -> str:
+    names = [str(entry["family"]) for entry in table]
+    on = f"on {rows} rows of shared surface over {stops:.1f} stops"
+    if len(names) == 1:
+        return f"{names[0]} fitted {on}"
+    text = ", ".join(f"{entry['family']} {entry['behind']:.1f} +- {entry['error']:.1f}" for entry in table)
+    verdict = "explains most" if chosen == best else f"is not significantly worse than {names[best]}"
+    return f"{names[chosen]} {verdict} {on} (log likelihood behind the best: {text})"
+
+
+def _fit(family: str, together: Channel, channels: Sequence[Channel], enough: Sequence[int]) -> Fitted:
+    """One curve for all channels first; each channel then has to earn its difference."""
+    start = response(family)
+    mean = np.array(START[family])
+    common = maximise(together, start, mean, _PRIOR)
+    size = start.params.size
+    params, covariance = np.tile(common.params, (3, 1)), np.zeros((3 * size, 3 * size))
+    score, clusters, widths = 0.0, {}, []
+    for c in range(3):
+        part = slice(c * size, (c + 1) * size)
+        if c not in enough:
+            covariance[part, part] = common.covariance + _CHANNEL_PRIOR**2 * np.eye(size)
+            continue
+        own = maximise(channels[c], start.with_params(common.params), common.params, _CHANNEL_PRIOR)
+        params[c], covariance[part, part] = own.params, own.covariance
+        score += own.score
+        widths.append(own.width)
+        for name, value in own.clusters.items():
+            clusters[name] = clusters.get(name, 0.0) + value
+    return Fitted(
+        start.with_params(params),
+        covariance,
+        score,
+        np.array([clusters[name] for name in sorted(clusters)]),
+        float(np.mean(widths)) if widths else 0.0,
+    )

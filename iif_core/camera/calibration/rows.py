@@ -1,0 +1,133 @@
+"""Rows of shared surface as the fit of a curve wants them: by channel, thinned, with the gains of their views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from iif_core.camera.gains import CameraGains
+from iif_core.camera.overlap import PatchRows
+
+DARK = 4.0 / 255.0
+FIT_ROWS = 8_000
+KNOTS = np.linspace(0.1, 1.0, 257) ** 2  # sensor values where log x and the gain are tabulated
+
+
+def log_factor(rows: PatchRows, gains: CameraGains) -> np.ndarray:
+    """(n, 3) log of what radiance was multiplied by in each row; NaN where the exposure is not known."""
+    radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
+    factor = gains.factor(rows.view, radius2)
+    return np.log(np.where(np.isfinite(factor) & (factor > 0), factor, np.nan))
+
+
+@dataclass
+class Channel:
+    """Rows of one channel (or of several one after another); n unsaturated ones and b bounds on C patches."""
+
+    cell: np.ndarray
+    value: np.ndarray
+    log_e: np.ndarray
+    block: np.ndarray
+    cluster: np.ndarray
+    full: np.ndarray  # (b,) patch of the bounds
+    full_e: np.ndarray
+    full_cluster: np.ndarray
+    row: np.ndarray  # (n,) entry of the flattened (rows, 3) table
+    full_row: np.ndarray
+    stops: float
+    saturation: float
+    knot: np.ndarray = field(init=False)
+    part: np.ndarray = field(init=False)
+    share: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.knot = np.clip(np.searchsorted(KNOTS, self.value, side="right") - 1, 0, len(KNOTS) - 2)
+        self.part = (self.value - KNOTS[self.knot]) / (KNOTS[self.knot + 1] - KNOTS[self.knot])
+        members = np.bincount(self.cell, minlength=self.cells)
+        self.share = (1.0 - 1.0 / np.maximum(members, 1))[self.cell]
+
+    def exposed(self, log_factor: np.ndarray) -> Channel:
+        """The same rows under other gains: `log_factor`, (all rows, 3)."""
+        return replace(self, log_e=log_factor.ravel()[self.row], full_e=log_factor.ravel()[self.full_row])
+
+    @property
+    def cells(self) -> int:
+        return int(max(self.cell.max(initial=-1), self.full.max(initial=-1))) + 1
+
+    def at(self, table: np.ndarray) -> np.ndarray:
+        """(n, ...) values of a table on the knots."""
+        part = self.part.reshape(-1, *[1] * (table.ndim - 1))
+        return table[self.knot] * (1.0 - part) + table[self.knot + 1] * part
+
+    def spread(self, row: np.ndarray) -> np.ndarray:
+        """(knots,) sums of row values at the knots: the transpose of `at`."""
+        size = len(KNOTS)
+        return np.bincount(self.knot, row * (1.0 - self.part), size) + np.bincount(self.knot + 1, row * self.part, size)
+
+
+def channel_rows(
+    rows: PatchRows, c: int, gains: CameraGains, saturation: float, min_stops: float, budget: int = FIT_ROWS
+) -> Channel:
+    """About `budget` rows on patches whose exposures span `min_stops` and that some view saw unsaturated."""
+    value, clipped = rows.value[:, c], rows.clipped[:, c]
+    log_e = log_factor(rows, gains)[:, c]
+    use = np.flatnonzero(np.isfinite(value) & (value > DARK) & np.isfinite(log_e))
+    owner = np.unique(rows.patch[use], return_inverse=True)[1]
+    size = int(owner.max(initial=-1)) + 1
+    low, high = np.full(size, np.inf), np.full(size, -np.inf)
+    np.minimum.at(low, owner, log_e[use])
+    np.maximum.at(high, owner, log_e[use])
+    span = (high - low) / np.log(2.0)
+    kept = np.flatnonzero((span >= min_stops - 1e-9) & (np.bincount(owner, ~clipped[use], size) > 0))
+    stops = float(span.max(initial=0.0))
+    index = use[_thinned(owner, value[use], clipped[use], kept, budget)[owner]]
+    cell = np.unique(rows.patch[index], return_inverse=True)[1]
+    cluster = rows.block[index].astype(np.int64) * (len(gains.gain) + 1) + rows.view[index]
+    block = np.unique(rows.block[index], return_inverse=True)[1]
+    full = clipped[index]
+    clear = ~full
+    return Channel(
+        cell=cell[clear],
+        value=value[index[clear]],
+        log_e=log_e[index[clear]],
+        block=block[clear],
+        cluster=cluster[clear],
+        full=cell[full],
+        full_e=log_e[index[full]],
+        full_cluster=cluster[full],
+        row=3 * index[clear] + c,
+        full_row=3 * index[full] + c,
+        stops=stops,
+        saturation=saturation,
+    )
+
+
+def _thinned(owner: np.ndarray, value: np.ndarray, clipped: np.ndarray, kept: np.ndarray, budget: int) -> np.ndarray:
+    """(patches,) bool: of the patches `kept` whole ones for about `budget` rows, evenly over ten ranges of brightness:
+    the few that come near saturation tie down the scale of x."""
+    size = int(owner.max(initial=-1)) + 1
+    top = np.zeros(size)
+    np.maximum.at(top, owner, np.where(clipped, 0.0, value))
+    order = kept[np.argsort(np.minimum((10.0 * top[kept]).astype(int), 9), kind="stable")]
+    members = np.bincount(owner, minlength=size)
+    tenth = np.minimum((10.0 * top[order]).astype(int), 9)
+    rows = np.bincount(tenth, members[order], 10)
+    level = np.sort(rows)
+    room = (budget - np.r_[0.0, np.cumsum(level)[:-1]]) / np.arange(10, 0, -1)
+    limit = room[np.argmax(room <= level)] if rows.sum() > budget else np.inf
+    share = np.minimum(1.0, limit / np.maximum(rows, 1.0))[tenth]
+    wanted = np.zeros(size, bool)
+    wanted[order[np.floor(np.cumsum(share) + 1e-9) > np.floor(np.cumsum(share) - share + 1e-9)]] = True
+    return wanted
+
+
+def joined(channels: Sequence[Channel]) -> Channel:
+    """Several channels as one: patches of their own, common clusters."""
+    offsets = np.cumsum([0] + [channel.cells for channel in channels])
+    own, common = ("cell", "full"), ("value", "log_e", "block", "cluster", "full_e", "full_cluster", "row", "full_row")
+    parts = {name: np.concatenate([getattr(channel, name) for channel in channels]) for name in common}
+    for name in own:
+        parts[name] = np.concatenate([getattr(channel, name) + o for channel, o in zip(channels, offsets, strict=False)])
+    return Channel(**parts, stops=max(channel.stops for channel in channels), saturation=channels[0].saturation)

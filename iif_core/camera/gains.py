@@ -1,0 +1,332 @@
+"""Exposure, white balance and vignetting of photographs from surface that they share (known or trial camera response).
+
+A surface patch p that views v and w both see sends, up to gloss, the same light to both:
+
+    log y_pvc = g_vc + a r^2 + b r^4 + s_pc,      y = f^-1(I), r: distance from the picture's centre / half its diagonal.
+
+Minimised robustly (Cauchy) over the levels s_pc, one gain a view (exposure) or three (exposure and white balance), and the
+falloff exp(a r^2 + b r^4) of the lens, the same in all views. The levels are eliminated; what is left has 3 V + 2 unknowns.
+A term enters when it helps on surface that the fit did not see (`choose_gains`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from iif_core.camera.exposure import components
+from iif_core.errors import InputError
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+SIGNIFICANT = 2.0
+"""Standard errors by which a term must help on held-out surface."""
+NOTICEABLE = 0.01
+"""Median |log gain| between channels, or largest |log falloff|, below which a term is not worth having."""
+MIN_ROWS = 8
+"""(patch, channel) rows on shared patches that a view needs."""
+LIMIT = 40_000
+"""Rows that the gains of all views are estimated from."""
+_SIGMA = 1.0  # prior of a, b
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a term did on held-out surface: mean fall of Cauchy's loss a row, its standard error over (block, view), size."""
+
+    gain: float
+    error: float
+    size: float
+    included: bool
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class CameraGains:
+    """What radiance is multiplied by before the response.
+
+    Attributes:
+        gain: (V, 3) float64, exposure times white balance; geometric mean 1 in each channel over overlapping views;
+            equal channels without white balance; 1 where not estimated.
+        vignetting: (2,) a, b of exp(a r^2 + b r^4).
+        estimated: (V,) bool.
+        residual: robust spread of log y about the model.
+        evidence: of the terms `white_balance` and `vignetting`, as far as they were tried.
+    """
+
+    gain: np.ndarray
+    vignetting: np.ndarray
+    estimated: np.ndarray
+    residual: float = 0.0
+    evidence: dict[str, Evidence] = field(default_factory=dict)
+
+    @classmethod
+    def plain(cls, exposure: np.ndarray) -> CameraGains:
+        """One known factor (V,) a view."""
+        exposure = np.asarray(exposure, np.float64)
+        return cls(np.repeat(exposure[:, None], 3, 1), np.zeros(2), np.ones(len(exposure), bool))
+
+    @property
+    def exposure(self) -> np.ndarray:
+        """(V,) geometric mean over the channels."""
+        return np.exp(np.log(self.gain).mean(1))
+
+    @property
+    def is_plain(self) -> bool:
+        """One factor a view."""
+        return not self.vignetting.any() and bool((self.gain == self.gain[:, :1]).all())
+
+    def factor(self, view: np.ndarray | int, radius2: np.ndarray) -> np.ndarray:
+        """(n, 3) of pixels at squared radius (n,) in views (n,) or in one."""
+        return self.gain[view] * falloff(self.vignetting, radius2)[:, None]
+
+
+def falloff(vignetting: np.ndarray, radius2: np.ndarray) -> np.ndarray:
+    """exp(a r^2 + b r^4), the shape of `radius2`; 1 in the picture's centre."""
+    return np.exp((vignetting[0] + vignetting[1] * radius2) * radius2)
+
+
+def radius_squared(index: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(n,) squared distance of pixels (indices of the flattened picture) from its centre; 1 in the corners."""
+    x, y = index % width + 0.5 - 0.5 * width, index // width + 0.5 - 0.5 * height
+    return (x**2 + y**2) / (0.25 * (width**2 + height**2))
+
+
+@dataclass(frozen=True)
+class GainRows:
+    """n rows: patch (n,) and view (n,) numbers, y (n, 3) = f^-1(I) (NaN = unknown), radius2 (n,), block (n,)."""
+
+    patch: np.ndarray
+    view: np.ndarray
+    y: np.ndarray
+    radius2: np.ndarray
+    block: np.ndarray
+
+    def take(self, choice: np.ndarray) -> GainRows:
+        """Some rows."""
+        return GainRows(*(getattr(self, name)[choice] for name in ("patch", "view", "y", "radius2", "block")))
+
+    def thinned(self, limit: int = LIMIT) -> GainRows:
+        """About `limit` rows: whole patches, by a hash of their number."""
+        if len(self.view) <= limit:
+            return self
+        mixed = self.patch.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40)
+        return self.take(mixed.astype(np.float64) < limit / len(self.view) * 2.0**24)
+
+
+def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignetting: bool = True, rounds: int = 20) -> CameraGains:
+    """Gains of the views under one of the four models. See the module's docstring.
+
+    Raises:
+        InputError: a view number out of range.
+    """
+    if len(rows.view) and (rows.view.min() < 0 or rows.view.max() >= n_views):
+        raise InputError(f"gains: view {int(rows.view.min())}..{int(rows.view.max())} out of range 0..{n_views - 1}")
+    data = _Long.of(rows, n_views)
+    if not len(data.value):
+        return CameraGains(np.ones((n_views, 3)), np.zeros(2), np.zeros(n_views, bool))
+    design = data.design(n_views, white_balance, vignetting)
+    gauge, group = data.gauge(n_views, white_balance, vignetting)
+    theta, weight, scale = np.zeros(design.shape[1]), np.ones(len(data.value)), 0.0
+    known = np.flatnonzero(np.asarray(np.abs(design).sum(0)).ravel() > 0)
+    for _ in range(rounds):
+        total = np.bincount(data.cell, weight)
+        mixed = data.members(weight) @ design
+        weighted = design.multiply(weight[:, None]).tocsr()
+        normal = np.asarray((design.T @ weighted - mixed.T @ mixed.multiply(1.0 / total[:, None])).todense())
+        level = np.bincount(data.cell, weight * data.value) / total
+        right = np.asarray(design.T @ (weight * (data.value - level[data.cell]))).ravel()
+        normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
+        if vignetting:
+            normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _SIGMA**2  # rows count 1, not 1 / scale^2
+        step = np.zeros(len(theta))
+        step[known] = np.linalg.solve(normal[np.ix_(known, known)], right[known])
+        left = data.value - design @ step
+        residual = left - (np.bincount(data.cell, weight * left) / total)[data.cell]
+        scale = float(1.4826 * np.median(np.abs(residual)))
+        # 2.385 scale: 95 % efficiency of Cauchy's weights; the floor keeps exact data from dividing by zero.
+        weight = 1.0 / (1.0 + (residual / max(2.385 * scale, 1e-6)) ** 2)
+        done = np.abs(step - theta).max() < 1e-7
+        theta = step
+        if done:
+            break
+    gains = theta[: 3 * n_views].reshape(n_views, 3) if white_balance else np.repeat(theta[:n_views, None], 3, 1)
+    seen = group >= 0
+    return CameraGains(np.exp(np.where(seen[:, None], gains, 0.0)), theta[-2:] if vignetting else np.zeros(2), seen, scale)
+
+
+def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
+    """The smallest model that held-out surface speaks for: exposure; then white balance; then vignetting.
+
+    Blocks (objects) are dealt to two halves. Each half is judged by gains fitted to the other: the loss of its rows about
+    levels of their own. A term enters when the loss falls by more than two standard errors and the term is noticeable.
+    """
+    half = _halves(rows)
+    model = {"white_balance": False, "vignetting": False}
+    evidence: dict[str, Evidence] = {}
+    best = estimate(rows, n_views, **model)
+    for term in model:
+        wider = estimate(rows, n_views, **{**model, term: True})
+        size = _chroma(wider) if term == "white_balance" else _depth(wider)
+        gain, error, before, after = _judge(rows, half, n_views, model, term)
+        included = gain > SIGNIFICANT * error and size > NOTICEABLE
+        evidence[term] = Evidence(gain, error, size, included, before, after)
+        if included:
+            model[term], best = True, wider
+    return CameraGains(best.gain, best.vignetting, best.estimated, best.residual, evidence)
+
+
+def follow(rows: GainRows, gains: CameraGains, moving: np.ndarray) -> CameraGains:
+    """Gains of the views that are not `moving` (V,) (kept for testing): medians against levels that the others set."""
+    log_y = np.log(np.where(rows.y > 0, rows.y, np.nan))
+    flat = log_y - np.log(falloff(gains.vignetting, rows.radius2))[:, None]
+    size = int(rows.patch.max(initial=-1)) + 1
+    out, estimated = gains.gain.copy(), gains.estimated.copy()
+    ahead = moving[rows.view] & gains.estimated[rows.view]
+    gap = np.full(flat.shape, np.nan)
+    for c in range(3):
+        use = ahead & np.isfinite(flat[:, c])
+        count = np.bincount(rows.patch[use], minlength=size)
+        total = np.bincount(rows.patch[use], flat[use, c] - np.log(gains.gain[rows.view[use], c]), size)
+        gap[:, c] = flat[:, c] - np.where(count > 0, total / np.maximum(count, 1), np.nan)[rows.patch]
+    shared = bool((gains.gain == gains.gain[:, :1]).all())
+    for v in np.flatnonzero(~moving):
+        own = gap[rows.view == v]
+        least = int(np.isfinite(own).sum(0).min())
+        estimated[v] = least >= MIN_ROWS
+        if estimated[v]:
+            out[v] = np.exp(np.nanmedian(own) if shared else np.nanmedian(own, 0))
+    return CameraGains(out, gains.vignetting, estimated, gains.residual, gains.evidence)
+
+
+# ------------------------------------------------------------------------------------------------------------ parts
+
+
+@dataclass(frozen=True)
+class _Long:
+    """One entry a (row, channel) with a value, on patches that two views share."""
+
+    cell: np.ndarray
+    view: np.ndarray
+    channel: np.ndarray
+    value: np.ndarray
+    radius2: np.ndarray
+
+    @classmethod
+    def of(cls, rows: GainRows, n_views: int) -> _Long:
+        row, channel = np.nonzero(np.isfinite(rows.y) & (rows.y > 0))
+        key = rows.patch[row].astype(np.int64) * 3 + channel
+        view = rows.view[row].astype(np.int64)
+        keep = np.ones(len(row), bool)
+        while keep.any():  # patches of one view say nothing; dropping thin views can leave new ones
+            cell = np.unique(key[keep], return_inverse=True)[1]
+            pairs = np.unique(cell.astype(np.int64) * n_views + view[keep]) // n_views
+            shared = np.bincount(pairs, minlength=int(cell.max()) + 1)[cell] >= 2
+            enough = np.bincount(view[keep][shared], minlength=n_views) >= MIN_ROWS
+            good = shared & enough[view[keep]]
+            if good.all():
+                break
+            keep[np.flatnonzero(keep)[~good]] = False
+        row, channel, view, key = row[keep], channel[keep], view[keep], key[keep]
+        cell = np.unique(key, return_inverse=True)[1]
+        return cls(cell, view, channel, np.log(rows.y[row, channel]), rows.radius2[row])
+
+    def design(self, n_views: int, white_balance: bool, vignetting: bool) -> csr_matrix:
+        """Sparse (n, V or 3 V, and 2)."""
+        from scipy.sparse import coo_matrix
+
+        number = np.arange(len(self.value))
+        gains = n_views * (3 if white_balance else 1)
+        column = 3 * self.view + self.channel if white_balance else self.view
+        parts = [(number, column, np.ones(len(number)))]
+        if vignetting:
+            parts += [(number, np.full(len(number), gains + k), self.radius2 ** (k + 1)) for k in range(2)]
+        row, column, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return coo_matrix((value, (row, column)), (len(number), gains + 2 * vignetting)).tocsr()
+
+    def members(self, weight: np.ndarray) -> csr_matrix:
+        """Sparse (cells, n)."""
+        from scipy.sparse import coo_matrix
+
+        return coo_matrix((weight, (self.cell, np.arange(len(weight)))), (int(self.cell.max()) + 1, len(weight))).tocsr()
+
+    def gauge(self, n_views: int, white_balance: bool, vignetting: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Projector on what the data leave open (the mean of each channel over views that overlap), and the groups (V,)."""
+        group = components(self.cell, self.view, n_views)
+        channels, size = (3, 3 * n_views) if white_balance else (1, n_views)
+        out = np.zeros((size + 2 * vignetting, size + 2 * vignetting))
+        for g in range(int(group.max(initial=-1)) + 1):
+            for c in range(channels):
+                own = np.flatnonzero(group == g) * channels + c
+                out[np.ix_(own, own)] = 1.0 / len(own)
+        return out, group
+
+
+def _chroma(gains: CameraGains) -> float:
+    logs = np.log(gains.gain[gains.estimated])
+    return float(np.median(np.abs(logs - logs.mean(1, keepdims=True)))) if len(logs) else 0.0
+
+
+def _depth(gains: CameraGains) -> float:
+    return float(np.abs(np.log(falloff(gains.vignetting, np.linspace(0, 1, 33)))).max())
+
+
+def _halves(rows: GainRows) -> np.ndarray:
+    """(n,) bool: whole blocks, dealt from the largest so that both halves are as large; patches where one block rules."""
+    blocks, number, count = np.unique(rows.block, return_inverse=True, return_counts=True)
+    if not len(blocks) or count.max() > 0.6 * count.sum():
+        return rows.patch.astype(np.int64) % 2 == 0
+    side, load = np.zeros(len(blocks), bool), [0, 0]
+    for b in np.argsort(-count, kind="stable"):
+        side[b] = load[1] < load[0]
+        load[int(side[b])] += count[b]
+    return side[number]
+
+
+def _judge(
+    rows: GainRows, half: np.ndarray, n_views: int, model: dict[str, bool], term: str
+) -> tuple[float, float, float, float]:
+    """Mean fall of the held-out loss when `term` joins `model`, its standard error, and the robust spreads."""
+    losses, clusters, spreads = [], [], []
+    for side in (False, True):
+        fitted, judged = rows.take(half == side), rows.take(half != side)
+        both = [estimate(fitted, n_views, **m) for m in (model, {**model, term: True})]
+        own = both[0].estimated & both[1].estimated
+        judged = judged.take(own[judged.view])
+        residual = [_held_residual(judged, gains, n_views) for gains in both]
+        if not len(residual[0][0]):
+            continue
+        spread = [float(1.4826 * np.median(np.abs(r))) for r, _ in residual]
+        width = max(2.385 * spread[0], 1e-4)
+        losses.append(np.log1p((residual[0][0] / width) ** 2) - np.log1p((residual[1][0] / width) ** 2))
+        clusters.append(judged.block[residual[0][1]].astype(np.int64) * n_views + judged.view[residual[0][1]])
+        spreads.append(spread)
+    if not losses:
+        return 0.0, np.inf, 0.0, 0.0
+    loss, cluster = np.concatenate(losses), np.unique(np.concatenate(clusters), return_inverse=True)[1]
+    total, count = np.bincount(cluster, loss), np.bincount(cluster)
+    mean = float(loss.mean())
+    error = float(np.sqrt(((total - mean * count) ** 2).sum()) / len(loss))
+    before, after = np.mean(spreads, 0)
+    return mean, error, float(before), float(after)
+
+
+def _held_residual(rows: GainRows, gains: CameraGains, n_views: int) -> tuple[np.ndarray, np.ndarray]:
+    """log y less the gains and the robust level of its patch; and the row of each."""
+    log_y = np.log(np.where(rows.y > 0, rows.y, np.nan)) - np.log(gains.factor(rows.view, rows.radius2))
+    row, channel = np.nonzero(np.isfinite(log_y))
+    cell = np.unique(rows.patch[row].astype(np.int64) * 3 + channel, return_inverse=True)[1]
+    if not len(cell):
+        return np.zeros(0), row
+    value, weight = log_y[row, channel], np.ones(len(row))
+    for _ in range(5):
+        level = np.bincount(cell, weight * value) / np.bincount(cell, weight)
+        residual = value - level[cell]
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
+        weight = 1.0 / (1.0 + (residual / (2.385 * scale)) ** 2)
+    several = np.bincount(cell)[cell] >= 2
+    return residual[several], row[several]

@@ -1,0 +1,561 @@
+"""Registration of photographs with a mesh: small corrections of poses and of the common intrinsics, and how sharp each is.
+
+A surface point p that several photographs show has one texture value C_p. With feature images I_v (`feature_image`) we minimise
+
+    sum_pv rho((I_v(pi_v(p)) - C_p) / s)  +  sum_vk ((1 - e_v(pi_v(q_k))) / s_e)^2  +  prior
+
+over one twist a view (rotation and translation in the camera's frame) and over focal length and principal point that all views
+share. The first term makes photographs agree with each other; by itself it is all but blind to a drift of all cameras together
+(texture slides along the surface). The second ties them to the mesh: q_k are points on creases and silhouettes of the mesh
+as view v sees them, e_v the photograph's own edges. C_p is eliminated (Schur complement), steps are Gauss-Newton with
+Cauchy's weights, blurred first and then sharp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.camera.exposure import estimate_gains
+from iif_core.errors import InputError
+
+SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
+"""Prior of a view's own correction: radians, metres."""
+SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
+"""Prior of the common correction: of the focal length, both."""
+BLURS = (2.5, 1.2, 0.7)
+"""Blur of the feature images in pixels, round by round."""
+ROUNDS = 6
+GRAZING = 0.25
+"""Cosine below which a surface is seen too flat to compare."""
+BLOCK = 0.3
+"""Edge in metres of the blocks of surface that are held out together."""
+EDGE_SAY = 0.15
+"""Neighbouring edge points err together: what one counts against a row of texture."""
+MIN_VIEWS = 6
+MIN_ROWS = 40
+"""Points that a view shares with others before anything is said about it."""
+HELD_OUT = 3
+"""One block in so many is held out."""
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photograph with what the mesh looks like from its camera.
+
+    Attributes:
+        image: (H, W, 3) sensor values or radiance; usable: (H, W) bool.
+        depth: (H, W) z-depth of the mesh in metres, 0 = miss; normal: (H, W, 3) unit, 0 = miss.
+        focal: (fx, fy), principal: (cx, cy) in pixels, pixel centres at u + 0.5.
+        pose: (4, 4) world_from_camera, OpenCV axes.
+        held: this photograph follows the others and does not move them (kept for testing).
+    """
+
+    image: np.ndarray
+    usable: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    pose: np.ndarray
+    held: bool = False
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Result of `register`.
+
+    Attributes:
+        pose: (V, 4, 4); principal: (2,) shift of the principal point in units of the focal length; focal: factor.
+        moved: (V,) median motion of a view's pixels, in pixels of the photographs given.
+        held_out: (before, after) robust spread of feature values on surface that the fit did not see.
+        gain, error: mean fall of the held-out loss a row and its standard error over views.
+        edges: (before, after) mean photograph edge at edges of the mesh that the fit did not see.
+        edge_gain, edge_error: its rise and the standard error over views.
+        rows: (point, view) pairs compared.
+        accepted: texture is better by more than two standard errors and edges not worse by as many, or edges are better and
+            texture not worse at all; and there are `MIN_VIEWS` views, without which a standard error means nothing.
+        sharpness: (V,) gradient of the texture as this view shows it / as the others do; 1 = as usual, 0 = not compared.
+        agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
+        shift: (V,) pixels by which a view still lies off the others' texture, as one translation.
+    """
+
+    pose: np.ndarray
+    principal: np.ndarray
+    focal: float
+    moved: np.ndarray
+    held_out: tuple[float, float]
+    gain: float
+    error: float
+    edges: tuple[float, float]
+    edge_gain: float
+    edge_error: float
+    rows: int
+    accepted: bool
+    sharpness: np.ndarray
+    agreement: np.ndarray
+    shift: np.ndarray
+
+
+def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """(H, W) float64: log luminance less its surroundings (6 % of the width), in units of 0.35, within +-3.
+
+    Exposure, white balance, vignetting and slow shading fall out.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    grey = np.log(0.02 + np.where(usable, np.nan_to_num(np.asarray(image, np.float64)).clip(0).mean(-1), 0.0))
+    weight = usable.astype(np.float64)
+    sigma = max(2.0, 0.06 * image.shape[1])
+    around = gaussian_filter(grey * weight, sigma) / np.maximum(gaussian_filter(weight, sigma), 1e-6)
+    out = np.where(usable, grey - around, 0.0)
+    return np.clip(out / 0.35, -3.0, 3.0)
+
+
+def mesh_edges(depth: np.ndarray, normal: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the mesh as a camera sees it: silhouettes (depth ratio above 5 %) and creases (more than 30 degrees).
+
+    Returns:
+        Pixel coordinates (n, 2), half way between the two pixels that differ, and the nearer one's z-depth (n,).
+    """
+    coordinates, near = [], []
+    for axis in (0, 1):
+        for step in (1, -1):
+            other, turned = np.roll(depth, step, axis), np.roll(normal, step, axis)
+            both = (depth > 0) & (other > 0) & usable
+            both[[0, -1]], both[:, [0, -1]] = False, False
+            jump = both & (other > 1.05 * depth)
+            bend = both & (np.abs(other / np.maximum(depth, 1e-9) - 1) < 0.05) & ((normal * turned).sum(-1) < 0.87)
+            found = np.argwhere(jump | bend)
+            at = found[:, ::-1] + 0.5
+            at[:, 1 - axis] -= 0.5 * step
+            coordinates.append(at)
+            near.append(depth[found[:, 0], found[:, 1]])
+    return np.concatenate(coordinates), np.concatenate(near)
+
+
+def photo_edges(feature: np.ndarray, blur: float) -> np.ndarray:
+    """(H, W) float64 in [0, 1]: gradient magnitude, blurred, over its 95 % quantile."""
+    from scipy.ndimage import gaussian_filter
+
+    dv, du = np.gradient(gaussian_filter(feature, 0.7))
+    size = gaussian_filter(np.minimum(np.hypot(du, dv), 1.0), blur)
+    return np.clip(size / max(float(np.quantile(size, 0.95)), 1e-9), 0.0, 1.0)
+
+
+def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = True, own: bool = True) -> Registration:
+    """Poses and common intrinsics that fit photographs to the mesh and to each other.
+
+    Args:
+        photos: at least one.
+        points: surface points compared, all views together.
+        intrinsics: correct focal length and principal point, the same relative correction in all views.
+        own: correct each pose.
+
+    Raises:
+        InputError: no photograph.
+    """
+    if not photos:
+        raise InputError("registration: no photograph given; at least one is needed")
+    start = state = _Start.of(photos)
+    features = [feature_image(p.image, p.usable) for p in photos]
+    rows = _overlap(photos, features, points)
+    edges = [_edge_points(p) for p in photos]
+    held = [_held_out(world) for world in edges]
+    fit = rows.take(~rows.held_out)
+    seen = [world[~h] for world, h in zip(edges, held, strict=True)]
+    free = np.r_[np.repeat(own, 6 * len(photos)), np.repeat(intrinsics, 3)].astype(bool)
+    for blur in BLURS if free.any() else ():
+        maps = [_Maps.of(f, blur) for f in features]
+        for _ in range(ROUNDS):
+            step = _step(photos, maps, state, fit, seen, free)
+            state = state.moved(step)
+    maps = [_Maps.of(f, BLURS[-1]) for f in features]
+    unseen = [world[h] for world, h in zip(edges, held, strict=True)]
+    spread, gain, error = _compared(photos, maps, (start, state), rows.take(rows.held_out))
+    tied, edge_gain, edge_error = _tied(photos, maps, (start, state), unseen)
+    better = gain > 2.0 * error or (edge_gain > 2.0 * edge_error and gain > 0.0)
+    worse = gain < -2.0 * error or edge_gain < -2.0 * edge_error
+    accepted = bool(better and not worse and len(photos) >= MIN_VIEWS)
+    final = state if accepted else start
+    return Registration(
+        state.pose,
+        state.principal,
+        state.focal,
+        np.array([_motion(photos, start, state, v) for v in range(len(photos))]),
+        spread,
+        gain,
+        error,
+        tied,
+        edge_gain,
+        edge_error,
+        len(rows.view),
+        accepted,
+        *_quality(photos, maps, final, rows),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ parts
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What is being fitted."""
+
+    pose: np.ndarray
+    principal: np.ndarray
+    focal: float
+    twist: np.ndarray  # (V, 6) sum of the steps, for the prior
+
+    @classmethod
+    def of(cls, photos: Sequence[Photo]) -> _Start:
+        return cls(np.array([p.pose for p in photos], np.float64), np.zeros(2), 1.0, np.zeros((len(photos), 6)))
+
+    def moved(self, step: np.ndarray) -> _Start:
+        views = len(self.pose)
+        twist = step[: 6 * views].reshape(views, 6)
+        pose = np.array([a @ _exponential(x) for a, x in zip(self.pose, twist, strict=True)])
+        common = step[6 * views :]
+        return replace(
+            self,
+            pose=pose,
+            principal=self.principal + common[:2],
+            focal=self.focal * float(np.exp(common[2])),
+            twist=self.twist + twist,
+        )
+
+
+def _exponential(twist: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = Rotation.from_rotvec(twist[:3]).as_matrix(), twist[3:]
+    return out
+
+
+@dataclass(frozen=True)
+class _Rows:
+    point: np.ndarray  # (n,) number of the surface point
+    view: np.ndarray  # (n,)
+    world: np.ndarray  # (n, 3)
+    held_out: np.ndarray  # (n,) bool
+
+    def take(self, choice: np.ndarray) -> _Rows:
+        """Some rows, points numbered anew."""
+        point = np.unique(self.point[choice], return_inverse=True)[1]
+        return _Rows(point, self.view[choice], self.world[choice], self.held_out[choice])
+
+
+@dataclass(frozen=True)
+class _Maps:
+    value: np.ndarray
+    du: np.ndarray
+    dv: np.ndarray
+    edge: np.ndarray
+    edge_du: np.ndarray
+    edge_dv: np.ndarray
+
+    @classmethod
+    def of(cls, feature: np.ndarray, blur: float) -> _Maps:
+        from scipy.ndimage import gaussian_filter
+
+        value, edge = gaussian_filter(feature, blur), photo_edges(feature, blur)
+        dv, du = np.gradient(value)
+        ev, eu = np.gradient(edge)
+        return cls(value, du, dv, edge, eu, ev)
+
+    def at(self, names: Sequence[str], uv: np.ndarray) -> list[np.ndarray]:
+        """Bilinear values at pixel coordinates (n, 2)."""
+        h, w = self.value.shape
+        x, y = np.clip(uv[:, 0] - 0.5, 0, w - 1.001), np.clip(uv[:, 1] - 0.5, 0, h - 1.001)
+        i, j = x.astype(int), y.astype(int)
+        a, b = x - i, y - j
+        out = []
+        for name in names:
+            m = getattr(self, name)
+            top, low = m[j, i] * (1 - a) + m[j, i + 1] * a, m[j + 1, i] * (1 - a) + m[j + 1, i + 1] * a
+            out.append(top * (1 - b) + low * b)
+        return out
+
+
+def _camera_points(state: _Start, v: int, world: np.ndarray) -> np.ndarray:
+    pose = state.pose[v]
+    return (world - pose[:3, 3]) @ pose[:3, :3]
+
+
+def _project(photo: Photo, state: _Start, local: np.ndarray) -> np.ndarray:
+    z = np.maximum(local[:, 2], 1e-6)
+    fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
+    u = photo.principal[0] + fx * (local[:, 0] / z + state.principal[0])
+    return np.stack([u, photo.principal[1] + fy * (local[:, 1] / z + state.principal[1])], -1)
+
+
+def _jacobian(photo: Photo, state: _Start, local: np.ndarray, du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of an image value by the twist (n, 6) and by principal point and log focal length (n, 3)."""
+    x, y, z = local[:, 0], local[:, 1], np.maximum(local[:, 2], 1e-6)
+    fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
+    gx, gy = du * fx / z, dv * fy / z
+    gz = -(gx * x + gy * y) / z
+    # x' = x - omega x x - t, so d x' / d omega = [x]_x and d x' / d t = -1.
+    turn = np.stack([gy * z - gz * y, gz * x - gx * z, gx * y - gy * x], -1)
+    shift = -np.stack([gx, gy, gz], -1)
+    scale = du * fx * (x / z + state.principal[0]) + dv * fy * (y / z + state.principal[1])
+    return np.concatenate([turn, shift], -1), np.stack([du * fx, dv * fy, scale], -1)
+
+
+def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: int) -> _Rows:
+    """Textured surface points and the views that show them."""
+    from scipy.ndimage import minimum_filter
+
+    state = _Start.of(photos)
+    flat = [_inner(p) for p in photos]
+    each = -(-points // len(photos))
+    world = []
+    for p, f, inside in zip(photos, features, flat, strict=True):
+        index = np.flatnonzero(inside)
+        if p.held or not len(index):
+            continue
+        dv, du = np.gradient(f)
+        strong = np.hypot(du, dv).ravel()[index]
+        # The strongest half, thinned evenly: every part of the picture keeps a say.
+        index = index[strong >= np.median(strong)]
+        world.append(_world(p, index[:: max(1, len(index) // each)]))
+    everything = np.concatenate(world) if world else np.zeros((0, 3))
+    point, view = [], []
+    for v, (p, inside) in enumerate(zip(photos, flat, strict=True)):
+        local = _camera_points(state, v, everything)
+        uv = _project(p, state, local)
+        h, w = p.depth.shape
+        i, j = np.floor(uv[:, 0]).astype(int), np.floor(uv[:, 1]).astype(int)
+        ok = (local[:, 2] > 0.05) & (i >= 2) & (j >= 2) & (i < w - 2) & (j < h - 2)
+        safe = minimum_filter(inside, 3)
+        found = np.flatnonzero(ok)
+        found = found[safe[j[found], i[found]]]
+        near = np.abs(p.depth[j[found], i[found]] - local[found, 2]) < 0.02 * local[found, 2]
+        point.append(found[near])
+        view.append(np.full(int(near.sum()), v))
+    number, view = np.concatenate(point), np.concatenate(view)
+    moving = np.array([not p.held for p in photos])
+    count = np.bincount(number[moving[view]], minlength=len(everything))
+    keep = count[number] >= 2
+    number, view = number[keep], view[keep]
+    return _Rows(np.unique(number, return_inverse=True)[1], view, everything[number], _held_out(everything[number]))
+
+
+def _held_out(world: np.ndarray) -> np.ndarray:
+    """(n,) bool of points (n, 3): whole blocks of surface."""
+    block = np.floor(world / BLOCK).astype(np.int64)
+    return (block * np.array([73856093, 19349663, 83492791])).sum(1) % 1_000_003 % HELD_OUT == 0
+
+
+def _inner(photo: Photo) -> np.ndarray:
+    """(H, W) bool: usable smooth surface away from silhouettes and borders, not seen flat."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    depth = photo.depth
+    low, high = minimum_filter(depth, 5), maximum_filter(depth, 5)
+    rays = _rays(photo)
+    facing = np.abs((photo.normal * (rays @ photo.pose[:3, :3].T)).sum(-1)) / np.linalg.norm(rays, axis=-1)
+    out = photo.usable & (low > 0) & (high < 1.1 * low) & (facing > GRAZING)
+    out[:3], out[-3:], out[:, :3], out[:, -3:] = False, False, False, False
+    return out
+
+
+def _rays(photo: Photo) -> np.ndarray:
+    h, w = photo.depth.shape
+    v, u = np.mgrid[:h, :w] + 0.5
+    x, y = (u - photo.principal[0]) / photo.focal[0], (v - photo.principal[1]) / photo.focal[1]
+    return np.stack([x, y, np.ones_like(x)], -1)
+
+
+def _world(photo: Photo, index: np.ndarray) -> np.ndarray:
+    local = (_rays(photo) * photo.depth[..., None]).reshape(-1, 3)[index]
+    return local @ photo.pose[:3, :3].T + photo.pose[:3, 3]
+
+
+def _edge_points(photo: Photo) -> np.ndarray:
+    at, z = mesh_edges(photo.depth, photo.normal, photo.usable)
+    x, y = (at[:, 0] - photo.principal[0]) / photo.focal[0], (at[:, 1] - photo.principal[1]) / photo.focal[1]
+    return np.stack([x * z, y * z, z], -1) @ photo.pose[:3, :3].T + photo.pose[:3, 3]
+
+
+def _level(value: np.ndarray, weight: np.ndarray, point: np.ndarray) -> np.ndarray:
+    total = np.bincount(point, weight)
+    return (np.bincount(point, weight * value) / np.maximum(total, 1e-12))[point]
+
+
+def _values(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows, names: Sequence[str]) -> list[np.ndarray]:
+    out = [np.zeros(len(rows.view)) for _ in names]
+    for v, (photo, m) in enumerate(zip(photos, maps, strict=True)):
+        own = np.flatnonzero(rows.view == v)
+        uv = _project(photo, state, _camera_points(state, v, rows.world[own]))
+        for k, values in enumerate(m.at(names, uv)):
+            out[k][own] = values
+    return out
+
+
+def _residuals(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows) -> np.ndarray:
+    """(n,) feature value less that of the point, the mean of the views that are not held."""
+    value = _values(photos, maps, state, rows, ("value",))[0]
+    moving = np.array([not p.held for p in photos], np.float64)[rows.view]
+    return value - _level(value, moving, rows.point)
+
+
+def _step(
+    photos: Sequence[Photo],
+    maps: Sequence[_Maps],
+    state: _Start,
+    rows: _Rows,
+    edges: Sequence[np.ndarray],
+    free: np.ndarray,
+) -> np.ndarray:
+    """One Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
+    from scipy.sparse import coo_matrix
+
+    views = len(photos)
+    size = 6 * views + 3
+    value, du, dv = _values(photos, maps, state, rows, ("value", "du", "dv"))
+    moving = np.array([not p.held for p in photos], np.float64)[rows.view]
+    jacobian, common = np.zeros((len(value), 6)), np.zeros((len(value), 3))
+    for v, photo in enumerate(photos):
+        own = np.flatnonzero(rows.view == v)
+        local = _camera_points(state, v, rows.world[own])
+        jacobian[own], common[own] = _jacobian(photo, state, local, du[own], dv[own])
+    residual = value - _level(value, moving, rows.point)
+    own = np.abs(residual[moving > 0])
+    scale = max(1.4826 * float(np.median(own)) if len(own) else 1.0, 1e-3)
+    weight = 1.0 / (1.0 + (residual / (2.385 * scale)) ** 2) / scale**2
+    # Of a photograph that is held only its own twist moves, and the level not at all.
+    common *= moving[:, None]
+    mean = _level(value, weight * moving + 1e-9, rows.point)
+    number = np.arange(len(value))
+    at = 6 * rows.view[:, None] + np.arange(6)
+    columns = np.concatenate([at, np.tile(6 * views + np.arange(3), (len(value), 1))], 1)
+    entries = np.concatenate([jacobian, common], 1)
+    matrix = coo_matrix((entries.ravel(), (np.repeat(number, 9), columns.ravel())), (len(value), size)).tocsr()
+    level = weight * moving
+    total = np.maximum(np.bincount(rows.point, level), 1e-9)
+    pooled = coo_matrix((level, (rows.point, number)), (len(total), len(value))).tocsr() @ matrix
+    pooled = pooled.multiply(1.0 / total[:, None]).tocsr()
+    # The level stands still for a photograph that is held: its rows must not move the others.
+    centred = matrix - pooled[rows.point].multiply(moving[:, None]).tocsr()
+    weighted = centred.multiply(weight[:, None]).tocsr()
+    normal = np.asarray((centred.T @ weighted).todense())
+    right = -np.asarray(weighted.T @ (value - mean)).ravel()
+    _add_edges(photos, maps, state, edges, normal, right)
+    precision = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** -2
+    precision *= max(len(value) / max(views, 1) / 200.0, 1.0)  # errors of neighbouring rows go together
+    sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
+    normal[np.diag_indices(size)] += precision
+    right -= precision * sum_of_steps
+    open_ = np.flatnonzero(free)
+    step = np.zeros(size)
+    if len(open_):
+        step[open_] = np.linalg.solve(normal[np.ix_(open_, open_)], right[open_])
+    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
+    return np.clip(step, -limit, limit)
+
+
+def _add_edges(
+    photos: Sequence[Photo],
+    maps: Sequence[_Maps],
+    state: _Start,
+    edges: Sequence[np.ndarray],
+    normal: np.ndarray,
+    right: np.ndarray,
+) -> None:
+    last = 6 * len(photos) + np.arange(3)
+    for v, (photo, m, world) in enumerate(zip(photos, maps, edges, strict=True)):
+        if not len(world):
+            continue
+        local = _camera_points(state, v, world)
+        value, du, dv = m.at(("edge", "edge_du", "edge_dv"), _project(photo, state, local))
+        own, common = _jacobian(photo, state, local, du, dv)
+        whole = np.concatenate([own, common * (not photo.held)], 1)
+        at = np.r_[6 * v + np.arange(6), last]
+        weight = EDGE_SAY / max(float(np.var(1 - value)), 1e-3)
+        normal[np.ix_(at, at)] += weight * whole.T @ whole
+        right[at] += weight * whole.T @ (1 - value)
+
+
+def _compared(
+    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Start], rows: _Rows
+) -> tuple[tuple[float, float], float, float]:
+    """Robust spread of the features under two states; mean fall of Cauchy's loss and its standard error."""
+    residual = [_residuals(photos, maps, state, rows) for state in states]
+    if not len(rows.view):
+        return (0.0, 0.0), 0.0, np.inf
+    spread = [float(1.4826 * np.median(np.abs(r))) for r in residual]
+    width = max(2.385 * spread[0], 1e-6)
+    loss = np.log1p((residual[0] / width) ** 2) - np.log1p((residual[1] / width) ** 2)
+    return (spread[0], spread[1]), *_by_cluster(loss, rows.view)
+
+
+def _tied(
+    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Start], edges: Sequence[np.ndarray]
+) -> tuple[tuple[float, float], float, float]:
+    """Mean photograph edge at mesh edges under two states; its rise and the standard error."""
+    view = np.repeat(np.arange(len(photos)), [len(world) for world in edges])
+    if not len(view):
+        return (0.0, 0.0), 0.0, np.inf
+    value = [
+        np.concatenate(
+            [
+                m.at(("edge",), _project(photo, state, _camera_points(state, v, world)))[0]
+                for v, (photo, m, world) in enumerate(zip(photos, maps, edges, strict=True))
+            ]
+        )
+        for state in states
+    ]
+    return (float(value[0].mean()), float(value[1].mean())), *_by_cluster(value[1] - value[0], view)
+
+
+def _quality(
+    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sharpness, agreement and remaining shift of each view against what the others show of the same surface."""
+    views = len(photos)
+    agreement, shift = np.zeros(views), np.zeros(views)
+    value, du, dv = _values(photos, maps, state, rows, ("value", "du", "dv"))
+    total, count = np.bincount(rows.point, value), np.bincount(rows.point)
+    others = (total[rows.point] - value) / np.maximum(count[rows.point] - 1, 1)
+    metres = np.zeros(len(value))
+    for v, photo in enumerate(photos):
+        own = np.flatnonzero(rows.view == v)
+        if len(own) < MIN_ROWS:
+            continue
+        metres[own] = np.maximum(_camera_points(state, v, rows.world[own])[:, 2], 1e-6) / photo.focal[0]
+        a, b = value[own] - value[own].mean(), others[own] - others[own].mean()
+        agreement[v] = float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-12))
+        slope, gap = np.stack([du[own], dv[own]], -1), value[own] - others[own]
+        robust = 1.0 / (1.0 + (gap / max(3.5 * np.median(np.abs(gap)), 1e-6)) ** 2)
+        normal = slope.T @ (robust[:, None] * slope) + 1e-9 * np.eye(2)
+        shift[v] = float(np.hypot(*np.linalg.solve(normal, slope.T @ (robust * gap))))
+    seen = metres > 0
+    # A gradient a metre of surface: a view from afar shows the same texture steeper a pixel.
+    steep = np.hypot(du[seen], dv[seen]) / metres[seen]
+    gains = estimate_gains(rows.point[seen], rows.view[seen], steep, views)
+    typical = np.median(gains.gain[gains.estimated]) if gains.estimated.any() else 1.0
+    return np.where(gains.estimated, gains.gain / typical, 0.0), agreement, shift
+
+
+def _motion(photos: Sequence[Photo], before: _Start, after: _Start, v: int) -> float:
+    index = np.flatnonzero(photos[v].depth > 0)[::97]
+    if not len(index):
+        return 0.0
+    world = _world(photos[v], index)
+    a, b = (_project(photos[v], s, _camera_points(s, v, world)) for s in (before, after))
+    return float(np.median(np.hypot(*(b - a).T)))
+
+
+def _by_cluster(loss: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
+    """Mean and its standard error when rows of a cluster go together."""
+    if not len(loss):
+        return 0.0, np.inf
+    total, count = np.bincount(cluster, loss), np.bincount(cluster)
+    mean = float(total.sum() / count.sum())
+    spread = (total - mean * count)[count > 0]
+    size = len(spread)
+    return mean, float(np.sqrt((spread**2).sum() * size / max(size - 1, 1)) / count.sum())

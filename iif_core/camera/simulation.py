@@ -1,0 +1,179 @@
+"""How a camera makes a photograph of rendered radiance: exposure, response curve, eight bits.
+
+    I_c = round(255 f_c(clip(e_v L_c, 0, 1))) / 255          (METHOD 1.3, 4.1; rounded, not truncated)
+
+The curves here are S-shaped tone curves over a gamma and belong to none of the families in
+`iif_core.camera.response`, so that a solver which recovers them has not been handed the answer's form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.numerics.color import luminance, srgb_from_linear
+
+STOPS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Exposures of the five groups of views, brightest group first (METHOD 4.1)."""
+
+_THIRD = 2.0 ** (-1 / 3)
+
+
+@dataclass(frozen=True)
+class ResponseCurve:
+    """f_c(x) = y + s_c y (1 - y) (2 y - p_c), y = sRGB(x^g_c): an S-curve of strength s, pivot p over sRGB.
+
+    Strictly increasing with f(0) = 0 and f(1) = 1 for s_c max(p_c, 2 - p_c) < 1, which is checked.
+
+    Attributes:
+        name: what `response_curve` knows it by.
+        gamma, strength, pivot: one value a channel; all-one gamma and zero strength is sRGB itself.
+        linear: leave out sRGB (y = x^g), for a camera that stores radiance.
+    """
+
+    name: str
+    gamma: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    strength: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pivot: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    linear: bool = False
+
+    def __post_init__(self) -> None:
+        steep = [s * max(p, 2 - p) for s, p in zip(self.strength, self.pivot, strict=True)]
+        if min(self.gamma) <= 0 or min(self.strength) < 0 or max(steep) >= 1:
+            raise InputError(
+                f"response {self.name}: gamma {self.gamma}, strength {self.strength}, pivot {self.pivot}"
+                " does not rise; needed: gamma > 0, strength >= 0, strength * max(pivot, 2 - pivot) < 1"
+            )
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Sensor values in [0, 1] of exposed radiance x (..., 3), clipped to [0, 1]; float64."""
+        y = np.clip(np.asarray(x, np.float64), 0, 1) ** np.array(self.gamma)
+        if not self.linear:
+            y = srgb_from_linear(y)
+        return y + np.array(self.strength) * y * (1 - y) * (2 * y - np.array(self.pivot))
+
+    def samples(self, count: int = 101) -> np.ndarray:
+        """(3, count) float64: f of `count` even steps from 0 to 1."""
+        return self(np.linspace(0, 1, count)[:, None] * np.ones(3)).T
+
+
+_CURVES = {
+    curve.name: curve
+    for curve in (
+        ResponseCurve("filmic", (1.0, 0.97, 1.04), (0.42, 0.38, 0.46), (1.05, 1.0, 0.95)),
+        ResponseCurve("soft", (0.92, 0.94, 0.90), (0.18, 0.20, 0.16), (0.85, 0.90, 0.80)),
+        ResponseCurve("srgb"),
+        ResponseCurve("linear", linear=True),
+    )
+}
+
+
+def response_curve(name: str = "filmic") -> ResponseCurve:
+    """A camera's response by name: `filmic` and `soft` differ from channel to channel; `srgb`; `linear`.
+
+    Example: `response_curve("srgb")([0.5, 0.5, 0.5])` is 0.7354 thrice.
+
+    Raises:
+        InputError: unknown name.
+    """
+    if name not in _CURVES:
+        raise InputError(f"response curve {name!r}: unknown; allowed: {', '.join(_CURVES)}")
+    return _CURVES[name]
+
+
+def exposures(
+    radiance: Sequence[np.ndarray] | np.ndarray,
+    valid: Sequence[np.ndarray] | np.ndarray | None = None,
+    stops: Sequence[float] = STOPS,
+    grey: float = 0.18,
+    saturated: float = 0.03,
+) -> np.ndarray:
+    """Exposure of every view: the brightest views get the shortest (METHOD 4.1), few pixels clip.
+
+    Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of near-equal
+    size, the brightest group with stops[0]. One common gain puts the geometric mean over views of stop x
+    median luminance at `grey`. A view with more than the share `saturated` of its valid pixels above 1 in
+    any channel is then closed by whole thirds of a stop until it has no more than that. A black view keeps
+    its group's exposure.
+
+    Args:
+        radiance: one (..., 3) array of linear radiance a view (sizes may differ; small metering pictures do),
+            or one stack (V, ..., 3), or mean radiances (V, 3).
+        valid: masks (...) of the pixels that should not clip, i.e. not lamps and windows; default: all.
+        stops: relative exposures of the groups, ascending, positive.
+        grey: linear value that a typical view's median luminance lands on.
+        saturated: share of pixels in [0, 1).
+
+    Returns:
+        (V,) float64, positive: e_v that multiplies radiance before the response.
+
+    Raises:
+        InputError: no view, shapes that do not match, negative or non-finite radiance, stops not ascending.
+    """
+    views = [np.asarray(r, np.float64) for r in radiance]
+    if not views:
+        raise InputError("exposures: no view given; at least one is needed")
+    stops = np.asarray(stops, np.float64)
+    if stops.ndim != 1 or not len(stops) or not (stops > 0).all() or (np.diff(stops) < 0).any():
+        raise InputError(f"exposures: stops {stops.tolist()}; they must be positive and ascending")
+    if not (grey > 0 and 0 <= saturated < 1):
+        raise InputError(f"exposures: grey={grey}, saturated={saturated}; allowed: grey > 0, 0 <= saturated < 1")
+    pixels = [_valid_pixels(v, r, None if valid is None else valid[v]) for v, r in enumerate(views)]
+
+    bright = [luminance(p) for p in pixels]
+    mean = np.array([y.mean() if len(y) else 0.0 for y in bright])
+    median = np.array([np.median(y) if len(y) else 0.0 for y in bright])
+    order = np.argsort(-mean, kind="stable")
+    stop = np.empty(len(views))
+    stop[order] = stops[np.arange(len(views)) * len(stops) // len(views)] if len(views) > 1 else np.median(stops)
+    lit = median > 0
+    gain = grey / np.exp(np.mean(np.log(stop[lit] * median[lit]))) if lit.any() else 1.0
+    return gain * stop * np.array([_closing(gain * s, p, saturated) for s, p in zip(stop, pixels, strict=True)])
+
+
+def _valid_pixels(view: int, radiance: np.ndarray, mask: np.ndarray | None) -> np.ndarray:
+    if radiance.ndim < 1 or radiance.shape[-1] != 3:
+        raise InputError(f"exposures: view {view} has shape {radiance.shape}; the last axis must be R, G, B")
+    if not np.isfinite(radiance).all() or (radiance < 0).any():
+        raise InputError(f"exposures: view {view} has negative or non-finite radiance; render it again or mask it to 0")
+    flat = radiance.reshape(-1, 3)
+    if mask is None:
+        return flat
+    mask = np.asarray(mask, bool)
+    if mask.shape != radiance.shape[:-1]:
+        raise InputError(f"exposures: view {view}: mask of shape {mask.shape} for radiance of shape {radiance.shape}")
+    return flat[mask.ravel()]
+
+
+def _closing(exposure: float, pixels: np.ndarray, saturated: float) -> float:
+    """Factor 2^(-n/3), smallest n >= 0, by which at most the share `saturated` of the pixels exceeds 1."""
+    if not len(pixels):
+        return 1.0
+    peak = np.sort(pixels.max(-1))
+    limit = exposure * peak[len(peak) - 1 - int(saturated * len(peak))]
+    return _THIRD ** max(0, np.ceil(3 * np.log2(limit) - 1e-9)) if limit > 1 else 1.0
+
+
+def expose(radiance: np.ndarray, exposure: float, curve: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
+    """The photograph: round(255 f(clip(e L, 0, 1))) / 255, (..., 3) float32 in [0, 1], one of 256 values.
+
+    Rounded to nearest: the truncation of METHOD 4.1 would darken by half a step. No sensor noise.
+
+    Args:
+        radiance: (..., 3) linear; below 0 counts as 0.
+        exposure: e > 0.
+        curve: a `ResponseCurve` or any f of (..., 3) into [0, 1]; default `response_curve()`.
+
+    Raises:
+        InputError: exposure not positive and finite, or non-finite radiance.
+    """
+    if not (np.isfinite(exposure) and exposure > 0):
+        raise InputError(f"exposure is {exposure}; it must be positive and finite")
+    radiance = np.asarray(radiance, np.float64)
+    if not np.isfinite(radiance).all():
+        raise InputError(f"{np.count_nonzero(~np.isfinite(radiance))} non-finite radiance values; nothing to photograph")
+    curve = response_curve() if curve is None else curve
+    return (np.rint(255 * curve(np.clip(exposure * radiance, 0, 1))) / 255).astype(np.float32)

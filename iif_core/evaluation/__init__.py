@@ -1,0 +1,1 @@
+"""Scores of images and material maps, with and without ground truth."""

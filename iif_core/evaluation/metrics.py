@@ -1,0 +1,444 @@
+"""Scores of one image: L2, PSNR, SSIM, FLIP, LPIPS for maps; log-L2 and IoU for emission; three protocols (METHOD 2.11).
+
+Protocols say what the prediction may be forgiven before it is compared:
+
+| protocol | the prediction is |
+|---|---|
+| `raw` | taken as it is |
+| `scaled` | multiplied by one gain per image and channel, sum truth / sum prediction (albedo, emission, radiance) |
+| `oracle_affine` | mapped by each object's best affine to the truth: 3x4 for albedo, 1x2 for roughness, metallic |
+
+Which pixels count is METHOD 2.11 (B), masks from the *truth*: emitters count for no material, mirrors (roughness below
+0.05) not for albedo, nor pixels without a hit or without meaningful truth. A prediction cannot change its own mask.
+
+All images are linear float (H, W) or (H, W, 3); `mask` is (H, W) bool. A score that cannot be computed is a `Score`
+with `value=None` and the reason, never a NaN. Not quantised to 8 bits (the reference is; that moves L2 by 1e-6).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.evaluation.flip import Seen, difference
+from iif_core.evaluation.lpips import Lpips, Weights
+from iif_core.numerics.filters import correlate
+
+Array = np.ndarray
+
+PSNR_CAP = 100.0
+"""PSNR of identical images, as in the reference; it would be infinite."""
+
+MIRROR_ROUGHNESS = 0.05
+"""Below this true roughness the albedo of a surface is not visible and not scored."""
+
+SSIM_WINDOW = 11
+PROTOCOLS = ("raw", "scaled", "oracle_affine")
+PROTOCOLS_OF = {
+    "albedo": PROTOCOLS,
+    "roughness": ("raw", "oracle_affine"),
+    "metallic": ("raw", "oracle_affine"),
+    "emission": ("raw", "scaled"),
+    "rgb": ("raw",),
+}
+"""Roughness and metallic have no gain that the photographs leave open; emission x albedo has one (LDR)."""
+
+METRICS_OF = {
+    "albedo": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
+    "roughness": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
+    "metallic": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
+    "emission": ("l2", "log_l2", "iou"),
+    "rgb": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
+}
+LPIPS_NETWORKS = {"lpips": "alex", "lpips_vgg": "vgg"}
+"""The paper reports LPIPS with VGG16; AlexNet is what its authors recommend, and a twentieth of the work."""
+
+PERCEPTUAL = ("flip", *LPIPS_NETWORKS)
+
+_MIN_MEAN = 1e-4  # H36: a darker prediction is not scaled
+_SCORED_MIN = 1e-6  # emission below this is no emission
+
+
+@dataclass(frozen=True)
+class Score:
+    """One number, or the reason why there is none."""
+
+    metric: str
+    protocol: str
+    value: float | None
+    reason: str = ""
+
+
+# --------------------------------------------------------------------------------------------------------------- masks
+
+
+def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) -> dict[str, Array]:
+    """Pixels that count for each quantity, METHOD 2.11 (B).
+
+    Args:
+        valid: (H, W) bool, the truth means something here.
+        hit: (H, W) bool, the pixel sees the mesh.
+        emission: (H, W, 3) true radiance; more than 0 in any channel = emitter.
+        roughness: (H, W) true perceptual roughness.
+
+    Returns:
+        `albedo`, `roughness`, `metallic`, `emission`: (H, W) bool.
+    """
+    seen = np.asarray(valid, bool) & np.asarray(hit, bool)
+    material = seen & ~(emission > 0).any(-1)
+    return {
+        "albedo": material & (roughness >= MIRROR_ROUGHNESS),
+        "roughness": material,
+        "metallic": material,
+        "emission": seen,
+    }
+
+
+# ------------------------------------------------------------------------------------------------------------- metrics
+
+
+def l2(prediction: Array, truth: Array, mask: Array) -> float:
+    """Mean squared error over the masked pixels and the channels (not a root). The mask must not be empty."""
+    difference = prediction[mask].astype(np.float64) - truth[mask]
+    return float(np.mean(difference * difference))
+
+
+def psnr(prediction: Array, truth: Array, mask: Array) -> float:
+    """10 log10(1 / MSE) in dB, data range 1, at most 100. Example: every pixel 0.1 off -> 20."""
+    return _decibel(l2(prediction, truth, mask))
+
+
+def _decibel(error: float) -> float:
+    return PSNR_CAP if error <= 10 ** (-PSNR_CAP / 10) else float(-10 * np.log10(error))
+
+
+def ssim(prediction: Array, truth: Array, mask: Array) -> float:
+    """Structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, range 1 (Wang et al. 2004).
+
+    Pixels that do not count get the truth on both sides, and the map of local similarities is averaged over pixels
+    that count: a window that reaches over the border of the mask sees agreement there, so such pixels score slightly
+    too well. As in the common implementations, the 5 pixels next to the image border are windows only, unless nothing
+    else counts.
+
+    Raises:
+        InputError: an image smaller than the window.
+    """
+    truth = np.where(np.isfinite(truth), truth, 0)
+    return _Structure(truth, mask).similarity(np.where(mask if mask.ndim == truth.ndim else mask[..., None], prediction, truth))
+
+
+class _Structure:
+    """A truth and the moments of its windows."""
+
+    def __init__(self, truth: Array, mask: Array):
+        if min(mask.shape) < SSIM_WINDOW:
+            raise InputError(
+                f"SSIM of a {mask.shape[1]}x{mask.shape[0]} image: at least {SSIM_WINDOW} pixels are needed each way"
+            )
+        x = np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2
+        self.window = np.exp(-x * x / (2 * 1.5**2))
+        self.window /= self.window.sum()
+        self.truth = _planes(truth)
+        self.moments = [(self._mean(t), self._mean(t * t)) for t in self.truth]
+        border = SSIM_WINDOW // 2
+        interior = np.zeros(mask.shape, bool)
+        interior[border:-border, border:-border] = True
+        self.counted = mask & interior if (mask & interior).any() else mask
+
+    def _mean(self, plane: Array) -> Array:
+        return correlate(plane, self.window, self.window, "symmetric")
+
+    def similarity(self, filled: Array) -> float:
+        """`filled`: the prediction, with the truth where the mask does not count."""
+        total = 0.0
+        for p, t, (mean_t, square_t) in zip(_planes(filled), self.truth, self.moments, strict=True):
+            mean_p, square_p, product = self._mean(p), self._mean(p * p), self._mean(p * t)
+            means, product_of_means = mean_p * mean_p + mean_t * mean_t, mean_p * mean_t
+            local = (2 * product_of_means + 0.01**2) * (2 * (product - product_of_means) + 0.03**2)
+            local /= (means + 0.01**2) * (square_p + square_t - means + 0.03**2)
+            total += local[self.counted].mean()
+        return float(total / len(self.truth))
+
+
+def _planes(image: Array) -> Array:
+    """(channels, H, W) float64 of (H, W) or (H, W, channels)."""
+    image = np.asarray(image, np.float64)
+    return image[None] if image.ndim == 2 else np.ascontiguousarray(np.moveaxis(image, -1, 0))
+
+
+def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) -> float:
+    """LDR-FLIP (`iif_core.evaluation.flip`), mean over the masked pixels, 0 = same.
+
+    Pixels that do not count get the truth on both sides. `encoded`: the images are sRGB-encoded, else linear.
+    """
+    truth = np.where(np.isfinite(truth), truth, 0)
+    filled = np.where(mask[..., None], prediction, truth)
+    images = (Seen(np.clip(image, 0, 1), encoded) for image in (filled, truth))
+    return float(difference(*images)[mask].mean(dtype=np.float64))
+
+
+def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
+    """Mean squared error of log(1 + x), for radiance (negative values count as 0)."""
+    difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(np.maximum(truth[mask], 0))
+    return float(np.mean(difference * difference))
+
+
+def iou(prediction: Array, truth: Array, mask: Array) -> float:
+    """Intersection over union of the emitting pixels (any channel above 1e-6); 1 when neither image emits."""
+    p, t = ((image[mask] > _SCORED_MIN).any(-1) for image in (prediction, truth))
+    union = np.count_nonzero(p | t)
+    return np.count_nonzero(p & t) / union if union else 1.0
+
+
+# ----------------------------------------------------------------------------------------------------------- protocols
+
+
+def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1.0) -> Array:
+    """Prediction times one gain per channel, sum truth / sum prediction over the mask; clamped to [0, limit].
+
+    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36), and so does one whose truth is black: a gain of
+    0 would erase what was wrongly found there. `limit=None`: not clamped above.
+    """
+    prediction = np.asarray(prediction, np.float64)
+    return _gained(prediction, prediction[mask].mean(0), np.asarray(truth, np.float64)[mask].mean(0), limit)
+
+
+def _gained(values: Array, mean_prediction: Array, mean_truth: Array, limit: float | None) -> Array:
+    known = (mean_prediction >= _MIN_MEAN) & (mean_truth > 0)
+    gain = np.where(known, mean_truth / np.maximum(mean_prediction, _MIN_MEAN), 1.0)
+    return np.clip(values * gain, 0, limit)
+
+
+def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
+    """Prediction mapped by the affine of each object that is nearest to the truth: an upper bound, not a result.
+
+    Least squares per image and object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's
+    pixels in `mask`; 3x4 for three channels, 1x2 for one; clamped to [0, 1]. Where the prediction is constant, A tends
+    to 0 and the object gets its mean. Pixels outside the mask are left as they are.
+
+    Args:
+        object_id: (H, W) int; -1 forms one object.
+        ridge: added variance; 1e-6 = differences of 0.001 are not stretched.
+    """
+    x = np.array(prediction, np.float64).reshape(*mask.shape, -1)
+    y = np.asarray(truth, np.float64).reshape(*mask.shape, -1)
+    if mask.any():
+        x[mask] = _Groups(object_id[mask], y[mask]).nearest(x[mask], ridge)
+    return x.reshape(np.shape(prediction))
+
+
+class _Groups:
+    """Pixels by object: `group` (n,) int, `truth` (n, channels) float64."""
+
+    def __init__(self, group: Array, truth: Array):
+        self.order = np.argsort(group, kind="stable")
+        ordered = group[self.order]
+        self.starts = np.flatnonzero(np.r_[True, ordered[1:] != ordered[:-1]])
+        self.count = np.diff(np.r_[self.starts, len(group)])
+        self.mean_y, self.dy = self._centred(truth)
+
+    def _centred(self, values: Array) -> tuple[Array, Array]:
+        """Means (groups, channels), and what is left, (channels, n) in the order of the groups."""
+        ordered = np.ascontiguousarray(values[self.order].T)
+        mean = np.add.reduceat(ordered, self.starts, 1) / self.count
+        return mean.T, ordered - np.repeat(mean, self.count, 1)
+
+    def nearest(self, values: Array, ridge: float = 1e-6) -> Array:
+        """(n, channels) `values` mapped by the affine of their group that is nearest to the truth, in [0, 1]."""
+        _, dx = self._centred(values)
+        n, m = len(dx), len(self.dy)
+        s_xx, s_xy = np.empty((len(self.count), n, n)), np.empty((len(self.count), n, m))
+        for i in range(n):
+            for j in range(i + 1):
+                s_xx[:, i, j] = s_xx[:, j, i] = np.add.reduceat(dx[i] * dx[j], self.starts)
+            for j in range(m):
+                s_xy[:, i, j] = np.add.reduceat(dx[i] * self.dy[j], self.starts)
+        s_xx += ridge * self.count[:, None, None] * np.eye(n)
+        slope = np.linalg.solve(s_xx, s_xy)  # (groups, channels of x, channels of y)
+        mapped = np.repeat(self.mean_y.T, self.count, 1)
+        for i in range(n):
+            mapped += np.repeat(slope[:, i].T, self.count, 1) * dx[i]
+        out = np.empty((len(values), m))
+        out[self.order] = np.clip(mapped, 0, 1).T
+        return out
+
+
+# ----------------------------------------------------------------------------------------------------------- one image
+
+
+def score_map(
+    quantity: str,
+    prediction: Array,
+    truth: Array,
+    mask: Array,
+    object_id: Array | None = None,
+    metrics: Iterable[str] | None = None,
+    encoded: bool = False,
+    networks: Mapping[str, Weights] | None = None,
+) -> list[Score]:
+    """Every score of one map under every protocol that applies to its quantity; see `Target`."""
+    return Target(quantity, truth, mask, object_id, encoded, networks).scores(prediction, metrics)
+
+
+class Target:
+    """A true map and the pixels that count; what the scores need of them is computed once, for any number of predictions.
+
+    Args:
+        quantity: `albedo`, `roughness`, `metallic`, `emission` or `rgb`.
+        truth: (H, W, 3), or (H, W) for roughness and metallic.
+        mask: (H, W) bool, pixels that count.
+        object_id: (H, W) int, for `oracle_affine`; without it that protocol is left out.
+        encoded: images are sensor values, not linear (matters to FLIP only; LPIPS takes every image as it is).
+        networks: `alex` and `vgg` -> weights of LPIPS (`iif_core.evaluation.lpips`).
+
+    Raises:
+        InputError: unknown quantity, or shapes that do not match.
+    """
+
+    def __init__(
+        self,
+        quantity: str,
+        truth: Array,
+        mask: Array,
+        object_id: Array | None = None,
+        encoded: bool = False,
+        networks: Mapping[str, Weights] | None = None,
+    ):
+        if quantity not in PROTOCOLS_OF:
+            raise InputError(f"score of {quantity!r}: unknown quantity; allowed: {', '.join(PROTOCOLS_OF)}")
+        self.quantity, self.truth, self.mask, self.encoded = quantity, np.asarray(truth), np.asarray(mask, bool), encoded
+        if self.truth.shape[:2] != self.mask.shape:
+            raise InputError(
+                f"score of {quantity}: truth {self.truth.shape}, mask {self.mask.shape}; they must share height, width"
+            )
+        self.networks = networks or {}
+        self._object_id = None if object_id is None else np.asarray(object_id)
+
+    def scores(
+        self, prediction: Array, metrics: Iterable[str] | None = None, perceptual: Container[str] = PROTOCOLS
+    ) -> list[Score]:
+        """Scores of one prediction, (H, W, 3) or (H, W) as the truth, under every protocol that applies to the quantity.
+
+        Args:
+            metrics: default: all of the quantity; LPIPS only where its network is given.
+            perceptual: protocols under which FLIP and LPIPS, which take most of the time, are computed.
+
+        Raises:
+            InputError: shapes that do not match.
+        """
+        prediction = np.asarray(prediction)
+        if prediction.shape != self.truth.shape:
+            raise InputError(
+                f"score of {self.quantity}: prediction {prediction.shape}, truth {self.truth.shape}, mask {self.mask.shape};"
+                " they must share height, width and channels"
+            )
+        wanted = tuple(METRICS_OF[self.quantity] if metrics is None else metrics)
+        wanted = tuple(m for m in wanted if m not in LPIPS_NETWORKS or LPIPS_NETWORKS[m] in self.networks)
+        plan = [
+            (protocol, metric)
+            for protocol in PROTOCOLS_OF[self.quantity]
+            if protocol != "oracle_affine" or self._object_id is not None
+            for metric in wanted
+            if (metric != "iou" or protocol == "raw")  # a mask has no scale
+            and (metric not in PERCEPTUAL or protocol in perceptual)
+        ]
+        values = self._at(prediction)
+        problem = self._problem(values)
+        if problem:
+            return [Score(metric, protocol, None, problem) for protocol, metric in plan]
+        out, image, at = [], None, ""
+        for protocol, metric in plan:
+            if protocol != at:
+                image, at = _Candidate(self, self._under(protocol, values)), protocol
+            out.append(self._score(metric, protocol, image))
+        return out
+
+    @cached_property
+    def _counted(self) -> Array:
+        """(n, channels) float64 truth of the pixels that count."""
+        return self._at(self.truth)
+
+    def _at(self, image: Array) -> Array:
+        return image[self.mask].astype(np.float64).reshape(-1, image.shape[2] if image.ndim == 3 else 1)
+
+    def _problem(self, values: Array) -> str:
+        if not len(values):
+            return "no pixel counts"
+        for name, image in (("prediction", values), ("truth", self._counted)):
+            bad = image.size - np.count_nonzero(np.isfinite(image))
+            if bad:
+                return f"{name} is not finite in {bad} values"
+        return ""
+
+    def _under(self, protocol: str, values: Array) -> Array:
+        if protocol == "scaled":
+            return _gained(values, values.mean(0), self._counted.mean(0), None if self.quantity == "emission" else 1.0)
+        return self._groups.nearest(values) if protocol == "oracle_affine" else values
+
+    @cached_property
+    def _groups(self) -> _Groups:
+        assert self._object_id is not None
+        return _Groups(self._object_id[self.mask], self._counted)
+
+    @cached_property
+    def _everywhere(self) -> Array:
+        """The truth, 0 where it is not finite (such pixels do not count)."""
+        return np.where(np.isfinite(self.truth), self.truth, 0).astype(np.float64)
+
+    @cached_property
+    def _structure(self) -> _Structure:
+        return _Structure(self._everywhere, self.mask)
+
+    @cached_property
+    def _seen(self) -> Seen:
+        return Seen(np.clip(self._everywhere, 0, 1), self.encoded)
+
+    @cached_property
+    def _learned(self) -> dict[str, Lpips]:
+        return {}
+
+    def _distance(self, network: str) -> Lpips:
+        if network not in self._learned:
+            self._learned[network] = Lpips(self.truth, self.networks[network], self.mask, network)
+        return self._learned[network]
+
+    def _score(self, metric: str, protocol: str, image: _Candidate) -> Score:
+        try:
+            if metric == "ssim":
+                value = self._structure.similarity(image.filled)
+            elif metric == "flip":
+                seen = Seen(np.clip(image.filled, 0, 1), self.encoded)
+                value = difference(seen, self._seen)[self.mask].mean(dtype=np.float64)
+            elif metric in LPIPS_NETWORKS:
+                value = self._distance(LPIPS_NETWORKS[metric])(image.filled)
+            elif metric in ("l2", "psnr"):
+                value = image.l2 if metric == "l2" else _decibel(image.l2)
+            else:
+                everything = np.ones(len(image.values), bool)
+                value = {"log_l2": log_l2, "iou": iou}[metric](image.values, self._counted, everything)
+        except InputError as error:
+            return Score(metric, protocol, None, str(error))
+        return Score(metric, protocol, float(value))
+
+
+class _Candidate:
+    """A prediction under one protocol: `values` (n, channels) of the pixels that count."""
+
+    def __init__(self, target: Target, values: Array):
+        self.target, self.values = target, values
+
+    @cached_property
+    def l2(self) -> float:
+        difference = self.values - self.target._counted
+        return float(np.mean(difference * difference))
+
+    @cached_property
+    def filled(self) -> Array:
+        """The whole image, the truth where a pixel does not count."""
+        image = self.target._everywhere.copy()
+        image[self.target.mask] = self.values if image.ndim == 3 else self.values[:, 0]
+        return image

@@ -1,0 +1,68 @@
+"""The loss of the paper's material stage, by which all solvers are judged (METHOD 2.8).
+
+    mean over pixels and channels of e^2 + 1e-3 mean |r - 1| + 5e-3 mean |m|,
+
+e = f(e L) - I where I < 0.9 and min(f(e L) - 0.9, 0) elsewhere: the reference clamps both at 0.9, which leaves predictions that
+are too bright without a gradient (METHOD H32). L is the mean of the cache's halves. The terms of the paper's own response basis
+have no counterpart here: every family is monotone as it is. HDR: e in the logarithmic tone curve of the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.camera.response import Response
+from iif_core.fitting.pixels import prepare, residuals
+from iif_core.fitting.problem import FitOptions, FitProblem, apply_affines
+
+CLAMP = 0.9
+ROUGHNESS_WEIGHT = 1e-3
+METALLIC_WEIGHT = 5e-3
+
+
+@dataclass(frozen=True)
+class ReferenceLoss:
+    """The loss and its parts; total = data + roughness + metallic."""
+
+    total: float
+    data: float
+    roughness: float
+    metallic: float
+
+
+def reference_problem(problem: FitProblem, response: Response) -> FitProblem:
+    """The problem as the reference sees it: mean of the halves, values from 0.9 on are bounds."""
+    merged = problem.merged()
+    if response.family == "identity":
+        return merged
+    with np.errstate(invalid="ignore"):
+        return replace(merged, saturated=problem.saturated | (problem.value >= CLAMP), value=np.minimum(problem.value, CLAMP))
+
+
+def reference_options(**changes: object) -> FitOptions:
+    """Options with which the direct solver minimises this loss and nothing else."""
+    own = FitOptions(
+        robust_width=1e6,
+        roughness_weight=ROUGHNESS_WEIGHT,
+        metallic_weight=METALLIC_WEIGHT,
+        population=False,
+        select=False,
+        metallic_prior=-1.0,
+        ridge=1e-9,
+        response_ridge=1e-9,
+    )
+    return replace(own, **changes)
+
+
+def reference_loss(problem: FitProblem, affine: np.ndarray, response: Response) -> ReferenceLoss:
+    """Loss of a solution, in the gauge of the cached light: affine (O, 16)."""
+    px, tone = prepare(reference_problem(problem, response), response)
+    if not len(px.obj):
+        return ReferenceLoss(0.0, 0.0, 0.0, 0.0)
+    data = float(np.mean(residuals(px, affine, tone, FitOptions()) ** 2))
+    value = apply_affines(affine, px.obj, px.base)
+    roughness = ROUGHNESS_WEIGHT * float(np.mean(1.0 - value[:, 3]))
+    metallic = METALLIC_WEIGHT * float(np.mean(value[:, 4]))
+    return ReferenceLoss(data + roughness + metallic, data, roughness, metallic)

@@ -1,0 +1,187 @@
+"""The optimiser's step on the CPU: loss and gradient as closed forms in one compiled pass (kernels.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iif_core.fusion.hashgrid.texture import HashGridTexture
+from iif_core.fusion.kernels import IDENTITY
+from iif_core.fusion.sgd.options import SgdOptions
+from iif_core.fusion.sgd.pool import Pool, Step, runs, shares, softmax, start_values
+
+_CHUNK = 4096  # pixels of a task; fixed, though results do not depend on it
+
+
+class Adam:
+    """Adam of a float32 array (torch.optim.Adam's defaults, dense), in the kernel of the hash grid."""
+
+    def __init__(self, parameter: NDArray):
+        from iif_core.fusion.hashgrid.kernels import SPAN
+
+        self.parameter = parameter.reshape(-1)
+        self.gradient, self.first, self.second = (np.zeros_like(self.parameter) for _ in range(3))
+        self.span = SPAN
+        self.live = np.zeros(-(-self.parameter.size // SPAN), bool)
+        self.steps = 0
+
+    def step(self, lr: float, run: Callable = lambda task, arguments: [task(a) for a in arguments]) -> None:
+        """One update; zeroes the gradient. `run` shares pieces out: elements are independent."""
+        from iif_core.fusion.hashgrid.kernels import adam
+
+        self.steps += 1
+        beta1, beta2 = 0.9, 0.999
+        rate, root = lr / (1 - beta1**self.steps), 1 / math.sqrt(1 - beta2**self.steps)
+        numbers = [np.float32(x) for x in (beta1, beta2, rate, root, 1e-8)]
+        piece = 4096
+
+        def update(low: int) -> None:
+            rows, spans = slice(low * self.span, (low + piece) * self.span), slice(low, low + piece)
+            adam(self.parameter[rows], self.first[rows], self.second[rows], self.gradient[rows], self.live[spans], *numbers)
+
+        run(update, range(0, len(self.live), piece))
+
+
+# ------------------------------------------------------------------------------------------------------------- engines
+
+
+class NumbaEngine:
+    """CPU engine: closed-form gradients. `alpha` fixed once `fix` was called."""
+
+    def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int):
+        from iif_core.fusion.sgd import kernels
+
+        self.kernels, self.pool, self.options = kernels, pool, options
+        self.threads = ThreadPoolExecutor(threads) if threads > 1 else None
+        s, k = pool.usable.shape
+        self.affine = np.tile(IDENTITY, (s, k, 1))
+        self.z = np.zeros((s, k, 3), np.float32)
+        self.fixed: NDArray | None = None
+        self.networks = kernels.selection_networks(k)
+        self.adam_affine, self.adam_z = Adam(self.affine), Adam(self.z)
+        self.d_alpha, self.votes = np.zeros((s, k, 3), np.float32), np.zeros((s, k, 3), np.float32)
+        self.grid = HashGridTexture(options.grid, options.seed, "cpu", threads) if options.texture == "hashgrid" else None
+        if self.grid is None:
+            self.table = start_values(pool, n_cells, options)
+            self.adam_table = Adam(self.table)
+
+    def close(self) -> None:
+        if self.threads is not None:
+            self.threads.shutdown()
+
+    def run(self, task: Callable[[Any], None], arguments: Iterable) -> None:
+        if self.threads is None:
+            for argument in arguments:
+                task(argument)
+        else:
+            list(self.threads.map(task, arguments))
+
+    def weights(self, temperature: float) -> tuple[NDArray, NDArray]:
+        """alpha, log alpha (S, K, 3) float32."""
+        if self.fixed is not None:
+            return self.fixed, np.log(self.fixed, out=np.zeros_like(self.fixed), where=self.fixed > 0)
+        divisor = temperature if self.options.logits == "scaled" else 1.0
+        return softmax(self.z, divisor, self.pool.usable)
+
+    def losses(self, step: Step, raw: NDArray, share: NDArray, error: NDArray) -> tuple[NDArray, NDArray]:
+        """Gradients into the Adams and d_alpha, votes; returns d_raw and the sums (SUMS,)."""
+        pool, options = self.pool, self.options
+        start, segment = runs(pool.segment[step.pixels])
+        alpha, log_alpha = self.weights(step.temperature)
+        self.d_alpha[segment], self.votes[segment] = 0, 0
+        d_raw = np.empty_like(raw)
+        sums = np.zeros((len(segment), self.kernels.SUMS))
+        numbers = np.array([step.temperature, options.scale_floor, options.data_weight, options.regulariser], np.float32)
+        flags = np.array([options.scale_floor_kind == "smooth", options.median_gradient, options.clamp_gradient == "inward"])
+        gradient = self.adam_affine.gradient.reshape(self.affine.shape)
+        edges = np.unique(np.searchsorted(start, np.arange(0, len(step.pixels) + _CHUNK, _CHUNK)).clip(0, len(segment)))
+
+        def work(piece: tuple[int, int]) -> None:
+            self.kernels.batch_loss(
+                *(*piece, start, segment, pool.values, step.pixels, share, raw, self.affine, alpha, log_alpha),
+                *(pool.usable, *self.networks, numbers, flags),
+                *(d_raw, gradient, self.d_alpha, self.votes, error, sums),
+            )
+
+        self.run(work, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)))
+        if self.fixed is None and pool.usable.shape[1] > 1:
+            divisor = step.temperature if options.logits == "scaled" else 1.0
+            slope = logit_slope(alpha[segment], self.d_alpha[segment], self.votes[segment], options.label_weight, divisor)
+            self.adam_z.gradient.reshape(self.z.shape)[segment] = slope
+        else:
+            sums[:, 1] = 0  # a kept selection has no label loss
+        return d_raw, sums.sum(0)
+
+    def step(self, step: Step) -> NDArray:
+        """One update of everything; returns the sums (SUMS,)."""
+        share = shares(self.pool, step.pixels, self.options)
+        error = np.zeros((*self.pool.usable.shape, 3))
+        rows, graph = self.pool.cell[step.pixels], None
+        if self.grid is None:
+            raw = self.table[rows]
+        else:
+            import torch
+
+            graph = self.grid(torch.from_numpy(step.coordinates))
+            raw = graph.detach().numpy()
+        d_raw, sums = self.losses(step, raw, share, error)
+        if np.isfinite(sums).all():
+            if graph is None:
+                self.kernels.add_rows(self.adam_table.gradient.reshape(self.table.shape), rows, d_raw)
+                self.adam_table.step(step.learning_rate, self.run)
+            else:
+                import torch
+
+                graph.backward(torch.from_numpy(d_raw))
+                self.grid.step(step.learning_rate)
+            self.adam_affine.step(step.learning_rate, self.run)
+            if self.fixed is None:
+                self.adam_z.step(step.learning_rate)
+        return sums
+
+    def errors(self, temperature: float) -> NDArray:
+        """(S, K, 3) mean L1 error of every corrected prediction against the texture, over all pixels."""
+        total = np.zeros((*self.pool.usable.shape, 3))
+        for low in range(0, len(self.pool), self.options.batch):
+            pixels = np.arange(low, min(low + self.options.batch, len(self.pool)), dtype=np.int32)
+            raw = self.raw(pixels)
+            self.losses(Step(pixels, None, temperature, 0.0), raw, np.ones(len(pixels), np.float32), total)
+        self.adam_affine.gradient[:] = 0
+        self.adam_z.gradient[:] = 0
+        return total
+
+    def raw(self, pixels: NDArray) -> NDArray:
+        """Raw outputs at pixels of the pool, without jitter."""
+        if self.grid is None:
+            return self.table[self.pool.cell[pixels]]
+        return self.at(self.pool.coordinates[pixels])
+
+    def at(self, coordinates: NDArray) -> NDArray:
+        """Raw outputs of the hash grid."""
+        import torch
+
+        return self.grid.evaluate(torch.from_numpy(coordinates)).numpy()
+
+    def cells(self) -> NDArray:
+        return self.table
+
+    def fix(self, alpha: NDArray) -> None:
+        self.fixed = np.ascontiguousarray(alpha, np.float32)
+
+    def state(self) -> NDArray:
+        return self.affine
+
+
+def logit_slope(alpha: NDArray, d_alpha: NDArray, votes: NDArray, label_weight: float, divisor: float) -> NDArray:
+    """Slope of the loss with respect to z, (S, K, 3), of alpha = softmax_k(z / divisor).
+
+    The data term comes through alpha, d_alpha its slope; the label loss -(label_weight / 3) sum votes log alpha directly.
+    """
+    slope = alpha * (d_alpha - (alpha * d_alpha).sum(1, keepdims=True))
+    slope += (alpha * votes.sum(1, keepdims=True) - votes) * alpha.dtype.type(label_weight / 3)
+    return slope / alpha.dtype.type(divisor)

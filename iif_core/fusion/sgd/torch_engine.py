@@ -1,0 +1,221 @@
+"""The optimiser's step on any device, its gradient left to automatic differentiation: the check of the compiled one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iif_core.fusion.hashgrid.texture import HashGridTexture
+from iif_core.fusion.kernels import IDENTITY
+from iif_core.fusion.problem import LOWEST
+from iif_core.fusion.sgd.kernels import LOCATION, SCALE
+from iif_core.fusion.sgd.options import SgdOptions
+from iif_core.fusion.sgd.pool import TERMS, Pool, Step, softmax, start_values
+
+if TYPE_CHECKING:
+    import torch
+
+_PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
+
+
+class TorchEngine:
+    """Any device: the same loss left to automatic differentiation."""
+
+    def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int, device: str):
+        import torch
+
+        self.torch, self.pool, self.options, self.device = torch, pool, options, torch.device(device)
+        s, k = pool.usable.shape
+        values = pool.values.view(np.float16) if pool.values.dtype == np.uint16 else pool.values
+        self.values = self.tensor(values)
+        self.segment, self.cell = self.tensor(pool.segment.astype(np.int64)), self.tensor(pool.cell.astype(np.int64))
+        self.usable, self.weight = self.tensor(pool.usable), self.tensor(pool.weight)
+        self.affine = self.tensor(np.tile(IDENTITY, (s, k, 1))).requires_grad_()
+        self.z = torch.zeros((s, k, 3), device=self.device, requires_grad=True)
+        self.fixed = None
+        self.grid, self.table = None, None
+        if options.texture == "hashgrid":
+            self.grid = HashGridTexture(options.grid, options.seed, str(device), threads)
+            parameters = [self.affine, self.z]
+        else:
+            self.table = self.tensor(start_values(pool, n_cells, options)).requires_grad_()
+            parameters = [self.table, self.affine, self.z]
+        self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate)
+
+    def tensor(self, array: NDArray) -> torch.Tensor:
+        return self.torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+
+    def close(self) -> None:
+        pass
+
+    def losses(self, pixels: torch.Tensor, raw: torch.Tensor, temperature: float) -> dict[str, torch.Tensor]:
+        segment = self.segment[pixels]
+        share = self.weight[pixels] if self.options.weighted else self.torch.ones_like(self.weight[pixels])
+        divisor = temperature if self.options.logits == "scaled" else 1.0
+        found = torch_losses(
+            raw,
+            self.values[pixels].to(self.torch.float32),
+            self.affine,
+            self.z,
+            segment,
+            self.usable,
+            share / share.sum(),
+            temperature,
+            divisor,
+            self.options,
+            self.fixed,
+        )
+        if self.fixed is not None:
+            found["label"] = self.torch.zeros_like(found["label"])  # a kept selection has no label loss
+        return found
+
+    def step(self, step: Step) -> NDArray:
+        pixels = self.tensor(step.pixels.astype(np.int64))
+        raw = self.grid(self.tensor(step.coordinates)) if self.table is None else self.table[self.cell[pixels]]
+        found = self.losses(pixels, raw, step.temperature)
+        o = self.options
+        loss = o.data_weight * found["data"] + o.regulariser * found["regulariser"] + o.label_weight * found["label"]
+        sums = self.torch.stack([found[name].detach() for name in TERMS]).cpu().numpy().astype(np.float64)
+        if np.isfinite(sums).all():
+            self.optimiser.zero_grad(set_to_none=False)
+            loss.backward()
+            self.optimiser.param_groups[0]["lr"] = step.learning_rate
+            self.optimiser.step()
+            if self.grid is not None:
+                self.grid.step(step.learning_rate)
+        return sums
+
+    def errors(self, temperature: float) -> NDArray:
+        total = np.zeros((*self.pool.usable.shape, 3))
+        with self.torch.no_grad():
+            for low in range(0, len(self.pool), self.options.batch):
+                rows = np.arange(low, min(low + self.options.batch, len(self.pool)))
+                found = self.losses(self.tensor(rows), self.tensor(self.raw(rows)), temperature)["error"]
+                np.add.at(total, self.pool.segment[rows], found.cpu().numpy())
+        return total
+
+    def raw(self, pixels: NDArray) -> NDArray:
+        if self.table is None:
+            return self.at(self.pool.coordinates[pixels])
+        return self.table.detach()[self.cell[self.tensor(pixels.astype(np.int64))]].cpu().numpy()
+
+    def at(self, coordinates: NDArray) -> NDArray:
+        return self.grid.evaluate(self.tensor(coordinates)).cpu().numpy()
+
+    def cells(self) -> NDArray:
+        return self.table.detach().cpu().numpy()
+
+    def weights(self, temperature: float) -> tuple[NDArray, NDArray]:
+        if self.fixed is not None:
+            alpha = self.fixed.cpu().numpy()
+            return alpha, np.log(alpha, out=np.zeros_like(alpha), where=alpha > 0)
+        divisor = temperature if self.options.logits == "scaled" else 1.0
+        return softmax(self.z.detach().cpu().numpy(), divisor, self.pool.usable)
+
+    def fix(self, alpha: NDArray) -> None:
+        self.fixed = self.tensor(np.asarray(alpha, np.float32))
+
+    def state(self) -> NDArray:
+        return self.affine.detach().cpu().numpy()
+
+
+def torch_losses(
+    raw: torch.Tensor,
+    values: torch.Tensor,
+    affine: torch.Tensor,
+    z: torch.Tensor,
+    segment: torch.Tensor,
+    usable: torch.Tensor,
+    share: torch.Tensor,
+    temperature: float,
+    divisor: float,
+    options: SgdOptions,
+    fixed: torch.Tensor | None = None,
+) -> dict[str, torch.Tensor]:
+    """The terms of the loss of a batch in torch operations, any real type and device; differentiable.
+
+    Args:
+        raw: (N, 10) raw outputs of the texture. values: (N, K, 5). affine: (S, K, 16). z: (S, K, 3).
+        segment: (N,) int64. usable: (S, K) bool. share: (N,), sum 1. divisor: of z. fixed: (S, K, 3) alpha, no logits.
+
+    Returns:
+        data, label, regulariser (without its weight), entropy, gain: scalars; error (N, K, 3) L1, without a graph.
+    """
+    import torch
+
+    low = torch.as_tensor(LOWEST, device=raw.device).to(raw.dtype)
+    floor = options.scale_floor
+    use, t = usable[segment], affine[segment]
+    n_used = use.sum(1)
+    sigmoid = raw.sigmoid()
+    mu = low + (1 - low) * sigmoid[:, LOCATION]
+    b = sigmoid[:, SCALE]
+    b = (b * b + floor**2).sqrt() if options.scale_floor_kind == "smooth" else b.clamp_min(floor)
+
+    albedo = t[..., :12].unflatten(-1, (3, 4))
+    corrected = torch.cat(
+        [
+            (albedo[..., :3] * values[..., None, :3]).sum(-1) + albedo[..., 3],
+            t[..., 12:13] * values[..., 3:4] + t[..., 13:14],
+            t[..., 14:15] * values[..., 4:] + t[..., 15:],
+        ],
+        -1,
+    )
+    corrected = _clamped(corrected, low, options.clamp_gradient)
+
+    if fixed is None:
+        y = (z - z.masked_fill(~usable[..., None], -torch.inf).amax(1, keepdim=True).clamp_min(-1e30).detach()) / divisor
+        log_alpha = y.masked_fill(~usable[..., None], -torch.inf).log_softmax(1).masked_fill(~usable[..., None], 0)
+        alpha = log_alpha.exp() * usable[..., None]
+    else:
+        alpha = fixed.to(raw.dtype)
+        log_alpha = torch.where(alpha > 0, alpha, 1.0).log()
+    alpha_n = alpha[segment]
+    mixed = (alpha_n[..., _PROPERTY_OF_CHANNEL] * corrected).sum(1)
+    spread = (mixed[:, None] - corrected).abs()
+    ranked = torch.where(use[..., None], spread.detach(), torch.inf).sort(dim=1).values
+    median = ranked.gather(1, ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5))
+    index = torch.arange(usable.shape[1], device=raw.device)[None, :, None]
+    is_median = (spread.detach() == median) & use[..., None]
+    first = torch.where(is_median, index, usable.shape[1] - 1).amin(1, keepdim=True)  # of those that are equal
+    b_ref = spread.gather(1, first)[:, 0].clamp_min(floor)
+    if not options.median_gradient:
+        b_ref = b_ref.detach()
+    d = (mixed - mu).abs()
+    kl = (b / b_ref).log() + (d + b_ref * (-d / b_ref).exp()) / b - 1
+    data = (share * kl.mean(1)).sum()
+
+    with torch.no_grad():
+        off = (corrected - mu[:, None]).abs()
+        error = torch.stack([off[..., :3].mean(-1), off[..., 3], off[..., 4]], -1)
+        nearest = torch.where(use[..., None], error, torch.inf).amin(1, keepdim=True)
+        q = ((nearest - error) / temperature).masked_fill(~use[..., None], -torch.inf).softmax(1)
+    label = -(share[:, None, None] * q * torch.where(q > 0, log_alpha[segment], 0)).sum() / 3
+
+    a, identity = albedo[..., :3], torch.eye(3, dtype=raw.dtype, device=raw.device)
+    penalty = ((a - identity) ** 2).sum((-1, -2)) + (albedo[..., 3] ** 2).sum(-1)
+    penalty = penalty + ((a @ a.mT - identity) ** 2).sum((-1, -2))
+    penalty = penalty + ((t[..., 12:] - torch.tensor([1.0, 0.0, 1.0, 0.0], device=raw.device)) ** 2).sum(-1)
+    regulariser = (share * (penalty * use).sum(1) / n_used).sum()
+
+    with torch.no_grad():
+        entropy = -(share * (alpha * log_alpha).sum((1, 2))[segment]).sum() / 3
+        gain = (share * (alpha_n[..., 0] * (t[..., 0] + t[..., 5] + t[..., 10])).sum(1)).sum() / 3
+        error = error * use[..., None]
+    return {"data": data, "label": label, "regulariser": regulariser, "entropy": entropy, "gain": gain, "error": error}
+
+
+def _clamped(x: torch.Tensor, low: torch.Tensor, gradient: str) -> torch.Tensor:
+    """x within [low, 1]; `gradient`: as in SgdOptions.clamp_gradient."""
+    import torch
+
+    clamped = torch.maximum(torch.minimum(x, torch.ones_like(x)), low.expand_as(x))
+    outside = x.detach() - clamped.detach()
+    dead = torch.where(outside == 0, x, clamped.detach())
+    if gradient == "dead" or not x.requires_grad:
+        return dead
+    inward = clamped.detach() + (x - x.detach())
+    inward.register_hook(lambda slope: torch.where((outside == 0) | (outside * slope > 0), slope, 0))
+    return inward

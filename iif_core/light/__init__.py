@@ -1,0 +1,1 @@
+"""Light: emitters, environment, light transport, irradiance, and relighting."""

@@ -1,0 +1,86 @@
+"""The radiance cache: mean outgoing radiance per voxel of everything that does not shine (METHOD 2.0)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.surface.cells import pack_keys, unpack_keys, voxel_indices
+
+
+@dataclass(frozen=True)
+class RadianceVoxels:
+    """A sparse voxel radiance cache.
+
+    Attributes:
+        edge: m; origin: (3,) corner of voxel (0, 0, 0).
+        ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black (METHOD H27).
+        radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored
+            one, a lower bound (H60).
+        samples: (n,) int32 observations behind `radiance`.
+        censored: (n,) bool, `radiance` is a lower bound.
+    """
+
+    edge: float
+    origin: np.ndarray
+    ijk: np.ndarray
+    radiance: np.ndarray
+    samples: np.ndarray
+    censored: np.ndarray
+
+
+class RadianceSums:
+    """Running sums per voxel: `add` the pixels of one view after another, then `finish` (METHOD 2.0).
+
+    Args:
+        edge: voxel edge in m.
+        origin: (3,) corner of voxel (0, 0, 0), below all points: `cells.grid_origin` of the mesh.
+    """
+
+    def __init__(self, edge: float, origin: np.ndarray):
+        self.edge, self.origin = float(edge), np.asarray(origin, np.float32)
+        self._key = np.zeros(0, np.uint64)
+        # columns: sum R G B, count, largest censored R G B, censored count
+        self._value = np.zeros((0, 8))
+
+    def add(self, points: np.ndarray, radiance: np.ndarray, censored: np.ndarray) -> None:
+        """Add pixels: points (n, 3) in m, radiance (n, 3) linear, censored (n,) bool; non-finite rows are left out.
+
+        The caller leaves out pixels on emitters (METHOD H28).
+
+        Raises:
+            InputError: edge not positive, or a point outside the 65536 voxels an axis from the origin.
+        """
+        good = np.isfinite(radiance).all(-1) & np.isfinite(points).all(-1)
+        key = pack_keys(voxel_indices(np.asarray(points)[good], self.edge, self.origin))
+        value, clipped = np.asarray(radiance, np.float64)[good], np.asarray(censored)[good]
+        row = np.concatenate(
+            [
+                np.where(clipped[:, None], 0.0, value),
+                (~clipped)[:, None],
+                np.where(clipped[:, None], value, 0.0),
+                clipped[:, None],
+            ],
+            1,
+        )
+        key = np.concatenate([self._key, key])
+        row = np.concatenate([self._value, row])
+        if not len(key):
+            return
+        order = np.argsort(key, kind="stable")
+        starts = np.flatnonzero(np.r_[True, key[order][1:] != key[order][:-1]])
+        self._key = key[order][starts]
+        sums = np.add.reduceat(row[order], starts, 0)
+        sums[:, 4:7] = np.maximum.reduceat(row[order][:, 4:7], starts, 0)
+        self._value = sums
+
+    def finish(self) -> RadianceVoxels:
+        """The cache of what was added so far."""
+        count, clipped = self._value[:, 3], self._value[:, 7]
+        bound = count == 0
+        mean = self._value[:, :3] / np.maximum(count, 1)[:, None]
+        radiance = np.where(bound[:, None], self._value[:, 4:7], mean)
+        ijk = unpack_keys(self._key)[0]
+        samples = np.where(bound, clipped, count).astype(np.int32)
+        return RadianceVoxels(self.edge, self.origin, ijk, radiance.astype(np.float32), samples, bound)

@@ -1,0 +1,435 @@
+"""Emission from photographs: light is linear in emission, so the emitters follow from non-negative least squares.
+
+With materials and geometry fixed, pixel p shows L_p = h_p + sum_g A_pg E_g in each colour channel (METHOD 7a). A
+is traced, so it is noisy, and a plain normal matrix M = E[A'A] = A'A + noise shrinks the answer (errors in
+variables): 50 % noise turns (5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W
+A2 + A2' W A1) / 2.
+
+H may be indefinite. Its eigenvalues relative to M are reliabilities: the share of what a direction of E does in the rows
+that is signal, at most 1. K = (A1' W A2 - A2' W A1) / 2 is nothing but noise, so |K| relative to M is how far such a
+share can be trusted. Directions below that are lifted to it, and what is lifted goes to the prior. Relative to M and not
+to the identity, because neighbouring triangles differ in directions that do little yet are well known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.light.emission.rows import EmissionRows
+
+TRUSTED = 1.5
+"""Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
+_DAMPED = 6  # rounds of re-weighting after which steps are halved
+_CHUNK = 1 << 24  # bytes of float64 rows converted at a time
+
+
+@dataclass(frozen=True)
+class EmissionSolution:
+    """Result of `solve_emission`.
+
+    Attributes:
+        radiance: (G, 3) float64 >= 0.
+        error: (G, 3) standard error: H^-1 (sum_k s_k s_k') H^-1 with the scores s_k of the clusters of rows, each the
+            cross of one trace's A with the other's residual, so that tracing noise is in it once and without bias;
+            plus the prior's own width in as far as the data leave a group to it.
+        determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
+        condition: largest / smallest eigenvalue of the normal matrix scaled to unit diagonal (worst channel), cut
+            at the noise level.
+        residual: weighted root mean square of target - A E, relative to that of the target.
+        violated: number of lower bounds that the answer does not reach.
+        iterations: rounds of re-weighting; `converged` says whether the answer came to rest.
+    """
+
+    radiance: np.ndarray
+    error: np.ndarray
+    determined: np.ndarray
+    condition: float
+    residual: float
+    violated: int
+    iterations: int
+    converged: bool
+
+    def with_level_error(self, level_error: float | np.ndarray) -> EmissionSolution:
+        """The same answer, with the error of the logarithm of the light that groups share (number or (G, 3)) in each one's."""
+        return replace(self, error=np.hypot(self.error, level_error * self.radiance))
+
+
+def solve_emission(
+    rows: EmissionRows,
+    initial: np.ndarray,
+    cross: bool = True,
+    ridge: float = 1e-4,
+    max_rounds: int = 20,
+    prior_width: float | np.ndarray = 5.0,
+    family: np.ndarray | None = None,
+) -> EmissionSolution:
+    """Radiance of every emitter group: weighted non-negative least squares with one-sided rows (METHOD 7a).
+
+    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the
+    diagonal)
+                        + sum_g v_g (E_g - E0_g)^2 / (prior_width E0_g)^2,
+    v_g = residual variance of a row of weight 1, times the design effect (`_design_effect`) once the answer has come to rest.
+    How sharp the bounds are is told by the noise of the rows (`_censored`); re-weighted until the answer rests.
+
+    Args:
+        rows: the system (see `block_rows`).
+        initial: (G, 3) E0 >= 0: where the answer stays when the data say nothing (unseen group, noise, duplicate
+            columns).
+        cross: normal matrix from both estimates of A (unbiased); False: from their mean (biased low, always definite).
+        ridge: pull towards E0 relative to the diagonal of the normal matrix.
+        max_rounds: of the re-weighting.
+        prior_width: number or (G,), standard deviation of E relative to E0 before looking at what it lights; keeps
+            small groups whose light reaches few pixels from taking any value at all. Infinity switches it off.
+        family: (G,) int, groups whose initial values are one number that the data already gave: they miss it in
+            different directions. None = each for itself.
+
+    Returns:
+        `EmissionSolution`; always finite.
+
+    Raises:
+        InputError: `initial` of the wrong shape, negative or non-finite; non-finite rows.
+    """
+    groups = rows.groups
+    initial = np.asarray(initial, np.float64)
+    if initial.shape != (groups, 3) or not np.isfinite(initial).all() or (initial < 0).any():
+        raise InputError(f"emission: initial radiance of shape {initial.shape}, needed ({groups}, 3), finite and >= 0")
+    for name in ("first", "second", "target", "target_second", "weight"):
+        if not np.isfinite(getattr(rows, name)).all():
+            raise InputError(f"emission rows: {name} holds non-finite values; drop those pixels first")
+    radiance, error, shares = initial.copy(), initial.copy(), np.zeros((groups, 3))
+    condition, violated, iterations, converged = 1.0, 0, 0, True
+    if groups == 0 or len(rows.target) == 0:
+        return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
+    square, square_target = 0.0, 0.0
+    for c in range(3):
+        width = _width(initial[:, c], prior_width)
+        channel = _ChannelRows.of(rows, c, initial[:, c], width, cross, ridge).solve(max_rounds, family)
+        radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
+        condition = max(condition, channel.condition)
+        violated += channel.violated
+        iterations = max(iterations, channel.rounds)
+        converged &= channel.converged
+        square += channel.square
+        square_target += channel.square_target
+    residual = float(np.sqrt(square / square_target)) if square_target > 0 else 0.0
+    return EmissionSolution(radiance, error, shares.min(1), condition, residual, violated, iterations, converged)
+
+
+FAMILY_WIDTH = 0.3
+"""Standard deviation of the groups of one object around their common radiance, relative to it."""
+OUTSIDE_WIDTH = 0.5
+"""The same of the directions that stand for what lies outside a mesh with large openings."""
+
+
+def solve_families(
+    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float | np.ndarray = FAMILY_WIDTH
+) -> EmissionSolution:
+    """`solve_emission` in two steps: groups of one object first share one radiance, then deviate from it.
+
+    The triangles of a window light the room almost alike, so what is known well is their sum. Solved alone, noise and
+    wrong albedos make one black and its neighbour twice as bright. The shared radiance becomes the initial value, and the
+    prior width of groups that have company is `width`.
+
+    Args:
+        family: (G,) int, groups with the same number are parts of one object; width: number or (G,).
+    """
+    number, members = np.unique(family, return_inverse=True)
+    size = np.bincount(members, minlength=len(number))
+    if not len(family) or size.max() == 1:
+        return solve_emission(rows, initial, cross)
+    joint = np.zeros((len(number), 3))
+    np.add.at(joint, members, initial)
+    joint /= size[:, None]
+    shared = replace(rows, first=_summed(rows.first, members, len(number)), second=_summed(rows.second, members, len(number)))
+    start = solve_emission(shared, joint, cross).radiance[members]
+    together = size[members] > 1
+    start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
+    return solve_emission(rows, start, cross, prior_width=np.where(together, width, 5.0), family=family)
+
+
+def _summed(matrix: np.ndarray, members: np.ndarray, count: int) -> np.ndarray:
+    out = np.zeros((len(matrix), count, 3), np.float32)
+    for group, family in enumerate(members):
+        out[:, family] += matrix[:, group]
+    return out
+
+
+def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """(H lifted, the lift, condition number), all of unit diagonal; see the head of this module."""
+    values, vectors = np.linalg.eigh(normal.m)
+    values = np.maximum(values, 1e-9 * values[-1])
+    root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
+    share, directions = np.linalg.eigh(inverse @ normal.h @ inverse)
+    noise = float(np.linalg.norm(inverse @ normal.k @ inverse, 2)) if normal.k.any() else 0.0
+    lift = np.where(share < max(TRUSTED * noise, 1e-6), 1.0 - share, 0.0)
+    whole = root @ directions
+    lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
+    spectrum = np.linalg.eigvalsh(normal.h + lifted)
+    return normal.h + lifted, lifted, float(spectrum[-1] / max(spectrum[0] - ridge, 1e-10))
+
+
+def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
+    """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
+
+    A pixel with noise sigma is saturated with probability Phi(-z), z = (bound - prediction) / sigma (Tobin 1958). One
+    Newton step on -log Phi(-z), with lambda = phi(z) / Phi(-z) and delta = lambda (lambda - z) in (0, 1), is the row
+    prediction + sigma lambda / delta with weight delta. sigma -> 0: those that are missed count fully, others not at
+    all. A hard bound instead would be pushed up by every pixel that noise alone has saturated.
+    """
+    from scipy.special import log_ndtr
+
+    share, shift = np.ones(len(difference)), np.zeros(len(difference))
+    missed = bound & (difference > 0)
+    share[bound] = missed[bound]
+    if scale is None or noise <= 0:
+        return share, shift
+    sigma = noise * scale[bound]
+    z = np.clip(difference[bound] / sigma, -30.0, 30.0)
+    ratio = np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
+    delta = np.clip(ratio * (ratio - z), 0.0, 1.0)
+    far = np.abs(difference[bound]) >= 29.0 * sigma
+    soft = ~far & (delta > 1e-4)
+    share[bound] = np.where(far, missed[bound], np.where(soft, delta, 0.0))
+    shift[bound] = np.where(soft, sigma * ratio / np.maximum(delta, 1e-4) - difference[bound], 0.0)
+    return share, shift
+
+
+def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
+    """Standard deviation of the prior; without any initial brightness there is no scale for it, and it is left out."""
+    largest = float(initial.max(initial=0.0))
+    if largest <= 0:
+        return np.full(len(initial), np.inf)
+    return relative * np.maximum(initial, 0.1 * largest)
+
+
+@dataclass(frozen=True)
+class _Channel:
+    radiance: np.ndarray
+    error: np.ndarray
+    share: np.ndarray
+    condition: float
+    violated: int
+    rounds: int
+    converged: bool
+    square: float
+    square_target: float
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """H, noise part K, M and b of one channel, float64."""
+
+    h: np.ndarray
+    k: np.ndarray
+    m: np.ndarray
+    b: np.ndarray
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of the groups that the rows know, scaled to unit diagonal of M.
+
+    Attributes:
+        known: (G,) bool; scale: of the unknowns; matrix, right: lifted H and prior, b; lifted: the part of the prior.
+    """
+
+    known: np.ndarray
+    scale: np.ndarray
+    matrix: np.ndarray
+    lifted: np.ndarray
+    right: np.ndarray
+    condition: float
+
+    def solve(self, initial: np.ndarray) -> np.ndarray:
+        """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
+        from scipy.linalg import solve_triangular
+        from scipy.optimize import nnls
+
+        lower = np.linalg.cholesky(self.matrix)
+        right = solve_triangular(lower, self.right + self.lifted @ (initial[self.known] * self.scale), lower=True)
+        answer = initial.copy()
+        answer[self.known] = nnls(lower.T, right, maxiter=50 * len(self.scale) + 50)[0] / self.scale
+        return answer
+
+
+@dataclass(frozen=True)
+class _ChannelRows:
+    """The rows of one colour channel and what is known of its answer beforehand.
+
+    Attributes:
+        first, second: (n, G) float32 views; target, target_second, weight: (n,); bound: (n,) bool.
+        cluster: (n,) int; noise: (n,) or None.
+        initial, width: (G,) mean and standard deviation of the prior; cross, ridge: as in `solve_emission`.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    target: np.ndarray
+    target_second: np.ndarray
+    weight: np.ndarray
+    bound: np.ndarray
+    cluster: np.ndarray
+    noise: np.ndarray | None
+    initial: np.ndarray
+    width: np.ndarray
+    cross: bool
+    ridge: float
+
+    @classmethod
+    def of(cls, rows: EmissionRows, c: int, initial: np.ndarray, width: np.ndarray, cross: bool, ridge: float) -> _ChannelRows:
+        """Channel c."""
+        data = (rows.first[:, :, c], rows.second[:, :, c], rows.target[:, c], rows.target_second[:, c], rows.weight[:, c])
+        cluster = np.full(len(rows.target), -1) if rows.cluster is None else rows.cluster
+        return cls(*data, rows.lower_bound[:, c], cluster, rows.noise, initial, width, cross, ridge)
+
+    @property
+    def mean_target(self) -> np.ndarray:
+        return 0.5 * (self.target + self.target_second)
+
+    @property
+    def sure(self) -> np.ndarray:
+        """Weights without the bounds: one that is reached says where the answer stops, not how far off it is."""
+        return np.where(self.bound, 0.0, self.weight)
+
+    def chunks(self) -> list[slice]:
+        """Rows that are converted to float64 at a time."""
+        step = max(1, _CHUNK // (8 * max(self.first.shape[1], 1)))
+        return [slice(start, start + step) for start in range(0, len(self.target), step)]
+
+    def normal(self, weight: np.ndarray, shift: np.ndarray) -> _Normal:
+        """Sums over the rows, targets shifted."""
+        groups = self.first.shape[1]
+        h, k, m, b = np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros(groups)
+        for part in self.chunks():
+            w = weight[part, None]
+            a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
+            mean = 0.5 * (a1 + a2)
+            t1, t2 = (t[part] + shift[part] for t in (self.target, self.target_second))
+            m += mean.T @ (w * mean)
+            if self.cross:
+                b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
+                product = a1.T @ (w * a2)
+                h += 0.5 * (product + product.T)
+                k += 0.5 * (product - product.T)
+            else:
+                b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
+        return _Normal(h if self.cross else m, k, m, b)
+
+    def scores(self, answer: np.ndarray) -> np.ndarray:
+        """sum_k s_k s_k' over clusters of rows that are no bounds: (G, G)."""
+        parts, weight = [], self.sure
+        for part in self.chunks():
+            w = weight[part, None]
+            a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
+            r1, r2 = self.target[part] - a1 @ answer, self.target_second[part] - a2 @ answer
+            if not self.cross:
+                a1 = a2 = 0.5 * (a1 + a2)
+                r1 = r2 = 0.5 * (r1 + r2)
+            parts.append(0.5 * w * (a1 * r2[:, None] + a2 * r1[:, None]))
+        single = np.concatenate(parts)
+        alone = self.cluster < 0
+        number = np.unique(self.cluster[~alone], return_inverse=True)[1]
+        together = np.zeros((int(number.max(initial=-1)) + 1, single.shape[1]))
+        np.add.at(together, number, single[~alone])
+        return single[alone].T @ single[alone] + together.T @ together
+
+    def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> _System | None:
+        """With the given weights and shifts, `variance` (G,) of a row of weight 1 to weigh the prior with; None when the rows
+        know nothing."""
+        normal = self.normal(weight, shift)
+        diagonal = np.diag(normal.m)
+        known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
+        if not known.any():
+            return None
+        scale = np.sqrt(diagonal[known])
+        unit, pick = np.outer(scale, scale), np.ix_(known, known)
+        scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
+        matrix, lifted, condition = _definite(scaled, self.ridge)
+        prior = np.diag(variance[known] / (self.width[known] * scale) ** 2)
+        return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+
+    def solve(self, max_rounds: int, family: np.ndarray | None) -> _Channel:
+        """Re-weighted until the answer rests; then the prior is weighed against what the rows really know."""
+        bound, weight, target = self.bound, self.weight, self.mean_target
+        mean_a = 0.5 * (self.first + self.second)
+        bounded = bool(np.isfinite(self.width).any())
+        answer, condition = self.initial.copy(), 1.0
+        rounds, converged, weighed, noise = 0, False, not bounded, 0.0
+        variance, effect = np.zeros(len(answer)), np.ones(len(answer))
+        while rounds < max_rounds and not (converged and weighed):
+            if converged and not weighed:
+                weighed, effect = True, self._design_effect(answer, variance)
+                variance = variance * effect
+            rounds += 1
+            before = answer
+            share, shift = _censored(target - mean_a @ before, bound, self.noise, noise)
+            system = self.system(weight * share, shift, variance)
+            if system is not None:
+                answer, condition = system.solve(self.initial), system.condition
+            if rounds > _DAMPED:  # two answers by turns: the one between them
+                answer = 0.5 * (before + answer)
+            difference = target - mean_a @ answer
+            used = np.where(bound & (difference <= 0), 0.0, weight)
+            residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
+            variance = effect * residual if bounded else variance
+            plain = ~bound & (weight > 0)
+            noise = float(np.sqrt((weight[plain] * difference[plain] ** 2).mean())) if plain.any() else 0.0
+            # The first round has no residual to weigh the prior and the bounds with.
+            change = np.abs(answer - before).max(initial=0.0)
+            converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
+        difference = target - mean_a @ answer
+        counted = np.where(bound & (difference < 0), 0.0, weight)
+        error, share = self._uncertainty(answer, variance, family)
+        return _Channel(
+            answer,
+            error,
+            share,
+            condition,
+            int((bound & (difference > 1e-6 * np.abs(target))).sum()),
+            rounds,
+            converged,
+            float((counted * difference**2).sum()),
+            float((np.where(bound, counted, weight) * target**2).sum()),
+        )
+
+    def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """(G,) >= 1, how many times less the rows know about a group than if their errors were independent (Kish 1965).
+
+        diag(H^-1 sum_k s_k s_k' H^-1) / diag(v H^-1): tracing noise and errors that the rows of an object share. The prior is
+        weighed against what the rows really know; otherwise neighbouring panes of one window are told apart by nothing but noise.
+        """
+        effect = np.ones(len(answer))
+        system = self.system(self.sure, np.zeros(len(self.target)), variance)
+        if system is not None:
+            known, inverse = system.known, np.linalg.inv(system.matrix)
+            real = np.diag(inverse @ self._meat(system, answer) @ inverse)
+            claimed = variance[known] * np.diag(inverse)
+            effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
+        return effect
+
+    def _meat(self, system: _System, answer: np.ndarray) -> np.ndarray:
+        """`scores` of the known groups in units of the system's scale."""
+        return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
+
+    def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """(standard error, share of the answer that is not the prior's), both (G,)."""
+        error, share = self.initial.copy(), np.zeros(len(answer))
+        system = self.system(self.sure, np.zeros(len(self.target)), variance)
+        if system is None:
+            return error, share
+        known, scale, initial = system.known, system.scale, self.initial[system.known]
+        inverse = np.linalg.inv(system.matrix)
+        pull = inverse @ system.lifted  # d answer / d initial
+        prior_part = pull * np.minimum(self.width[known], np.maximum(initial, 1e-300)) * scale
+        if family is not None:
+            member = family[known][:, None] == np.unique(family)
+            size = member.sum(0)
+            mean = prior_part @ (member / np.maximum(size, 1))
+            prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
+        data_part = np.clip(np.diag(inverse @ self._meat(system, answer) @ inverse), 0, None)
+        share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
+        error[known] = np.sqrt(data_part + (prior_part**2).sum(1)) / scale
+        return error, share

@@ -1,0 +1,159 @@
+"""Groups that only reflect are recognised by the solve and dropped (METHOD 2.5, 8).
+
+What a white surface would show in a group's place is known from the same transport: A_w E + h_w, light of the other
+groups. A group that is clearly brighter than that shines, whatever its albedo. Any other may just be a bright surface
+near a lamp, and one with little power something that shines through; such groups stay only if the rest of the scene
+misses their light. The least credible one goes first, because the light of a false emitter makes its neighbours look
+like reflectors. A group that is dropped goes on to show what was seen of it: once it is no emitter, the radiance cache holds it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.light.emission.direct import EmissionSolution, solve_emission
+from iif_core.light.emission.rows import EmissionRows
+
+CERTAIN = 2.0
+"""Brightness relative to a white surface from which a group shines for certain; twice, since the light that the white
+surface would reflect is only known as well as the other emitters are."""
+CERTAIN_OPEN = 8.0
+"""The same where much of the light comes through large openings of the mesh, from lamps that no camera sees: a table under such
+a lamp is three times as bright as a white surface under the mean light, a lamp in view ten times or more."""
+
+
+RESIDUAL_CHANGE = 0.03
+"""Growth of the residual from which a group is missed. METHOD 8 has 0.001; with albedos that are only predicted, one
+more free column always finds something to explain (kitchen: 0.3 to 1 % for a lit wall)."""
+
+
+_ROUNDS = 6  # of re-weighting in a trial, which only says which groups are needed
+
+
+@dataclass(frozen=True)
+class WhiteSurface:
+    """What groups show, and what a white diffuse surface would show in their place.
+
+    Attributes:
+        seen: (G, 3) radiance seen on each group, 0 = not seen.
+        matrix: (G, G, 3) mean of A over the pixels of each group (first axis) if they were white; cached: (G, 3)
+            the same of h.
+    """
+
+    seen: np.ndarray
+    matrix: np.ndarray
+    cached: np.ndarray
+
+    def excess(self, radiance: np.ndarray) -> np.ndarray:
+        """(G,) brightness of each group relative to the white surface under the light of the others; infinite without
+        light, 0 where the group was not seen."""
+        others = self.matrix * (1.0 - np.eye(len(self.seen)))[:, :, None]
+        white = (np.einsum("ghc,hc->gc", others, radiance) + self.cached).sum(1)
+        seen = self.seen.sum(1)
+        return np.where(seen > 0, np.divide(seen, white, out=np.full(len(seen), np.inf), where=white > 0), 0.0)
+
+
+@dataclass(frozen=True)
+class PrunedEmission:
+    """Result of `prune_groups`: the solution with dropped groups at 0, which were kept, and why not; (G,) `excess` of the
+    last round a group took part in."""
+
+    solution: EmissionSolution
+    kept: np.ndarray
+    reason: list[str]
+    excess: np.ndarray
+
+
+def prune_groups(
+    rows: EmissionRows,
+    initial: np.ndarray,
+    area: np.ndarray,
+    white: WhiteSurface,
+    elsewhere: np.ndarray,
+    protected: np.ndarray,
+    share: float = 0.01,
+    certain: float = CERTAIN,
+    residual_change: float = RESIDUAL_CHANGE,
+    cross: bool = True,
+) -> PrunedEmission:
+    """Solve, then drop groups that do not shine, the least credible first, and solve again.
+
+    Dropped is a group without emission left; and, unless the residual elsewhere grows by more than `residual_change`
+    without it, one that is not brighter than `certain` white surfaces or has less than `share` of the total power
+    area x sum E.
+
+    Args:
+        rows, initial, cross: as in `solve_emission`.
+        area: (G,) m^2; white: what their pixels say.
+        elsewhere: (n,) bool, rows that are not a group's own pixels: what its light does, not what it looks like.
+        protected: (G,) bool, never dropped (environment).
+    """
+    kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
+    excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
+    solution = solve_emission(rows, initial, cross, max_rounds=_ROUNDS)
+    while True:
+        emission = solution.radiance.sum(1)
+        power = area * emission * ~protected
+        power = power / max(power.sum(), 1e-300)
+        shown = np.where(kept[:, None], solution.radiance, white.seen)
+        excess = np.where(kept, white.excess(shown), excess)
+        dark = kept & ~protected & (emission <= 0)
+        open_ = kept & ~protected & ~dark & ~missed
+        reflecting, weak = open_ & (excess < certain), open_ & (power < share)
+        if dark.any():
+            drop = dark
+        elif reflecting.any():
+            drop = reflecting & (excess <= 1.1 * excess[reflecting].min())
+        elif weak.any():
+            drop = weak
+        else:
+            break
+        if singly and not dark.any():
+            drop &= power <= power[drop].min()
+        trial = _solve_subset(rows, initial, kept & ~drop, white.seen, cross)
+        before = _misfit(rows, shown, elsewhere)
+        after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
+        if not dark.any() and after > before * (1 + residual_change) + 1e-12:
+            # One lamp that is missed must not keep those that were to go with it.
+            if drop.sum() > 1 and not singly:
+                singly = True
+            else:
+                missed |= drop
+            continue
+        for g in np.flatnonzero(drop):
+            reason[g] = _reason(dark[g], bool(reflecting[g]), excess[g], power[g])
+        kept, solution = kept & ~drop, trial
+    return PrunedEmission(solution, kept, reason, excess)
+
+
+def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
+    if dark:
+        return "no emission is left for it"
+    if reflecting:
+        return f"reflects: a white surface in its place would have {1 / max(excess, 1e-9):.0%} of its brightness"
+    return f"{power:.2%} of the power, and not missed"
+
+
+def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float:
+    """Weighted root sum of squares of some rows; bounds that are met do not count."""
+    mean = 0.5 * (rows.first[mask] + rows.second[mask])
+    difference = rows.mean_target[mask] - np.einsum("ngc,gc->nc", mean, radiance)
+    counted = np.where(rows.lower_bound[mask] & (difference < 0), 0.0, rows.weight[mask])
+    return float(np.sqrt((counted * difference**2).sum()))
+
+
+def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray, cross: bool) -> EmissionSolution:
+    """Solution over all groups, 0 outside `kept`: the others light the scene with what they show, as the cache will."""
+    part = solve_emission(_without(rows, kept, shown), initial[kept], cross, max_rounds=_ROUNDS)
+    radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
+    determined = np.zeros(len(initial))
+    radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
+    return replace(part, radiance=radiance, error=error, determined=determined)
+
+
+def _without(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
+    """The system of the `kept` groups; the light of the others, `shown` (G, 3), is taken off the targets."""
+    first, second = (np.einsum("ngc,gc->nc", a[:, ~kept], shown[~kept]) for a in (rows.first, rows.second))
+    return replace(rows.columns(kept), target=rows.target - first, target_second=rows.target_second - second)

@@ -1,0 +1,30 @@
+"""From photographs to radiance, with what saturation leaves unknown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.camera.response import Response
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """What turns sensor values into radiance.
+
+    Attributes:
+        curve: camera response; is_hdr: values are linear radiance already; saturation: sensor value from which a
+            pixel only bounds the radiance from below.
+    """
+
+    curve: Response
+    is_hdr: bool
+    saturation: float
+
+    def radiance(self, value: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
+        """(n, 3) linear radiance f^-1(I) / e and (n, 3) bool: only a lower bound (METHOD H30)."""
+        if self.is_hdr:
+            return np.maximum(value, 0.0), np.zeros(value.shape, bool)
+        bound = value >= self.saturation
+        return self.curve.inverse(np.clip(value, 0.0, self.saturation)) / exposure, bound

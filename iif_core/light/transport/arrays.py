@@ -1,0 +1,119 @@
+"""Moving arrays between NumPy and the device, and cutting work into lanes with a random stream each.
+
+A lane owns a few samples of one point and adds them up itself; the lanes of a point are added in a fixed
+order. How a point is cut depends on the number of samples alone, so its result does not depend on its
+neighbours, on the chunks or on the threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+
+Array = np.ndarray
+
+
+def chunks(count: int, size: int) -> Iterator[slice]:
+    """Consecutive slices of at most `size` that cover range(count)."""
+    if size < 1:
+        raise InputError(f"chunk size is {size}; it must be at least 1")
+    for start in range(0, count, size):
+        yield slice(start, min(start + size, count))
+
+
+def table(rows: ArrayLike) -> Any:
+    """Flat device float32 table of a NumPy array, row-major."""
+    return mi.Float(np.ascontiguousarray(rows, np.float32).ravel())
+
+
+def vectors(kind: Any, rows: Array) -> Any:
+    """Device vectors of type `kind` from (n, width) rows."""
+    return kind(*(mi.Float(np.ascontiguousarray(rows[:, axis], np.float32)) for axis in range(rows.shape[1])))
+
+
+def to_numpy(value: Any) -> Array:
+    """(n,) of a device scalar type, (n, width) of a device vector type."""
+    data = value.numpy()
+    return data if data.ndim == 1 else np.ascontiguousarray(data.T)
+
+
+def rows_of(value: ArrayLike, count: int, width: int | None, name: str) -> Array:
+    """`value` as float32 of shape (count, width) (or (count,) for width None), checked to be finite."""
+    shape = (count,) if width is None else (count, width)
+    value = np.asarray(value, np.float32)
+    if value.shape != shape:
+        raise InputError(f"{name} has shape {value.shape}, expected {shape}")
+    if not np.isfinite(value).all():
+        raise InputError(f"{name} contains NaN or infinity; remove those rows first")
+    return value
+
+
+SAMPLES_PER_LANE = 8
+"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough that the start-up is
+paid off."""
+
+LANES = 1 << 18
+"""Lanes on the device at once, unless their results would need more than DEVICE_FLOATS."""
+
+DEVICE_FLOATS = 1 << 26
+"""Entries of one result on the device at once (256 MiB)."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Points `part` of the caller's arrays, each worked on by `split` neighbouring lanes, numbered from
+    `first_lane`."""
+
+    part: slice
+    split: int
+    first_lane: int
+
+    @property
+    def lanes(self) -> int:
+        return (self.part.stop - self.part.start) * self.split
+
+    def spread(self, kind: Any, rows: Array) -> Any:
+        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes
+        of a point."""
+        rows = rows[self.part]
+        columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
+        parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
+        return kind(*parts)
+
+    def samples(self, count: int) -> tuple[Any, Any]:
+        """(first, end) sample number of every lane, so that the lanes of a point share `count` samples."""
+        lane = dr.arange(mi.UInt32, self.lanes) % dr.opaque(mi.UInt32, self.split)
+        each, left = (dr.opaque(mi.UInt32, value) for value in divmod(count, self.split))
+        first = lane * each + dr.minimum(lane, left)
+        return first, first + each + dr.select(lane < left, mi.UInt32(1), 0)
+
+    def collect(self, lane_sums: Any) -> Array:
+        """Sum over the lanes of every point, (points,) or (points, width)."""
+        return to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums)
+
+    def streams(self, seed: int) -> Any:
+        """One PCG32 stream a lane, a function of (seed, lane number) alone. The seed is any integer >= 0."""
+        words = np.random.SeedSequence(seed).generate_state(4)
+        lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
+        a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
+        c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
+        return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))
+
+
+def batches(points: int, samples: int, floats_per_lane: int, lanes: int | None = None) -> Iterator[Batch]:
+    """Cuts `points` x `samples` into batches of at most `lanes` lanes (at least one point)."""
+    split = -(-samples // SAMPLES_PER_LANE)
+    if points * split >= 1 << 32:
+        raise InputError(f"{points} points with {samples} samples are too many for one call; call with fewer points")
+    if lanes is None:
+        lanes = min(LANES, DEVICE_FLOATS // max(floats_per_lane, 1))
+    for part in chunks(points, max(1, lanes // split)):
+        yield Batch(part, split, part.start * split)

@@ -1,0 +1,211 @@
+"""Emitters: radiance per face and of the environment, and drawing points or directions with an exactly known density."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+from iif_core.light.environment import as_map, direction_in, solid_angles, texel_of, texel_weights
+from iif_core.light.transport.arrays import rows_of, table
+from iif_core.light.transport.geometry import Geometry, cosine_directions, trace
+from iif_core.numerics.xp import DRJIT
+
+Array = np.ndarray
+
+MIN_SLOTS = 4096
+
+SHARE_LIMITS = (0.1, 0.5)
+"""Bounds of the environment's share of the draws beside emitting faces: neither is starved by a bad guess of its
+power."""
+
+
+class Emitters:
+    """Emitting faces of one geometry and the light around it.
+
+    radiance (m, 3) per face, linear, >= 0; side (m,) int8: +1 the side of the right-hand normal emits, -1 the
+    other, 0 both (default 0); environment (3,) or (H, W, 3): radiance of escaping rays, a map as in
+    `iif_core.light.environment`; sampling_weight (m,) >= 0: how often a face is drawn (default area x mean radiance);
+    environment_weight (H, W) >= 0 likewise (default solid angle x mean radiance; a map of one texel is never drawn, since
+    directions of the BRDF find it as well); environment_share: of all draws, where both are drawn (default by power). A face
+    or texel with weight 0 is still found by directions that hit it; those with a positive weight and unknown radiance 0 may
+    be candidates. Emitting faces reflect too, with whatever the material says.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        radiance: ArrayLike,
+        side: ArrayLike | None = None,
+        environment: ArrayLike = (0.0, 0.0, 0.0),
+        sampling_weight: ArrayLike | None = None,
+        environment_weight: ArrayLike | None = None,
+        environment_share: float | None = None,
+    ):
+        faces = len(geometry.faces)
+        radiance = rows_of(radiance, faces, 3, "emitter radiance")
+        side = np.zeros(faces, np.int8) if side is None else np.asarray(side)
+        if side.shape != (faces,) or not np.isin(side, (-1, 0, 1)).all():
+            raise InputError(f"emitter side has shape {side.shape}; expected ({faces},) of -1, 0 or +1")
+        if radiance.min() < 0:
+            raise InputError("emitter radiance is negative somewhere; radiance is never negative")
+        power = geometry.areas * radiance.mean(axis=1, dtype=np.float64)
+        weight = power if sampling_weight is None else rows_of(sampling_weight, faces, None, "sampling_weight")
+        if weight.min() < 0:
+            raise InputError("sampling_weight is negative somewhere")
+        self.radiance, self.side, self.environment = radiance, side.astype(np.int8), as_map(environment)
+        weight = np.where(geometry.areas > 0, weight, 0.0)
+        sky = _sky_weight(self.environment, environment_weight)
+        if sky.any():
+            if environment_share is None:
+                environment_share = share_of_environment(
+                    geometry, power.sum(), texel_weights(self.environment).sum() / (4 * np.pi)
+                )
+            weight = np.concatenate(
+                [_scaled(weight, 1 - environment_share), _scaled(sky.ravel(), environment_share if weight.any() else 1.0)]
+            )
+        first, copies = _coincident(geometry, np.flatnonzero(weight[:faces] > 0), side)
+        weight[first] += weight[copies]
+        weight[copies] = 0
+        measure = np.concatenate([geometry.areas, solid_angles(*sky.shape).ravel()])[: len(weight)]
+        self.slots, pdf = _slots(weight, measure)
+        self.pdf_area = pdf[:faces]
+        self.pdf_area[copies] = self.pdf_area[first]
+        self.pdf_sky = pdf[faces:].reshape(sky.shape) if sky.any() else np.zeros(sky.shape, np.float32)
+        self.can_be_sampled = len(self.slots) > 0
+        self.sky_is_sampled = bool(self.pdf_sky.any())
+        self._faces, self._slots = faces, mi.UInt32(self.slots) if self.can_be_sampled else None
+        self._radiance_pdf = table(np.column_stack([radiance, self.pdf_area]))
+        self._side = table(self.side) if np.any(self.side) else None
+        self._constant = [dr.opaque(mi.Float, float(value)) for value in self.environment[0, 0]]
+        self._texels = table(np.concatenate([self.environment, self.pdf_sky[..., None]], -1))
+
+    def texel(self, texel: Any, active: Any) -> tuple[Any, Any]:
+        """(radiance, density per steradian) of a texel, row x W + column; density 0 where it is never drawn."""
+        if self.environment.shape[:2] == (1, 1):
+            return mi.Color3f(*self._constant), mi.Float(0)
+        record = dr.gather(mi.Vector4f, self._texels, texel, active)
+        return mi.Color3f(record.x, record.y, record.z), record.w
+
+    def texel_along(self, direction: Any) -> Any:
+        """Texel that a unit direction escapes into."""
+        height, width = self.environment.shape[:2]
+        if height * width == 1:
+            return mi.UInt32(0)
+        row, column = texel_of(DRJIT, direction, height, width)
+        return mi.UInt32(row) * width + mi.UInt32(column)
+
+    def direction_to(self, texel: Any, u1: Any, u2: Any) -> Any:
+        """Unit direction drawn in a texel with the density that `texel` reports."""
+        height, width = self.environment.shape[:2]
+        return mi.Vector3f(*direction_in(DRJIT, mi.Float(texel // width), mi.Float(texel % width), u1, u2, height, width))
+
+    def surface(self, face: Any, cos_front: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """(radiance, area density, emits, is_emitter) of a face seen under the cosine `cos_front` to its
+        right-hand normal.
+
+        `emits`: the side that is seen is a radiating one; `is_emitter`: the face is one at all.
+        """
+        record = dr.gather(mi.Vector4f, self._radiance_pdf, face, active)
+        is_emitter = active & ((record.w > 0) | (dr.maximum(dr.maximum(record.x, record.y), record.z) > 0))
+        emits = is_emitter & (cos_front != 0)
+        if self._side is not None:
+            side = dr.gather(mi.Float, self._side, face, is_emitter)
+            emits &= (side == 0) | (side * cos_front > 0)
+        return mi.Color3f(record.x, record.y, record.z), record.w, emits, is_emitter
+
+    def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(face, on_sky, texel) drawn with the densities that `surface` and `texel` report, from a uniform u in [0, 1)."""
+        count = len(self.slots)
+        slot = dr.minimum(mi.UInt32(u * count), count - 1)
+        drawn = dr.gather(mi.UInt32, self._slots, slot, active)
+        if not self.sky_is_sampled:
+            return drawn, mi.Bool(False), mi.UInt32(0)
+        on_sky = drawn >= self._faces
+        return dr.select(on_sky, 0, drawn), on_sky, dr.select(on_sky, drawn - self._faces, 0)
+
+
+def share_of_environment(geometry: Geometry, power: float, sky: float) -> float:
+    """Share of the draws that the environment deserves beside emitting faces, by the light that each gives to surfaces.
+
+    power: sum of area x mean radiance of the faces; sky: mean radiance over all directions. By reciprocity the
+    environment gives surfaces of area A, from which a share s of cosine-distributed rays escapes, A s x sky, in the same
+    units. Clipped to SHARE_LIMITS.
+    """
+    outside = geometry.areas.sum() * _escape_share(geometry) * sky
+    total = outside + power
+    return float(np.clip(outside / total if total > 0 else 1.0, *SHARE_LIMITS))
+
+
+def _escape_share(geometry: Geometry, rays: int = 4096) -> float:
+    """Share of cosine-distributed rays from random points of both sides of the surface that leave the mesh."""
+    rng = np.random.default_rng(0)
+    face = rng.choice(len(geometry.areas), rays, p=geometry.areas / geometry.areas.sum())
+    root, u2 = np.sqrt(rng.random(rays)), rng.random(rays)
+    corners = geometry.vertices[geometry.faces[face]].astype(np.float64)
+    weights = np.stack([1 - root, root * (1 - u2), root * u2], 1)
+    normal = geometry.normals[face] * rng.choice([-1.0, 1.0], rays)[:, None]
+    start = np.einsum("ij,ijk->ik", weights, corners) + 1e-3 * normal
+    hit, _ = trace(geometry, start, cosine_directions(normal, rng))
+    return float((hit < 0).mean())
+
+
+def _coincident(geometry: Geometry, drawn: Array, side: Array) -> tuple[Array, Array]:
+    """(first, copy): faces out of `drawn` with the same corners that radiate to the same side, each copy with the first.
+
+    A ray meets one of them only, so drawing a point on each would count its light twice.
+    """
+    corners = geometry.vertices[geometry.faces[drawn]]
+    order = np.lexsort((corners[..., 2], corners[..., 1], corners[..., 0]), axis=1)
+    key = np.take_along_axis(corners, order[..., None], 1).reshape(-1, 9)
+    turned = np.where(np.isin(order @ np.array([9, 3, 1]), (5, 15, 19)), 1, -1)  # even permutations of 0 1 2
+    key = np.column_stack([key, turned * side[drawn]])
+    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    group = group.ravel()
+    if len(count) == len(drawn):
+        return drawn[:0], drawn[:0]
+    by_group = np.argsort(group, kind="stable")
+    start = np.repeat(np.cumsum(count) - count, count)
+    is_copy = np.arange(len(drawn)) > start
+    return drawn[by_group[start[is_copy]]], drawn[by_group[is_copy]]
+
+
+def _sky_weight(environment: Array, weight: ArrayLike | None) -> Array:
+    shape = environment.shape[:2]
+    if shape == (1, 1):
+        return np.zeros(shape)
+    if weight is None:
+        return texel_weights(environment)
+    weight = np.asarray(weight, np.float64)
+    if weight.shape != shape or not (np.isfinite(weight).all() and weight.min() >= 0):
+        raise InputError(f"environment_weight has shape {weight.shape}; expected {shape}, finite and not negative")
+    return weight
+
+
+def _scaled(weight: Array, total: float) -> Array:
+    return weight * (total / weight.sum()) if weight.any() else weight
+
+
+def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
+    """(slots uint32, pdf (m,) float32): item of every slot and count / slots / measure, the density of one draw.
+
+    Each item of positive weight owns at least one slot; the rest follow the weights by largest remainder,
+    ties to the lower id. A table replaces the search in a cumulative sum: one read, no rounding at its
+    ends (METHOD H22).
+    """
+    pdf = np.zeros(len(weight), np.float32)
+    items = np.flatnonzero(weight > 0)
+    if not len(items):
+        return np.zeros(0, np.uint32), pdf
+    count = max(MIN_SLOTS, 1 << int(4 * len(items) - 1).bit_length())
+    share = weight[items] / weight[items].max()
+    share *= (count - len(items)) / share.sum()
+    counts = 1 + np.floor(share).astype(np.int64)
+    rest = count - counts.sum()
+    counts[np.argsort(-(share - np.floor(share)), kind="stable")[:rest]] += 1
+    pdf[items] = counts / count / measure[items]
+    return np.repeat(items, counts).astype(np.uint32), pdf

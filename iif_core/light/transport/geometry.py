@@ -1,0 +1,166 @@
+"""The mesh of a scene, its ray tracing and the tables that kernels read about a face."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+from iif_core.light.transport.arrays import chunks, table, to_numpy, vectors
+
+Array = np.ndarray
+
+MIN_AREA = 1e-12
+"""Faces below this area (m^2) count as degenerate: never hit, never sampled, given a unit normal (METHOD
+H48)."""
+
+NO_FACE = -1
+
+
+class Geometry:
+    """One merged mesh ready for ray tracing. Made by `build_geometry`; not a Dr.Jit struct, so kernels leave
+    it alone.
+
+    vertices (n, 3) float32, faces (m, 3) int32, object_id (m,) int32, normals (m, 3) float32 unit right-hand
+    normals (finite for degenerate faces too), areas (m,) float64 in m^2 with 0 for degenerate faces.
+    """
+
+    def __init__(self, vertices: Array, faces: Array, object_id: Array):
+        self.vertices, self.faces, self.object_id = vertices, faces, object_id
+        corners = vertices.astype(np.float64)[faces]
+        edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        normals = np.cross(edge1, edge2)
+        twice = np.linalg.norm(normals, axis=1)
+        solid = twice / 2 >= MIN_AREA
+        self.areas = np.where(solid, twice / 2, 0.0)
+        up = np.array([0.0, 0.0, 1.0])
+        self.normals = np.where(solid[:, None], normals / np.where(solid, twice, 1.0)[:, None], up).astype(np.float32)
+        if not solid.any():
+            raise InputError(f"the mesh has no face of area >= {MIN_AREA} m^2 among {len(faces)}; give a mesh with surface")
+
+        primitives = np.flatnonzero(solid)
+        mesh = mi.Mesh("scene", len(vertices), len(primitives), has_vertex_normals=False, has_vertex_texcoords=False)
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = vertices.ravel()
+        parameters["faces"] = faces[primitives].astype(np.uint32).ravel()
+        parameters.update()
+        self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
+
+        self._face_of_primitive = None if solid.all() else mi.UInt32(primitives.astype(np.uint32))
+        self._normal_object = table(np.column_stack([self.normals, object_id.view(np.float32)]))
+        self._corner = table(_padded(corners[:, 0]))
+        self._edge1, self._edge2 = table(_padded(edge1)), table(_padded(edge2))
+
+    def normal_and_object(self, face: Any, active: Any) -> tuple[Any, Any]:
+        """Unit right-hand normal and object id of a face (device types)."""
+        record = dr.gather(mi.Vector4f, self._normal_object, face, active)
+        return mi.Vector3f(record.x, record.y, record.z), dr.reinterpret_array(mi.Int32, record.w)
+
+    def point_on_face(self, face: Any, b1: Any, b2: Any, active: Any) -> Any:
+        """v0 + b1 (v1 - v0) + b2 (v2 - v0)."""
+        v0 = dr.gather(mi.Vector4f, self._corner, face, active)
+        e1 = dr.gather(mi.Vector4f, self._edge1, face, active)
+        e2 = dr.gather(mi.Vector4f, self._edge2, face, active)
+        p = v0 + b1 * e1 + b2 * e2
+        return mi.Point3f(p.x, p.y, p.z)
+
+    def intersect(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(hit, face, t) of the nearest face along origin + t direction; face is 0 where nothing is hit."""
+        found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
+        hit = active & found.is_valid()
+        face = dr.select(hit, found.prim_index, 0)
+        if self._face_of_primitive is not None:
+            face = dr.gather(mi.UInt32, self._face_of_primitive, face, hit)
+        return hit, face, found.t
+
+    def occluded(self, origin: Any, direction: Any, distance: Any, active: Any) -> Any:
+        """Whether something lies on origin + t direction for 0 < t < distance (direction of unit length)."""
+        return self.scene.ray_test(mi.Ray3f(origin, direction, distance, 0.0, mi.Color0f()), coherent=False, active=active)
+
+
+def _padded(rows: Array) -> Array:
+    return np.column_stack([rows, np.zeros(len(rows))])
+
+
+def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) -> Geometry:
+    """Merged mesh from vertices (n, 3) metres, faces (m, 3) vertex ids and object_id (m,) (-1 = none).
+
+    Degenerate faces keep their id and are never hit. Raises InputError for wrong shapes, ids out of range,
+    non-finite vertices or a mesh without surface.
+    """
+    vertices = np.ascontiguousarray(vertices, np.float32)
+    faces = np.ascontiguousarray(faces, np.int32)
+    object_id = np.ascontiguousarray(object_id, np.int32)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+        raise InputError(f"mesh of vertices {vertices.shape} and faces {faces.shape}; both must be (count, 3), not empty")
+    if object_id.shape != (len(faces),):
+        raise InputError(f"object_id has shape {object_id.shape}, expected ({len(faces)},): one id for each face")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"faces name vertices {faces.min()} ... {faces.max()}, the mesh has 0 ... {len(vertices) - 1}")
+    if not np.isfinite(vertices[faces.ravel()]).all():
+        raise InputError("the mesh has faces with NaN or infinite vertices; remove them first")
+    if object_id.min() < -1:
+        raise InputError(f"object ids start at {object_id.min()}; -1 means none, others count from 0")
+    return Geometry(np.where(np.isfinite(vertices), vertices, 0), faces, object_id)
+
+
+def offset_from(point: Any, normal: Any) -> Any:
+    """Point moved off the surface along the viewer's normal by max(1e-4, 3e-6 |x|_inf) metres (METHOD
+    H24)."""
+    reach = dr.maximum(dr.maximum(dr.abs(point.x), dr.abs(point.y)), dr.abs(point.z))
+    return mi.Point3f(dr.fma(normal, dr.maximum(1e-4, 3e-6 * reach), point))
+
+
+@dataclass
+class Hit:
+    """One nearest intersection on the device: `normal` is the right-hand normal, `t` in units of the
+    direction."""
+
+    valid: Any
+    face: Any
+    object_id: Any
+    point: Any
+    normal: Any
+    t: Any
+
+
+def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any) -> Hit:
+    """Nearest intersection with everything a path vertex needs to know about it."""
+    valid, face, t = geometry.intersect(origin, direction, active)
+    normal, object_id = geometry.normal_and_object(face, valid)
+    return Hit(valid, face, object_id, mi.Point3f(dr.fma(direction, t, origin)), normal, t)
+
+
+def cosine_directions(normals: ArrayLike, rng: np.random.Generator) -> Array:
+    """(n, 3) float64 directions around unit normals (n, 3), density cos / pi per steradian; not of unit length."""
+    normals = np.asarray(normals, np.float64)
+    ball = rng.normal(size=normals.shape)
+    # A uniform point on the sphere that touches the surface from above is cosine-distributed.
+    return (1 + 1e-6) * normals + ball / np.linalg.norm(ball, axis=1, keepdims=True)
+
+
+def trace(geometry: Geometry, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20) -> tuple[Array, Array]:
+    """(face_id int32 with -1 = miss, t float32 with inf = miss) of the nearest face along origin + t
+    direction.
+
+    origins (n, 3) or (3,), directions (n, 3), not necessarily of unit length: t counts directions, so with
+    `camera.pixel_directions` it is the z-depth. Both sides of a face are hit.
+    """
+    directions = np.asarray(directions, np.float32).reshape(-1, 3)
+    origins = np.broadcast_to(np.asarray(origins, np.float32), directions.shape)
+    face_id = np.full(len(directions), NO_FACE, np.int32)
+    distance = np.full(len(directions), np.inf, np.float32)
+    for part in chunks(len(directions), chunk):
+        hit, face, t = geometry.intersect(
+            vectors(mi.Point3f, origins[part]), vectors(mi.Vector3f, directions[part]), mi.Bool(True)
+        )
+        face = dr.select(hit, mi.Int32(face), NO_FACE)
+        t = dr.select(hit, t, dr.inf)
+        dr.eval(face, t)
+        face_id[part], distance[part] = to_numpy(face), to_numpy(t)
+    return face_id, distance

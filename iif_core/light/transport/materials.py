@@ -1,0 +1,92 @@
+"""Materials: callables `material(point, face, object_id, active) -> (base_color, roughness, metallic)` on
+device types.
+
+Table rows are (base colour R, G, B, roughness, metallic), linear; roughness is clamped to [0.02, 1], the
+others to [0, 1].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+from iif_core.light.transport.arrays import rows_of, table
+from iif_core.light.transport.cache import VoxelRows
+from iif_core.reflectance.brdf import R_MIN
+from iif_core.surface.cells import COARSE, coarse_cells
+
+Array = np.ndarray
+
+
+class _Rows:
+    """Device table of material rows, padded to 8 floats so that one row is two aligned reads."""
+
+    def __init__(self, values: ArrayLike, name: str):
+        values = np.asarray(values, np.float32)
+        values = rows_of(values, len(values), 5, name)
+        clamped = np.clip(values, [0, 0, 0, R_MIN, 0], 1)
+        self.count = len(values)
+        self._table = table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
+
+    def read(self, row: Any, active: Any) -> tuple[Any, Any, Any]:
+        first = dr.gather(mi.Vector4f, self._table, row * 2, active)
+        metallic = dr.gather(mi.Float, self._table, row * 8 + 4, active)
+        # A masked read gives 0, which is no valid roughness.
+        return mi.Color3f(first.x, first.y, first.z), dr.maximum(first.w, R_MIN), metallic
+
+
+class FaceMaterials:
+    """One material for each face: face_values (m, 5)."""
+
+    def __init__(self, face_values: ArrayLike):
+        self._rows = _Rows(face_values, "face_values")
+
+    def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
+        return self._rows.read(face, active & (face < self._rows.count))
+
+
+class CellMaterials:
+    """One material for each surface cell (voxel x object); the mean of the coarse cell around where the cell was not
+    observed, the object's mean where that is empty too.
+
+    `ijk` (n, 3) from `cells.voxel_indices(points, edge, origin)`, `object_id` (n,), values (n, 5),
+    object_values (n_objects, 5). Faces without an object (-1) and without a cell get the mean over all
+    objects.
+    """
+
+    def __init__(
+        self,
+        edge: float,
+        origin: ArrayLike,
+        ijk: ArrayLike,
+        object_id: ArrayLike,
+        values: ArrayLike,
+        object_values: ArrayLike,
+    ):
+        ijk = np.asarray(ijk).reshape(-1, 3)
+        values = rows_of(np.asarray(values, np.float32).reshape(-1, 5), len(ijk), 5, "cell values")
+        object_values = np.asarray(object_values, np.float32)
+        object_values = rows_of(object_values, len(object_values), 5, "object values")
+        if not len(object_values):
+            raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
+        self._cells = VoxelRows(edge, origin, ijk, object_id)
+        self._objects = len(object_values)
+        coarse_ijk, coarse_object, coarse = coarse_cells(ijk, object_id, values)
+        self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
+        self._first_coarse, self._first_object = len(ijk), len(ijk) + len(coarse)
+        # One table: cells, coarse cells, objects, the overall mean; a miss only changes which row is read.
+        parts = [values, coarse, object_values, object_values.mean(axis=0, keepdims=True)]
+        self._rows = _Rows(np.concatenate(parts), "values")
+
+    def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
+        found, row = self._cells.find(point, object_id, active)
+        near, around = self._coarse.find(point, object_id, active & ~found)
+        known = (object_id >= 0) & (object_id < self._objects)
+        fallback = self._first_object + dr.select(known, mi.UInt32(object_id), self._objects)
+        row = dr.select(found, row, dr.select(near, self._first_coarse + around, fallback))
+        return self._rows.read(row, active)

@@ -1,0 +1,1 @@
+"""Numerical ground: array namespaces, Laplace distributions, separable filters, colour transfer functions."""

@@ -1,0 +1,263 @@
+"""Clusters of masks -> objects on faces: parts that lie apart are told apart, the pixels of every face vote, and what the views
+do not hold together is parted again, what they do is joined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.objects.mask_clustering import agreeing_pairs, components, packed_flags
+from iif_core.surface.cells import neighbour_pairs, unpack_keys
+
+Array = np.ndarray
+
+PIECE_VIEWS = 3.0
+"""What a piece of the mesh is worth as a whole, in views of one of its faces."""
+
+JOIN_VIEWS = 3
+JOIN_SHARE = 0.8
+"""Objects are joined if at least so many views see both, and this share of them in one mask."""
+
+TIE = 1e-6
+"""Views by which majorities of shares must differ to be told apart from rounding."""
+
+
+@dataclass(frozen=True)
+class Votes:
+    """What photographs say about faces; n rows, one a (view, face, voxel of a cluster).
+
+    face: (n,) int64; key: (n,) uint64 voxel and cluster (`iif_core.surface.cells.pack_keys`); pixels: (n,) int64;
+    share: (n,) float64 of the view's pixels on that face. outside: (F,) float64 shares of pixels in no mask, summed over the views.
+    """
+
+    face: Array
+    key: Array
+    pixels: Array
+    share: Array
+    outside: Array
+
+
+def view_votes(face: Array, key: Array, clustered: Array, masked: Array, count: int) -> Votes:
+    """Votes of one view. All arguments (n,), a row a pixel that hits the mesh; `count` faces.
+
+    key: voxel and cluster where `clustered`; masked: lies in a mask (whose cluster may be unknown: it does not vote).
+    """
+    seen = np.bincount(face, minlength=count)
+    keys, which = np.unique(key[clustered], return_inverse=True)
+    width = max(len(keys), 1)
+    pair, pixels = np.unique(face[clustered].astype(np.int64) * width + which, return_counts=True)
+    rows, at = pair // width, pair % width
+    outside = np.bincount(face[~masked], minlength=count) / np.maximum(seen, 1)
+    return Votes(rows, keys[at] if len(keys) else np.zeros(0, np.uint64), pixels, pixels / seen[rows], outside)
+
+
+def joined(votes: list[Votes]) -> Votes:
+    """All views together."""
+    columns = {name: np.concatenate([getattr(v, name) for v in votes]) for name in ("face", "key", "pixels", "share")}
+    return Votes(**columns, outside=np.sum([v.outside for v in votes], axis=0))
+
+
+def split_apart(keys: Array) -> tuple[Array, Array]:
+    """Part of every voxel, (n,) int32: voxels of one cluster that touch; and the cluster of every part.
+
+    `keys`: (n,) uint64 sorted and distinct.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = neighbour_pairs(keys)
+    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(keys), len(keys)))
+    count, part = connected_components(graph, directed=False)
+    cluster = np.zeros(count, np.int64)
+    cluster[part] = unpack_keys(keys)[1]
+    return part, cluster
+
+
+def elect(face: Array, label: Array, weight: Array, share: Array, piece: Array, piece_views: float = PIECE_VIEWS) -> Array:
+    """Label of every face, (F,) int64, -1 where nothing is known.
+
+        score(face, l) = W(face, l) + piece_views W(piece, l) / N(piece)
+
+    W sums `weight` over the votes for l, N sums `share` over all votes in the face's piece of the mesh: faces that few
+    photographs show follow their piece, others their own votes. Candidates are the labels of the face's votes and the first
+    of its piece; ties go to the lowest label.
+
+    Args:
+        face, label, weight, share: (n,), a row a vote; labels from 0.
+        piece: (F,) int from 0.
+    """
+    out = np.full(len(piece), -1, np.int64)
+    if not len(face):
+        return out
+    span, pieces = int(label.max()) + 1, int(piece.max()) + 1
+    of_piece = piece[face].astype(np.int64)
+    pair, row = np.unique(of_piece * span + label, return_inverse=True)
+    total = np.bincount(row, weight, len(pair))
+    order = np.lexsort((pair % span, -total, pair // span))
+    held, first = np.unique(pair[order] // span, return_index=True)
+    favourite = np.zeros(pieces, np.int64)
+    favourite[held] = pair[order][first] % span
+    views = np.bincount(of_piece, share, pieces)
+
+    voted = np.unique(face).astype(np.int64)
+    code = np.concatenate([face.astype(np.int64) * span + label, voted * span + favourite[piece[voted]]])
+    candidate, row = np.unique(code, return_inverse=True)
+    score = np.bincount(row, np.concatenate([weight, np.zeros(len(voted))]), len(candidate))
+    face_of, label_of = candidate // span, candidate % span
+    of_piece = piece[face_of].astype(np.int64)
+    score += piece_views * total[np.searchsorted(pair, of_piece * span + label_of)] / views[of_piece]
+    order = np.lexsort((label_of, -score, face_of))
+    first = np.unique(face_of[order], return_index=True)[1]
+    out[face_of[order][first]] = label_of[order][first]
+    return out
+
+
+def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: Array) -> tuple[Array, Array, Array]:
+    """Part of every face (F,) int64 (-1 = none), faces that lie mostly outside masks (F,) bool, and (P,) how far pixels agree.
+
+    A vote weighs 1 / sqrt(size of its cluster): a small thing in front of a large one is lost whenever the two share a mask,
+    the large one never. Clusters of one mask count only where no other does.
+
+    Args:
+        votes: of all views.
+        cluster_size: (C,) points of a mask of the cluster, mean; cluster_masks: (C,) number of its masks.
+        piece: (F,) pieces of the mesh.
+    """
+    keys, which = np.unique(votes.key, return_inverse=True)
+    part_of_key, cluster = split_apart(keys)
+    part = part_of_key[which]
+    lone = cluster_masks[cluster[part]] < 2
+    firm = np.zeros(len(piece), bool)
+    firm[votes.face[~lone]] = True
+    counted = ~lone | ~firm[votes.face]
+    inside = np.bincount(votes.face[counted], votes.share[counted], len(piece))
+    bare = votes.outside > inside
+    counted &= ~bare[votes.face]
+    face, part, share = votes.face[counted], part[counted], votes.share[counted]
+    weight = share / np.sqrt(np.maximum(cluster_size[cluster[part]], 1.0))
+    label = elect(face, part, weight, share, piece)
+    pixels = votes.pixels[counted]
+    mine = label[face] == part
+    agreeing = np.bincount(part[mine], pixels[mine], len(cluster))
+    cast = np.bincount(label[face], pixels, len(cluster)) if len(face) else np.zeros(len(cluster))
+    return label, bare, agreeing / np.maximum(cast, 1)
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Where fragments of objects lie in masks; n rows, one a (view, fragment, mask).
+
+    view, fragment, mask: (n,) int64, masks numbered from 1 in every view; pixels: (n,) float64 > 0.
+    """
+
+    view: Array
+    fragment: Array
+    mask: Array
+    pixels: Array
+
+
+def sightings(views: Iterable[tuple[Array, Array]]) -> Sightings:
+    """Of every view the fragment and the mask of its pixels, both (p,) int, for pixels that lie in a mask."""
+    columns = []
+    for view, (fragment, mask) in enumerate(views):
+        span = int(mask.max(initial=0)) + 1
+        code, pixels = np.unique(fragment.astype(np.int64) * span + mask, return_counts=True)
+        columns.append((np.full(len(code), view, np.int64), code // span, code % span, pixels.astype(np.float64)))
+    return Sightings(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def keep_together(home: Array, seen: Sightings) -> Array:
+    """Object of every fragment, (n,) int64: `home`, or a new one if the views do not hold it together with the rest of `home`.
+
+    A fragment is what an object has of one piece of the mesh. Every object grows from its fragment of the most pixels. Of the
+    n views that see a fragment and something of the object so far, t_f is the share of the fragment's pixels in that mask of
+    view f which holds most of the object. It joins if
+
+        1 + sum t_f > (1 + n) / 2
+
+    a majority in which its election into the object counts as one view; a tie parts. When none joins, those that no view shows
+    with the object do. What then remains is one new object, which grows likewise.
+    """
+    home = np.array(home, np.int64)
+    waits, size = np.ones(len(home), bool), np.bincount(seen.fragment, seen.pixels, len(home))
+    span = int(seen.view.max(initial=0)) + 1
+    _, pair = np.unique(seen.fragment * span + seen.view, return_inverse=True)
+    share = seen.pixels / np.bincount(pair, seen.pixels)[pair]
+    waits[_largest(home, size, waits)] = False
+    while waits.any():
+        together, views = _support(home, waits, seen, share)
+        joins = waits & (views > 0) & (1 + together > 0.5 * (1 + views) + TIE)
+        if not joins.any():
+            joins = waits & (views == 0)
+        waits &= ~joins
+        if not joins.any():
+            home[waits] = int(home.max()) + 1 + np.unique(home[waits], return_inverse=True)[1]
+            waits[_largest(home, size, waits)] = False
+    return home
+
+
+def _largest(home: Array, size: Array, waits: Array) -> Array:
+    """Of every object with waiting fragments the one of the most pixels; of equals the first."""
+    rows = np.flatnonzero(waits)
+    rows = rows[np.lexsort((rows, -size[rows], home[rows]))]
+    return rows[np.unique(home[rows], return_index=True)[1]]
+
+
+def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[Array, Array]:
+    """Of every waiting fragment: sum of t_f, and the number of views that see it with its object (both 0 for others)."""
+    growing = np.zeros(int(home.max()) + 1, bool)
+    growing[home[waits]] = True
+    rows = np.flatnonzero(growing[home[seen.fragment]])
+    views = int(seen.view.max(initial=0)) + 1
+    place = home[seen.fragment[rows]] * views + seen.view[rows]
+    waiting = waits[seen.fragment[rows]]
+
+    there = rows[~waiting]
+    at, chosen, _ = _main_masks(place[~waiting], seen.mask[there], seen.pixels[there])
+    rows, place = rows[waiting], place[waiting]
+    both = np.isin(place, at)
+    rows, place = rows[both], place[both]
+    inside = seen.mask[rows] == chosen[np.searchsorted(at, place)]
+    fragment = seen.fragment[rows]
+    return np.bincount(fragment, share[rows] * inside, len(home)), np.bincount(fragment, share[rows], len(home))
+
+
+def _main_masks(place: Array, mask: Array, pixels: Array) -> tuple[Array, Array, Array]:
+    """Places (ascending), the mask that holds most pixels of each (of equals the lowest), and the share of them in it."""
+    masks = int(mask.max(initial=0)) + 1
+    held, which = np.unique(place * masks + mask, return_inverse=True)
+    count = np.bincount(which, pixels, len(held))
+    order = np.lexsort((held, -count, held // masks))
+    at, first = np.unique(held[order] // masks, return_index=True)
+    total = np.bincount(np.searchsorted(at, held // masks), count, len(at))
+    return at, held[order][first] % masks, count[order][first] / total
+
+
+def join_together(home: Array, seen: Sightings) -> Array:
+    """Object of every fragment, (n,) int64: `home`, those joined that the views hold together; the lowest number stays.
+
+    A view sees an object in the mask that holds most of it, if that is more than half. Two objects are one if at least
+    JOIN_VIEWS views see both, and JOIN_SHARE of them in the same mask; repeated with what was joined. The election tells
+    objects apart by the clusters of their masks; of small ones, and of those that were parted, the pixels know more.
+    """
+    from scipy.sparse import csr_matrix
+
+    home = np.array(home, np.int64)
+    views, masks = int(seen.view.max(initial=0)) + 1, int(seen.mask.max(initial=0)) + 1
+    while True:
+        objects, at = np.unique(home, return_inverse=True)
+        place, mask, share = _main_masks(at[seen.fragment] * views + seen.view, seen.mask, seen.pixels)
+        node, view, mask = place[share > 0.5] // views, place[share > 0.5] % views, mask[share > 0.5]
+        holders = csr_matrix((np.ones(len(node), np.float32), (node, view * masks + mask)), (len(objects), views * masks))
+        by = np.zeros((len(objects), views), bool)
+        by[node, view] = True
+        first, second, supporters, observers = agreeing_pairs(holders, packed_flags(by))
+        one = (observers >= JOIN_VIEWS) & (supporters >= JOIN_SHARE * observers - TIE)
+        if not one.any():
+            return home
+        group = components(len(objects), first[one], second[one])
+        lowest = np.full(int(group.max()) + 1, int(home.max()))
+        np.minimum.at(lowest, group, objects)
+        home = lowest[group[at]]

@@ -1,0 +1,1 @@
+"""Reflectance: the microfacet BRDF."""

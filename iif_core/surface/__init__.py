@@ -1,0 +1,1 @@
+"""Surface: triangle meshes, surface cells, segments, and shading cells."""

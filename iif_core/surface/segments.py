@@ -1,0 +1,279 @@
+"""Objects on faces and segments in views.
+
+A *segment* is one object in one view: the unit that shares one affine correction (METHOD 1.1). Segments are numbered
+view by view, inside a view by ascending object id. Ids are int32, -1 = none. Faces get their object by the majority
+of the pixels that see them; a face nobody saw takes the label of the nearest labelled face across shared edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iif_core.errors import InputError
+
+
+@dataclass(frozen=True)
+class SegmentTable:
+    """Rows of the segment table, one a segment, in segment id order; all int32 of shape (S,)."""
+
+    segment_id: NDArray
+    view: NDArray
+    object: NDArray
+    pixels: NDArray
+
+    def __len__(self) -> int:
+        return len(self.segment_id)
+
+
+def view_segments(object_map: NDArray, first_segment: int = 0) -> tuple[NDArray, NDArray, NDArray]:
+    """Segments of one view: (segment ids (H, W) int32, object of each segment (s,), pixels of each segment (s,)).
+
+    `object_map` (H, W) integer, -1 (any negative) = none and stays -1. Ids start at `first_segment`.
+    """
+    object_map = _integer_map(object_map, "object map")
+    seen = object_map >= 0
+    objects, rank, pixels = np.unique(object_map[seen], return_inverse=True, return_counts=True)
+    segment_map = np.full(object_map.shape, -1, np.int32)
+    segment_map[seen] = first_segment + rank
+    return segment_map, objects.astype(np.int32), pixels.astype(np.int32)
+
+
+def segment_table(object_maps: Iterable[NDArray]) -> tuple[list[NDArray], SegmentTable]:
+    """Segments of all views from their object maps.
+
+    `object_maps`: (V, H, W) or a sequence of (H, W) maps (views may differ in size), integer, negative = none.
+    Returns the segment id maps (int32, -1 = none) and the table (segment_id, view, object, pixels), where `view` is
+    the position in the sequence.
+    """
+    maps, views, objects, pixels, first = [], [], [], [], 0
+    for view, object_map in enumerate(object_maps):
+        segment_map, ids, counts = view_segments(object_map, first)
+        maps.append(segment_map)
+        views.append(np.full(len(ids), view, np.int32))
+        objects.append(ids)
+        pixels.append(counts)
+        first += len(ids)
+
+    def joined(parts: list[NDArray]) -> NDArray:
+        return np.concatenate(parts) if parts else np.zeros(0, np.int32)
+
+    return maps, SegmentTable(np.arange(first, dtype=np.int32), joined(views), joined(objects), joined(pixels))
+
+
+def interior(object_map: NDArray, border: int) -> NDArray:
+    """Pixels not within `border` pixels of another id: bool (H, W); the picture's own edge is no border.
+
+    The neighbourhood is the (2 border + 1)^2 square. Pixels without an object (-1) are never interior; border = 0
+    keeps every pixel that has an object.
+    """
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    object_map = _integer_map(object_map, "object map")
+    if border < 0:
+        raise InputError(f"border is {border} pixels; it must be 0 or more")
+    if border == 0 or object_map.size == 0:
+        return object_map >= 0
+    size = 2 * border + 1
+    same = minimum_filter(object_map, size, mode="nearest") == maximum_filter(object_map, size, mode="nearest")
+    return same & (object_map >= 0)
+
+
+def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
+    """Pairs of faces that share an edge: (M, 2) int32, lower face first, sorted.
+
+    `faces` (F, 3) vertex indices. With `vertices` (N, 3) corners at identical positions count as one vertex, so that
+    faces split by texture or normal seams stay neighbours. An edge of n > 2 faces gives a chain of n - 1 pairs.
+    """
+    faces = np.asarray(faces)
+    if faces.ndim != 2 or faces.shape[1] != 3:
+        raise InputError(f"faces have shape {faces.shape}; they must be (F, 3) vertex indices")
+    if len(faces) == 0:
+        return np.zeros((0, 2), np.int32)
+    if vertices is not None:
+        faces = _welded(np.asarray(vertices))[faces]
+    corners = faces.astype(np.int64)
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    key = edges.min(1) * (corners.max() + 1) + edges.max(1)
+    owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
+    order = np.argsort(key, kind="stable")
+    key, owner = key[order], owner[order]
+    shared = np.flatnonzero(key[1:] == key[:-1])
+    pairs = np.stack([owner[shared], owner[shared + 1]], 1)
+    pairs.sort(axis=1)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]  # a degenerate face shares an edge with itself
+    code = np.unique(pairs[:, 0].astype(np.int64) * len(faces) + pairs[:, 1])
+    return np.stack([code // len(faces), code % len(faces)], 1).astype(np.int32)
+
+
+def _welded(vertices: NDArray) -> NDArray:
+    """Index of the first vertex at the same position, by vertex."""
+    order = np.lexsort(vertices.T)
+    ordered = vertices[order]
+    new = np.r_[True, (ordered[1:] != ordered[:-1]).any(1)]
+    welded = np.empty(len(vertices), np.int64)
+    welded[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    return welded
+
+
+@dataclass(frozen=True)
+class FaceVotes:
+    """Object of every face and how well its pixels agree.
+
+    `object_of_face` (F,) int32; `votes` (F,) int32 pixels that saw the face (0 = label came from a neighbour or the
+    background); `object_id` (O,) int32 ascending, every id that occurs on a face; `pixels`, `agreement` (O,): votes
+    cast on the object's faces, and the share of them that named it (0 where no pixel saw the object);
+    `background` the id given to faces no label reaches, or None if there are none.
+    """
+
+    object_of_face: NDArray
+    votes: NDArray
+    object_id: NDArray
+    pixels: NDArray
+    agreement: NDArray
+    background: int | None
+
+
+def vote_faces(
+    face_id: NDArray,
+    instance_id: NDArray,
+    n_faces: int,
+    faces_adjacency: NDArray | None = None,
+    background: int | None = None,
+) -> FaceVotes:
+    """Object of every face by the majority of the pixels that see it (METHOD 2.2, in place of a neural field).
+
+    `face_id`, `instance_id`: integer arrays of one shape (pixels of all views), negative = miss / not labelled, which
+    casts no vote. Ties go to the lowest instance id. Faces without a vote take the label of the nearest labelled face,
+    counted in steps across shared edges (`faces_adjacency` (M, 2), see `face_adjacency`; equal distance: lowest id);
+    faces no label reaches become `background` (default: one more than the highest instance id).
+    """
+    face, instance = np.ravel(face_id), np.ravel(instance_id)
+    if face.shape != instance.shape:
+        raise InputError(f"{face.size} face ids and {instance.size} instance ids; one of each per pixel is needed")
+    voting = (face >= 0) & (instance >= 0)
+    face, instance = face[voting].astype(np.int64), instance[voting].astype(np.int64)
+    if face.size and face.max() >= n_faces:
+        raise InputError(f"face id {face.max()} in a map, but the mesh has {n_faces} faces; map and mesh differ")
+
+    span = int(instance.max()) + 1 if instance.size else 1
+    pair, count = np.unique(face * span + instance, return_counts=True)
+    pair_face, pair_instance = pair // span, pair % span
+    order = np.lexsort((pair_instance, -count, pair_face))  # by face, most votes first, then lowest id
+    winner = order[np.unique(pair_face[order], return_index=True)[1]]
+    label = np.full(n_faces, -1, np.int64)
+    label[pair_face[winner]] = pair_instance[winner]
+    votes = np.bincount(face, minlength=n_faces)
+
+    if faces_adjacency is not None and len(faces_adjacency):
+        label = _spread(label, np.asarray(faces_adjacency))
+    unreached = label < 0
+    if background is None:
+        background = span if instance.size else 0
+    label[unreached] = background
+
+    object_id = np.unique(label)
+    column = np.searchsorted(object_id, label)
+    pixels = np.bincount(column, votes, len(object_id))
+    agreeing = (
+        np.bincount(np.searchsorted(object_id, label[pair_face]), count * (label[pair_face] == pair_instance), len(object_id))
+        if pair.size
+        else np.zeros(len(object_id))
+    )
+    return FaceVotes(
+        label.astype(np.int32),
+        votes.astype(np.int32),
+        object_id.astype(np.int32),
+        pixels.astype(np.int64),
+        (agreeing / np.maximum(pixels, 1)).astype(np.float32),
+        int(background) if unreached.any() else None,
+    )
+
+
+def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDArray) -> NDArray:
+    """Labels for every face, (F,) int32: where photographs say nothing, the mesh decides.
+
+    A face without a label (-1) takes that of the nearest labelled face across shared edges, without leaving its `piece` (F,)
+    and without entering a `closed` one (F,) bool. What remains becomes one new object a piece, numbered after the others.
+    """
+    label, piece, closed = np.asarray(label, np.int64), np.asarray(piece, np.int64), np.asarray(closed, bool)
+    pairs = np.asarray(adjacency).reshape(-1, 2)
+    a, b = pairs.T
+    label = _spread(label, pairs[(piece[a] == piece[b]) & ~closed[a] & ~closed[b]])
+    rest = label < 0
+    if rest.any():
+        label[rest] = label.max(initial=-1) + 1 + np.unique(piece[rest], return_inverse=True)[1]
+    return label.astype(np.int32)
+
+
+def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float, NDArray]:
+    """How alike two partitions of one set are: the adjusted Rand index, and of every label of `a` how well it is found again.
+
+    With n_ij the weight in label i of `a` and j of `b`, a_i and b_j its sums, N the total, p = sum a_i^2, q = sum b_j^2:
+
+        ARI = (sum n_ij^2 - p q / N^2) / ((p + q) / 2 - p q / N^2)
+
+    (Hubert and Arabie 1985 for weights instead of counts): 1 = the same, about 0 = no more alike than by chance. The second
+    result, (max(a) + 1,) float64, is max_j n_ij / (a_i + b_j - n_ij), the best overlap over union; NaN without weight.
+
+    Args:
+        a, b: (n,) int labels from 0; weight: (n,) >= 0.
+
+    Raises:
+        InputError: shapes that differ, or no weight at all.
+    """
+    from scipy.sparse import coo_matrix
+
+    a, b, weight = np.ravel(a), np.ravel(b), np.ravel(weight).astype(np.float64)
+    if not (a.shape == b.shape == weight.shape):
+        raise InputError(f"partitions of {a.size} and {b.size} elements with {weight.size} weights; all must be as many")
+    total = weight.sum()
+    if not total > 0:
+        raise InputError("partitions without weight cannot be compared")
+    table = coo_matrix((weight, (a, b))).tocsr()  # sums what falls together
+    table = table.tocoo()
+    of_a, of_b = np.bincount(a, weight), np.bincount(b, weight)
+    p, q = (of_a**2).sum(), (of_b**2).sum()
+    chance = p * q / total**2
+    most = 0.5 * (p + q) - chance
+    index = ((table.data**2).sum() - chance) / most if most > 1e-12 * total**2 else 1.0
+    best = np.where(of_a > 0, 0.0, np.nan)
+    union = of_a[table.row] + of_b[table.col] - table.data
+    found = table.data > 0
+    np.maximum.at(best, table.row[found], table.data[found] / union[found])
+    return float(index), best
+
+
+def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
+    """Labels grown over the face graph ring by ring; a face reached by several in one ring takes the lowest."""
+    n = len(label)
+    ends = np.concatenate([adjacency, adjacency[:, ::-1]]).astype(np.int64)
+    ends = ends[np.argsort(ends[:, 0], kind="stable")]
+    start = np.searchsorted(ends[:, 0], np.arange(n + 1))
+    label = label.copy()
+    ring = np.flatnonzero(label >= 0)
+    unset = np.iinfo(np.int64).max
+    while ring.size:
+        degree = start[ring + 1] - start[ring]
+        offset = np.arange(degree.sum()) - np.repeat(np.cumsum(degree) - degree, degree)
+        neighbour = ends[np.repeat(start[ring], degree) + offset, 1]
+        source = np.repeat(label[ring], degree)
+        fresh = label[neighbour] < 0
+        neighbour, source = neighbour[fresh], source[fresh]
+        ring, column = np.unique(neighbour, return_inverse=True)
+        lowest = np.full(len(ring), unset)
+        np.minimum.at(lowest, column, source)
+        label[ring] = lowest
+    return label
+
+
+def _integer_map(values: NDArray, name: str) -> NDArray:
+    values = np.asarray(values)
+    if values.ndim != 2 or values.dtype.kind not in "iu":
+        raise InputError(
+            f"{name} has shape {values.shape} and type {values.dtype}; it must be (H, W) of integers with -1 for none"
+        )
+    return values.astype(np.int32, copy=False)

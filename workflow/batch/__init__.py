@@ -1,0 +1,1 @@
+"""Many scenes: the batch table, what became of each scene, and the page that shows it."""

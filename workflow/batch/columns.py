@@ -1,0 +1,36 @@
+"""What the summary of a batch says of each scene: its states, and its scores."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+STATUSES = {
+    "done": "published, as the settings, inputs and code of now would make it",
+    "refused": "its settings or data cannot be used; no job was started",
+    "failed": "a job ended with an error",
+    "killed": "a job was started and did not end: killed (memory, time limit), or still running",
+    "not run": "jobs are missing and none of them has run as it would now",
+}
+
+
+class Score(NamedTuple):
+    """One column of scores: mean over the views of a row of metrics.parquet. `split`: of these photographs alone."""
+
+    column: str
+    title: str
+    quantity: str
+    metric: str
+    protocol: str
+    split: str = ""
+    digits: int = 2
+
+
+SCORES = (
+    Score("rgb_psnr", "re-rendering PSNR", "rgb", "psnr", "raw", "train"),
+    Score("rgb_psnr_held_out", "held-out PSNR", "rgb", "psnr", "raw", "test"),
+    Score("albedo_psnr", "albedo PSNR", "albedo", "psnr", "raw"),
+    Score("albedo_psnr_scaled", "albedo PSNR, scaled", "albedo", "psnr", "scaled"),
+    Score("roughness_l2", "roughness L2", "roughness", "l2", "raw", digits=4),
+    Score("metallic_l2", "metallic L2", "metallic", "l2", "raw", digits=4),
+    Score("emission_iou", "emission IoU", "emission", "iou", "raw", digits=3),
+)

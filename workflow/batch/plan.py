@@ -1,0 +1,58 @@
+"""What `snakemake scenes` will run: every scene of the batch table, checked on its own before any job starts."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+import time
+from dataclasses import dataclass
+from functools import lru_cache
+
+from iif_core.errors import InputError
+from workflow.artifacts.files import sha256_of
+from workflow.batch.page import TEMPLATE
+from workflow.runtime import fingerprint as fp
+from workflow.runtime import input_digests
+from workflow.settings.batch_table import Line, read_table
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What `snakemake scenes` will run: fingerprint of every scene's deliverable, and the reason of every refused one."""
+
+    lines: tuple[Line, ...]
+    ready: dict[str, str]
+    refused: dict[str, str]
+
+
+@lru_cache(None)
+def plan(quality: str) -> Plan:
+    """Check every scene of the table on its own: settings, and all that its source can tell without pixels.
+
+    Raises:
+        InputError: only for the table as such (`read_table`).
+    """
+    lines = read_table()
+    ready, refused = {}, {}
+    said = time.monotonic()
+    with input_digests.saved_once():
+        for done, line in enumerate(lines):
+            if time.monotonic() > said + 5:
+                said = time.monotonic()
+                print(f"batch: {done} of {len(lines)} scenes checked", file=sys.stderr)
+            try:
+                ready[line.name] = fp.fingerprint("publish", line.name, quality)
+            except InputError as error:
+                refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
+            except Exception as error:  # one scene must not stop hundreds of others, whatever is wrong with it
+                refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
+    return Plan(lines, ready, refused)
+
+
+def fingerprint(quality: str) -> str:
+    """Changes when the summary may: with the scenes, their results, what is refused, or the summary's code."""
+    found = plan(quality)
+    code = [fp.modules_digest(fp.import_closure("workflow.batch.summary")), sha256_of(TEMPLATE)]
+    facts = [[line.number, line.name] for line in found.lines], found.ready, found.refused, quality, code
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,194 @@
+"""What became of a batch: results/batch/summary.parquet, .tsv and report.html, one row a scene of config/batch.tsv.
+
+Reads what the jobs left and nothing else, so it can be made at any time (`python -m workflow batch`), also while they run.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from iif_core.errors import InputError
+from workflow.artifacts.files import read_parquet, write_atomically
+from workflow.batch import plan as batch_plan
+from workflow.batch.columns import SCORES, STATUSES
+from workflow.batch.page import render
+from workflow.registry import STAGES
+from workflow.runtime import fingerprint as fp
+from workflow.runtime.job_state import read_state
+from workflow.runtime.timings import read_parts, read_timings
+from workflow.settings.batch_table import Line
+
+FOLDER = Path("results/batch")
+_TEXT = ("scene", "status", "stage", "reason", "source", "base", "quality", "log", "report", "slowest")
+COLUMNS = {
+    "line": "int64",
+    **dict.fromkeys(_TEXT[:7], "string"),
+    "views": "int64",
+    **dict.fromkeys((score.column for score in SCORES), "float64"),
+    **dict.fromkeys(("seconds", "cpu_seconds", "max_rss_mb"), "float64"),
+    **dict.fromkeys(_TEXT[7:], "string"),
+}
+
+Row = dict[str, Any]
+
+
+def write_summary(quality: str, complete: str | None = None) -> None:
+    """Write table and page; say in the log what is not done, and why.
+
+    Args:
+        complete: fingerprint of the plan, when all its jobs are done. Without it `results/batch/complete` is taken away, lest
+            Snakemake take what a failed run left for the summary of a finished one.
+    """
+    (FOLDER / "complete").unlink(missing_ok=True)
+    plan = batch_plan.plan(quality)
+    rows = [row_of(line, plan, quality) for line in plan.lines]
+    write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
+    write_atomically(FOLDER / "summary.tsv", lambda path: path.write_text(_tsv(rows), encoding="utf-8"))
+    page = render(rows, quality, SCORES, STATUSES)
+    write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
+    if complete:
+        write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
+    logging.getLogger("batch").info("%s", closing(rows))
+
+
+def refuse(quality: str) -> None:
+    """Fail with the reasons of all scenes that cannot be run.
+
+    Raises:
+        InputError: one line a scene.
+    """
+    refused = batch_plan.plan(quality).refused
+    if refused:
+        raise InputError(f"{len(refused)} of the batch cannot be run:\n" + "\n".join(refused.values()))
+    raise InputError("settings or data changed while the workflow was running. Run the same command again.")
+
+
+def closing(rows: Sequence[Row]) -> str:
+    """The last words of a run: how many are done, and what the others lack."""
+    done = sum(row["status"] == "done" for row in rows)
+    lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
+    for row in rows:
+        if row["status"] != "done":
+            where = f" in {row['stage']}" if row["stage"] else ""
+            lines.append(f"{row['scene']}: {row['status']}{where}: {row['reason']}")
+    return "\n".join(lines)
+
+
+# ------------------------------------------------------------------------------------------------------------ one scene
+
+
+def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
+    """Everything about one scene; what is unknown is None. Nothing that one scene's files hold can raise."""
+    scene = line.name
+    row: Row = dict.fromkeys(COLUMNS)
+    row |= {"line": line.number, "scene": scene, "base": line.base or None, "quality": quality}
+    if scene in plan.refused:
+        return row | {"status": "refused", "reason": plan.refused[scene], "source": line.source or None}
+    row["source"] = json.loads(fp.resolved(scene, quality))["source"]["kind"]
+    row |= _costs(scene)
+    if _is_published(scene, plan.ready[scene]):
+        try:
+            return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene)}
+        except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
+            reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
+            return row | {"status": "failed", "stage": "publish", "reason": reason}
+    return row | _why_not(scene, quality)
+
+
+def _is_published(scene: str, fingerprint: str) -> bool:
+    return _fingerprint_in(Path("scenes") / scene / "manifest.json") == fingerprint
+
+
+def _fingerprint_in(manifest: Path) -> str:
+    try:
+        return str(json.loads(manifest.read_text()).get("fingerprint", ""))
+    except (OSError, ValueError, AttributeError):
+        return ""
+
+
+def _why_not(scene: str, quality: str) -> Row:
+    """Status, stage, reason and log of the first job that did not end well; of the first that is missing if none ran."""
+    missing = [
+        stage.name
+        for stage in STAGES.values()
+        if not stage.on_demand and _fingerprint_in(_manifest(scene, stage.name)) != fp.fingerprint(stage.name, scene, quality)
+    ]
+    killed: Row = {}
+    for stage in missing:
+        state = read_state(scene, stage, fp.fingerprint(stage, scene, quality))
+        if not state:
+            continue
+        found = {"stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
+        if state.get("state") == "failed":
+            return found | {"status": "failed", "reason": str(state.get("reason", ""))}
+        killed = killed or found | {"status": "killed", "reason": "started and did not end: killed, or still running"}
+    stage = missing[0] if missing else "publish"
+    return killed or {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
+
+
+def _manifest(scene: str, stage: str) -> Path:
+    return Path("results") / scene / stage / "manifest.json"
+
+
+def _costs(scene: str) -> Row:
+    """Sums over the last run of each job on record, the largest memory, and the job that took longest."""
+    jobs = read_timings(scene)
+    if not jobs:
+        return {}
+    own = {job["rule"]: read_parts(scene, job["rule"]).get("job", {}) for job in jobs}
+    cpu = sum(max(job["cpu_seconds"], own[job["rule"]].get("cpu_seconds", 0.0)) for job in jobs)
+    memory = max(max(job["max_rss_mb"], own[job["rule"]].get("max_rss_mb", 0.0)) for job in jobs)
+    slowest = max(jobs, key=lambda job: job["seconds"])
+    return {
+        "seconds": sum(job["seconds"] for job in jobs),
+        "cpu_seconds": cpu,
+        "max_rss_mb": memory,
+        "slowest": f"{slowest['rule']} {slowest['seconds']:.0f} s",
+    }
+
+
+def _scores(scene: str) -> Row:
+    table = read_parquet(Path("scenes") / scene / "metrics.parquet")
+    cameras = read_parquet(Path("results") / scene / "capture/cameras.parquet")
+    split = dict(zip(cameras["name"].tolist(), cameras["split"].tolist(), strict=True))
+    out: Row = {"views": len(split)}
+    rows = zip(*(table[name].tolist() for name in ("view", "quantity", "metric", "protocol", "value")), strict=True)
+    values: dict[str, list[float]] = {score.column: [] for score in SCORES}
+    for view, *key, value in rows:
+        for score in SCORES:
+            if key == [score.quantity, score.metric, score.protocol] and score.split in ("", split.get(view)):
+                values[score.column].append(value)
+    return out | {name: sum(found) / len(found) for name, found in values.items() if found}
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def _write_parquet(rows: Sequence[Row], path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {name: pa.array([row[name] for row in rows], getattr(pa, kind)()) for name, kind in COLUMNS.items()}
+    pq.write_table(pa.table(columns), path, compression="zstd")
+
+
+def _tsv(rows: Sequence[Row]) -> str:
+    out = io.StringIO()
+    writer = csv.writer(out, delimiter="\t", lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for row in rows:
+        writer.writerow(["" if row[name] is None else _cell(row[name]) for name in COLUMNS])
+    return out.getvalue()
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return " | ".join(str(value).split("\n")).replace("\t", " ")

@@ -1,0 +1,250 @@
+"""What a scene requires, by measurement (METHOD 8): every function decides one component and says why.
+
+All return the same record, ready for `plan.yaml`:
+`{component, included, measure, value, threshold, reason}` with plain Python values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from iif_core.camera.gains import SIGNIFICANT, Evidence
+
+Decision = dict[str, Any]
+
+ESCAPE_PRIMARY = 1e-3
+ESCAPE_SECONDARY = 2e-3
+ESCAPE_BRIGHTNESS = 0.02
+ESCAPE_OPEN = 0.3
+"""Share of escaping rays from which a mesh is a part of a room. What its holes show is then the rest of the room, near and
+different from everywhere: no map of what cameras see there, but twelve directions that the lit room decides
+(`iif_core.light.emission.environment`)."""
+EXPOSURE_LOG_RATIO = 0.05
+RESPONSE_ERRORS = 2.0
+METALLIC_PRIOR = 0.25
+SPECULAR_ROUGHNESS = 0.85
+STABLE_OBJECTS = 0.7
+CACHE_COVERAGE = 0.3
+SECOND_PASS_GAIN = 0.10
+
+
+def _decision(component: str, included: bool, measure: str, value: float, threshold: float, reason: str) -> Decision:
+    finite = float(value) if np.isfinite(value) else 0.0
+    return {
+        "component": component,
+        "included": bool(included),
+        "measure": measure,
+        "value": round(finite, 6),
+        "threshold": float(threshold),
+        "reason": reason,
+    }
+
+
+def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
+    """Constant light from outside: needed when rays leave the mesh and what they meet is not black.
+
+    Args:
+        setting: `on`, `off` or `auto`.
+        primary_escape: share of camera rays without a hit.
+        secondary_escape: share of cosine-distributed rays from the surface that leave.
+        relative_brightness: mean radiance of escaping camera rays / mean radiance of the photographs; None = none
+            escaped.
+    """
+    measure = "share of cosine-distributed rays from the surface that leave the mesh"
+    if setting != "auto":
+        return _decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
+    leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
+    dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
+    if not leaves:
+        reason = f"the mesh is closed: {primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    elif dark:
+        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: nothing shines in from outside"
+    else:
+        reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
+
+
+def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:
+    """Corrected poses and intrinsics, and photographs that are better left out (`iif_core.camera.registration`).
+
+    Args:
+        gain, error: fall of the loss on held-out texture, and its standard error; edges of the mesh decide where it does not.
+        moved: pixels of the photographs as given, median over the views.
+    """
+    measure = "fall of the loss on texture that the fit did not see, in standard errors"
+    value = gain / error if error > 0 else 0.0
+    done = (
+        f"photographs moved by {moved:.1f} of their own pixels (median)"
+        if accepted
+        else f"moving them by {moved:.1f} pixels would not pay"
+    )
+    by = "texture" if gain > SIGNIFICANT * error else "edges of the mesh"
+    reason = f"{done}{f', which {by} spoke for' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
+    return _decision("registration", accepted, measure, value, SIGNIFICANT, reason)
+
+
+def segmentation(kind: str, objects: int, stability: float | None, perturbed: str, facts: dict[str, Any]) -> Decision:
+    """Objects: where they come from, and how far they depend on the choice of photographs and thresholds.
+
+    Args:
+        objects: seen by some photograph. stability: adjusted Rand index with the perturbed runs, None = nothing to perturb.
+        perturbed: what the runs change, in words. facts: numbers of the clustering, if there was one.
+    """
+    component = f"objects ({kind})"
+    if stability is None:
+        return _decision(component, True, "ids taken as they are", 1.0, STABLE_OBJECTS, f"{objects} objects are seen")
+    reason = f"{objects} objects are seen"
+    if "masks" in facts:
+        reason += f"; {facts['masks_undersegmented']} of {facts['masks']} masks hold several things and were dropped"
+    if stability < STABLE_OBJECTS:
+        reason += "; they depend on the choice of photographs: judge the overlay in the report"
+    return _decision(component, True, f"adjusted Rand index with {perturbed}", stability, STABLE_OBJECTS, reason)
+
+
+def emitters(groups: int, dropped: int, candidates: int) -> Decision:
+    """Emitters: whether any group was found and survived the solve."""
+    if groups:
+        reason = f"{groups} groups shine ({dropped} candidates dropped)"
+    elif candidates:
+        reason = f"none of the {candidates} candidate groups shines by itself; light comes from cache and environment"
+    else:
+        reason = "no face was seen saturated often enough; light comes from cache and environment"
+    return _decision("emitters", groups > 0, "emitter groups", groups, 1, reason)
+
+
+def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
+    """Indirect light from photographed radiance, or from paths that go on with the base materials.
+
+    The cache holds what the cameras saw; paths compound the error of the base albedo at every bounce. Against true incident
+    light (14 views of 112^2, LDR) the objects' diffuse shading was off by -0.6 % +- 1.8 % (kitchen) and +5 % +- 4.6 % (Country
+    Kitchen) with the cache, by -25 % +- 8 % and -51 % +- 19 % with paths; thinned to half of its hits the cache still won.
+
+    Args:
+        setting: `cache`, `path` or `auto`.
+        coverage: share of cosine-distributed rays from the surface that meet a voxel, of those that meet no emitter.
+        censored: share of the voxels that were only ever seen saturated.
+    """
+    measure = "share of secondary hits whose radiance was photographed"
+    if setting != "auto":
+        return _decision("radiance_cache", setting == "cache", measure, coverage, CACHE_COVERAGE, f"set to {setting}")
+    reason = f"{coverage:.0%} of secondary hits were photographed ({censored:.1%} of the voxels only saturated)"
+    return _decision("radiance_cache", coverage > CACHE_COVERAGE, measure, coverage, CACHE_COVERAGE, reason)
+
+
+def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision:
+    """Camera response: never for linear radiance; for LDR whatever `calibration.calibrate_response` chose, and why.
+
+    Args:
+        calibration: `calibration.calibration_facts`.
+    """
+    table = calibration["candidates"]
+    measure = "log likelihood by which the simplest curve is behind the best, in standard errors"
+    value = table[0]["behind"] / max(table[0]["error"], 1e-9) if table else 0.0
+    return _decision("camera_response", dynamic_range != "hdr", measure, value, RESPONSE_ERRORS, calibration["reason"])
+
+
+def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
+    """Exposure gains of the views: whether what overlapping views disagree by exceeds 5 %."""
+    spread = float(np.median(np.abs(log_gains))) if len(log_gains) else 0.0
+    measure = "median |log gain| between overlapping views"
+    if setting != "estimate":
+        return _decision("exposure", False, measure, spread, EXPOSURE_LOG_RATIO, "exposures taken as given")
+    if spread <= EXPOSURE_LOG_RATIO:
+        return _decision("exposure", False, measure, spread, EXPOSURE_LOG_RATIO, "overlapping views agree")
+    return _decision("exposure", True, measure, spread, EXPOSURE_LOG_RATIO, f"gains estimated for {estimated} views")
+
+
+def camera_term(term: str, evidence: Evidence) -> Decision:
+    """White balance of the views, or vignetting of the lens: whether held-out surface speaks for it.
+
+    Args:
+        term: `white_balance` or `vignetting`; evidence: of `camera_gains.choose_gains`.
+    """
+    measure = "fall of the held-out loss by this term, in standard errors"
+    value = evidence.gain / evidence.error if evidence.error > 0 else 0.0
+    what = "median |log gain| of a channel" if term == "white_balance" else "largest |log falloff|"
+    reason = (
+        f"{what} {evidence.size:.3f}; spread on surface that the fit did not see {evidence.before:.4f} without,"
+        f" {evidence.after:.4f} with it"
+    )
+    return _decision(term, evidence.included, measure, value, SIGNIFICANT, reason)
+
+
+def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
+    """Metalness: where the photographs' evidence says metal, or metal in parts; dielectric elsewhere.
+
+    Args:
+        free: (O,) bool, not a dielectric; prior_median: (O,) median predicted metalness.
+    """
+    count = int(np.count_nonzero(free))
+    predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
+    value = float(np.max(prior_median)) if len(prior_median) else 0.0
+    paying = count - predicted
+    reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {paying} because it pays)"
+    return _decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
+
+
+def gloss_is_idle(glossy: float, matte: float) -> bool:
+    """Whether the views of a cell, all of one albedo of its own, differ no less with the fitted gloss than with none; not where
+    no cell can tell (0)."""
+    return 0 < glossy and matte <= glossy
+
+
+def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
+    """Specular lobe: some object is glossier than 0.85 in 5 % of its cells, or metallic.
+
+    Args:
+        scatter: where gloss had to pay first, by how much the views of a cell differed with it and with none.
+    """
+    if scatter is not None and gloss_is_idle(*scatter):
+        measure = "how much more the views of a cell differ without gloss than with it (root mean square)"
+        reason = f"they differ by {scatter[0]:.4f} with the gloss that was fitted, by {scatter[1]:.4f} with none: fitted without"
+        return _decision("specular", False, measure, scatter[1] - scatter[0], 0.0, reason)
+    value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
+    needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
+    reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
+    return _decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
+
+
+def affine_size(models: list[str]) -> Decision:
+    """Size of the per-object albedo map, from the colour directions of each object's texture."""
+    kinds = [m.split(",")[0].split(" (")[0] for m in models]
+    counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "population", "identity")}
+    value = counts["full"] / len(kinds) if kinds else 0.0
+    reason = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number) or "no objects"
+    return _decision("affine_size", counts["full"] > 0, "share of objects with the full 3x4 map", value, 0.0, reason)
+
+
+def scale(kind: str, factor: float, relative_error: float) -> Decision:
+    """What fixes the scale between light and albedo (METHOD 7a, iif_core.fitting.gauge)."""
+    reasons = {
+        "found": "the light as it was found, by how much of it is indirect, weighed against the mean albedo of the base texture",
+        "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",
+        "mean_albedo": "the given mean albedo",
+        "white_patch": "the given albedo of a patch",
+        "lamp": "the given radiance of a lamp",
+    }
+    reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
+    return _decision("scale", abs(factor - 1.0) > 1e-3, "factor on the light that the fit was given", factor, 1.0, reason)
+
+
+def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
+    """Another round of light and materials: recommended when the fitted gains move the median pixel by more than 10 %.
+
+    Recorded, not done: each round multiplies the bias of the scale (COMPUTE 7).
+    """
+    values, weights = np.abs(np.asarray(gains) - 1.0), np.asarray(pixels, np.float64)
+    measure = "median |fitted albedo gain - 1| over pixels"
+    if not weights.sum():
+        return _decision("second_pass", False, measure, 0.0, SECOND_PASS_GAIN, "nothing was fitted")
+    order = np.argsort(values, kind="stable")
+    cumulative = np.cumsum(weights[order])
+    value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
+    reason = (
+        "light solved again with the fitted materials would change, but its overall level drifts from pass to pass: left out"
+        if value > SECOND_PASS_GAIN
+        else "light would hardly change"
+    )
+    return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)

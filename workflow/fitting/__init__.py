@@ -1,0 +1,1 @@
+"""File work of stage `affines`: earlier methods, and textures of cells."""

@@ -1,0 +1,373 @@
+"""What stage affines does for `affines.model` other than `objects`: earlier methods, over the same light and shading.
+
+All read the emission and the cached shading that ours reads, and leave what ours leaves, so that rendering, scores, export
+and page need not know. `base`: the fused base as it is. `object_mean`: the mean of all predictions of an object.
+`texture_average`: the photographs' mean colour in every surface cell, taken as albedo, with no prior at all. `fipt`,
+`iris`: a free BRDF in every surface cell (METHOD 6.2, 6.3).
+
+Where the originals would do worse for reasons that have nothing to do with their idea, they get our treatment: the light of
+stage emission, exposures, saturated values as bounds, dark pixels left out, border pixels weighted down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from iif_core.camera.response import Response, response, response_facts, response_from_facts
+from iif_core.fitting.baselines.adam import solve_adam
+from iif_core.fitting.baselines.camera import fit_camera
+from iif_core.fitting.baselines.direct import solve_direct
+from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown, object_means
+from iif_core.fitting.baselines.problem import DARK, CellSums, PixelRows
+from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
+from iif_core.fitting.problem import IDENTITY
+from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
+from workflow.models.denoise import denoise, require_denoiser
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import (
+    MATERIAL,
+    UNKNOWN_MATERIAL,
+    BaseScene,
+    ViewPixels,
+    base_maps,
+    pixel_gains,
+    read_base_scene,
+    read_gains,
+    read_light,
+    sensor_bounds,
+    view_pixels,
+)
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.recovered import write_response
+
+BORDER_WEIGHT = 0.1
+BLOCK_FOOTPRINTS = 1.6
+"""Edge, in median pixel footprints, of the blocks of cells that share roughness, metalness and diffuse light."""
+CAMERA_PIXELS = 200_000
+"""Pixels, of whole blocks, that the camera response is fitted to."""
+_SEEDS = 0x626C6E  # keeps the random numbers of this module apart from those of others
+WORDS = {
+    "base": "identity",
+    "object_mean": "mean of the predictions",
+    "texture_average": "mean of the photographs",
+    "fipt": "free cells (FIPT)",
+    "iris": "free cells (IRIS)",
+}
+
+
+@dataclass(frozen=True)
+class _Result:
+    """Materials of cells (C, 5) and of objects (O, 5), the cells' uncertainty (C,), and facts for affines.json."""
+
+    cells: np.ndarray
+    objects: np.ndarray
+    uncertainty: np.ndarray
+    curve: Response
+    pixels: np.ndarray
+    facts: dict[str, Any]
+
+
+def run(job: Job) -> None:
+    """Write what stage affines writes, for the model that the settings name."""
+    model = job.settings.affines.model
+    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    if model == "texture_average":
+        result = _texture_average(job, capture, scene)
+    elif model in ("fipt", "iris"):
+        result = _free_cells(job, capture, scene, model)
+    else:
+        result = _given(job, capture, scene, model)
+    _write_objects(job, scene, result, model)
+    if not capture.is_hdr:
+        write_response(job, result.curve)
+    _write_cells(job, result)
+    _write_maps(job, capture, scene, result, per_pixel=model == "base")
+    facts = {"model": model, "light_scale": 1.0, "converged": True, "history": [0.0], "residual": 0.0, "plan": []}
+    job.writer.json(
+        "affines.json", {**facts, "pixels": int(result.pixels.sum()), "response": response_facts(result.curve), **result.facts}
+    )
+
+
+# ------------------------------------------------------------------------------------------------------ without a fit
+
+
+def _given(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
+    """Nothing is fitted: the base, or one constant per object."""
+    cells = job.read("base").table("cells.parquet")
+    deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1).mean(1)
+    objects = scene.object_values if model == "base" else _object_means(job, capture, scene)
+    values = scene.cell_values if model == "base" else objects[scene.cell_object]
+    return _Result(values, objects, deviation, _start(job), np.zeros(scene.n_objects), {})
+
+
+def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndarray:
+    """(O, 5): mean over views, pixels and predictions of each object (METHOD 6.1 B1); the base's where none has any."""
+    used = int(job.read("base").json("base.json")["predictions"])
+    sums = np.zeros((scene.n_objects, 6))
+    for view in capture.views:
+        file = f"maps/{view.name}.exr"
+        if not job.read("prior").has(file):
+            continue
+        channels = job.read("prior").exr(file)
+        numbers = sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})[:used]
+        object_id = ids_from_disk(job.read("segmentation").exr(file)["object.id"]).ravel()
+        seen = object_id >= 0
+        for k in numbers:
+            names = [*(f"albedo.{c}" for c in "RGB"), "roughness", "metallic"]
+            for i, name in enumerate(names):
+                value = channels[f"prior.{k:03d}.{name}"].ravel()[seen].astype(np.float64)
+                sums[:, i] += np.bincount(object_id[seen], value, scene.n_objects)
+            sums[:, 5] += np.bincount(object_id[seen], minlength=scene.n_objects)
+    return np.where(sums[:, 5:] > 0, sums[:, :5] / np.maximum(sums[:, 5:], 1), scene.object_values)
+
+
+def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Result:
+    """Mean radiance that the used photographs show of every cell (of the object, where none does), as albedo: matte, no metal.
+
+    One gain for all: that with which albedo x the diffuse light of stage shading is nearest to the radiance (least squares). The
+    response is that of stage emission, saturated values count as they are.
+    """
+    curve, gains = _start(job), read_gains(job)
+    cells, objects = np.zeros((len(scene.cell_object), 4)), np.zeros((scene.n_objects, 4))
+    emits = read_light(job, len(scene.faces)).emits
+    lit: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for number, view in enumerate(capture.views):
+        if view.split == "test":
+            continue
+        pixels = view_pixels(job, capture, scene, view)
+        cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+        use = pixels.valid & (cell >= 0) & ~emits[pixels.face]
+        pixels, cell = pixels.take(use), cell[use]
+        radiance = np.asarray(pixels.value, np.float64)
+        if not capture.is_hdr:
+            radiance = curve.inverse(np.clip(radiance, 0, 1)) / pixel_gains(gains, number, view, pixels.index)
+        for sums, row in ((cells, cell), (objects, scene.cell_object[cell])):
+            for c in range(3):
+                sums[:, c] += np.bincount(row, radiance[:, c], len(sums))
+            sums[:, 3] += np.bincount(row, minlength=len(sums))
+        lit.append((cell, _mean_of_halves(job.read("shading").exr(f"maps/{view.name}.exr"), "diffuse", pixels.index), radiance))
+    of_object = objects[:, :3] / np.maximum(objects[:, 3:], 1)
+    of_cell = np.where(cells[:, 3:] > 0, cells[:, :3] / np.maximum(cells[:, 3:], 1), of_object[scene.cell_object])
+    across = sum(float((of_cell[cell] * light * radiance).sum()) for cell, light, radiance in lit)
+    square = sum(float(((of_cell[cell] * light) ** 2).sum()) for cell, light, _ in lit)
+    gain = across / square if square > 0 else 1.0
+
+    def material(albedo: np.ndarray) -> np.ndarray:
+        rest = np.tile(np.float64(UNKNOWN_MATERIAL[3:]), (len(albedo), 1))
+        return np.concatenate([np.clip(gain * albedo, 0, 1), rest], 1)
+
+    return _Result(material(of_cell), material(of_object), np.zeros(len(of_cell)), curve, objects[:, 3], {"gain": gain})
+
+
+# --------------------------------------------------------------------------------------------------------- free cells
+
+
+def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
+    """Roughness and metalness of blocks of cells, then the albedo of every cell."""
+    levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
+    options = FIPT if model == "fipt" else IRIS
+    edge = max(1, round(BLOCK_FOOTPRINTS * _footprint(capture) / scene.cell_edge))
+    block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
+    prior = _object_means(job, capture, scene) if model == "iris" else None
+    goal = prior[owner, :3] if prior is not None else None
+    views = CellPixels(job, capture, scene, block_of, len(owner))
+    sums = CellSums(owner, scene.n_objects, levels)
+    curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
+    if goal is not None and not capture.is_hdr:
+        share = min(1.0, CAMERA_PIXELS / max(views.count, 1))
+        chosen = np.random.default_rng([job.seed, _SEEDS]).random(len(owner)) < share
+        rows = _joined([rows.take(np.flatnonzero(chosen[rows.cell])) for rows, _ in views])
+        with job.timed("solve"):
+            fitted = fit_camera(rows, sums, _start(job), goal, options, dark=views.dark)
+        curve, camera = fitted.response, fitted.history
+        del rows
+    for rows, _ in views:
+        with job.timed("solve"):
+            sums.add(rows, curve, views.dark)
+    problem = sums.problem()
+    with job.timed("solve"):
+        solve = solve_direct if job.settings.affines.solver == "direct" else solve_adam
+        fit = solve(problem, options, goal)
+    unseen = prior if prior is not None else np.tile(np.float64(UNKNOWN_MATERIAL), (scene.n_objects, 1))
+    blocks = fill_unknown(fit, problem, unseen)
+    job.log.info("%d of %d blocks seen, loss %s", fit.known.sum(), len(fit.known), fit.history[-1:])
+    fine = AlbedoSums(len(block_of))
+    for rows, cell in views:
+        own = blocks[rows.cell]
+        with job.timed("solve"):
+            fine.add(replace(rows, cell=cell), levels, own[:, 3], own[:, 4], curve, views.dark)
+    values = blocks[block_of]
+    pull = {"prior": goal[block_of] / max(fit.scale, 1e-6), "weight": options.prior * fit.scale**2} if goal is not None else {}
+    values[:, :3] = fine.albedo(values[:, :3], **pull)
+    pixels = np.bincount(owner, problem.pixels, scene.n_objects)
+    facts = {"history": fit.history, "camera_history": camera, "residual": _residual(fit), "prior_scale": fit.scale}
+    facts |= {"blocks": len(owner), "blocks_seen": int(fit.known.sum()), "solver": job.settings.affines.solver}
+    deviation = albedo_deviation(problem, blocks)[block_of]
+    return _Result(values, object_means(problem, blocks, unseen), deviation, curve, pixels, facts)
+
+
+def _residual(fit: CellFit) -> float:
+    return float(np.sqrt(max(fit.history[-1], 0.0))) if fit.history else 0.0
+
+
+def _footprint(capture: CaptureReader) -> float:
+    """Median over the views of the median size of a pixel on the surface, in metres; 0 where nothing is seen."""
+    sizes = []
+    for view in capture.views:
+        depth = capture.gbuffer(view)[0]
+        if (depth > 0).any():
+            sizes.append(float(np.median(depth[depth > 0])) / view.fx)
+    return float(np.median(sizes)) if sizes else 0.0
+
+
+class CellPixels:
+    """Valid pixels of surface that does not shine, view by view: rows by block, and the cell of each.
+
+    Attributes:
+        count: how many there are; dark: light below which a pixel says nothing (`PixelRows.usable`).
+    """
+
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, block_of: np.ndarray, blocks: int):
+        self.job, self.capture, self.scene, self.block_of = job, capture, scene, block_of
+        require_denoiser()
+        self.emits = read_light(job, len(scene.faces)).emits
+        self.levels = len(job.read("shading").table("levels.parquet")["roughness"])
+        light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
+        for rows, _ in self._views(None):
+            light.add(rows.cell, rows.diffuse)
+            own = rows.light()
+            samples.append(own[np.isfinite(own)][:: max(1, len(own) // 4096)])
+            self.count += len(own)
+        joined = np.concatenate(samples)
+        self.dark = DARK * float(np.median(joined)) if len(joined) else 0.0
+        self.diffuse = light.mean()
+
+    def __iter__(self) -> Iterator[tuple[PixelRows, np.ndarray]]:
+        return self._views(self.diffuse)
+
+    def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
+        """With the diffuse light of blocks; without: that of the pixels, and no lobes."""
+        job, capture, gains = self.job, self.capture, read_gains(self.job)
+        views = capture.used
+        for done, view in enumerate(views):
+            pixels = view_pixels(job, capture, self.scene, view)
+            cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+            use = pixels.valid & (cell >= 0) & ~self.emits[pixels.face]
+            channels = job.read("shading").exr(f"maps/{view.name}.exr")
+            d = _denoised(channels, view, pixels)[use] if diffuse is None else np.zeros(0)
+            pixels, cell = pixels.take(use), cell[use]
+            block = self.block_of[cell]
+            levels = self.levels if diffuse is not None else 0
+            s0, s1 = (_lobes(channels, name, levels, pixels.index) for name in ("s0", "s1"))
+            d = d if diffuse is None else diffuse[block]
+            value = np.asarray(pixels.value, np.float32)
+            value, saturated = sensor_bounds(value, capture.is_hdr, job.settings.emission.saturation)
+            number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
+            factor = np.ones((len(cell), 3)) if capture.is_hdr else pixel_gains(gains, number, view, pixels.index)
+            exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
+            if not gains.is_plain:
+                ratio = (factor / exposure[:, None]).astype(np.float32)
+                # Blocks average light before any photograph's white balance.
+                d = d if diffuse is None else d * ratio
+                s0, s1 = s0 * ratio[:, None], s1 * ratio[:, None]
+            weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
+            yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
+            job.progress(done + 1, len(views), "views read")
+
+
+def _denoised(channels: dict[str, np.ndarray], view: View, pixels: ViewPixels) -> np.ndarray:
+    """(n, 3) diffuse light of pixels, denoised as FIPT does; a free albedo would keep all of its noise."""
+    normals = np.zeros((view.height * view.width, 3), np.float32)
+    normals[pixels.index] = pixels.normals
+    shape = (view.height, view.width, 3)
+    both = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
+    return denoise(both, np.ones(shape, np.float32), normals.reshape(shape)).reshape(-1, 3)[pixels.index]
+
+
+def _mean_of_halves(channels: dict[str, np.ndarray], layer: str, index: np.ndarray) -> np.ndarray:
+    halves = [rgb(channels, f"half{half}.{layer}").reshape(-1, 3)[index] for half in range(2)]
+    return 0.5 * (halves[0] + halves[1])
+
+
+def _lobes(channels: dict[str, np.ndarray], name: str, levels: int, index: np.ndarray) -> np.ndarray:
+    if not levels:
+        return np.zeros((len(index), 0, 3), np.float32)
+    return np.stack([_mean_of_halves(channels, f"{name}.{j:02d}", index) for j in range(levels)], 1)
+
+
+def _joined(parts: list[PixelRows]) -> PixelRows:
+    return PixelRows(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in PixelRows.__dataclass_fields__})
+
+
+def _start(job: Job) -> Response:
+    """Where stage emission left the response, one row of parameters a channel."""
+    start = response_from_facts(job.read("emission").json("emission.json")["response"])
+    return start.with_params(np.tile(start.params, (3, 1))) if start.names and start.params.ndim == 1 else start
+
+
+# ------------------------------------------------------------------------------------------------------------- output
+
+
+def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> None:
+    """Affines that map the base's object means, which surface without cells shows, to those of the model: a constant, or
+    the identity."""
+    table = job.read("segmentation").table("objects.parquet")
+    names = [f"object{i}" for i in range(scene.n_objects)]
+    for i, name in zip(table["object_id"], table["name"], strict=True):
+        names[int(i)] = str(name)
+    affine = np.tile(IDENTITY, (scene.n_objects, 1))
+    if model != "base":
+        affine[:] = 0.0
+        affine[:, [3, 7, 11, 13, 15]] = result.objects
+    columns: dict[str, Any] = {"object_id": np.arange(len(names), dtype=np.int32), "name": np.array(names, dtype=str)}
+    columns["pixels"] = result.pixels.astype(np.int64)
+    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
+        columns[f"T_{name}"], columns[f"std_{name}"] = affine[:, part], np.zeros_like(affine[:, part])
+    zeros = np.zeros(len(names))
+    columns |= {"covariance_trace": zeros, "residual": zeros, "model": np.array([WORDS[model]] * len(names), dtype=str)}
+    job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
+
+
+def _write_cells(job: Job, result: _Result) -> None:
+    values = result.cells.astype(np.float32)
+    columns = {"cell_id": job.read("base").table("cells.parquet")["cell_id"]}
+    columns |= {name: values[:, i] for i, name in enumerate(MATERIAL)}
+    job.writer.table("cells.parquet", {**columns, "uncertainty": result.uncertainty.astype(np.float32)})
+
+
+def _write_maps(job: Job, capture: CaptureReader, scene: BaseScene, result: _Result, per_pixel: bool) -> None:
+    """Materials of the cell of every pixel; of its object where it has none. `per_pixel`: the base's own maps."""
+    base, segmentation = job.read("base"), job.read("segmentation")
+    for done, view in enumerate(capture.views):
+        file = f"maps/{view.name}.exr"
+        maps = base.exr(file)
+        cell = ids_from_disk(maps["cell.id"]).ravel()
+        object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel()
+        seen = object_id >= 0
+        value = base_maps(job, view) if per_pixel else _of_pixels(result, cell, object_id)
+        deviation = np.where(cell >= 0, result.uncertainty[cell] if len(result.uncertainty) else 0.0, 1.0)
+        if per_pixel:
+            deviation = maps["uncertainty.albedo"].ravel()
+        value, deviation = np.where(seen[:, None], value, 0.0).astype(np.float32), np.where(seen, deviation, 0.0)
+        job.writer.exr(file, _channels(view, value, deviation.astype(np.float32)))
+        job.progress(done + 1, len(capture.views), "views written")
+
+
+def _of_pixels(result: _Result, cell: np.ndarray, object_id: np.ndarray) -> np.ndarray:
+    value = np.zeros((len(cell), 5))
+    if len(result.objects):
+        value = np.where((object_id >= 0)[:, None], result.objects[object_id], value)
+    if len(result.cells):
+        value = np.where((cell >= 0)[:, None], result.cells[cell], value)
+    return value
+
+
+def _channels(view: View, value: np.ndarray, deviation: np.ndarray) -> dict[str, np.ndarray]:
+    shape = (view.height, view.width)
+    channels = split_rgb(value[:, :3].reshape(*shape, 3), "albedo")
+    channels |= {"roughness": value[:, 3].reshape(shape), "metallic": value[:, 4].reshape(shape)}
+    return channels | {"uncertainty": deviation.reshape(shape)}

@@ -1,0 +1,68 @@
+"""Cells with the texture of the photographs themselves, for stage affines: what it reads, and in which order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iif_core.fitting.baselines.texture import AlbedoSums
+from iif_core.fitting.cell_texture import smooth_light, textured_albedo
+from iif_core.fitting.problem import MATTE, FitResult, apply_affines
+from iif_core.surface.cells import neighbour_pairs, pack_keys
+from workflow.fitting.baselines import CellPixels
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import BaseScene
+from workflow.scene.normal_form import CaptureReader
+
+
+def _points(job: Job) -> np.ndarray:
+    """(C, 3) metres, means of what was seen of the cells."""
+    cells = job.read("base").table("cells.parquet")
+    return np.stack([cells[c] for c in "xyz"], 1)
+
+
+@dataclass(frozen=True)
+class CellTextures:
+    """Cells with the photographs' own texture, for priors that had no light to divide by."""
+
+    job: Job
+    scene: BaseScene
+    views: CellPixels
+    levels: np.ndarray
+
+    @classmethod
+    def of(cls, job: Job, capture: CaptureReader, scene: BaseScene) -> CellTextures | None:
+        texture, cells = job.settings.affines.texture, len(scene.cell_object)
+        if texture == "base" or (texture == "auto" and job.settings.prior.kind != "retinex") or not cells:
+            return None
+        levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
+        views = CellPixels(job, capture, scene, np.arange(cells), cells)
+        views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)
+        return cls(job, scene, views, levels)
+
+    def scatter(self, fit: FitResult) -> tuple[float, float]:
+        """How much the views of a cell differ with the fitted gloss, and with none (root mean square). Of these priors no gloss
+        is known, and in real rooms it is where errors of light and normals go: it has to pay."""
+        fitted = self._fitted(fit)
+        glossy, matte = (sums.scatter() for sums in self._sums(fit, (fitted[:, 3:], np.tile(MATTE[1:3], (len(fitted), 1)))))
+        return glossy, matte
+
+    def albedo(self, fit: FitResult) -> np.ndarray:
+        """(C, 3)."""
+        fitted, scene = self._fitted(fit), self.scene
+        (sums,) = self._sums(fit, (fitted[:, 3:],))
+        pairs = neighbour_pairs(pack_keys(scene.cell_ijk, scene.cell_object))
+        return textured_albedo(fitted[:, :3], *sums.sums, scene.cell_ijk, pairs, _points(self.job), scene.cell_object)
+
+    def _fitted(self, fit: FitResult) -> np.ndarray:
+        return apply_affines(fit.affine, self.scene.cell_object.astype(np.int64), self.scene.cell_values)
+
+    def _sums(self, fit: FitResult, glosses: tuple[np.ndarray, ...]) -> list[AlbedoSums]:
+        """For each (C, 2) roughness and metalness of the cells."""
+        out, scale = [AlbedoSums(len(gloss)) for gloss in glosses], np.float32(fit.light_scale)
+        for rows, cell in self.views:
+            rows = replace(rows, diffuse=rows.diffuse * scale, s0=rows.s0 * scale, s1=rows.s1 * scale)
+            for sums, gloss in zip(out, glosses, strict=True):
+                sums.add(rows, self.levels, *gloss[cell].T, fit.response, self.views.dark * float(scale))
+        return out

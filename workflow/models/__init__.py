@@ -1,0 +1,1 @@
+"""Learned models: checkpoints, weights of LPIPS, and the denoiser."""

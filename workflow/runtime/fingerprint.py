@@ -1,0 +1,238 @@
+"""Chained fingerprints: what a stage's result depends on, in sixteen characters.
+
+fingerprint(stage) = sha256(settings that the stage reads, digest of the code that it imports, digest of the raw input files,
+fingerprints of all upstream stages). Every rule carries it as a parameter, so Snakemake reruns exactly what changed and
+everything below it, also after a run that failed half-way; touching a file or editing a comment changes nothing.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib
+import importlib.util
+import json
+import sys
+import threading
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from iif_core.errors import InputError
+from workflow import settings as settings_module
+from workflow.artifacts.files import sha256_of, write_json
+from workflow.registry import STAGES
+from workflow.runtime import input_digests
+from workflow.settings import study_files
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PACKAGES = ("iif_core", "workflow")  # their __init__ hold a docstring and nothing else
+# Runners, not results: their effect on artefacts is versioned by the schema number in the manifest.
+INFRASTRUCTURE = (
+    "workflow.runtime",
+    "workflow.registry",
+    "workflow.settings",
+    "workflow.studies",
+    "workflow.batch",
+    "workflow.artifacts",
+    "iif_core.errors",
+)
+# A setting that chooses a module at run time -> the module's name.
+PLUGINS = {
+    "capture": (("source", "kind", "workflow.sources.{}"),),
+    "prior": (("prior", "kind", "workflow.priors.{}"),),
+    "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
+}
+# Modules that know (and check) further input files of a stage.
+FILE_MODULES = {"emission": ("workflow.scene.response_file",)}
+VGG = Path("results/weights/lpips_vgg.npz")
+
+
+def module_file(module: str) -> Path | None:
+    """Source file of one of our modules, or None if there is no such module."""
+    path = REPOSITORY.joinpath(*module.split("."))
+    if path.with_suffix(".py").is_file():
+        return path.with_suffix(".py")
+    if (path / "__init__.py").is_file():
+        return path / "__init__.py"
+    return None
+
+
+def is_infrastructure(module: str) -> bool:
+    return module in PACKAGES or any(module == name or module.startswith(name + ".") for name in INFRASTRUCTURE)
+
+
+_CODE = Path("results/.code-digests.json")
+_remembered: dict[str, list[Any]] = {}  # module -> [sha256 of its source, digest of its code, names that it imports]
+_unsaved = False
+_lock = threading.Lock()  # stages read their upstream from several threads
+
+
+@lru_cache(None)
+def _recall() -> None:
+    """Take over what an earlier process found with the same Python and the same text of this module."""
+    try:
+        document = json.loads(_CODE.read_text())
+        if document["by"] == _reader_of_code():
+            _remembered.update(document["modules"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+
+
+def _reader_of_code() -> str:
+    return f"{sys.version_info[:3]} {sha256_of(Path(__file__))}"
+
+
+def _save() -> None:
+    global _unsaved
+    with _lock:
+        if _unsaved:
+            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
+            _unsaved = False
+
+
+@lru_cache(None)
+def _facts(module: str) -> tuple[str, tuple[str, ...]]:
+    """Digest of a module's code, and the names within our packages that it imports anywhere in its source.
+
+    Reading all modules takes longer than some stages, so it is remembered by the sha256 of the source.
+    """
+    global _unsaved
+    path = module_file(module)
+    if path is None:
+        return "", ()
+    _recall()
+    source = sha256_of(path)
+    found = _remembered.get(module)
+    if found is None or found[0] != source:
+        tree = ast.parse(path.read_text(), str(path))
+        names = _imported(tree, module if path.name == "__init__.py" else module.rpartition(".")[0])
+        found = [source, _digest_of(tree), sorted(names)]
+        with _lock:
+            _remembered[module], _unsaved = found, True
+    return found[1], tuple(found[2])
+
+
+def _imported(tree: ast.Module, package: str) -> set[str]:
+    out: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            out.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = importlib.util.resolve_name("." * node.level + (node.module or ""), package) if node.level else node.module
+            out.update([base or "", *(f"{base}.{alias.name}" for alias in node.names)])
+    return {name for name in out if name.split(".")[0] in PACKAGES}
+
+
+@lru_cache(None)
+def direct_imports(module: str) -> frozenset[str]:
+    """Our modules that `module` imports anywhere in its source (also inside functions)."""
+    found: set[str] = set()
+    for name in _facts(module)[1]:
+        if module_file(name):
+            parts = name.split(".")
+            found.update(".".join(parts[: i + 1]) for i in range(len(parts)))
+    return frozenset(name for name in found if module_file(name))
+
+
+def import_closure(*modules: str) -> list[str]:
+    """Every module of ours that importing `modules` can reach, without the infrastructure; sorted."""
+    todo, seen = list(modules), set()
+    while todo:
+        module = todo.pop()
+        if module in seen or is_infrastructure(module):
+            continue
+        seen.add(module)
+        package = module.rpartition(".")[0]  # importing a module runs its packages' __init__ first
+        todo.extend([*direct_imports(module), *([package] if package else [])])
+    return sorted(seen)
+
+
+def _digest_of(tree: ast.Module) -> str:
+    for node in ast.walk(tree):  # docstrings and comments do not change results
+        body = getattr(node, "body", None)
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body:
+            first = body[0]
+            if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str):
+                node.body = body[1:]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+@lru_cache(None)
+def _roots_digest(roots: tuple[str, ...]) -> str:
+    return modules_digest(import_closure(*roots))
+
+
+def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
+    """Modules whose code a stage's result depends on, with these settings."""
+    return import_closure(*_roots(stage, settings))
+
+
+def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
+    plugins = PLUGINS.get(stage, ())
+    return STAGES[stage].module, *(pattern.format(settings[section][key]) for section, key, pattern in plugins)
+
+
+def code_digest(stage: str, settings: dict[str, Any]) -> str:
+    """Digest of the code behind a stage, blind to comments, docstrings and layout."""
+    return _roots_digest(_roots(stage, settings))
+
+
+def modules_digest(modules: list[str]) -> str:
+    """Digest of the code of some modules."""
+    parts = [f"{module}:{_facts(module)[0]}" for module in modules]
+    _save()
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+
+
+def raw_digest(paths: list[Path]) -> str:
+    """Digest of the contents of input files (workflow/runtime/input_digests.py says how large ones are told apart)."""
+    return hashlib.sha256("\n".join(input_digests.digests(paths)).encode()).hexdigest()[:16]
+
+
+def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
+    """Input files from outside that a stage reads; the source (or prior) module knows them and checks them first."""
+    wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
+    out = [VGG] if wants_vgg and VGG.is_file() else []
+    if stage == "relight":
+        out.extend(settings_module.relight_files(document))
+    for section, key, pattern in PLUGINS.get(stage, ()):
+        module = importlib.import_module(pattern.format(document[section][key]))
+        if hasattr(module, "raw_inputs"):
+            out.extend(module.raw_inputs(document))
+    for name in FILE_MODULES.get(stage, ()):
+        out.extend(importlib.import_module(name).raw_inputs(document))
+    return out
+
+
+@lru_cache(None)
+def resolved(scene: str, quality: str) -> str:
+    """Settings of a scene as JSON text (so that it can be cached)."""
+    return json.dumps(settings_module.dump(settings_module.load(scene, quality)), sort_keys=True)
+
+
+@lru_cache(None)
+def fingerprint(stage: str, scene: str, quality: str) -> str:
+    """Sixteen hexadecimal characters that change when, and only when, the stage's result may."""
+    document = json.loads(resolved(scene, quality))
+    try:
+        raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
+    except InputError as error:
+        raise InputError(f"{settings_module.scene_origin(scene)}: {error}") from None
+    facts = {
+        "stage": stage,
+        "settings": settings_module.select(document, STAGES[stage].settings),
+        "code": code_digest(stage, document),
+        "raw": raw,
+        "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@lru_cache(None)
+def home(stage: str, scene: str, quality: str) -> str:
+    """Scene in whose folder the result of a stage lies: a study's variant shares what others would make alike."""
+    for shared in study_files.bases(scene):
+        if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
+            return shared
+    return scene

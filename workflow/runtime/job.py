@@ -1,0 +1,211 @@
+"""One job: a stage of a scene. Gives the stage its settings, its inputs and its writer, and nothing else."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import logging
+import platform
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from iif_core.errors import InputError
+from workflow import settings as settings_module
+from workflow.artifacts import StageReader, StageWriter
+from workflow.artifacts.files import sha256_of, write_json
+from workflow.registry import STAGES
+from workflow.runtime import fingerprint as fp
+from workflow.runtime import input_digests
+
+_LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
+
+
+def stage_directory(scene: str, stage: str) -> Path:
+    """Where a stage of a scene lies."""
+    return Path("results") / scene / stage
+
+
+def _namespace(value: Any) -> Any:
+    if isinstance(value, dict):
+        return SimpleNamespace(**{k: _namespace(v) for k, v in value.items()})
+    return value
+
+
+class Job:
+    """What a stage's `run(job)` gets.
+
+    Attributes:
+        settings: the parts of the settings tree that the registry lets this stage see, by attribute
+            (`job.settings.base.ridge`); anything else raises AttributeError.
+        seed: seed of the scene (only when the registry lists it).
+        threads: cores that this job may use.
+        log: logger of the job; `progress(done, total, what)` writes at most one line every five seconds.
+    """
+
+    def __init__(self, stage: str, scene: str, quality: str, threads: int):
+        self.stage, self.scene, self.quality, self.threads = STAGES[stage], scene, quality, threads
+        self.log = logging.getLogger(f"{stage}")
+        self.document = json.loads(fp.resolved(scene, quality))
+        self._last_progress = self._started = time.monotonic()
+        self._progress_of, self._first_item = "", (0, self._started)
+        self._cpu_started = time.process_time()
+        self._parts: dict[str, dict[str, float]] = {}
+        self._readers: dict[str, StageReader] = {}
+
+    @cached_property
+    def settings(self) -> SimpleNamespace:
+        tree: dict[str, Any] = {}
+        for dotted, value in settings_module.select(self.document, self.stage.settings).items():
+            node = tree
+            *parents, leaf = dotted.split(".")
+            for part in parents:
+                node = node.setdefault(part, {})
+            if isinstance(value, dict) and isinstance(node.get(leaf), dict):
+                node[leaf].update(value)
+            else:
+                node[leaf] = value
+        return _namespace(tree)
+
+    @property
+    def seed(self) -> int:
+        return self.settings.seed
+
+    @property
+    def fingerprint(self) -> str:
+        return fp.fingerprint(self.stage.name, self.scene, self.quality)
+
+    def read(self, stage: str) -> StageReader:
+        """Reader of an upstream stage; one that was built under other settings or code is refused."""
+        if stage not in self.stage.upstream:
+            raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as upstream")
+        if stage not in self._readers:
+            scene = fp.home(stage, self.scene, self.quality)
+            reader = StageReader(stage_directory(scene, stage), stage, scene)
+            expected = fp.fingerprint(stage, self.scene, self.quality)
+            if reader.fingerprint != expected:
+                raise InputError(
+                    f"{reader.directory / 'manifest.json'}: built as {reader.fingerprint}, needed {expected}"
+                    f" (settings, inputs or code changed since). Run: snakemake --cores 2 scenes/{self.scene}"
+                    f" --config quality={self.quality}"
+                )
+            self._readers[stage] = reader
+        return self._readers[stage]
+
+    @cached_property
+    def writer(self) -> StageWriter:
+        """Writer of this stage's folder; `run` need not finish it."""
+        return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
+
+    def _provenance(self) -> dict[str, Any]:
+        inputs = {}
+        for stage in self.stage.upstream:
+            reader = self.read(stage)
+            inputs[stage] = {
+                "fingerprint": reader.fingerprint,
+                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
+            }
+        return {
+            "scene": self.scene,
+            "stage": self.stage.name,
+            "quality": self.quality,
+            "fingerprint": self.fingerprint,
+            "settings": settings_module.select(self.document, self.stage.settings),
+            "code": fp.code_digest(self.stage.name, self.document),
+            "seed": self.document["seed"],
+            "inputs": inputs,
+            "versions": library_versions(),
+        }
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Record the wall and CPU seconds of a part of the job (all threads of this process); parts of one name add up.
+
+        They go to `results/<scene>/benchmarks/<stage>.parts.json`, not into the manifest: no two runs take the same time.
+        """
+        wall, cpu = time.perf_counter(), time.process_time()
+        try:
+            yield
+        finally:
+            part = self._parts.setdefault(name, {"seconds": 0.0, "cpu_seconds": 0.0})
+            part["seconds"] += time.perf_counter() - wall
+            part["cpu_seconds"] += time.process_time() - cpu
+
+    def write_timings(self) -> None:
+        """Write what `timed` recorded, and seconds, CPU seconds peak memory (MB) and threads of the job so far as `job`."""
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
+        whole = {
+            "seconds": time.monotonic() - self._started,
+            "cpu_seconds": time.process_time() - self._cpu_started,
+            "max_rss_mb": memory,
+            "threads": self.threads,
+        }
+        parts = {name: {key: round(value, 3) for key, value in part.items()} for name, part in self._parts.items()}
+        document = {**parts, "job": {key: round(value, 3) for key, value in whole.items()}}
+        write_json(Path("results") / self.scene / "benchmarks" / f"{self.stage.name}.parts.json", document)
+
+    def progress(self, done: int, total: int, what: str) -> None:
+        """Say how far the job is, at most every five seconds and at the end."""
+        now = time.monotonic()
+        if self._progress_of != what or done <= 1:  # the first item pays for compiling and loading; the estimate starts after it
+            self._progress_of, self._first_item = what, (done, now)
+        if done < total and now - self._last_progress < 5:
+            return
+        self._last_progress = now
+        spent = now - self._started
+        done_first, then = self._first_item
+        since = (now - then) / (done - done_first) if done > done_first else 0.0
+        left = f", about {since * (total - done):.0f} s left" if since and done < total else ""
+        self.log.info("%s: %d of %d (%.0f s%s)", what, done, total, spent, left)
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of Python and of the libraries that make numbers."""
+    out = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        try:
+            out[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            out[name] = "absent"
+    return out
+
+
+def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, expected: str | None = None) -> None:
+    """Run one stage of one scene in this process.
+
+    Args:
+        expected: fingerprint that the caller planned with; a difference means that settings, code or inputs changed
+            between planning and running, and is refused.
+
+    Raises:
+        InputError: with a message for the user.
+    """
+    job = Job(stage, scene, quality, threads)
+    if expected and expected != job.fingerprint:
+        raise InputError(
+            f"scene {scene}, stage {stage}: settings, code or input files changed while the workflow was running"
+            f" (planned {expected}, now {job.fingerprint}). Run the same command again."
+        )
+    module = importlib.import_module(job.stage.module)
+    module.run(job)
+    job.writer.finish()
+    if job.stage.reads_raw:
+        input_digests.remember(fp.raw_inputs(stage, job.document))
+    job.write_timings()
+
+
+def configure_logging(path: Path | None) -> None:
+    """Log to stderr and, when given, to a file of the job's own; warnings included."""
+    handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
+    if path:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handlers.append(logging.FileHandler(path, mode="w"))
+    logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", handlers=handlers, force=True)
+    logging.captureWarnings(True)

@@ -1,0 +1,238 @@
+"""Native libraries and the process environment: what must be right before `mitsuba` or `open3d` is imported.
+
+Dr.Jit compiles through a shared libLLVM. With LLVM 15 it does not raise: it aborts the whole process in the
+first kernel ("Cannot select fminimum"), and with none it fails only when a variant is chosen. So the
+library is looked for and asked for its version here, in a child process, before Dr.Jit is imported. Open3D
+needs libusb although no camera is ever opened; where the system has none, the one of the `libusb-package`
+wheel is loaded under its soname.
+
+Standard library only; importing this module changes nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import importlib
+import importlib.util
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from iif_core.errors import InputError
+
+OLDEST_LLVM = 16
+LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
+SYSTEM_FOLDERS = (
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib64/llvm*/lib*",
+    "/usr/lib",
+    "/usr/lib/llvm-*/lib",
+    "/usr/local/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+)
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "ARROW_IO_THREADS",
+)
+_LIBRARY_NAME = re.compile(r"libLLVM(?:-[\d.]+)?\.(?:so|dylib)[\d.]*$")
+_NAMED_VERSION = re.compile(r"libLLVM[-.](?:so\.)?(\d+)")
+# LLVMGetVersion exists from LLVM 16 on: its absence is the answer "older".
+_ASK = """
+import ctypes, sys
+try: library = ctypes.CDLL(sys.argv[1])
+except OSError as error: sys.exit(str(error))
+major = ctypes.c_uint()
+try: library.LLVMGetVersion(ctypes.byref(major), None, None)
+except AttributeError: print(0)
+else: print(major.value)
+"""
+
+
+@dataclass(frozen=True)
+class LlvmReport:
+    """The LLVM library that Dr.Jit shall load, or the reason why there is none.
+
+    path: absolute path of the usable library, None if there is none.
+    version: its major version, 0 if path is None.
+    candidates: every library found as (path, major version by its file name or 0), best first.
+    problem: one line (what was found, what is needed, what to do), None if path is usable.
+    """
+
+    path: str | None
+    version: int
+    candidates: tuple[tuple[str, int], ...]
+    problem: str | None
+
+
+def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None) -> LlvmReport:
+    """Find an LLVM >= 16: `DRJIT_LIBLLVM_PATH` if set, else this environment's lib folder, else the system's.
+
+    A variable that names an unusable library is a problem even where another library would do: it was set
+    on purpose and every child process inherits it.  Never raises.
+
+    environment: default `os.environ`.
+    folders: glob patterns of library folders, best first; default `<sys.prefix>/lib`,
+    `<sys.base_prefix>/lib`, SYSTEM_FOLDERS.
+    """
+    environment = os.environ if environment is None else environment
+    if folders is None:
+        own = dict.fromkeys(f"{glob.escape(p)}/lib" for p in (sys.prefix, sys.base_prefix))
+        folders = (*own, *SYSTEM_FOLDERS)
+    candidates = _libraries(folders)
+
+    chosen = environment.get(LLVM_VARIABLE, "")
+    if chosen:
+        chosen = os.path.abspath(os.path.expanduser(chosen))
+        version, reason = _version(chosen)
+        if reason is None:
+            return LlvmReport(chosen, version, candidates, None)
+        problem = f"{LLVM_VARIABLE} names {chosen}, {reason}; unset it or name an LLVM {OLDEST_LLVM} or newer"
+        usable = [path for path, named in candidates if named >= OLDEST_LLVM]
+        return LlvmReport(None, 0, candidates, problem + (f" such as {usable[0]}" if usable else ""))
+
+    reasons = []
+    for path, named in candidates:
+        version, reason = (named, f"which is LLVM {named}") if 0 < named < OLDEST_LLVM else _version(path)
+        if reason is None:
+            return LlvmReport(path, version, candidates, None)
+        reasons.append(f"{path}, {reason}")
+    found = "found only " + "; ".join(reasons) if reasons else "found no LLVM library"
+    return LlvmReport(
+        None,
+        0,
+        candidates,
+        f"{found}. Dr.Jit needs LLVM {OLDEST_LLVM} or newer (older ones abort the process): "
+        f"run `bash envs/setup.sh`, which installs one without root, or set {LLVM_VARIABLE} to a libLLVM.so",
+    )
+
+
+def load_libusb() -> bool:
+    """Make libusb-1.0 resolvable for a later `import open3d`; False where neither system nor wheel has it."""
+    try:
+        ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
+        return True
+    except OSError:
+        pass
+    spec = importlib.util.find_spec("libusb_package")  # importing it would need importlib_resources
+    if spec is None or spec.origin is None:
+        return False
+    try:
+        ctypes.CDLL(str(Path(spec.origin).with_name("libusb-1.0.so")), mode=ctypes.RTLD_GLOBAL)
+    except OSError:
+        return False
+    return True
+
+
+def prepare() -> LlvmReport:
+    """Set `DRJIT_LIBLLVM_PATH` to a usable LLVM and make libusb loadable; call before importing Mitsuba.
+
+    Idempotent (about 20 ms the first time).  Raises InputError with one line when there is no usable LLVM,
+    and RuntimeError if Dr.Jit was imported without it: it reads the variable at its import, so it may hold
+    a wrong LLVM.
+    """
+    if "drjit" in sys.modules and not os.environ.get(LLVM_VARIABLE):
+        raise RuntimeError("drjit was imported before native.prepare(); call prepare() first")
+    load_libusb()
+    report = find_llvm()
+    if report.path is None:
+        raise InputError(report.problem)
+    os.environ[LLVM_VARIABLE] = report.path
+    return report
+
+
+def process_environment() -> None:
+    """Put this interpreter first on PATH and the repository first on PYTHONPATH, for this process's children.
+
+    So `.venv/bin/snakemake` works from an environment that was never activated, or is empty.  HOME is
+    filled in from the user database where it is unset: Dr.Jit and Snakemake keep their caches there.
+    Idempotent.
+    """
+    repository = Path(__file__).resolve().parents[2]
+    for variable, first in (("PATH", Path(sys.executable).parent), ("PYTHONPATH", repository)):
+        rest = [part for part in os.environ.get(variable, "").split(os.pathsep) if part and part != str(first)]
+        os.environ[variable] = os.pathsep.join([str(first), *rest])
+    home = os.path.expanduser("~")
+    if "HOME" not in os.environ and os.path.isabs(home):
+        os.environ["HOME"] = home
+
+
+def limit_threads(count: int) -> None:
+    """Let numerical libraries use `count` >= 1 threads, the calling one included.
+
+    Libraries not yet imported read it from environment variables, as do child processes; torch and pyarrow
+    are told if they are imported already.  Dr.Jit reads no variable, so after prepare() it is imported here
+    and told.  An OpenBLAS that NumPy has already started keeps its threads.  Raises InputError if
+    count < 1.
+    """
+    if count < 1:
+        raise InputError(f"threads: found {count}, allowed is 1 or more")
+    for variable in THREAD_VARIABLES:
+        os.environ[variable] = str(count)
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(count)
+    if pyarrow := sys.modules.get("pyarrow"):
+        pyarrow.set_cpu_count(count)
+        pyarrow.set_io_thread_count(count)
+    if "drjit" in sys.modules or (os.environ.get(LLVM_VARIABLE) and importlib.util.find_spec("drjit")):
+        importlib.import_module("drjit").set_thread_count(count)
+
+
+def _libraries(folders: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    """(path, version by name) of every libLLVM: folder by folder, newest first, links resolved."""
+    found: dict[str, int] = {}
+    for folder in folders:
+        here: dict[str, int] = {}
+        for path in glob.glob(f"{folder}/libLLVM*"):
+            real = os.path.realpath(path)
+            if _LIBRARY_NAME.match(os.path.basename(path)) and os.path.isfile(real) and real not in found:
+                here[real] = max(_named_version(real), _named_version(path))
+        found |= sorted(here.items(), key=lambda item: (-item[1], item[0]))
+    return tuple(found.items())
+
+
+def _named_version(path: str) -> int:
+    match = _NAMED_VERSION.match(os.path.basename(path))
+    return int(match[1]) if match else 0
+
+
+def _version(path: str) -> tuple[int, str | None]:
+    """Major version that the library itself reports, and why it cannot be used (None if it can)."""
+    if not os.path.exists(path):
+        return 0, "which does not exist"
+    if not os.path.isfile(path):
+        return 0, "which is not a file"
+    status = os.stat(path)
+    version, error = _ask_version(path, status.st_mtime_ns, status.st_size)
+    if error is not None:
+        return 0, f"which cannot be loaded ({error})"
+    if version < OLDEST_LLVM:
+        named = version or _named_version(os.path.realpath(path))
+        return version, f"which is LLVM {named or f'older than {OLDEST_LLVM}'}"
+    return version, None
+
+
+@lru_cache(maxsize=32)
+def _ask_version(path: str, _mtime_ns: int, _size: int) -> tuple[int, str | None]:
+    # In a child: two LLVMs in one process can clash, and a broken one may crash it.
+    command = [sys.executable, "-I", "-S", "-c", _ASK, path]
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return 0, f"asking it failed: {error}"
+    if child.returncode == 0 and child.stdout.strip().isdigit():
+        return int(child.stdout), None
+    lines = child.stderr.strip().splitlines()
+    return 0, lines[-1] if lines else f"its loader ended with code {child.returncode}"

@@ -1,0 +1,87 @@
+"""`affines.response: {file: ...}`: a measured camera response, checked before any job starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.camera.response import Response, sampled_response
+from iif_core.errors import InputError
+
+COLUMNS = ("x", "R", "G", "B")
+FALL = 1e-3
+"""Of the range: measured curves may fall by this much (noise, rounding); it is flattened. More is refused."""
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """The file that a scene's settings name, if any; read once, so that a bad one stops before any job."""
+    setting = document["affines"]["response"]
+    if not isinstance(setting, dict):
+        return []
+    read_response_file(Path(setting["file"]))
+    return [Path(setting["file"])]
+
+
+def read_response_file(path: Path) -> Response:
+    """The curve (3 channels), scaled to f(0) = 0 and f(1) = 1.
+
+    Raises:
+        InputError: no such file, unknown kind, missing columns, values that are not finite, outside [0, 1] or falling,
+            x that does not rise from 0 to 1.
+    """
+    if not path.is_file():
+        raise InputError(f"affines.response.file: {path}: not found; a path counts from the folder of the Snakefile")
+    readers = {".csv": _csv, ".parquet": _parquet, ".npy": _npy}
+    if path.suffix.lower() not in readers:
+        raise InputError(f"{path}: a response is .csv, .parquet (columns x, R, G, B) or .npy (3, samples)")
+    try:
+        x, y = readers[path.suffix.lower()](path)
+    except (ValueError, OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a response: {error}") from None
+    if len(x) < 2 or not (np.isfinite(x).all() and np.isfinite(y).all()):
+        raise InputError(f"{path}: {len(x)} samples; a response needs at least 2, all numbers finite")
+    if abs(x[0]) > 1e-6 or abs(x[-1] - 1) > 1e-6 or (np.diff(x) <= 0).any():
+        raise InputError(f"{path}: x runs from {x[0]:g} to {x[-1]:g}; it must rise from 0 to 1 (exposed radiance)")
+    if y.min() < -1e-6 or y.max() > 1 + 1e-6:
+        raise InputError(f"{path}: sensor values from {y.min():g} to {y.max():g}; allowed: 0 to 1 (divide 8-bit values by 255)")
+    for name, curve in zip("RGB", y, strict=True):
+        fall = float(np.max(np.maximum.accumulate(curve) - curve))
+        if fall > FALL or curve[-1] - curve[0] < 0.5:
+            raise InputError(
+                f"{path}: channel {name} goes from {curve[0]:g} to {curve[-1]:g} and falls by up to {fall:.3g};"
+                f" a response rises, by at least half of the range, and falls by no more than {FALL:g}"
+            )
+    x = x.copy()
+    x[0], x[-1] = 0.0, 1.0
+    return sampled_response(x, y)
+
+
+def _columns(table: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    missing = [name for name in COLUMNS if name not in table]
+    if missing:
+        raise ValueError(f"columns {', '.join(map(str, table))}; needed {', '.join(COLUMNS)}")
+    x, *y = (np.asarray(table[name], np.float64) for name in COLUMNS)
+    return x, np.stack(y)
+
+
+def _csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    names = [name.strip() for name in lines[0]] if lines else []
+    if any(len(line) != len(names) for line in lines):
+        raise ValueError(f"lines of different length; the first has {len(names)} columns")
+    return _columns(dict(zip(names, zip(*lines[1:], strict=True), strict=False)) if len(lines) > 1 else {})
+
+
+def _parquet(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import pyarrow.parquet
+
+    return _columns(pyarrow.parquet.read_table(path).to_pydict())
+
+
+def _npy(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    y = np.load(path, allow_pickle=False)
+    if y.ndim != 2 or y.shape[0] != 3:
+        raise ValueError(f"shape {y.shape}; needed (3, samples)")
+    return np.linspace(0.0, 1.0, y.shape[1]), y.astype(np.float64)

@@ -1,0 +1,1 @@
+"""File work of the stages that score material maps."""

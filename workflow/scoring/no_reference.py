@@ -1,0 +1,88 @@
+"""Scores that need no truth (docs/real-scenes.md): shading left in albedo, distance between the views of one surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from iif_core.evaluation.consistency import ShadingLeft, ViewSpread
+from iif_core.evaluation.metrics import Score
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_light
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scoring.scores import prediction_numbers
+
+EVERY_VIEW = "all"
+"""What stands in column `view` of scores over all views together."""
+DARK = 0.02
+"""Pixels with less than this share of the median light are left out: light and albedo are noise there."""
+
+
+def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, str, str, list[Score]]]:
+    """(variant, view, quantity, scores) of `result`, `base`, `prior_k0` and the mean of the scores of every prediction.
+
+    Light: the diffuse light of stage shading (mean of its halves) at interior pixels of surface that does not shine, in the
+    views that were used; surface cells: of its edge.
+    """
+    vertices, faces = capture.mesh()
+    emits = read_light(job, len(faces)).emits
+    edge = float(job.read("shading").json("shading.json")["diffuse"]["cell_edge_m"])
+    origin = grid_origin(vertices[faces.ravel()], edge)
+    left: dict[str, ShadingLeft] = {}
+    spread: dict[str, ViewSpread] = {}
+    for view in capture.used:
+        light, use, object_id = _light(job, capture, view, emits)
+        if not use.any():
+            continue
+        points = capture.points(view, capture.gbuffer(view)[0])[use]
+        own = object_id[use]
+        keys = pack_keys(voxel_indices(points, edge, origin), own % 65535)
+        for name, albedo in _albedos(job, view):
+            left.setdefault(name, ShadingLeft()).add(albedo[use], light[use], own)
+            spread.setdefault(name, ViewSpread()).add(albedo[use], keys)
+    rows = {name: _scores(left[name], spread[name]) for name in left}
+    each = [scores for name, scores in rows.items() if name.startswith("prior.")]
+    for name in ("result", "base"):
+        if name in rows:
+            yield name, EVERY_VIEW, "albedo", rows[name]
+    if each:
+        yield "prior_k0", EVERY_VIEW, "albedo", each[0]
+        means = [
+            Score(first.metric, first.protocol, None if any(v is None for v in values) else float(np.mean(values)), first.reason)
+            for first, values in ((group[0], [score.value for score in group]) for group in zip(*each, strict=True))
+        ]
+        yield "prior_mean_k", EVERY_VIEW, "albedo", means
+
+
+def _scores(left: ShadingLeft, spread: ViewSpread) -> list[Score]:
+    shading, apart = left.finish(), spread.finish()
+    return [
+        Score("shading_left", "raw", abs(shading.correlation)),
+        Score("shading_slope", "raw", shading.slope),
+        Score("view_spread", "raw", apart, "" if apart is not None else "no surface is seen in two views"),
+    ]
+
+
+def _light(job: Job, capture: CaptureReader, view: View, emits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(H, W, 3) diffuse light; (H, W) which pixels count; (H, W) object."""
+    file = f"maps/{view.name}.exr"
+    channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
+    light = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
+    face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
+    use = capture.photo(view)[1] & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~emits[np.maximum(face, 0)]
+    brightness = light.mean(-1)
+    return light, use & (brightness > DARK * float(np.median(brightness[use])) if use.any() else use), object_id
+
+
+def _albedos(job: Job, view: View) -> Iterator[tuple[str, np.ndarray]]:
+    file = f"maps/{view.name}.exr"
+    for name, stage in (("result", "affines"), ("base", "base")):
+        if job.read(stage).has(file):
+            yield name, rgb(job.read(stage).exr(file), "albedo")
+    if job.read("prior").has(file):
+        channels = job.read("prior").exr(file)
+        for k in prediction_numbers(channels):
+            yield f"prior.{k:03d}", rgb(channels, f"prior.{k:03d}.albedo")

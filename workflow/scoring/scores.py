@@ -1,0 +1,189 @@
+"""Scores of the material maps of views against ground truth: what the stages metrics and base_scores share."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from iif_core.evaluation import metrics
+from iif_core.evaluation.lpips import Weights
+from iif_core.fusion.problem import CHANNELS
+from iif_core.fusion.uncertainty import CALIBRATION, LEVELS, SMALLEST, coverage, gauge_free_error
+from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.models.lpips import lpips_weights
+from workflow.scene.normal_form import CaptureReader, Truth, View
+
+MATERIALS = ("albedo", "roughness", "metallic")
+UNITS = {"value": "l2: squared; psnr: dB; coverage: share of cells"}
+
+
+@dataclass
+class ScoreRows:
+    """Columns of a table of scores, in order of arrival, and the scores that could not be computed."""
+
+    columns: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    missing: list[dict[str, str]] = field(default_factory=list)
+
+    def add(self, variant: str, view: str, quantity: str, scores: list[metrics.Score]) -> None:
+        for score in scores:
+            facts = {"variant": variant, "view": view, "quantity": quantity, "metric": score.metric}
+            facts["protocol"] = score.protocol
+            if score.value is None:
+                self.missing.append({**facts, "reason": score.reason})
+                continue
+            for name, value in facts.items():
+                self.columns[name].append(value)
+            self.columns["value"].append(score.value)
+
+    def table(self, scene: str, variants: set[str] | None = None) -> dict[str, Any]:
+        """Columns scene, view, quantity, metric, protocol, variant (unless some are chosen), value."""
+        chosen = [i for i, v in enumerate(self.columns["variant"]) if variants is None or v in variants]
+        names = ["view", "quantity", "metric", "protocol"] + ([] if variants else ["variant"])
+        out: dict[str, Any] = {"scene": np.array([scene] * len(chosen), object)}
+        out |= {name: np.array([self.columns[name][i] for i in chosen], object) for name in names}
+        out["value"] = np.array([self.columns["value"][i] for i in chosen], np.float64)
+        return out
+
+    def means(self) -> dict[str, Any]:
+        """variant -> quantity -> protocol -> metric -> {mean over views, number of views}."""
+        sums: dict[tuple[str, ...], list[float]] = defaultdict(list)
+        for i, value in enumerate(self.columns["value"]):
+            sums[tuple(self.columns[c][i] for c in ("variant", "quantity", "protocol", "metric"))].append(value)
+        means: dict[str, Any] = {}
+        for (variant, quantity, protocol, metric), values in sorted(sums.items()):
+            entry = {"mean": round(float(np.mean(values)), 6), "views": len(values)}
+            means.setdefault(variant, {}).setdefault(quantity, {}).setdefault(protocol, {})[metric] = entry
+        return means
+
+
+@dataclass(frozen=True)
+class MaterialTruth:
+    """What the material maps of a view are compared with."""
+
+    truth: Truth
+    targets: dict[str, metrics.Target]  # by quantity
+    masks: dict[str, np.ndarray]  # quantity, or emission -> (H, W) bool
+    object_id: np.ndarray  # (H, W) int32
+
+    def scores(
+        self,
+        maps: dict[str, np.ndarray],
+        quantity: str,
+        only: Iterable[str] | None = None,
+        perceptual: Container[str] = metrics.PROTOCOLS,
+    ) -> list[metrics.Score]:
+        """Every score of one quantity (or the `only` ones) under every protocol; FLIP and LPIPS under `perceptual`."""
+        return self.targets[quantity].scores(maps[quantity], only, perceptual)
+
+
+def material_truth(
+    capture: CaptureReader,
+    segmentation: StageReader,
+    view: View,
+    networks: Mapping[str, Mapping[str, Weights]] | None = None,
+) -> MaterialTruth:
+    """Targets, masks and objects of a view of a capture that has truth; `networks`: quantity -> what LPIPS is scored with."""
+    truth = capture.truth(view)
+    _, face_id = capture.gbuffer(view)
+    masks = metrics.material_masks(truth.valid, face_id >= 0, truth.emission, truth.roughness)
+    object_id = ids_from_disk(segmentation.exr(f"maps/{view.name}.exr")["object.id"])
+    maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
+    targets = {
+        quantity: metrics.Target(quantity, image, masks[quantity], object_id, networks=(networks or {}).get(quantity))
+        for quantity, image in maps.items()
+    }
+    return MaterialTruth(truth, targets, masks, object_id)
+
+
+def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
+    """Numbers k of the predictions in the channels of one view."""
+    return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
+
+
+def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
+    """albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
+    return {
+        "albedo": rgb(channels, f"{prefix}albedo"),
+        "roughness": channels[f"{prefix}roughness"].astype(np.float32),
+        "metallic": channels[f"{prefix}metallic"].astype(np.float32),
+    }
+
+
+def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:
+    """Weights of LPIPS for a stage that scores its views in threads of its own: torch gets one thread in each."""
+    import torch
+
+    torch.set_num_threads(1)  # a convolution's last bits depend on how many threads share it
+    weights = lpips_weights(with_vgg)
+    return {name: {part: np.asarray(array, np.float32) for part, array in parts.items()} for name, parts in weights.items()}
+
+
+_CHANNELS_OF = {"albedo": CHANNELS[:3], "roughness": CHANNELS[3:4], "metallic": CHANNELS[4:]}
+
+
+def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageReader) -> dict[str, np.ndarray]:
+    """Mean truth of every cell: quantity -> (cells, channels) float64, NaN where no pixel of the cell counts."""
+    n = len(base.table("cells.parquet")["cell_id"])
+    sums = {quantity: np.zeros((n, 1 + len(names))) for quantity, names in _CHANNELS_OF.items()}
+    for view in capture.views:
+        file = f"maps/{view.name}.exr"
+        if not base.has(file):
+            continue
+        cell = ids_from_disk(base.exr(file)["cell.id"])
+        truth = material_truth(capture, segmentation, view)
+        for quantity, summed in sums.items():
+            mask = truth.masks[quantity] & (cell >= 0)
+            target = truth.targets[quantity].truth[mask].reshape(np.count_nonzero(mask), -1)
+            summed[:, 0] += np.bincount(cell[mask], minlength=n)
+            for c in range(target.shape[1]):
+                summed[:, 1 + c] += np.bincount(cell[mask], target[:, c], n)
+    return {q: np.where(s[:, :1] > 0, s[:, 1:] / np.maximum(s[:, :1], 1), np.nan) for q, s in sums.items()}
+
+
+def interval_scores(
+    cells: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], predictions: int
+) -> Iterator[tuple[str, list[metrics.Score]]]:
+    """Share of the surface cells whose error lies within the interval that the base claims, at 50, 80 and 95 %.
+
+    The columns `uncertainty_*` are standard deviations of the error that is left when each object's truth is mapped to the base
+    by its nearest affine, over all views together (iif_core.fusion.uncertainty): protocol `oracle_affine`. `raw` is the same
+    without the affine, which no such scale can know. Objects of few cells are left out (their affine follows the errors).
+
+    `psnr_3d` is over cells, with one affine per object for all views together: unlike the score of each
+    view it sees levels that differ from view to view.
+
+    Args:
+        cells: table base/cells.parquet; truth: of `cell_truth`; predictions: K.
+    """
+    for quantity, names in _CHANNELS_OF.items():
+        labels = [f"coverage_{round(100 * level)}" for level in LEVELS]
+        known = np.isfinite(truth[quantity]).all(1) & (cells["coverage"] > 0)
+        of_object = np.bincount(cells["object_id"][known], minlength=int(cells["object_id"].max(initial=0)) + 1)
+        known &= of_object[cells["object_id"]] >= SMALLEST
+        if not known.any():
+            yield quantity, [metrics.Score(name, "raw", None, "no cell counts") for name in labels]
+            continue
+        target = truth[quantity][known]
+        value, claimed = (
+            np.stack([cells[f"{prefix}{name}"][known] for name in names], 1).astype(np.float64) for prefix in ("", "uncertainty_")
+        )
+        errors = {"raw": value - target, "oracle_affine": gauge_free_error(value, target, cells["object_id"][known])}
+        fitted = gauge_free_error(target, value, cells["object_id"][known])
+        whole = metrics.Score("psnr_3d", "oracle_affine", float(-10 * np.log10(max(np.mean(fitted**2), 1e-10))))
+        yield (
+            quantity,
+            [
+                whole,
+                *(
+                    metrics.Score(name, protocol, share)
+                    for protocol, error in errors.items()
+                    for name, share in zip(
+                        labels, coverage(error, claimed, float(CALIBRATION[quantity].beta(predictions))), strict=True
+                    )
+                ),
+            ],
+        )

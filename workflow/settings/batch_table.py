@@ -1,0 +1,250 @@
+"""config/batch.tsv: one scene a line, run together by `snakemake scenes` (docs/batch.md).
+
+A mistake about which scenes there are (encoding, header, cells, names) stops before any job, all of them in one message. A
+mistake in what one scene is (its base, settings, data) refuses that scene alone, with the reason. Imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from iif_core.errors import InputError
+from workflow.settings.names import RESERVED, SCENE_NAME, scene_names
+from workflow.settings.yaml_file import read_yaml
+
+TABLE = Path("config/batch.tsv")
+COLUMNS = ("name", "source", "path", "base", "overrides")
+_NAME = re.compile(SCENE_NAME)
+_KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
+_SHOWN = 20  # problems in one message
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the table, its cells stripped; `number` counts from 1 with the header and comments."""
+
+    number: int
+    name: str
+    source: str = ""
+    path: str = ""
+    base: str = ""
+    overrides: str = ""
+
+    def at(self, column: str = "") -> str:
+        """Where in the table: `config/batch.tsv, line 7, column overrides`."""
+        return f"{TABLE}, line {self.number}" + (f", column {column}" if column else "")
+
+    @property
+    def is_plain(self) -> bool:
+        """Only a name: config/scenes/<name>.yaml as it is."""
+        return not (self.source or self.path or self.base or self.overrides)
+
+
+# ---------------------------------------------------------------------------------------------------------------- table
+
+
+def read_table(root: Path = Path(".")) -> tuple[Line, ...]:
+    """The lines of the table; without a table every scene that has a file (`number` 0).
+
+    Raises:
+        InputError: every mistake about which scenes there are, with line and column.
+    """
+    path = root / TABLE
+    if not path.is_file():
+        return tuple(Line(0, name) for name in scene_names(root))
+    status = path.stat()
+    return _read_table(path, (status.st_size, status.st_mtime_ns))
+
+
+@lru_cache(8)
+def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
+    problems: list[str] = []
+    header: list[str] = []
+    lines: dict[str, Line] = {}
+    for number, text in enumerate(_text_of(path).split("\n"), 1):
+        if not text.strip() or text.lstrip().startswith("#"):
+            continue
+        cells = [cell.strip() for cell in text.split("\t")]
+        if not header:
+            _check_header(cells, number, text)
+            header = cells
+            continue
+        problem = _problem_of_cells(cells, header, text)
+        line = Line(number, **dict(zip(header, cells, strict=False)))
+        problem = problem or _problem_of_name(line, lines) or _problem_of_file(line, path.parent / "scenes")
+        if problem:
+            problems.append(f"{TABLE}, line {number}{problem}")
+        else:
+            lines[line.name] = line
+    if not problems and not lines:
+        problems = [f"{TABLE}: no scene in it; write the header line {' <tab> '.join(COLUMNS)} and below it a line a scene"]
+    if problems:
+        more = f"\n... and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        raise InputError("\n".join(problems[:_SHOWN]) + more)
+    return tuple(lines.values())
+
+
+def _text_of(path: Path) -> str:
+    """UTF-8 with or without byte order mark, any of the usual ends of line."""
+    data = path.read_bytes()
+    if b"\0" in data:
+        raise InputError(f"{TABLE}: holds zero bytes (UTF-16, or no text at all); save it as UTF-8, columns separated by tabs")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        number = data[: error.start].count(b"\n") + 1
+        raise InputError(f"{TABLE}, line {number}: not UTF-8 text (byte {error.start}); save it as UTF-8") from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _check_header(cells: list[str], number: int, text: str) -> None:
+    where = f"{TABLE}, line {number}"
+    if len(cells) == 1 and len(text.split()) > 1:
+        raise InputError(f"{where}: the header has one column, {text.strip()!r}; columns are separated by tabs, not by spaces")
+    for i, cell in enumerate(cells):
+        if cell not in COLUMNS:
+            near = difflib.get_close_matches(cell, COLUMNS, 1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            raise InputError(f"{where}: column {i + 1} is called {cell!r}.{hint} Allowed: {', '.join(COLUMNS)}")
+        if cell in cells[:i]:
+            raise InputError(f"{where}: column {cell} stands twice; remove one")
+    if "name" not in cells:
+        raise InputError(f"{where}: no column name; allowed: {', '.join(COLUMNS)}")
+
+
+def _problem_of_cells(cells: list[str], header: list[str], text: str) -> str:
+    if len(cells) > len(header):
+        return (
+            f", column {len(header) + 1}: found {len(cells)} cells, the header has {len(header)} columns"
+            f" ({', '.join(header)}); remove {cells[len(header)]!r} or a tab before it"
+        )
+    if "\t" not in text and len(text.split()) > 1:
+        return f", column name: found {text.strip()!r}; cells are separated by tabs, this line has spaces"
+    return ""
+
+
+def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
+    where, name = ", column name: ", line.name
+    if not name:
+        return where + "empty; every scene needs a name"
+    if not _NAME.fullmatch(name) or "--" in name:
+        return where + f"found {name!r}; allowed are letters, digits, _ and single -, the first no sign"
+    if name in RESERVED:
+        return where + f"found {name!r}, which results/ uses otherwise; choose another name"
+    if name in earlier:
+        return where + f"{name!r} stands in line {earlier[name].number} already; names must differ"
+    return ""
+
+
+def _problem_of_file(line: Line, folder: Path) -> str:
+    if line.is_plain or not (folder / f"{line.name}.yaml").is_file():
+        return ""
+    return (
+        f", column name: config/scenes/{line.name}.yaml is there already; leave the other cells empty to run it as it is,"
+        f" or take another name and write {line.name} into column base"
+    )
+
+
+# -------------------------------------------------------------------------------------------------------- one scene
+
+
+def find(name: str, root: Path = Path(".")) -> Line | None:
+    """The line that makes a scene; None for a scene with a file of its own, a study's, and one that is not listed."""
+    if "--" in name or (root / "config/scenes" / f"{name}.yaml").is_file() or not (root / TABLE).is_file():
+        return None
+    return next((line for line in read_table(root) if line.name == name and not line.is_plain), None)
+
+
+def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
+    """(where it stands, settings) of a line, lowest first: its base, its columns, its overrides.
+
+    Raises:
+        InputError: no such base, or overrides that cannot be read.
+    """
+    out: list[tuple[str, dict[str, Any]]] = []
+    if line.base:
+        out.append(_base(line, root))
+    if line.source:
+        out.append((line.at("source"), {"source": {"kind": line.source}}))
+    if line.path:
+        out.append((line.at("path"), {"source": {"path": line.path}}))
+    if line.overrides:
+        out.append((line.at("overrides"), parse_overrides(line.overrides, line.at("overrides"))))
+    return out
+
+
+def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str], str]:
+    """Tells where the value of a dotted key comes from: the layer that names most of it, the upper one of two."""
+
+    def where(dotted: str) -> str:
+        best, found = line.at(), 0
+        for name, layer in among:
+            depth, node = 0, layer
+            for part in dotted.split("."):
+                if not isinstance(node, dict) or part not in node:
+                    break
+                depth, node = depth + 1, node[part]
+            if depth and depth >= found:
+                best, found = name, depth
+        missing = dotted == "source.path" and found < 2
+        return line.at("path") if missing else best
+
+    return where
+
+
+def _base(line: Line, root: Path) -> tuple[str, dict[str, Any]]:
+    name = Path(line.base).stem if line.base.startswith("config/scenes/") else line.base
+    path = root / "config/scenes" / f"{name}.yaml"
+    if not path.is_file():
+        names = scene_names(root)
+        near = difflib.get_close_matches(name, names, 1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise InputError(f"{line.at('base')}: config/scenes/{name}.yaml not found.{hint} Known: {', '.join(names) or 'none'}.")
+    return f"config/scenes/{name}.yaml (base of {line.at()})", _read_base(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(8)
+def _read_base(path: Path, _stamp: int) -> dict[str, Any]:
+    return read_yaml(path)  # hundreds of lines share one base
+
+
+def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
+    """`capture.views=24;prior.samples=8` as a tree; values are YAML, a `;` always ends one.
+
+    Raises:
+        InputError: begins with `where`; says which entry.
+    """
+    out: dict[str, Any] = {}
+    seen: list[str] = []
+    for entry in filter(None, (part.strip() for part in text.split(";"))):
+        key, sign, value = (part.strip() for part in entry.partition("="))
+        if not sign or not value or not _KEY.fullmatch(key):
+            raise InputError(
+                f"{where}: found {entry!r}, needed key=value with a dotted key, such as capture.views=24;prior.samples=8"
+            )
+        if key in ("source.kind", "source.path"):
+            raise InputError(f"{where}: {key!r} has a column of its own, {'source' if key.endswith('kind') else 'path'}")
+        for other in seen:
+            if key == other:
+                raise InputError(f"{where}: {key!r} stands twice")
+            if key.startswith(other + ".") or other.startswith(key + "."):
+                raise InputError(f"{where}: {other!r} and {key!r} set the same thing; keep one")
+        seen.append(key)
+        try:
+            parsed = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise InputError(f"{where}: {key!r}: {value!r} is not a YAML value ({getattr(error, 'problem', error)})") from None
+        *parents, leaf = key.split(".")
+        node = out
+        for part in parents:
+            node = node.setdefault(part, {})
+        node[leaf] = parsed
+    return out

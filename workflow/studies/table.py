@@ -1,0 +1,408 @@
+"""What a study needs, and its table: results/studies/<study>.parquet, .md and .png from the scores and times of its jobs.
+
+The Snakefile imports this module, so what is heavy is imported inside.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from iif_core.errors import InputError
+from workflow.artifacts.files import write_atomically
+from workflow.runtime import fingerprint as fp
+from workflow.runtime.timings import read_parts, read_timings
+from workflow.settings import study_files
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RESULTS = Path("results/studies")
+HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "l2": False, "flip": False, "lpips": False, "lpips_vgg": False}
+HIGHER_IS_BETTER |= {"log_l2": False, "iou": True}
+NAMES = {
+    "psnr": "PSNR",
+    "ssim": "SSIM",
+    "l2": "L2",
+    "flip": "FLIP",
+    "lpips": "LPIPS (AlexNet)",
+    "lpips_vgg": "LPIPS (VGG)",
+    "log_l2": "L2 of log(1 + E)",
+    "iou": "IoU",
+}
+HIGHER_IS_BETTER |= {"psnr_3d": True, "view_spread": False}
+NAMES["psnr_3d"] = "PSNR over cells, one affine an object"
+NAMES |= {
+    "shading_left": "shading left (correlation with light inside objects)",
+    "shading_slope": "shading left (slope over light inside objects)",
+    "view_spread": "spread of log albedo over views",
+}
+NAMES |= {f"coverage_{n}": f"share within the claimed {n} % interval" for n in (50, 80, 95)}
+PROTOCOLS = {"raw": "raw", "scaled": "scaled", "oracle_affine": "oracle"}
+EXPLAINED = {
+    "raw": "as it is",
+    "scaled": "after one gain per image and channel, which 8-bit photographs leave open",
+    "oracle_affine": "each object mapped by its best affine to the truth first, an upper bound and not a result",
+}
+COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb")
+KEY = ["scene", "quantity", "metric", "protocol"]
+
+
+class Cell(NamedTuple):
+    """One variant of one scene with one seed; `name` is its derived scene."""
+
+    scene: str
+    variant: str
+    seed: int
+    name: str
+
+
+class Plan(NamedTuple):
+    """What a study runs, and the scenes that it has to leave out with the reason."""
+
+    study: study_files.Study
+    cells: tuple[Cell, ...]
+    skipped: dict[str, str]
+
+
+@lru_cache(None)
+def plan(name: str, quality: str) -> Plan:
+    """Check every setting of every variant, then leave out the scenes whose data are not there.
+
+    Raises:
+        InputError: a mistake in the study's file or in settings that it leads to.
+    """
+    study = study_files.load_study(name)
+    cells, skipped = [], {}
+    for scene in study.scenes:
+        of_scene = [
+            Cell(scene, variant, seed, study_files.scene_of(name, scene, variant, seed))
+            for variant in study.variants
+            for seed in study.seeds
+        ]
+        for cell in of_scene:
+            fp.resolved(cell.name, quality)
+        try:
+            fp.fingerprint("prior", f"{scene}--s{study.seeds[0]}", quality)
+        except InputError as error:
+            skipped[scene] = str(error)
+            continue
+        cells.extend(of_scene)
+    return Plan(study, tuple(cells), skipped)
+
+
+def home(cell: Cell, quality: str, stage: str = "base_scores") -> Path:
+    """Folder of a stage's result."""
+    return Path("results") / fp.home(stage, cell.name, quality) / stage
+
+
+def left_out(name: str, quality: str) -> list[str]:
+    """What the table will lack, and why."""
+    study, _, skipped = plan(name, quality)
+    notes = [f"without {scene}: {reason}" for scene, reason in skipped.items()]
+    if any(key.endswith("lpips_vgg") for key in study.show) and not Path("results/weights/lpips_vgg.npz").is_file():
+        notes.append(
+            "without LPIPS (VGG16): its weights are not here; `snakemake --cores 1 results/weights/lpips_vgg.npz` fetches them"
+        )
+    return notes
+
+
+def inputs(name: str, quality: str) -> list[str]:
+    """Manifests that the study collects; variants that agree with what studies share have one in common."""
+    study, cells, _ = plan(name, quality)
+    return sorted({str(home(cell, quality, study.scores) / "manifest.json") for cell in cells})
+
+
+def fingerprint(name: str, quality: str) -> str:
+    """Changes when the study's file, its code, its scores or the scenes that can be run do."""
+    study, cells, skipped = plan(name, quality)
+    facts = {
+        "study": study.model_dump(mode="json"),
+        "skipped": skipped,
+        "scores": [fp.fingerprint(study.scores, cell.name, quality) for cell in cells],
+        "code": fp.modules_digest(fp.import_closure("workflow.studies.table")),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def write_study(name: str, quality: str) -> None:
+    """Write the table, the page and the picture of a study whose jobs are done."""
+    from workflow.studies.plots import draw
+
+    study, cells, skipped = plan(name, quality)
+    frame = table(name, quality)
+    write_atomically(RESULTS / f"{name}.parquet", partial(_write_table, frame))
+    text = page(study, frame, skipped)
+    write_atomically(RESULTS / f"{name}.md", lambda temporary: temporary.write_text(text))
+    histories = {cell: _history(cell, quality) for cell in cells} if study.plot.kind == "history" else {}
+    write_atomically(RESULTS / f"{name}.png", lambda temporary: draw(study, frame, histories, temporary))
+    logging.getLogger("study").info("\n%s", text)
+
+
+# ---------------------------------------------------------------------------------------------------------------- table
+
+
+def table(name: str, quality: str) -> pd.DataFrame:
+    """One row a scene, variant, seed, quantity, metric and protocol (docs/studies.md), and one a scene that was left out."""
+    import pandas as pd
+
+    study, cells, skipped = plan(name, quality)
+    rows: list[dict[str, Any]] = []
+    for cell in cells:
+        variant = study.variants[cell.variant]
+        facts = {
+            "study": name,
+            "scene": cell.scene,
+            "variant": cell.variant,
+            "label": variant.label or cell.variant,
+            "settings": json.dumps(variant.overrides, sort_keys=True),
+            "seed": cell.seed,
+            **(_costs(cell, quality, study.costs) if not variant.row else {}),
+            "status": "ok",
+        }
+        paper = study.paper.get(cell.variant)
+        for (quantity, metric, protocol), (value, views) in _scores(cell, quality, study.scores, variant.row or "result").items():
+            agrees = paper is not None and protocol == _protocol_of(paper, quantity)
+            printed = paper.values.get(f"{quantity}/{metric}") if paper and agrees else None
+            scored = {"quantity": quantity, "metric": metric, "protocol": protocol, "value": value, "views": views}
+            rows.append({**facts, **scored, "paper": printed})
+    rows += [{"study": name, "scene": scene, "status": "skipped", "reason": reason} for scene, reason in skipped.items()]
+    frame = pd.DataFrame(rows, columns=[name for name, _ in COLUMNS])
+    frame["pareto"] = _pareto(frame)
+    return frame
+
+
+COLUMNS = [
+    *((name, "string") for name in ("study", "scene", "variant", "label", "settings")),
+    ("seed", "int64"),
+    *((name, "string") for name in ("quantity", "metric", "protocol")),
+    ("value", "float64"),
+    ("views", "int64"),
+    ("paper", "float64"),
+    *((name, "float64") for name in COSTS),
+    ("threads", "int64"),
+    ("pareto", "bool"),
+    ("status", "string"),
+    ("reason", "string"),
+]
+
+
+def _write_table(frame: pd.DataFrame, path: Path) -> None:
+    import pandas as pd
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {}
+    for name, kind in COLUMNS:
+        values = [None if pd.isna(value) else value for value in frame[name].tolist()]
+        if kind == "int64":
+            values = [None if value is None else int(value) for value in values]
+        columns[name] = pa.array(values, getattr(pa, "bool_" if kind == "bool" else kind)())
+    pq.write_table(pa.table(columns), path, compression="zstd")
+
+
+def _protocol_of(paper: study_files.Paper, quantity: str) -> str:
+    """The protocol that a publication's numbers follow: `raw` for quantities that its own does not apply to."""
+    from iif_core.evaluation.metrics import PROTOCOLS_OF
+
+    return paper.protocol if paper.protocol in PROTOCOLS_OF[quantity] else "raw"
+
+
+def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, str, str], tuple[float, int]]:
+    """(quantity, metric, protocol) -> (mean over views, views)."""
+    import pandas as pd
+
+    from workflow.artifacts import StageReader
+
+    directory = home(cell, quality, stage)
+    reader = StageReader(directory, stage, directory.parent.name)
+    frame = pd.DataFrame(reader.table("scores.parquet" if stage == "base_scores" else "variants.parquet"))
+    if "variant" in frame:
+        if row not in set(frame["variant"]):
+            known = ", ".join(sorted(set(frame["variant"])))
+            raise InputError(f"{study_files.FOLDER}: `row: {row}` of {cell.name}: not in variants.parquet, which has {known}")
+        frame = frame[frame["variant"] == row]
+    means = frame.groupby(["quantity", "metric", "protocol"])["value"].agg(["mean", "count"])
+    return {key: (float(row["mean"]), int(row["count"])) for key, row in means.iterrows()}
+
+
+def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
+    """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`); what
+    one of them did not record is missing."""
+    jobs, solver = [], {}
+    for stage in stages:
+        scene = fp.home(stage, cell.name, quality)
+        parts = read_parts(scene, stage)
+        whole: dict[str, Any] = parts.get("job", {})
+        jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
+        solver = parts.get("solve", {})
+    out: dict[str, Any] = {}
+    for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("threads", max)):
+        known = [job[name] for job in jobs if job.get(name) is not None]
+        out[name] = together(known) if known and len(known) == len(jobs) else None
+    return out | {f"solver_{name}": solver.get(name) for name in ("seconds", "cpu_seconds")}
+
+
+def _history(cell: Cell, quality: str) -> list[dict[str, float]]:
+    from workflow.artifacts import StageReader
+
+    directory = home(cell, quality, "base")
+    return StageReader(directory, "base", directory.parent.name).json("base.json")["history"]
+
+
+def _pareto(frame: pd.DataFrame) -> pd.Series:
+    """Whether no other variant is as cheap and better, or as good and cheaper (CPU seconds, means over the seeds)."""
+    import pandas as pd
+
+    out = pd.Series([None] * len(frame), index=frame.index, dtype=object)
+    for key, group in frame[frame["value"].notna()].groupby(KEY):
+        better = HIGHER_IS_BETTER.get(key[2])
+        means = group.groupby("variant")[["value", "cpu_seconds"]].mean()
+        if better is None or means["cpu_seconds"].isna().any():
+            continue
+        front = pareto_front(means["cpu_seconds"].tolist(), means["value"].tolist(), better)
+        out[group.index] = group["variant"].map(dict(zip(means.index, front, strict=True)))
+    return out
+
+
+def pareto_front(costs: list[float], values: list[float], higher_is_better: bool) -> list[bool]:
+    """Which points no other point beats: none is at least as good in both and better in one. Equal points stand together."""
+    points = [(cost, -value if higher_is_better else value) for cost, value in zip(costs, values, strict=True)]
+    return [not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points) for p in points]
+
+
+# ----------------------------------------------------------------------------------------------------------------- page
+
+
+def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> str:
+    """The table as Markdown: a block a metric, ours raw and with the oracle beside what the paper prints; then the costs."""
+    lines = [f"# {study.title}", ""]
+    for scene, reason in skipped.items():
+        lines += [f"Left out: {scene}. {reason}", ""]
+    shown = frame[frame["status"] == "ok"]
+    scenes = [scene for scene in study.scenes if scene not in skipped]
+    if shown.empty:
+        return "\n".join([*lines, "Nothing was scored.", ""])
+    seeds = len(study.seeds)
+    note = f"Mean over views and {seeds} seed{'s' * (seeds > 1)} of the prior" + (" (± standard deviation)" if seeds > 1 else "")
+    if study.reference:
+        label = study.variants[study.reference].label or study.reference
+        lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
+    explained = "; ".join(f"*{PROTOCOLS[protocol]}*: {EXPLAINED[protocol]}" for protocol in study.protocols)
+    lines += [f"{note}. {explained}. The paper's numbers are of other scenes; in brackets the protocol that they follow.", ""]
+    front = study.plot.kind == "pareto"
+    if front:
+        lines += ["A star marks the Pareto front: no other variant is both better and cheaper in CPU seconds.", ""]
+    labels = {name: variant.label or name for name, variant in study.variants.items()}
+    for key in study.show:
+        quantity, metric = key.split("/")
+        chosen = shown[(shown["quantity"] == quantity) & (shown["metric"] == metric)]
+        columns = [(scene, protocol) for scene in scenes for protocol in study.protocols]
+        columns = [c for c in columns if ((chosen["scene"] == c[0]) & (chosen["protocol"] == c[1])).any()]
+        if len(scenes) > 1 and study.scores == "metrics":
+            columns += [("mean", protocol) for protocol in study.protocols if ("mean", protocol) not in columns and columns]
+            columns = [c for c in columns if (chosen["protocol"] == c[1]).any()]
+        if not columns:
+            lines += [f"## {quantity} {NAMES.get(metric, metric)}", "", f"Not scored{_why(metric)}.", ""]
+            continue
+        printed = any(key in paper.values for paper in study.paper.values())
+        head = [f"{scene} {PROTOCOLS[protocol]}" for scene, protocol in columns] + ["paper"] * printed
+        body = []
+        for name, label in labels.items():
+            row = [label]
+            for scene, protocol in columns:
+                cell = chosen[(chosen["protocol"] == protocol) & (chosen["variant"] == name)]
+                if scene == "mean":  # of the scenes' means, so that each counts once
+                    row.append(_mean_cell(metric, cell.groupby("scene")["value"].mean().tolist()))
+                    continue
+                cell = cell[cell["scene"] == scene]
+                if study.reference and name != study.reference and len(cell):
+                    row.append(_moved(metric, cell, chosen, study.reference))
+                    continue
+                star = " *" if front and len(cell) and cell["pareto"].iloc[0] is True else ""
+                row.append(_number(metric, cell["value"].tolist()) + star)
+            paper = study.paper.get(name)
+            if printed:
+                known = paper is not None and key in paper.values
+                protocol = PROTOCOLS[_protocol_of(paper, quantity)] if paper else ""
+                row.append(f"{_shown(metric, paper.values[key])} ({protocol})" if paper and known else "")
+            body.append(row)
+        lines += [f"## {quantity} {NAMES.get(metric, metric)}{_direction(metric)}", "", *_markdown(["variant", *head], body), ""]
+    what = "the base texture" if study.costs == ["base"] else ", ".join(study.costs)
+    lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
+    return "\n".join(lines)
+
+
+def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str]) -> list[str]:
+    body = []
+    for scene in scenes:
+        for name, label in labels.items():
+            runs = shown[(shown["scene"] == scene) & (shown["variant"] == name)].groupby("seed")[list(COSTS)].first()
+            digits = [0 if cost == "max_rss_mb" else 1 for cost in COSTS]
+            cells = [_mean(runs[cost].dropna().tolist(), n) for cost, n in zip(COSTS, digits, strict=True)]
+            body.append([scene, label, *cells])
+    return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB"], body, words=2)
+
+
+def _why(metric: str) -> str:
+    fetch = "snakemake --cores 1 results/weights/lpips_vgg.npz"
+    return f": the weights of VGG16 are not there ({fetch} fetches them)" if metric == "lpips_vgg" else ""
+
+
+def _direction(metric: str) -> str:
+    unit = " in dB" if metric == "psnr" else ""
+    better = HIGHER_IS_BETTER.get(metric)
+    return unit if better is None else f"{unit} ({'higher' if better else 'lower'} is better)"
+
+
+def _shown(metric: str, value: float) -> str:
+    return f"{value:.2f}" if metric == "psnr" else f"{value:.3g}" if metric in ("l2", "log_l2") else f"{value:.3f}"
+
+
+def _moved(metric: str, cell: pd.DataFrame, chosen: pd.DataFrame, reference: str) -> str:
+    """Mean over the seeds, and in brackets how far it is from the reference's, seed by seed (± standard deviation)."""
+    import numpy as np
+
+    keys = ["scene", "protocol", "seed"]
+    both = cell.merge(chosen[chosen["variant"] == reference], on=keys, suffixes=("", "_reference"))
+    moved = (both["value"] - both["value_reference"]).to_numpy(np.float64)
+    text = _shown(metric, float(cell["value"].mean()))
+    if not len(moved):
+        return text
+    spread = f" ± {float(np.std(moved, ddof=1)):.1g}" if len(moved) > 1 else ""
+    return f"{text} ({float(moved.mean()):+.2g}{spread})"
+
+
+def _mean_cell(metric: str, values: list[float]) -> str:
+    return _shown(metric, sum(values) / len(values)) if values else ""
+
+
+def _number(metric: str, values: list[float]) -> str:
+    import numpy as np
+
+    if not values:
+        return ""
+    mean = _shown(metric, float(np.mean(values)))
+    return mean if len(values) == 1 else f"{mean} ± {float(np.std(values, ddof=1)):.1g}"
+
+
+def _mean(values: list[float], digits: int) -> str:
+    return f"{sum(values) / len(values):.{digits}f}" if values else ""
+
+
+def _markdown(head: list[str], body: list[list[str]], words: int = 1) -> list[str]:
+    """Aligned, so that it reads in a terminal too; the first `words` columns to the left, numbers to the right."""
+    widths = [max(len(row[i]) for row in [head, *body]) for i in range(len(head))]
+
+    def line(row: list[str]) -> str:
+        cells = [
+            text.ljust(width) if i < words else text.rjust(width) for i, (text, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        return f"| {' | '.join(cells)} |"
+
+    rule = "|" + "|".join("-" * (width + 2) if i < words else "-" * (width + 1) + ":" for i, width in enumerate(widths)) + "|"
+    return [line(head), rule, *map(line, body)]
