@@ -29,7 +29,7 @@ class Votes:
     """What photographs say about faces; n rows, one a (view, face, voxel of a cluster).
 
     face: (n,) int64; key: (n,) uint64 voxel and cluster (`iif_core.surface.cells.pack_keys`); pixels: (n,) int64;
-    share: (n,) float64 of the view's pixels on that face. outside: (F,) float64 shares of pixels in no mask, summed over the views.
+    share: (n,) float64 of the view's pixels on that face. outside: (F,) float64 shares of pixels in no mask, over all views.
     """
 
     face: Array

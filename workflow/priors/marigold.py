@@ -86,7 +86,7 @@ def describe(settings: SimpleNamespace) -> dict[str, Any]:
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
     """K samples of a view, (K, H, W, 5) float32 in [0, 1]; NaN where the model's numbers overflowed."""
     from workflow.priors.diffusion import predicted
-    from workflow.priors.photograph import seen
+    from workflow.scene.photograph import seen
 
     prior = settings.prior
     index = check(vars(prior), RECIPE).index

@@ -14,8 +14,8 @@ import numpy as np
 from iif_core.light.irradiance import LightField, SurfaceCellsBuilder, Trace, with_light
 from iif_core.priors.retinex import albedo_level, retinex_predictions
 from iif_core.surface.mesh import face_geometry
-from workflow.priors.photograph import GAMMA
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
 

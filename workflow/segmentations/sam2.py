@@ -30,9 +30,9 @@ from workflow.models.checkpoint import (
     require_packages,
     weights_in,
 )
-from workflow.priors.photograph import seen
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.photograph import seen
 
 ORIGIN = Origin(
     repository="facebook/sam2.1-hiera-large",
