@@ -8,7 +8,7 @@ SNAKEMAKE := .venv/bin/snakemake
 # QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
 CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 
-.PHONY: help setup scenes verify test doctor lint format lock clean always
+.PHONY: help setup scenes verify test test-all doctor lint format lock docs clean always
 
 help:
 	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
@@ -20,6 +20,7 @@ help:
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
 	@echo 'make lock             resolve envs/requirements.in again (needs uv)'
+	@echo 'make docs             the documentation as a site, in site/'
 	@echo 'make clean            remove caches; results/ and scenes/ stay'
 
 setup:
@@ -43,6 +44,7 @@ doctor:
 
 lint: setup
 	$(PYTHON_BIN) -m ruff check .
+	.venv/bin/lint-imports
 	$(PYTHON_BIN) -m snakefmt --check Snakefile workflow/rules
 
 format: setup
@@ -58,6 +60,15 @@ lock:
 	cd envs && uv pip compile --generate-hashes --python-version 3.11 --python-platform x86_64-manylinux_2_36 \
 	  $(addprefix --no-emit-package ,$(OUTSIDE_LOCK)) requirements.in -o requirements.lock
 
+# The site has an environment of its own: none of its packages is needed to run the workflow.
+docs: .venv-docs/.made
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict
+
+.venv-docs/.made: envs/docs.txt
+	$${PYTHON:-python3} -m venv .venv-docs
+	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r envs/docs.txt
+	touch $@
+
 clean:
-	rm -rf .pytest_cache .ruff_cache .hypothesis .benchmarks
+	rm -rf .pytest_cache .ruff_cache .hypothesis .benchmarks .import_linter_cache site
 	find . -name .venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
