@@ -8,14 +8,15 @@ SNAKEMAKE := .venv/bin/snakemake
 # QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
 CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 
-.PHONY: help setup scenes verify test test-all doctor lint format lock docs clean always
+.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always
 
 help:
 	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make verify           re-hash every artefact against its manifest'
-	@echo 'make test             the whole test suite (PYTEST_ARGS="-k laplace" for a part)'
+	@echo 'make test             the quick proofs, 12 minutes (PYTEST_ARGS="-k laplace" for a part)'
+	@echo 'make test-all         every test, also those on large scenes'
 	@echo 'make doctor           what this machine offers and lacks'
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
@@ -35,8 +36,19 @@ scenes verify: setup
 
 always:
 
-test: setup
-	$(PYTHON_BIN) -m pytest $(PYTEST_ARGS)
+# The quick proofs, at most 12 minutes on two cores; test-all adds large scenes and long studies (docs/development/testing.md).
+test: setup validator
+	$(PYTHON_BIN) -m pytest -n 2 --dist loadfile -m "not long" $(PYTEST_ARGS)
+
+test-all: setup validator
+	$(PYTHON_BIN) -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
+
+# Khronos' validator of glTF, for the tests of scene.glb; machines without npm test the file's structure alone.
+GLTF_VALIDATOR := .node/node_modules/gltf-validator
+validator:
+	@if [ ! -d $(GLTF_VALIDATOR) ] && command -v npm >/dev/null; then \
+	  npm install --no-save --no-audit --no-fund --silent --prefix .node gltf-validator@2.0.0-dev.3.10 \
+	    || echo 'validator: npm could not install gltf-validator; its test will be skipped' >&2; fi
 
 # Needs nothing installed: it tells what is missing.
 doctor:

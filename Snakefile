@@ -2,46 +2,47 @@
 #   snakemake --cores 2 scenes/kitchen
 #   snakemake --cores 2 scenes/kitchen --config quality=standard
 #   snakemake --cores 2 scenes                                     every scene of config/batch.tsv
-# What depends on what is in workflow/rules/, what is computed in iif_core/. docs/architecture.md is the map.
+# The rules are in workflow/rules/, the computations in iif_core/; docs/development/architecture.md is the map.
 from snakemake.utils import min_version
 
-min_version("9.0")
+min_version("9.27")
 
 
 configfile: f"{workflow.basedir}/config/config.yaml"
 
 
+report: "workflow/report/captions/workflow.rst"
+
+
+# Read with `--sdm apptainer` alone: the image of envs/Dockerfile, converted by
+# `apptainer build envs/iif.sif docker-daemon://iif:latest`.
+container: f"{workflow.basedir}/envs/iif.sif"
+
+
 include: "workflow/rules/common.smk"
-include: "workflow/rules/capture.smk"
-include: "workflow/rules/prior.smk"
-include: "workflow/rules/segmentation.smk"
-include: "workflow/rules/base.smk"
-include: "workflow/rules/emission.smk"
-include: "workflow/rules/shading.smk"
-include: "workflow/rules/affines.smk"
+include: "workflow/rules/stages.smk"
 include: "workflow/rules/deliver.smk"
-include: "workflow/rules/relight.smk"
 include: "workflow/rules/studies.smk"
 include: "workflow/rules/batch.smk"
 
 
-localrules:
-    scenes,
-    verify,
-
-
 rule scenes:
+    """Every scene of config/batch.tsv, and the summary in results/batch/."""
     default_target: True
     input:
         batch_targets,
 
 
 rule verify:
+    """Hash every artefact again and name what differs from its manifest."""
     log:
         "results/verify.log",
-    params:
-        python=sys.executable,
+    localrule: True
     message:
-        "re-hashing every artefact"
+        "hashing every artefact again"
     shell:
-        "{params.python:q} -m workflow verify 2>&1 | tee {log:q}"
+        "python3 -m workflow verify 2>&1 | tee {log:q}"
+
+
+onerror:
+    tell_reasons()

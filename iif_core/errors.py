@@ -1,5 +1,5 @@
-"""Errors that a user can act on."""
+"""Exceptions."""
 
 
 class InputError(ValueError):
-    """The input cannot be used: the message says what was found, what is allowed and what to do next."""
+    """The input cannot be used. The message says what was found, what is allowed and what to do next."""

@@ -1,7 +1,7 @@
-"""`python -m workflow <stage> <scene>`: what the rules call, and what a person calls in a debugger.
+"""`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
-Also `python -m workflow verify [scene ...]`, `python -m workflow study <study>` and `python -m workflow batch` (collect what
-their jobs left, at any time) and `python -m workflow lpips_vgg` (fetches weights).
+`python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
+workflow batch` collect what jobs have left so far, and `python -m workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -11,9 +11,13 @@ import logging
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from iif_core.errors import InputError
 from workflow.registry import STAGES
+
+if TYPE_CHECKING:
+    from workflow.runtime.job_state import JobState
 
 
 def _arguments() -> argparse.Namespace:
@@ -53,37 +57,43 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
-def _guarded(what: str, run: Callable[[], None], failed: Callable[[str], None] = lambda reason: None) -> int:
+def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) -> int:
+    """Call `run`; log an error, record it in `state`, and return the exit code."""
+    if state:
+        state.started()
     try:
         run()
     except InputError as error:
         logging.getLogger("error").error("%s", error)
-        failed(str(error))
-        return 1
+        reason = str(error)
     except Exception as error:
         logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
-        failed(f"{type(error).__name__}: {error} (a bug: please report it with the log)")
-        return 1
-    return 0
+        reason = f"{type(error).__name__}: {error} (a bug: please report it with the log)"
+    else:
+        if state:
+            state.done()
+        return 0
+    if state:
+        state.failed(reason)
+    return 1
 
 
 def _run_stage(arguments: argparse.Namespace) -> int:
     from workflow.runtime.job import run_stage
-    from workflow.runtime.job_state import Outcome
+    from workflow.runtime.job_state import JobState
+    from workflow.settings import scene_origin
 
-    note = Path("results") / arguments.scene / "benchmarks" / f"{arguments.command}.threads"
+    stage, scene = arguments.command, arguments.scene
+    if _guarded(f"{stage} of {scene}", lambda: scene_origin(scene)):
+        return 1  # no folder is made for a scene that does not exist
+    note = Path("results") / scene / "benchmarks" / f"{stage}.threads"
     note.parent.mkdir(parents=True, exist_ok=True)
     note.write_text(f"{arguments.threads}\n")
-    outcome = Outcome(arguments.scene, arguments.command, arguments.fingerprint)
-    outcome.started()
-    code = _guarded(
-        f"{arguments.command} of {arguments.scene}",
-        lambda: run_stage(arguments.command, arguments.scene, arguments.quality, arguments.threads, arguments.fingerprint),
-        outcome.failed,
+    return _guarded(
+        f"{stage} of {scene}",
+        lambda: run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint),
+        JobState(scene, stage, arguments.fingerprint),
     )
-    if code == 0:
-        outcome.done()
-    return code
 
 
 def _batch(arguments: argparse.Namespace) -> int:
@@ -95,7 +105,7 @@ def _batch(arguments: argparse.Namespace) -> int:
 
 
 def main() -> int:
-    """Exit code 0, or 1 with one line on stderr."""
+    """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
     if arguments.command == "verify":
         return _verify(arguments.scenes)
@@ -108,16 +118,18 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return 1
     from workflow.runtime.job import configure_logging
+    from workflow.runtime.job_state import JobState
 
     configure_logging(arguments.log)
     if arguments.command == "study":
         from workflow.studies.table import write_study
 
-        return _guarded(f"study {arguments.study}", lambda: write_study(arguments.study, arguments.quality))
+        state = JobState("studies", arguments.study)
+        return _guarded(f"study {arguments.study}", lambda: write_study(arguments.study, arguments.quality), state)
     if arguments.command == "lpips_vgg":
         from workflow.models.lpips import fetch_vgg
 
-        return _guarded("fetching VGG16", fetch_vgg)
+        return _guarded("fetching VGG16", fetch_vgg, JobState("weights", "lpips_vgg"))
     if arguments.command == "batch":
         return _batch(arguments)
     return _run_stage(arguments)

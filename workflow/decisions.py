@@ -27,7 +27,6 @@ METALLIC_PRIOR = 0.25
 SPECULAR_ROUGHNESS = 0.85
 STABLE_OBJECTS = 0.7
 CACHE_COVERAGE = 0.3
-SECOND_PASS_GAIN = 0.10
 
 
 def _decision(component: str, included: bool, measure: str, value: float, threshold: float, reason: str) -> Decision:
@@ -228,23 +227,3 @@ def scale(kind: str, factor: float, relative_error: float) -> Decision:
     }
     reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
     return _decision("scale", abs(factor - 1.0) > 1e-3, "factor on the light that the fit was given", factor, 1.0, reason)
-
-
-def second_pass(gains: np.ndarray, pixels: np.ndarray) -> Decision:
-    """Another round of light and materials: recommended when the fitted gains move the median pixel by more than 10 %.
-
-    Recorded, not done: each round multiplies the bias of the scale (COMPUTE 7).
-    """
-    values, weights = np.abs(np.asarray(gains) - 1.0), np.asarray(pixels, np.float64)
-    measure = "median |fitted albedo gain - 1| over pixels"
-    if not weights.sum():
-        return _decision("second_pass", False, measure, 0.0, SECOND_PASS_GAIN, "nothing was fitted")
-    order = np.argsort(values, kind="stable")
-    cumulative = np.cumsum(weights[order])
-    value = float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
-    reason = (
-        "light solved again with the fitted materials would change, but its overall level drifts from pass to pass: left out"
-        if value > SECOND_PASS_GAIN
-        else "light would hardly change"
-    )
-    return _decision("second_pass", False, measure, value, SECOND_PASS_GAIN, reason)

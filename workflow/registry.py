@@ -1,7 +1,7 @@
-"""The stages, in one table: what each needs and which settings it reads. Imports nothing heavy (the Snakefile reads it).
+"""The stages, in one table: what each is for, what it needs and which settings it reads.
 
-`settings` are dotted paths into the settings tree; a stage can see no others (`Job.settings` refuses), so its fingerprint
-covers whatever it can depend on.
+`settings` are dotted paths into the settings tree. A stage can see no others (`Job.settings` refuses), so its fingerprint covers
+everything that it can depend on. Nothing heavy is imported here, because the Snakefile reads this table.
 """
 
 from dataclasses import dataclass
@@ -9,12 +9,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Stage:
-    """One rule: name, upstream stages, settings that it reads, whether raw input files enter here.
+    """One rule of workflow/rules/stages.smk.
 
-    `on_demand`: no scene needs it; a study or a target of its own asks for it.
+    Attributes:
+        name: of the stage, its rule, its module in workflow/stages/ and its folder in results/<scene>/.
+        purpose: what it does, for `snakemake --list`.
+        upstream: stages whose files it reads.
+        settings: dotted paths of the settings that it reads.
+        reads_raw: whether files from outside results/ enter here.
+        on_demand: whether no scene needs it, only a study or a target of its own.
     """
 
     name: str
+    purpose: str
     upstream: tuple[str, ...]
     settings: tuple[str, ...]
     reads_raw: bool = False
@@ -28,26 +35,65 @@ class Stage:
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
-        Stage("capture", (), ("source", "capture", "seed"), reads_raw=True),
-        Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
-        Stage("segmentation", ("capture",), ("segmentation", "source", "capture"), reads_raw=True),
-        Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
-        Stage("base_scores", ("capture", "prior", "segmentation", "base"), ("metrics.views",), reads_raw=True, on_demand=True),
+        Stage(
+            "capture",
+            "Bring photographs, cameras and mesh into the normal form, or render them.",
+            (),
+            ("source", "capture", "seed"),
+            reads_raw=True,
+        ),
+        Stage(
+            "prior", "Predict materials K times for every photograph.", ("capture",), ("prior", "source", "seed"), reads_raw=True
+        ),
+        Stage(
+            "segmentation",
+            "Assign faces of the mesh to objects, and pixels to segments.",
+            ("capture",),
+            ("segmentation", "source", "capture"),
+            reads_raw=True,
+        ),
+        Stage(
+            "base",
+            "Fuse the predictions of all views into one base texture.",
+            ("capture", "prior", "segmentation"),
+            ("base", "seed"),
+        ),
+        Stage(
+            "base_scores",
+            "Score the base texture; made on demand by studies.",
+            ("capture", "prior", "segmentation", "base"),
+            (),
+            reads_raw=True,
+            on_demand=True,
+        ),
         Stage(
             "emission",
+            "Find the emitters and solve for their radiance.",
             ("capture", "segmentation", "base"),
             ("emission", "capture.dynamic_range", "affines.response", "seed"),
             reads_raw=True,
         ),
-        Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
+        Stage(
+            "shading",
+            "Trace the light that arrives at every pixel, once for all later fits.",
+            ("capture", "segmentation", "base", "emission"),
+            ("shading", "seed"),
+        ),
         Stage(
             "affines",
+            "Fit one affine map per object, and the camera response, to the photographs.",
             ("capture", "prior", "segmentation", "base", "emission", "shading"),
             ("affines", "capture.dynamic_range", "emission.saturation", "prior.kind", "seed"),
         ),
-        Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),
+        Stage(
+            "render",
+            "Render every view again with the recovered materials and lights.",
+            ("capture", "segmentation", "base", "emission", "affines"),
+            ("render", "seed"),
+        ),
         Stage(
             "relight",
+            "Render the recovered scene under other light; made on demand.",
             ("capture", "segmentation", "base", "emission", "affines"),
             ("relight", "seed"),
             reads_raw=True,
@@ -55,18 +101,26 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "metrics",
+            "Score the result against ground truth, where there is any, and against the photographs.",
             ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render"),
             ("metrics",),
             reads_raw=True,
         ),
-        Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
+        Stage(
+            "export",
+            "Write the result for other programs: glTF, Mitsuba, tables.",
+            ("capture", "segmentation", "base", "emission", "affines"),
+            ("export",),
+        ),
         Stage(
             "report",
+            "Write report.html and plan.yaml.",
             ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
             ("report",),
         ),
         Stage(
             "publish",
+            "Copy the deliverable to scenes/<scene>/.",
             (
                 "capture",
                 "prior",

@@ -1,1 +1,1 @@
-"""Cameras: pinhole projection, lens distortion, registration, response, exposure, and simulated photographs."""
+"""Cameras: projection, lens distortion, registration, response, exposure and gains, simulated photographs."""

@@ -1,15 +1,14 @@
-"""Lens distortion: from a distorted photograph to the pinhole camera that the rest of the method assumes.
+"""Lens distortion: resampling of a distorted photograph to a pinhole camera (docs/method/camera.md#lens-distortion).
 
-Points are normalised camera coordinates (x, y) = (X/Z, Y/Z), OpenCV axes; r = |(x, y)|. Both models are
-OpenCV's:
+Points are normalised camera coordinates (x, y) = (X/Z, Y/Z) with OpenCV axes, r = |(x, y)|. Both models are those of OpenCV
+(Eq. C.4, C.5):
 
     radial_tangential   x_d = x c + 2 p1 x y + p2 (r^2 + 2 x^2)      c = 1 + k1 r^2 + k2 r^4 + k3 r^6
                         y_d = y c + p1 (r^2 + 2 y^2) + 2 p2 x y
     fisheye             (x_d, y_d) = t_d / r (x, y)      t = atan r,  t_d = t (1 + k1 t^2 + ... + k4 t^8)
 
-A polynomial that fits the picture may turn back outside it: two directions then land on one pixel.
-Directions beyond the first turning point are reported as not visible instead of showing a mirrored piece of
-the picture.
+Outside the picture the polynomial may turn back, so that two directions reach one pixel. Directions beyond the first turning
+point count as not visible (docs/method/numerics.md#lens-that-folds-back).
 """
 
 from __future__ import annotations
@@ -26,17 +25,18 @@ from iif_core.errors import InputError
 Array = np.ndarray
 
 MAX_ANGLE = math.radians(60.0)
-"""Widest half-angle of the pinhole picture: at 60 degrees perspective stretches radially by 1 / cos^2 = 4."""
+"""Largest half-angle of the pinhole picture in radians; at 60 degrees perspective stretches radially by 1 / cos^2 = 4."""
 
 BAND_PIXELS = 1 << 19
-"""Target pixels that are resampled at a time."""
+"""Number of target pixels that are resampled at a time."""
 
 
 @dataclass(frozen=True)
 class Distortion:
     """A lens: `kind`, radial k1 ... k4 (radial_tangential: k4 = 0), tangential p1, p2 (fisheye: 0).
 
-    Raises InputError for a non-finite coefficient or one that the model does not have.
+    Raises:
+        InputError: a coefficient that is not finite or that the model does not have.
     """
 
     kind: Literal["radial_tangential", "fisheye"]
@@ -55,12 +55,12 @@ class Distortion:
 
     @property
     def is_identity(self) -> bool:
-        """Whether the lens is a pinhole already (a fisheye never is: t_d = atan r)."""
+        """Whether the lens is a pinhole already; a fisheye never is, because t_d = atan r."""
         return self.kind == "radial_tangential" and not any(self.k) and not any(self.p)
 
     @property
     def turning_radius(self) -> float:
-        """r from which on r_d falls again, inf if it never does. Tangential terms are left out."""
+        """Smallest r from which r_d falls, inf if there is none (Eq. C.6); tangential terms are ignored."""
         k1, k2, k3, k4 = self.k
         # d/dr of r c(r^2) (or of t c(t^2)) as a polynomial in s = r^2 (t^2), highest power first.
         slope = np.array([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
@@ -86,7 +86,7 @@ class Pinhole:
 
 
 def _radial(lens: Distortion, r: Array) -> Array:
-    """r_d of r, along the radius."""
+    """r_d as a function of r."""
     k1, k2, k3, k4 = lens.k
     t = np.arctan(r) if lens.kind == "fisheye" else r
     s = t * t
@@ -94,9 +94,11 @@ def _radial(lens: Distortion, r: Array) -> Array:
 
 
 def distort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
-    """Distorted position of pinhole points (..., 2), float64, and whether it is one-to-one there (...), bool.
+    """Distort pinhole points (..., 2); returns (..., 2) float64 and whether the map is one-to-one there, (...) bool.
 
-    Example: `distort(Distortion("radial_tangential", (0.1, 0, 0, 0)), [[1.0, 0.0]])[0]` is [[1.1, 0]].
+    Example:
+        >>> distort(Distortion("radial_tangential", (0.1, 0, 0, 0)), [[1.0, 0.0]])[0].tolist()
+        [[1.1, 0.0]]
     """
     points = np.asarray(points, np.float64)
     x, y = points[..., 0], points[..., 1]
@@ -110,11 +112,10 @@ def distort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
 
 
 def undistort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
-    """Pinhole position (..., 2) float64 of distorted points (..., 2), and whether there is one (...), bool.
+    """Find the pinhole position (..., 2) float64 of distorted points (..., 2), and whether there is one, (...) bool.
 
-    The radius by bisection below the turning point (always converges), then Newton in (x, y) if p1, p2 are
-    set. Points without a solution (beyond the turning point, or 90 degrees and more off the axis) become
-    (0, 0).
+    The radius comes from bisection below the turning point, which always converges; Newton steps in (x, y) follow if p1 or p2
+    is set. Points without a solution (beyond the turning point, or 90 degrees and more off the axis) become (0, 0).
     """
     points = np.asarray(points, np.float64)
     r_d = np.hypot(points[..., 0], points[..., 1])
@@ -132,7 +133,7 @@ def undistort(lens: Distortion, points: ArrayLike) -> tuple[Array, Array]:
 
 def _invert_radial(lens: Distortion, r_d: Array) -> Array:
     """r with _radial(r) = r_d below the turning point; NaN where there is none."""
-    # Bisection in the angle: bounded also where r is not.
+    # The angle is bounded where r is not.
     top = math.atan(lens.turning_radius)
     low, high = np.zeros_like(r_d), np.full_like(r_d, top)
     limit = float(_radial(lens, np.array(math.tan(min(top, math.pi / 2 - 1e-9)))))
@@ -161,20 +162,19 @@ def _newton_step(lens: Distortion, q: Array, target: Array) -> Array:
     error = distort(lens, q)[0] - target
     step = np.stack([yy * error[..., 0] - xy * error[..., 1], xx * error[..., 1] - xy * error[..., 0]], -1)
     step = step / by[..., None]
-    # Far steps mean that the start was near a turning point: no solution there, and squares must not
-    # overflow.
+    # Large steps occur near a turning point, where there is no solution; squares must not overflow.
     small = regular & (np.abs(step).max(-1) <= 1 + np.sqrt(s))
     return np.where(small[..., None], q - step, q)
 
 
 def pinhole_inside(lens: Distortion, source: Pinhole) -> Pinhole:
-    """Pinhole camera of the same focal length over the largest upright rectangle that the photograph covers.
+    """Find the pinhole camera of the same focal length for the largest upright rectangle that the photograph covers.
 
-    The rectangle lies inside the undistorted border of the picture (OpenCV: `alpha = 0`) and within
-    MAX_ANGLE of the axis; its size in pixels is free, so nothing is lost in the centre. A pinhole picture
-    comes back unchanged.
+    The rectangle lies inside the undistorted border of the picture (OpenCV: `alpha = 0`) and within MAX_ANGLE of the axis. Its
+    size in pixels follows from the focal length, so the centre keeps its resolution. A pinhole picture is unchanged.
 
-    Raises InputError when nothing is left.
+    Raises:
+        InputError: nothing is left.
     """
     steps = np.linspace(0.0, 1.0, 129)
     left, right = (source.width * edge - source.cx for edge in (0.0, 1.0))
@@ -212,17 +212,17 @@ def undistort_image(
     valid: ArrayLike | None = None,
     nearest: bool = False,
 ) -> tuple[Array, Array]:
-    """The photograph as the `target` camera at the same place sees it, and which pixels it covers.
+    """Resample a photograph to the `target` camera at the same place.
 
     Args:
-        image: (H, W) or (H, W, C), any dtype; kept.
+        image: (H, W) or (H, W, C), any dtype.
         lens, source: the camera that took it; source.width, source.height must be W, H.
         target: for example `pinhole_inside(lens, source)`.
-        valid: (H, W) bool; a target pixel that touches an invalid pixel is invalid. Default: all.
-        nearest: take the nearest pixel (ids) instead of bilinear interpolation.
+        valid: (H, W) bool; a target pixel that touches an invalid pixel is invalid. All are valid if None.
+        nearest: use the nearest pixel (for ids) instead of bilinear interpolation.
 
     Returns:
-        (h, w[, C]) image, 0 where nothing is seen, and (h, w) bool.
+        (h, w[, C]) image of the same dtype, 0 where nothing is seen, and (h, w) bool, which pixels the photograph covers.
     """
     image = np.asarray(image)
     if image.shape[:2] != (source.height, source.width):
@@ -245,7 +245,7 @@ def undistort_image(
 
 
 def _sample(image: Array, known: Array, u: Array, v: Array, nearest: bool) -> tuple[Array, Array]:
-    """Image at pixel positions (u, v), and whether all pixels that count there are known."""
+    """Image at pixel positions (u, v), and whether all pixels that contribute there are known."""
     height, width = known.shape
     inside = (u > -1e-6) & (u < width + 1e-6) & (v > -1e-6) & (v < height + 1e-6)
     u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)

@@ -1,8 +1,7 @@
-"""Exposure of every view from surface that several views share.
+"""Exposure of every view from surface that several views share (Eq. C.25 with one gain per view, Eq. C.26).
 
-A surface cell c that views v and w both see is, up to gloss, equally bright in both: log y_vc = g_v + s_c.
-Minimising over the cells s_c leaves a small V x V problem in the gains g_v, solved by iteratively re-weighted
-least squares (Cauchy).
+A surface cell c that the views v and w both see is, up to gloss, equally bright in both: log y_vc = g_v + s_c. Eliminating
+the levels s_c leaves a V x V problem in the gains g_v, which iteratively reweighted least squares (Cauchy) solves.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.numerics.graph import component_labels
 
 
 @dataclass(frozen=True)
@@ -19,12 +19,12 @@ class ExposureGains:
     """Result of `estimate_gains`.
 
     Attributes:
-        gain: (V,) float64, what the linearised photographs are multiplied by; geometric mean 1 within each group
-            of views that overlap; 1 where not estimated.
-        error: (V,) float64 standard error of log gain (0 where not estimated).
+        gain: (V,) float64, factors of the linearised photographs; geometric mean 1 within each group of views that overlap; 1
+            where not estimated.
+        error: (V,) float64 standard error of the log gain; 0 where not estimated.
         estimated: (V,) bool.
-        group: (V,) int32, views with the same number are tied together by shared surface; -1 = no overlap.
-        residual: robust scale of log y - g - s (1.4826 x median absolute), 0 without overlap.
+        group: (V,) int32, views with the same number are connected by shared surface; -1 = no overlap.
+        residual: robust standard deviation of log y - g - s (1.4826 x median absolute value); 0 without overlap.
         pairs: number of (cell, view) pairs used.
     """
 
@@ -39,19 +39,19 @@ class ExposureGains:
 def estimate_gains(
     cell: np.ndarray, view: np.ndarray, value: np.ndarray, n_views: int, iterations: int = 20, min_pairs: int = 8
 ) -> ExposureGains:
-    """Relative exposure of the views: robust minimum of sum w (log y_vc - g_v - s_c)^2 over g and s.
+    """Estimate the relative exposure of the views: the robust minimum of sum w (log y_vc - g_v - s_c)^2 over g and s.
 
     Args:
-        cell: (n,) int, surface cell that a pixel sees; -1 = leave out.
+        cell: (n,) int, surface cell that a pixel sees; -1 = ignore.
         view: (n,) int in [0, n_views).
-        value: (n,) or (n, 3) linearised sensor value f^-1(I), unsaturated; not-positive and non-finite values are
-            left out. The three channels share the gain.
+        value: (n,) or (n, 3) linearised, unsaturated sensor values f^-1(I); values that are not positive and finite are
+            ignored. The three channels share the gain.
         n_views: V.
-        iterations: re-weighted solves.
+        iterations: number of reweighted solves.
         min_pairs: (cell, view) pairs on shared cells that a view needs.
 
     Returns:
-        `ExposureGains`. Only ratios are known: the mean of log gain is 0 in each group of overlapping views.
+        Gains, up to one factor per group of overlapping views: the mean of the log gains of a group is 0.
 
     Raises:
         InputError: shapes that do not match, or a view number out of range.
@@ -64,7 +64,7 @@ def estimate_gains(
         raise InputError(f"exposure: view {int(view.min())}..{int(view.max())} out of range 0..{n_views - 1}")
     cell, view, log_y, weight = _pairs(cell, view, value, n_views)
     nothing = ExposureGains(np.ones(n_views), np.zeros(n_views), np.zeros(n_views, bool), np.full(n_views, -1, np.int32), 0.0, 0)
-    # Cells that one view alone sees say nothing; dropping thin views can leave new ones, hence the loop.
+    # A cell that only one view sees carries no information; dropping a view may create such cells, hence the loop.
     while len(cell):
         count = np.bincount(cell)
         shared = count[cell] >= 2
@@ -76,7 +76,7 @@ def estimate_gains(
     if not len(cell):
         return nothing
     cell = np.unique(cell, return_inverse=True)[1]
-    group = components(cell, view, n_views)
+    group = view_groups(cell, view, n_views)
     gains, error, scale = _solve(cell, view, log_y, weight, group, n_views, iterations)
     estimated = group >= 0
     return ExposureGains(np.where(estimated, np.exp(gains), 1.0), error, estimated, group, scale, len(cell))
@@ -85,7 +85,7 @@ def estimate_gains(
 def _pairs(
     cell: np.ndarray, view: np.ndarray, value: np.ndarray, n_views: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """One row a (cell, view, channel): mean log value and weight sqrt(pixels); channels become cells of their own."""
+    """One row per (cell, view, channel): mean log value and weight sqrt(pixels); the channels become cells of their own."""
     rows = []
     for c in range(value.shape[1]):
         good = (cell >= 0) & np.isfinite(value[:, c]) & (value[:, c] > 0)
@@ -98,14 +98,9 @@ def _pairs(
     return np.unique(cells, return_inverse=True)[1], views.astype(np.int64), logs, weights
 
 
-def components(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
-    """(V,) int32: views with the same number are tied together by cells (n,) that they share; -1 = sees none."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    size = n_views + int(cell.max()) + 1
-    graph = coo_matrix((np.ones(len(cell)), (view, cell + n_views)), (size, size))
-    label = connected_components(graph, directed=False)[1][:n_views]
+def view_groups(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
+    """Number the groups of views that are connected by shared cells (n,), (V,) int32; -1 for a view without cells."""
+    label = component_labels(n_views + int(cell.max()) + 1, view, cell + n_views)[:n_views]
     present = np.bincount(view, minlength=n_views) > 0
     out = np.full(n_views, -1, np.int32)
     out[present] = np.unique(label[present], return_inverse=True)[1]
@@ -145,7 +140,7 @@ def _solve(
         level = np.bincount(cell, w * (log_y - step[view]), n_cells) / total
         residual = log_y - step[view] - level[cell]
         scale = float(1.4826 * np.median(np.abs(residual)))
-        # 2.385 scale: 95 % efficiency of Cauchy's weights; the floor keeps exact data from dividing by zero.
+        # 2.385 scale gives Cauchy's weights 95 % efficiency; the floor prevents division by zero for exact data.
         robust = 1.0 / (1.0 + (residual / max(2.385 * scale, 1e-6)) ** 2)
         converged = np.max(np.abs(step - gains)) < 1e-10
         gains = step

@@ -1,12 +1,12 @@
-"""Exposure, white balance and vignetting of photographs from surface that they share (known or trial camera response).
+"""Exposure, white balance and vignetting from surface that photographs share (docs/method/camera.md, Eq. C.25 to C.27).
 
-A surface patch p that views v and w both see sends, up to gloss, the same light to both:
+A surface patch p that the views v and w both see sends, up to gloss, the same light to both:
 
     log y_pvc = g_vc + a r^2 + b r^4 + s_pc,      y = f^-1(I), r: distance from the picture's centre / half its diagonal.
 
-Minimised robustly (Cauchy) over the levels s_pc, one gain a view (exposure) or three (exposure and white balance), and the
-falloff exp(a r^2 + b r^4) of the lens, the same in all views. The levels are eliminated; what is left has 3 V + 2 unknowns.
-A term enters when it helps on surface that the fit did not see (`choose_gains`).
+The fit is robust (Cauchy). The levels s_pc are eliminated; the unknowns are one gain per view (exposure) or three (exposure
+and white balance), and the vignetting exp(a r^2 + b r^4), which all views share. A term enters the model when it helps on
+surface that the fit did not use (`choose_gains`).
 """
 
 from __future__ import annotations
@@ -16,26 +16,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from iif_core.camera.exposure import components
+from iif_core.camera.exposure import view_groups
 from iif_core.errors import InputError
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
 SIGNIFICANT = 2.0
-"""Standard errors by which a term must help on held-out surface."""
-NOTICEABLE = 0.01
-"""Median |log gain| between channels, or largest |log falloff|, below which a term is not worth having."""
+"""Number of standard errors by which a term must reduce the loss on held-out surface."""
+MIN_EFFECT = 0.01
+"""Smallest useful term: median |log gain| of a channel relative to its view, or largest |log vignetting|."""
 MIN_ROWS = 8
-"""(patch, channel) rows on shared patches that a view needs."""
-LIMIT = 40_000
-"""Rows that the gains of all views are estimated from."""
-_SIGMA = 1.0  # prior of a, b
+"""Number of (patch, channel) rows on shared patches that a view needs."""
+MAX_ROWS = 40_000
+"""Number of rows from which the gains of all views are estimated."""
+_VIGNETTING_SIGMA = 1.0  # standard deviation of the prior of a and b
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a term did on held-out surface: mean fall of Cauchy's loss a row, its standard error over (block, view), size."""
+    """Effect of a term of the model on held-out surface (Eq. C.27).
+
+    Attributes:
+        gain: mean decrease of Cauchy's loss per row; error: its standard error over (block, view).
+        size: size of the term; included: whether it enters the model.
+        before, after: robust spread of the residuals without and with the term.
+    """
 
     gain: float
     error: float
@@ -47,7 +53,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class CameraGains:
-    """What radiance is multiplied by before the response.
+    """Factors of radiance before the response (Eq. C.8).
 
     Attributes:
         gain: (V, 3) float64, exposure times white balance; geometric mean 1 in each channel over overlapping views;
@@ -55,7 +61,7 @@ class CameraGains:
         vignetting: (2,) a, b of exp(a r^2 + b r^4).
         estimated: (V,) bool.
         residual: robust spread of log y about the model.
-        evidence: of the terms `white_balance` and `vignetting`, as far as they were tried.
+        evidence: for `white_balance` and `vignetting`, as far as they were tried.
     """
 
     gain: np.ndarray
@@ -66,7 +72,7 @@ class CameraGains:
 
     @classmethod
     def plain(cls, exposure: np.ndarray) -> CameraGains:
-        """One known factor (V,) a view."""
+        """Gains of views with one known factor (V,) each."""
         exposure = np.asarray(exposure, np.float64)
         return cls(np.repeat(exposure[:, None], 3, 1), np.zeros(2), np.ones(len(exposure), bool))
 
@@ -77,28 +83,28 @@ class CameraGains:
 
     @property
     def is_plain(self) -> bool:
-        """One factor a view."""
+        """Whether each view has one factor only."""
         return not self.vignetting.any() and bool((self.gain == self.gain[:, :1]).all())
 
     def factor(self, view: np.ndarray | int, radius2: np.ndarray) -> np.ndarray:
-        """(n, 3) of pixels at squared radius (n,) in views (n,) or in one."""
+        """Factors (n, 3) of pixels at squared radius (n,), in views (n,) or in one view."""
         return self.gain[view] * falloff(self.vignetting, radius2)[:, None]
 
 
 def falloff(vignetting: np.ndarray, radius2: np.ndarray) -> np.ndarray:
-    """exp(a r^2 + b r^4), the shape of `radius2`; 1 in the picture's centre."""
+    """Compute the vignetting exp(a r^2 + b r^4), in the shape of `radius2`; 1 in the centre of the picture."""
     return np.exp((vignetting[0] + vignetting[1] * radius2) * radius2)
 
 
 def radius_squared(index: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(n,) squared distance of pixels (indices of the flattened picture) from its centre; 1 in the corners."""
+    """Compute the squared distance (n,) of pixels, given by flat index, from the picture's centre; 1 in its corners (Eq. C.9)."""
     x, y = index % width + 0.5 - 0.5 * width, index // width + 0.5 - 0.5 * height
     return (x**2 + y**2) / (0.25 * (width**2 + height**2))
 
 
 @dataclass(frozen=True)
 class GainRows:
-    """n rows: patch (n,) and view (n,) numbers, y (n, 3) = f^-1(I) (NaN = unknown), radius2 (n,), block (n,)."""
+    """n rows: patch and view numbers (n,), y = f^-1(I) (n, 3) with NaN = unknown, radius2 (n,), block (n,)."""
 
     patch: np.ndarray
     view: np.ndarray
@@ -107,11 +113,11 @@ class GainRows:
     block: np.ndarray
 
     def take(self, choice: np.ndarray) -> GainRows:
-        """Some rows."""
+        """Select rows."""
         return GainRows(*(getattr(self, name)[choice] for name in ("patch", "view", "y", "radius2", "block")))
 
-    def thinned(self, limit: int = LIMIT) -> GainRows:
-        """About `limit` rows: whole patches, by a hash of their number."""
+    def thinned(self, limit: int = MAX_ROWS) -> GainRows:
+        """Select about `limit` rows: whole patches, by a hash of their number."""
         if len(self.view) <= limit:
             return self
         mixed = self.patch.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40)
@@ -119,14 +125,23 @@ class GainRows:
 
 
 def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignetting: bool = True, rounds: int = 20) -> CameraGains:
-    """Gains of the views under one of the four models. See the module's docstring.
+    """Estimate the gains of the views under one of the four models (Eq. C.25, C.26).
+
+    Args:
+        rows: shared surface.
+        n_views: V.
+        white_balance, vignetting: terms of the model besides the exposure.
+        rounds: largest number of reweighted solves.
+
+    Returns:
+        Gains without evidence.
 
     Raises:
         InputError: a view number out of range.
     """
     if len(rows.view) and (rows.view.min() < 0 or rows.view.max() >= n_views):
         raise InputError(f"gains: view {int(rows.view.min())}..{int(rows.view.max())} out of range 0..{n_views - 1}")
-    data = _Long.of(rows, n_views)
+    data = _Entries.of(rows, n_views)
     if not len(data.value):
         return CameraGains(np.ones((n_views, 3)), np.zeros(2), np.zeros(n_views, bool))
     design = data.design(n_views, white_balance, vignetting)
@@ -142,13 +157,13 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
         right = np.asarray(design.T @ (weight * (data.value - level[data.cell]))).ravel()
         normal += gauge * max(float(np.trace(normal)) / len(theta), 1e-12)
         if vignetting:
-            normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _SIGMA**2  # rows count 1, not 1 / scale^2
+            normal[[-2, -1], [-2, -1]] += max(scale, 1e-3) ** 2 / _VIGNETTING_SIGMA**2  # rows count 1, not 1 / scale^2
         step = np.zeros(len(theta))
         step[known] = np.linalg.solve(normal[np.ix_(known, known)], right[known])
         left = data.value - design @ step
         residual = left - (np.bincount(data.cell, weight * left) / total)[data.cell]
         scale = float(1.4826 * np.median(np.abs(residual)))
-        # 2.385 scale: 95 % efficiency of Cauchy's weights; the floor keeps exact data from dividing by zero.
+        # 2.385 scale gives Cauchy's weights 95 % efficiency; the floor prevents division by zero for exact data.
         weight = 1.0 / (1.0 + (residual / max(2.385 * scale, 1e-6)) ** 2)
         done = np.abs(step - theta).max() < 1e-7
         theta = step
@@ -160,10 +175,11 @@ def estimate(rows: GainRows, n_views: int, white_balance: bool = True, vignettin
 
 
 def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
-    """The smallest model that held-out surface speaks for: exposure; then white balance; then vignetting.
+    """Estimate the smallest model that held-out surface supports: exposure; then white balance; then vignetting.
 
-    Blocks (objects) are dealt to two halves. Each half is judged by gains fitted to the other: the loss of its rows about
-    levels of their own. A term enters when the loss falls by more than two standard errors and the term is noticeable.
+    The blocks (objects) are divided into two halves. Each half is judged by the gains fitted to the other, through the loss of
+    its rows about levels of their own. A term enters when the loss decreases by more than SIGNIFICANT standard errors and the
+    term is larger than MIN_EFFECT.
     """
     half = _halves(rows)
     model = {"white_balance": False, "vignetting": False}
@@ -173,15 +189,15 @@ def choose_gains(rows: GainRows, n_views: int) -> CameraGains:
         wider = estimate(rows, n_views, **{**model, term: True})
         size = _chroma(wider) if term == "white_balance" else _depth(wider)
         gain, error, before, after = _judge(rows, half, n_views, model, term)
-        included = gain > SIGNIFICANT * error and size > NOTICEABLE
+        included = gain > SIGNIFICANT * error and size > MIN_EFFECT
         evidence[term] = Evidence(gain, error, size, included, before, after)
         if included:
             model[term], best = True, wider
     return CameraGains(best.gain, best.vignetting, best.estimated, best.residual, evidence)
 
 
-def follow(rows: GainRows, gains: CameraGains, moving: np.ndarray) -> CameraGains:
-    """Gains of the views that are not `moving` (V,) (kept for testing): medians against levels that the others set."""
+def with_held_out_views(rows: GainRows, gains: CameraGains, moving: np.ndarray) -> CameraGains:
+    """Add the gains of held-out views, those not `moving` (V,): medians against the levels that the other views set."""
     log_y = np.log(np.where(rows.y > 0, rows.y, np.nan))
     flat = log_y - np.log(falloff(gains.vignetting, rows.radius2))[:, None]
     size = int(rows.patch.max(initial=-1)) + 1
@@ -203,12 +219,9 @@ def follow(rows: GainRows, gains: CameraGains, moving: np.ndarray) -> CameraGain
     return CameraGains(out, gains.vignetting, estimated, gains.residual, gains.evidence)
 
 
-# ------------------------------------------------------------------------------------------------------------ parts
-
-
 @dataclass(frozen=True)
-class _Long:
-    """One entry a (row, channel) with a value, on patches that two views share."""
+class _Entries:
+    """One entry per (row, channel) with a value, on patches that two views share."""
 
     cell: np.ndarray
     view: np.ndarray
@@ -217,12 +230,12 @@ class _Long:
     radius2: np.ndarray
 
     @classmethod
-    def of(cls, rows: GainRows, n_views: int) -> _Long:
+    def of(cls, rows: GainRows, n_views: int) -> _Entries:
         row, channel = np.nonzero(np.isfinite(rows.y) & (rows.y > 0))
         key = rows.patch[row].astype(np.int64) * 3 + channel
         view = rows.view[row].astype(np.int64)
         keep = np.ones(len(row), bool)
-        while keep.any():  # patches of one view say nothing; dropping thin views can leave new ones
+        while keep.any():  # dropping a view can leave patches that only one view sees
             cell = np.unique(key[keep], return_inverse=True)[1]
             pairs = np.unique(cell.astype(np.int64) * n_views + view[keep]) // n_views
             shared = np.bincount(pairs, minlength=int(cell.max()) + 1)[cell] >= 2
@@ -236,7 +249,7 @@ class _Long:
         return cls(cell, view, channel, np.log(rows.y[row, channel]), rows.radius2[row])
 
     def design(self, n_views: int, white_balance: bool, vignetting: bool) -> csr_matrix:
-        """Sparse (n, V or 3 V, and 2)."""
+        """Sparse design matrix (n, V or 3 V, plus 2 with vignetting)."""
         from scipy.sparse import coo_matrix
 
         number = np.arange(len(self.value))
@@ -249,14 +262,14 @@ class _Long:
         return coo_matrix((value, (row, column)), (len(number), gains + 2 * vignetting)).tocsr()
 
     def members(self, weight: np.ndarray) -> csr_matrix:
-        """Sparse (cells, n)."""
+        """Sparse (cells, n) matrix that sums entries with `weight` over each cell."""
         from scipy.sparse import coo_matrix
 
         return coo_matrix((weight, (self.cell, np.arange(len(weight)))), (int(self.cell.max()) + 1, len(weight))).tocsr()
 
     def gauge(self, n_views: int, white_balance: bool, vignetting: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Projector on what the data leave open (the mean of each channel over views that overlap), and the groups (V,)."""
-        group = components(self.cell, self.view, n_views)
+        """Projector on the undetermined directions (mean of each channel over connected views), and the groups of views (V,)."""
+        group = view_groups(self.cell, self.view, n_views)
         channels, size = (3, 3 * n_views) if white_balance else (1, n_views)
         out = np.zeros((size + 2 * vignetting, size + 2 * vignetting))
         for g in range(int(group.max(initial=-1)) + 1):
@@ -276,7 +289,7 @@ def _depth(gains: CameraGains) -> float:
 
 
 def _halves(rows: GainRows) -> np.ndarray:
-    """(n,) bool: whole blocks, dealt from the largest so that both halves are as large; patches where one block rules."""
+    """(n,) bool: blocks dealt from the largest into two halves of equal size; patches where one block dominates."""
     blocks, number, count = np.unique(rows.block, return_inverse=True, return_counts=True)
     if not len(blocks) or count.max() > 0.6 * count.sum():
         return rows.patch.astype(np.int64) % 2 == 0
@@ -290,7 +303,7 @@ def _halves(rows: GainRows) -> np.ndarray:
 def _judge(
     rows: GainRows, half: np.ndarray, n_views: int, model: dict[str, bool], term: str
 ) -> tuple[float, float, float, float]:
-    """Mean fall of the held-out loss when `term` joins `model`, its standard error, and the robust spreads."""
+    """Mean decrease of the held-out loss when `term` joins `model`, its standard error, and the robust spreads."""
     losses, clusters, spreads = [], [], []
     for side in (False, True):
         fitted, judged = rows.take(half == side), rows.take(half != side)
@@ -316,7 +329,7 @@ def _judge(
 
 
 def _held_residual(rows: GainRows, gains: CameraGains, n_views: int) -> tuple[np.ndarray, np.ndarray]:
-    """log y less the gains and the robust level of its patch; and the row of each."""
+    """log y less the gains and the robust level of its patch, and the row of each value."""
     log_y = np.log(np.where(rows.y > 0, rows.y, np.nan)) - np.log(gains.factor(rows.view, rows.radius2))
     row, channel = np.nonzero(np.isfinite(log_y))
     cell = np.unique(rows.patch[row].astype(np.int64) * 3 + channel, return_inverse=True)[1]

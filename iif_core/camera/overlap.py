@@ -1,9 +1,9 @@
-"""Surface patches that several photographs show: what exposure and camera response are calibrated on.
+"""Surface patches that several photographs show, for calibrating exposure and response (docs/method/camera.md#patches).
 
-A patch is a voxel of one object that faces one way. Its pixels in one photograph become one row: the mean of the
-middle half of their sensor values, which next to no curve moves (quantiles pass through any rising curve). Patches
-that are uneven in a photograph (texture, a shadow's edge, a highlight) are left out there: another photograph sees
-another mixture of them.
+A patch is a voxel of one object with one direction of the normal. Its pixels in one photograph become one row, the mean of the
+middle half of their sensor values. This mean is nearly equivariant under any rising response curve, because quantiles are.
+Patches that are uneven in a photograph (texture, the edge of a shadow, a highlight) are left out there, because another
+photograph sees another mixture of them.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from iif_core.errors import InputError
 from iif_core.surface.cells import INDEX_LIMIT, pack_keys, voxel_indices
 
 PATCH_FOOTPRINTS = 3.2
-"""Edge of a patch in pixel footprints: some ten pixels, small enough to be even."""
+"""Edge of a patch in pixel footprints; a patch then covers about ten pixels."""
 
 
 @dataclass(frozen=True)
 class PatchRows:
-    """Patches as photographs show them; n rows, one a (patch, view).
+    """Patches in photographs; n rows, one per (patch, view).
 
     Attributes:
-        patch: (n,) uint64 key of the patch; facing: (n,) int8 dominant axis and sign of its normal, 0 ... 5; the two
-            together are the patch.
-        block: (n,) int32, patches that may err together (their object).
+        patch: (n,) uint64 key of voxel and object; facing: (n,) int8 dominant axis and sign of the normal, 0 ... 5. Both
+            together identify the patch.
+        block: (n,) int32, patches whose errors may be correlated (their object).
         view: (n,) int32.
         value: (n, 3) float64 sensor value; NaN where a channel cannot be used.
         clipped: (n, 3) bool: at least three quarters of the pixels are saturated; `value` is a bound.
@@ -45,20 +45,30 @@ class PatchRows:
     radius2: np.ndarray | None = None
 
     def take(self, index: np.ndarray) -> PatchRows:
-        """Some of the rows."""
+        """Select rows."""
         return PatchRows(**{name: None if array is None else array[index] for name, array in self.__dict__.items()})
 
 
 def patch_edge(footprint: float, extent: float = 0.0) -> float:
-    """Edge of a patch in metres for a median pixel footprint (distance / focal length in pixels) in metres; at least what
-    the numbers of a scene of `extent` metres hold."""
+    """Compute the edge of a patch in metres from the median pixel footprint (distance / focal length in pixels) in metres.
+
+    It is at least as large as the voxel indices of a scene of `extent` metres require.
+    """
     if not footprint > 0:
         raise InputError(f"patches: pixel footprint {footprint} m; it must be positive")
     return max(PATCH_FOOTPRINTS * footprint, extent / (INDEX_LIMIT - 8))
 
 
 def patch_numbers(points: np.ndarray, object_id: np.ndarray, edge: float, origin: np.ndarray) -> np.ndarray:
-    """(n,) uint64 patch of each surface point (n, 3) in metres: its voxel and its object."""
+    """Number surface points by voxel and object.
+
+    Args:
+        points: (n, 3) in metres; object_id: (n,) int.
+        edge, origin: voxel grid, in metres.
+
+    Returns:
+        (n,) uint64.
+    """
     return pack_keys(voxel_indices(points, edge, origin), object_id)
 
 
@@ -74,17 +84,21 @@ def patch_rows(
     share: float = 1.0,
     radius2: np.ndarray | None = None,
 ) -> PatchRows:
-    """Rows of one photograph.
+    """Collect the rows of one photograph.
 
     Args:
-        patch: (n,) uint64 of each pixel; normal: (n, 3), patches split by its dominant axis and sign.
-        block: (n,) int, what a patch belongs to; value: (n, 3) sensor values; non-finite pixels are left out.
+        patch: (n,) uint64 of each pixel; normal: (n, 3), whose dominant axis and sign divide patches.
+        block: (n,) int, block of each pixel.
+        value: (n, 3) sensor values; pixels that are not finite are ignored.
         view: number of the photograph.
-        saturation: values from here on are bounds; channels between one and three quarters saturated become NaN.
+        saturation: sensor values from here on are bounds; a channel with one to three quarters of saturated pixels is NaN.
         min_pixels: pixels that a row needs.
-        evenness: largest interquartile range / value; one and a half 8-bit steps are always allowed.
-        share: of the patches, the same ones in every view, to keep.
-        radius2: (n,) squared distance of the pixels from the picture's centre (`camera_gains.radius_squared`); 0 if None.
+        evenness: largest interquartile range relative to the value; 1.5 8-bit steps are always allowed.
+        share: share of the patches to keep; every view keeps the same patches.
+        radius2: (n,) squared distance from the picture's centre (`gains.radius_squared`); 0 if None.
+
+    Returns:
+        Rows with at least one usable channel.
     """
     value, normal = np.asarray(value, np.float64), np.asarray(normal)
     good = np.isfinite(value).all(1)
@@ -126,14 +140,14 @@ def patch_rows(
 
 
 def no_rows() -> PatchRows:
-    """Nothing seen."""
+    """Return an empty set of rows."""
     kinds = (np.uint64, np.int8, np.int32, np.int32)
     empty = [np.zeros(0, kind) for kind in kinds]
     return PatchRows(*empty, np.zeros((0, 3)), np.zeros((0, 3), bool), np.zeros(0, np.int32), np.zeros(0))
 
 
 def join_rows(parts: Sequence[PatchRows]) -> PatchRows:
-    """Rows of all photographs, patches numbered from 0 (`facing` is then in the number)."""
+    """Join the rows of all photographs; `patch` becomes a number from 0 that includes `facing`."""
     names = PatchRows.__dataclass_fields__
     rows = PatchRows(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
     order = np.lexsort((rows.facing, rows.patch))

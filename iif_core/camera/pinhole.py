@@ -1,5 +1,7 @@
-"""Pinhole cameras with OpenCV axes (x right, y down, z forward); pixel (u, v) has its centre at (u + 0.5, v +
-0.5)."""
+"""Pinhole cameras with OpenCV axes: x right, y down, z forward (docs/method/camera.md#axes-and-pixels).
+
+Pixel (column, row) has its centre at (u, v) = (column + 0.5, row + 0.5). Focal lengths and principal point are in pixels.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,20 @@ def _pose(world_from_camera: ArrayLike) -> Array:
 
 
 def pixel_directions(fx: float, fy: float, cx: float, cy: float, width: int, height: int, world_from_camera: ArrayLike) -> Array:
-    """World direction of every pixel centre, NOT normalised: its camera z is 1, so point = origin + depth *
-    direction.
+    """Compute the world direction of every pixel centre, not normalised: point = origin + depth * direction (Eq. C.1).
 
-    d = R ((u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, 1). Focal lengths and principal point in pixels.
-    Returns (height, width, 3) float32. Source: METHOD 1.4. Raises InputError for non-positive sizes or focal
-    lengths.
+    d = R ((u - cx) / fx, (v - cy) / fy, 1).
+
+    Args:
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        width, height: size in pixels.
+        world_from_camera: (4, 4) or (3, 4).
+
+    Returns:
+        (height, width, 3) float32.
+
+    Raises:
+        InputError: sizes or focal lengths that are not positive, or an unusable pose.
     """
     if width < 1 or height < 1 or not (fx > 0 and fy > 0):
         raise InputError(f"camera of {width}x{height} pixels with fx={fx}, fy={fy}: all must be positive")
@@ -36,8 +46,7 @@ def pixel_directions(fx: float, fy: float, cx: float, cy: float, width: int, hei
 
 
 def direction_derivatives(fx: float, fy: float, world_from_camera: ArrayLike) -> tuple[Array, Array]:
-    """(d_du, d_dv): change of the un-normalised `pixel_directions` per pixel step right and down, (3,)
-    float32 each."""
+    """Compute the change of `pixel_directions` per pixel to the right and down, (3,) float32 each (Eq. C.3)."""
     rotation = _pose(world_from_camera)[:3, :3]
     return (rotation[:, 0] / fx).astype(np.float32), (rotation[:, 1] / fy).astype(np.float32)
 
@@ -45,10 +54,20 @@ def direction_derivatives(fx: float, fy: float, world_from_camera: ArrayLike) ->
 def project(
     points: ArrayLike, fx: float, fy: float, cx: float, cy: float, world_from_camera: ArrayLike
 ) -> tuple[Array, Array, Array]:
-    """Pixel coordinates (u, v) and z-depth of world points (..., 3); float64.
+    """Project world points to pixel coordinates (Eq. C.2).
 
-    u = fx x/z + cx with a pixel centre at u = column + 0.5; u and v are NaN where z <= 0 (behind the camera).
-    Assumes a rigid pose (orthonormal rotation).
+    Args:
+        points: (..., 3).
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        world_from_camera: (4, 4) or (3, 4), with an orthonormal rotation.
+
+    Returns:
+        u, v and z-depth, (...) float64; u and v are NaN behind the camera.
+
+    Example:
+        >>> u, v, z = project([0, 0, 2], 100, 100, 32, 24, np.eye(4))
+        >>> float(u), float(v), float(z)
+        (32.0, 24.0, 2.0)
     """
     pose = _pose(world_from_camera)
     local = (np.asarray(points, np.float64) - pose[:3, 3]) @ pose[:3, :3]
@@ -58,11 +77,13 @@ def project(
 
 
 def look_at(origin: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
-    """`world_from_camera` (4x4 float64) of a camera at `origin` that sees `target` in its centre with `up`
-    upwards.
+    """Compute the pose (4, 4) float64 of a camera at `origin` that sees `target` in its centre, with `up` upwards.
 
-    z = target - origin, x = z x up, y = z x x, all normalised. When `up` is parallel to the view the world
-    axis least along the view takes its place. Raises InputError when origin and target coincide.
+    z = target - origin, x = z x up, y = z x x, all normalised. If `up` is parallel to the view, the world axis that is least
+    along the view replaces it.
+
+    Raises:
+        InputError: origin and target coincide.
     """
     origin, target, up = (np.asarray(value, np.float64) for value in (origin, target, up))
     forward = target - origin

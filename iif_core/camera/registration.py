@@ -1,14 +1,15 @@
-"""Registration of photographs with a mesh: small corrections of poses and of the common intrinsics, and how sharp each is.
+"""Registration of photographs with a mesh: small corrections of poses and common intrinsics, and the sharpness of each view.
 
-A surface point p that several photographs show has one texture value C_p. With feature images I_v (`feature_image`) we minimise
+A surface point p that several photographs show has one texture value C_p. With feature images I_v (`feature_image`) the
+objective is (Eq. C.30)
 
     sum_pv rho((I_v(pi_v(p)) - C_p) / s)  +  sum_vk ((1 - e_v(pi_v(q_k))) / s_e)^2  +  prior
 
-over one twist a view (rotation and translation in the camera's frame) and over focal length and principal point that all views
-share. The first term makes photographs agree with each other; by itself it is all but blind to a drift of all cameras together
-(texture slides along the surface). The second ties them to the mesh: q_k are points on creases and silhouettes of the mesh
-as view v sees them, e_v the photograph's own edges. C_p is eliminated (Schur complement), steps are Gauss-Newton with
-Cauchy's weights, blurred first and then sharp.
+over one twist per view (rotation and translation in the camera's frame) and over focal length and principal point, which all
+views share. The first term makes the photographs agree with each other. It hardly notices a drift of all cameras together,
+because texture then slides along the surface. The second term ties the photographs to the mesh: q_k are points on creases and
+silhouettes of the mesh as view v sees them, and e_v are the edges of the photograph. C_p is eliminated (Schur complement).
+Steps are Gauss-Newton with Cauchy's weights, on images that are blurred less and less.
 """
 
 from __future__ import annotations
@@ -22,35 +23,35 @@ from iif_core.camera.exposure import estimate_gains
 from iif_core.errors import InputError
 
 SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
-"""Prior of a view's own correction: radians, metres."""
+"""Standard deviation of the correction of a view: radians, metres."""
 SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
-"""Prior of the common correction: of the focal length, both."""
+"""Standard deviation of the common corrections, relative to the focal length."""
 BLURS = (2.5, 1.2, 0.7)
-"""Blur of the feature images in pixels, round by round."""
-ROUNDS = 6
-GRAZING = 0.25
-"""Cosine below which a surface is seen too flat to compare."""
-BLOCK = 0.3
+"""Standard deviations of the successive blurs of the feature images, in pixels."""
+STEPS_PER_BLUR = 6
+MIN_COSINE = 0.25
+"""Smallest cosine between normal and viewing direction at which surface is compared."""
+HELD_OUT_BLOCK = 0.3
 """Edge in metres of the blocks of surface that are held out together."""
-EDGE_SAY = 0.15
-"""Neighbouring edge points err together: what one counts against a row of texture."""
+EDGE_WEIGHT = 0.15
+"""Weight of an edge point relative to a row of texture; the errors of neighbouring edge points are correlated."""
 MIN_VIEWS = 6
 MIN_ROWS = 40
-"""Points that a view shares with others before anything is said about it."""
-HELD_OUT = 3
-"""One block in so many is held out."""
+"""Number of points that a view must share with others before its quality is judged."""
+HELD_OUT_EVERY = 3
+"""One of so many blocks is held out."""
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One photograph with what the mesh looks like from its camera.
+    """One photograph and the mesh as its camera sees it.
 
     Attributes:
         image: (H, W, 3) sensor values or radiance; usable: (H, W) bool.
         depth: (H, W) z-depth of the mesh in metres, 0 = miss; normal: (H, W, 3) unit, 0 = miss.
         focal: (fx, fy), principal: (cx, cy) in pixels, pixel centres at u + 0.5.
         pose: (4, 4) world_from_camera, OpenCV axes.
-        held: this photograph follows the others and does not move them (kept for testing).
+        held: whether the photograph is kept for testing; it is aligned with the others and does not move them.
     """
 
     image: np.ndarray
@@ -69,17 +70,16 @@ class Registration:
 
     Attributes:
         pose: (V, 4, 4); principal: (2,) shift of the principal point in units of the focal length; focal: factor.
-        moved: (V,) median motion of a view's pixels, in pixels of the photographs given.
-        held_out: (before, after) robust spread of feature values on surface that the fit did not see.
-        gain, error: mean fall of the held-out loss a row and its standard error over views.
-        edges: (before, after) mean photograph edge at edges of the mesh that the fit did not see.
-        edge_gain, edge_error: its rise and the standard error over views.
+        moved: (V,) median motion of the pixels of a view, in pixels of the given photographs.
+        held_out: (before, after) robust spread of feature values on held-out surface.
+        gain, error: mean decrease of the held-out loss per row and its standard error over views.
+        edges: (before, after) mean photograph edge at held-out edges of the mesh.
+        edge_gain, edge_error: its increase and the standard error over views.
         rows: (point, view) pairs compared.
-        accepted: texture is better by more than two standard errors and edges not worse by as many, or edges are better and
-            texture not worse at all; and there are `MIN_VIEWS` views, without which a standard error means nothing.
-        sharpness: (V,) gradient of the texture as this view shows it / as the others do; 1 = as usual, 0 = not compared.
+        accepted: whether the correction satisfies Eq. C.32 and there are at least MIN_VIEWS views.
+        sharpness: (V,) gradient of the texture relative to the other views; 1 = typical, 0 = not compared.
         agreement: (V,) correlation of features with the mean of the other views, after registration; 0 = not compared.
-        shift: (V,) pixels by which a view still lies off the others' texture, as one translation.
+        shift: (V,) remaining translation against the texture of the other views, in pixels (Eq. C.33).
     """
 
     pose: np.ndarray
@@ -100,9 +100,9 @@ class Registration:
 
 
 def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """(H, W) float64: log luminance less its surroundings (6 % of the width), in units of 0.35, within +-3.
+    """Compute log luminance less its surroundings (6 % of the width), in units of 0.35, clipped to +-3 (Eq. C.29).
 
-    Exposure, white balance, vignetting and slow shading fall out.
+    The result, (H, W) float64, does not depend on exposure, white balance, vignetting and slow shading.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -115,10 +115,10 @@ def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
 
 
 def mesh_edges(depth: np.ndarray, normal: np.ndarray, usable: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the mesh as a camera sees it: silhouettes (depth ratio above 5 %) and creases (more than 30 degrees).
+    """Find edges of the mesh as a camera sees it: silhouettes (depth ratio above 5 %) and creases (more than 30 degrees).
 
     Returns:
-        Pixel coordinates (n, 2), half way between the two pixels that differ, and the nearer one's z-depth (n,).
+        Pixel coordinates (n, 2) half way between the two pixels that differ, and the z-depth (n,) of the nearer pixel.
     """
     coordinates, near = [], []
     for axis in (0, 1):
@@ -137,7 +137,7 @@ def mesh_edges(depth: np.ndarray, normal: np.ndarray, usable: np.ndarray) -> tup
 
 
 def photo_edges(feature: np.ndarray, blur: float) -> np.ndarray:
-    """(H, W) float64 in [0, 1]: gradient magnitude, blurred, over its 95 % quantile."""
+    """Compute the blurred gradient magnitude over its 95 % quantile: (H, W) float64 in [0, 1]."""
     from scipy.ndimage import gaussian_filter
 
     dv, du = np.gradient(gaussian_filter(feature, 0.7))
@@ -145,37 +145,40 @@ def photo_edges(feature: np.ndarray, blur: float) -> np.ndarray:
     return np.clip(size / max(float(np.quantile(size, 0.95)), 1e-9), 0.0, 1.0)
 
 
-def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = True, own: bool = True) -> Registration:
-    """Poses and common intrinsics that fit photographs to the mesh and to each other.
+def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = True, poses: bool = True) -> Registration:
+    """Correct poses and common intrinsics so that the photographs fit the mesh and each other.
 
     Args:
         photos: at least one.
-        points: surface points compared, all views together.
-        intrinsics: correct focal length and principal point, the same relative correction in all views.
-        own: correct each pose.
+        points: number of surface points that are compared, over all views.
+        intrinsics: correct focal length and principal point, by the same relative amount in all views.
+        poses: correct each pose.
+
+    Returns:
+        Corrected cameras, whether they are accepted, and the quality of each view.
 
     Raises:
         InputError: no photograph.
     """
     if not photos:
         raise InputError("registration: no photograph given; at least one is needed")
-    start = state = _Start.of(photos)
+    start = state = _Cameras.of(photos)
     features = [feature_image(p.image, p.usable) for p in photos]
     rows = _overlap(photos, features, points)
     edges = [_edge_points(p) for p in photos]
     held = [_held_out(world) for world in edges]
     fit = rows.take(~rows.held_out)
     seen = [world[~h] for world, h in zip(edges, held, strict=True)]
-    free = np.r_[np.repeat(own, 6 * len(photos)), np.repeat(intrinsics, 3)].astype(bool)
+    free = np.r_[np.repeat(poses, 6 * len(photos)), np.repeat(intrinsics, 3)].astype(bool)
     for blur in BLURS if free.any() else ():
         maps = [_Maps.of(f, blur) for f in features]
-        for _ in range(ROUNDS):
+        for _ in range(STEPS_PER_BLUR):
             step = _step(photos, maps, state, fit, seen, free)
             state = state.moved(step)
     maps = [_Maps.of(f, BLURS[-1]) for f in features]
     unseen = [world[h] for world, h in zip(edges, held, strict=True)]
-    spread, gain, error = _compared(photos, maps, (start, state), rows.take(rows.held_out))
-    tied, edge_gain, edge_error = _tied(photos, maps, (start, state), unseen)
+    spread, gain, error = _compare_features(photos, maps, (start, state), rows.take(rows.held_out))
+    tied, edge_gain, edge_error = _compare_edges(photos, maps, (start, state), unseen)
     better = gain > 2.0 * error or (edge_gain > 2.0 * edge_error and gain > 0.0)
     worse = gain < -2.0 * error or edge_gain < -2.0 * edge_error
     accepted = bool(better and not worse and len(photos) >= MIN_VIEWS)
@@ -197,12 +200,9 @@ def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = T
     )
 
 
-# ------------------------------------------------------------------------------------------------------------ parts
-
-
 @dataclass(frozen=True)
-class _Start:
-    """What is being fitted."""
+class _Cameras:
+    """The unknowns of the registration."""
 
     pose: np.ndarray
     principal: np.ndarray
@@ -210,10 +210,10 @@ class _Start:
     twist: np.ndarray  # (V, 6) sum of the steps, for the prior
 
     @classmethod
-    def of(cls, photos: Sequence[Photo]) -> _Start:
+    def of(cls, photos: Sequence[Photo]) -> _Cameras:
         return cls(np.array([p.pose for p in photos], np.float64), np.zeros(2), 1.0, np.zeros((len(photos), 6)))
 
-    def moved(self, step: np.ndarray) -> _Start:
+    def moved(self, step: np.ndarray) -> _Cameras:
         views = len(self.pose)
         twist = step[: 6 * views].reshape(views, 6)
         pose = np.array([a @ _exponential(x) for a, x in zip(self.pose, twist, strict=True)])
@@ -243,7 +243,7 @@ class _Rows:
     held_out: np.ndarray  # (n,) bool
 
     def take(self, choice: np.ndarray) -> _Rows:
-        """Some rows, points numbered anew."""
+        """Select rows and renumber the points."""
         point = np.unique(self.point[choice], return_inverse=True)[1]
         return _Rows(point, self.view[choice], self.world[choice], self.held_out[choice])
 
@@ -267,7 +267,7 @@ class _Maps:
         return cls(value, du, dv, edge, eu, ev)
 
     def at(self, names: Sequence[str], uv: np.ndarray) -> list[np.ndarray]:
-        """Bilinear values at pixel coordinates (n, 2)."""
+        """Interpolate bilinearly at pixel coordinates (n, 2)."""
         h, w = self.value.shape
         x, y = np.clip(uv[:, 0] - 0.5, 0, w - 1.001), np.clip(uv[:, 1] - 0.5, 0, h - 1.001)
         i, j = x.astype(int), y.astype(int)
@@ -280,20 +280,20 @@ class _Maps:
         return out
 
 
-def _camera_points(state: _Start, v: int, world: np.ndarray) -> np.ndarray:
+def _camera_points(state: _Cameras, v: int, world: np.ndarray) -> np.ndarray:
     pose = state.pose[v]
     return (world - pose[:3, 3]) @ pose[:3, :3]
 
 
-def _project(photo: Photo, state: _Start, local: np.ndarray) -> np.ndarray:
+def _project(photo: Photo, state: _Cameras, local: np.ndarray) -> np.ndarray:
     z = np.maximum(local[:, 2], 1e-6)
     fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
     u = photo.principal[0] + fx * (local[:, 0] / z + state.principal[0])
     return np.stack([u, photo.principal[1] + fy * (local[:, 1] / z + state.principal[1])], -1)
 
 
-def _jacobian(photo: Photo, state: _Start, local: np.ndarray, du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of an image value by the twist (n, 6) and by principal point and log focal length (n, 3)."""
+def _jacobian(photo: Photo, state: _Cameras, local: np.ndarray, du: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of an image value by the twist (n, 6) and by principal point and log focal length (n, 3) (Eq. C.31)."""
     x, y, z = local[:, 0], local[:, 1], np.maximum(local[:, 2], 1e-6)
     fx, fy = photo.focal[0] * state.focal, photo.focal[1] * state.focal
     gx, gy = du * fx / z, dv * fy / z
@@ -306,10 +306,10 @@ def _jacobian(photo: Photo, state: _Start, local: np.ndarray, du: np.ndarray, dv
 
 
 def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: int) -> _Rows:
-    """Textured surface points and the views that show them."""
+    """Find textured surface points and the views that show them."""
     from scipy.ndimage import minimum_filter
 
-    state = _Start.of(photos)
+    state = _Cameras.of(photos)
     flat = [_inner(p) for p in photos]
     each = -(-points // len(photos))
     world = []
@@ -319,7 +319,7 @@ def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: in
             continue
         dv, du = np.gradient(f)
         strong = np.hypot(du, dv).ravel()[index]
-        # The strongest half, thinned evenly: every part of the picture keeps a say.
+        # The half with the strongest gradients, thinned evenly over the picture.
         index = index[strong >= np.median(strong)]
         world.append(_world(p, index[:: max(1, len(index) // each)]))
     everything = np.concatenate(world) if world else np.zeros((0, 3))
@@ -345,20 +345,20 @@ def _overlap(photos: Sequence[Photo], features: Sequence[np.ndarray], points: in
 
 
 def _held_out(world: np.ndarray) -> np.ndarray:
-    """(n,) bool of points (n, 3): whole blocks of surface."""
-    block = np.floor(world / BLOCK).astype(np.int64)
-    return (block * np.array([73856093, 19349663, 83492791])).sum(1) % 1_000_003 % HELD_OUT == 0
+    """Which of the points (n, 3) are held out, (n,) bool: whole blocks of surface."""
+    block = np.floor(world / HELD_OUT_BLOCK).astype(np.int64)
+    return (block * np.array([73856093, 19349663, 83492791])).sum(1) % 1_000_003 % HELD_OUT_EVERY == 0
 
 
 def _inner(photo: Photo) -> np.ndarray:
-    """(H, W) bool: usable smooth surface away from silhouettes and borders, not seen flat."""
+    """(H, W) bool: usable smooth surface away from silhouettes and borders, not seen at a grazing angle."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     depth = photo.depth
     low, high = minimum_filter(depth, 5), maximum_filter(depth, 5)
     rays = _rays(photo)
     facing = np.abs((photo.normal * (rays @ photo.pose[:3, :3].T)).sum(-1)) / np.linalg.norm(rays, axis=-1)
-    out = photo.usable & (low > 0) & (high < 1.1 * low) & (facing > GRAZING)
+    out = photo.usable & (low > 0) & (high < 1.1 * low) & (facing > MIN_COSINE)
     out[:3], out[-3:], out[:, :3], out[:, -3:] = False, False, False, False
     return out
 
@@ -386,7 +386,9 @@ def _level(value: np.ndarray, weight: np.ndarray, point: np.ndarray) -> np.ndarr
     return (np.bincount(point, weight * value) / np.maximum(total, 1e-12))[point]
 
 
-def _values(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows, names: Sequence[str]) -> list[np.ndarray]:
+def _values(
+    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows, names: Sequence[str]
+) -> list[np.ndarray]:
     out = [np.zeros(len(rows.view)) for _ in names]
     for v, (photo, m) in enumerate(zip(photos, maps, strict=True)):
         own = np.flatnonzero(rows.view == v)
@@ -396,8 +398,8 @@ def _values(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows:
     return out
 
 
-def _residuals(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows) -> np.ndarray:
-    """(n,) feature value less that of the point, the mean of the views that are not held."""
+def _residuals(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows) -> np.ndarray:
+    """(n,) feature value less that of the point, which is the mean over the views that are not held out."""
     value = _values(photos, maps, state, rows, ("value",))[0]
     moving = np.array([not p.held for p in photos], np.float64)[rows.view]
     return value - _level(value, moving, rows.point)
@@ -406,12 +408,12 @@ def _residuals(photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, ro
 def _step(
     photos: Sequence[Photo],
     maps: Sequence[_Maps],
-    state: _Start,
+    state: _Cameras,
     rows: _Rows,
     edges: Sequence[np.ndarray],
     free: np.ndarray,
 ) -> np.ndarray:
-    """One Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
+    """Compute one Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
     from scipy.sparse import coo_matrix
 
     views = len(photos)
@@ -427,7 +429,7 @@ def _step(
     own = np.abs(residual[moving > 0])
     scale = max(1.4826 * float(np.median(own)) if len(own) else 1.0, 1e-3)
     weight = 1.0 / (1.0 + (residual / (2.385 * scale)) ** 2) / scale**2
-    # Of a photograph that is held only its own twist moves, and the level not at all.
+    # A held-out photograph changes its own twist only, not the intrinsics and not the levels.
     common *= moving[:, None]
     mean = _level(value, weight * moving + 1e-9, rows.point)
     number = np.arange(len(value))
@@ -439,21 +441,21 @@ def _step(
     total = np.maximum(np.bincount(rows.point, level), 1e-9)
     pooled = coo_matrix((level, (rows.point, number)), (len(total), len(value))).tocsr() @ matrix
     pooled = pooled.multiply(1.0 / total[:, None]).tocsr()
-    # The level stands still for a photograph that is held: its rows must not move the others.
+    # The levels are constants for a held-out photograph, so that its rows do not move the other cameras.
     centred = matrix - pooled[rows.point].multiply(moving[:, None]).tocsr()
     weighted = centred.multiply(weight[:, None]).tocsr()
     normal = np.asarray((centred.T @ weighted).todense())
     right = -np.asarray(weighted.T @ (value - mean)).ravel()
     _add_edges(photos, maps, state, edges, normal, right)
     precision = np.r_[np.tile(np.repeat([SIGMA_ROTATION, SIGMA_TRANSLATION], 3), views), [SIGMA_PRINCIPAL] * 2, SIGMA_FOCAL] ** -2
-    precision *= max(len(value) / max(views, 1) / 200.0, 1.0)  # errors of neighbouring rows go together
+    precision *= max(len(value) / max(views, 1) / 200.0, 1.0)  # the errors of neighbouring rows are correlated
     sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
     normal[np.diag_indices(size)] += precision
     right -= precision * sum_of_steps
-    open_ = np.flatnonzero(free)
+    unknowns = np.flatnonzero(free)
     step = np.zeros(size)
-    if len(open_):
-        step[open_] = np.linalg.solve(normal[np.ix_(open_, open_)], right[open_])
+    if len(unknowns):
+        step[unknowns] = np.linalg.solve(normal[np.ix_(unknowns, unknowns)], right[unknowns])
     limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
     return np.clip(step, -limit, limit)
 
@@ -461,7 +463,7 @@ def _step(
 def _add_edges(
     photos: Sequence[Photo],
     maps: Sequence[_Maps],
-    state: _Start,
+    state: _Cameras,
     edges: Sequence[np.ndarray],
     normal: np.ndarray,
     right: np.ndarray,
@@ -475,15 +477,15 @@ def _add_edges(
         own, common = _jacobian(photo, state, local, du, dv)
         whole = np.concatenate([own, common * (not photo.held)], 1)
         at = np.r_[6 * v + np.arange(6), last]
-        weight = EDGE_SAY / max(float(np.var(1 - value)), 1e-3)
+        weight = EDGE_WEIGHT / max(float(np.var(1 - value)), 1e-3)
         normal[np.ix_(at, at)] += weight * whole.T @ whole
         right[at] += weight * whole.T @ (1 - value)
 
 
-def _compared(
-    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Start], rows: _Rows
+def _compare_features(
+    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Cameras], rows: _Rows
 ) -> tuple[tuple[float, float], float, float]:
-    """Robust spread of the features under two states; mean fall of Cauchy's loss and its standard error."""
+    """Robust spread of the features under two states; mean decrease of Cauchy's loss and its standard error."""
     residual = [_residuals(photos, maps, state, rows) for state in states]
     if not len(rows.view):
         return (0.0, 0.0), 0.0, np.inf
@@ -493,10 +495,10 @@ def _compared(
     return (spread[0], spread[1]), *_by_cluster(loss, rows.view)
 
 
-def _tied(
-    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Start], edges: Sequence[np.ndarray]
+def _compare_edges(
+    photos: Sequence[Photo], maps: Sequence[_Maps], states: Sequence[_Cameras], edges: Sequence[np.ndarray]
 ) -> tuple[tuple[float, float], float, float]:
-    """Mean photograph edge at mesh edges under two states; its rise and the standard error."""
+    """Mean photograph edge at mesh edges under two states; its increase and the standard error."""
     view = np.repeat(np.arange(len(photos)), [len(world) for world in edges])
     if not len(view):
         return (0.0, 0.0), 0.0, np.inf
@@ -513,9 +515,9 @@ def _tied(
 
 
 def _quality(
-    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Start, rows: _Rows
+    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sharpness, agreement and remaining shift of each view against what the others show of the same surface."""
+    """Sharpness, agreement and remaining shift of each view, relative to the other views of the same surface."""
     views = len(photos)
     agreement, shift = np.zeros(views), np.zeros(views)
     value, du, dv = _values(photos, maps, state, rows, ("value", "du", "dv"))
@@ -534,14 +536,14 @@ def _quality(
         normal = slope.T @ (robust[:, None] * slope) + 1e-9 * np.eye(2)
         shift[v] = float(np.hypot(*np.linalg.solve(normal, slope.T @ (robust * gap))))
     seen = metres > 0
-    # A gradient a metre of surface: a view from afar shows the same texture steeper a pixel.
+    # Gradients are per metre of surface, because a distant view shows the same texture steeper per pixel.
     steep = np.hypot(du[seen], dv[seen]) / metres[seen]
     gains = estimate_gains(rows.point[seen], rows.view[seen], steep, views)
     typical = np.median(gains.gain[gains.estimated]) if gains.estimated.any() else 1.0
     return np.where(gains.estimated, gains.gain / typical, 0.0), agreement, shift
 
 
-def _motion(photos: Sequence[Photo], before: _Start, after: _Start, v: int) -> float:
+def _motion(photos: Sequence[Photo], before: _Cameras, after: _Cameras, v: int) -> float:
     index = np.flatnonzero(photos[v].depth > 0)[::97]
     if not len(index):
         return 0.0
@@ -551,7 +553,7 @@ def _motion(photos: Sequence[Photo], before: _Start, after: _Start, v: int) -> f
 
 
 def _by_cluster(loss: np.ndarray, cluster: np.ndarray) -> tuple[float, float]:
-    """Mean and its standard error when rows of a cluster go together."""
+    """Mean, and its standard error when the rows of a cluster are correlated."""
     if not len(loss):
         return 0.0, np.inf
     total, count = np.bincount(cluster, loss), np.bincount(cluster)

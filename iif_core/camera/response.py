@@ -1,24 +1,24 @@
 """Camera response: the sensor value f(x) of exposed radiance x = e L, its derivatives and its inverse.
 
-A `Response` is a family and its parameters. Every family is monotone with f(0) = 0 and f(1) = 1; beyond [0, 1] it
-goes on as a straight line with its end slope, so that a prediction that is too bright keeps a gradient (METHOD
-H32). `identity` (HDR) is a straight line everywhere.
+A `Response` is a family and its parameters (docs/method/camera.md#response-families). Every family increases from f(0) = 0 to
+f(1) = 1. Beyond [0, 1] it continues as a straight line with the slope of that end, so that a prediction that is too bright
+keeps a gradient (Eq. C.16, docs/method/numerics.md#response-above-white).
 
 | family | parameters | f(x), 0 <= x <= 1 |
 |---|---|---|
-| identity | - | x |
-| srgb | - | IEC 61966-2-1 |
-| gamma | gamma | x^(1 / gamma) |
-| ggcm | a0, a1, a2 | x^exp(a0 + a1 x + a2 x^2)  (Ng, Chang and Tsui: generalised gamma curve model) |
-| spline | rise_1 ... rise_{K-1}, slope_0 ... slope_K | S(x^0.45), K even bins (ECOSYSTEM 8) |
+| identity | - | x (HDR; a straight line everywhere) |
+| srgb | - | IEC 61966-2-1 (Eq. C.11) |
+| gamma | gamma | x^(1 / gamma) (Eq. C.12) |
+| ggcm | a0, a1, a2 | x^exp(a0 + a1 x + a2 x^2), the generalised gamma curve model of Ng, Chang and Tsui (Eq. C.13) |
+| spline | rise_1 ... rise_{K-1}, slope_0 ... slope_K | S(x^0.45), K even bins (Eq. C.14) |
 | sampled | - | straight lines between given samples |
 
-S is the monotone rational-quadratic spline (Gregory and Delbourgo): knots at k / K, slopes exp(slope_k) there, and rises
-between knots that are the softmax of (rise_1, ..., rise_{K-1}, 0). Any numbers give a strictly rising curve with a closed
+S is the monotone rational-quadratic spline of Gregory and Delbourgo: knots at k / K, slopes exp(slope_k) there, and rises
+between knots that are the softmax of (rise_1, ..., rise_{K-1}, 0). Any parameters give a strictly rising curve with a closed
 inverse; all zeros give x^0.45.
 
-Powers have an infinite slope at 0. Below x = 1e-4 (less than one 8-bit step) they are continued by the parabola through
-the origin that has the same value and slope there.
+Powers have an infinite slope at 0. Below x = 1e-4, less than one 8-bit step, a parabola through the origin with the same value
+and slope at 1e-4 replaces them (Eq. C.15, docs/method/numerics.md#pow-at-zero).
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ START: dict[str, tuple[float, ...]] = {
 }
 """Starting parameters, near sRGB."""
 SPLINE_BINS = (2, 8)
-"""Fewest and most bins of a spline; K bins have 2 K parameters, and 3 unless said."""
+"""Smallest and largest number of bins K of a spline, which has 2 K parameters; 3 by default."""
 _SPLINE_POWER = 0.45
-_SPLINE_BOUND = 5.0  # rises between 1e-5 and 1, slopes between 1/150 and 150 of x^0.45's
+_SPLINE_BOUND = 5.0  # of all parameters; allows slopes between 1/150 and 150 times that of x^0.45
 _TOE = 1e-4  # end of the parabola that replaces a power near 0
 _GAMMA_BOUNDS = (0.6, 6.0)
 _A0_BOUNDS = (-2.0, 0.5)  # exponent at 0 between 0.135 and 1.65
 _A_BOUND = 4.0
 # x^exp(P(x)) rises wherever 1 + x log(x) P'(x) > 0; x log x >= -1/e, so P' < e on [0, 1] is enough.
 _SLOPE_BOUND = 2.5
-_MIN_INCREMENT = 1e-6  # METHOD H29: flat pieces of a measured curve have no inverse
+_MIN_INCREMENT = 1e-6  # flat pieces of a measured curve have no inverse (docs/method/numerics.md#flat-pieces-of-a-response)
 
 
 @dataclass(frozen=True)
 class Response:
-    """A camera response; build one with `response(family)` or `sampled_response(x, y)`.
+    """A camera response; made by `response(family)` or `sampled_response(x, y)`.
 
     Attributes:
         family: one of `FAMILIES`.
         params: (P,) float64, shared by the channels, or (C, P), one row for each entry of the last axis of the input.
-        samples: `sampled` only: x (S,) and y (S,) or (C, S), increasing, from 0 to 1.
+        samples: of `sampled` only: x (S,) and y (S,) or (C, S), increasing, from 0 to 1.
     """
 
     family: str
@@ -74,25 +74,26 @@ class Response:
         return parameter_names(self.family, self.params.shape[-1])
 
     def with_params(self, params: np.ndarray) -> Response:
-        """The same family with other parameters, moved into the range where the curve is monotone."""
+        """Return the same family with other parameters, moved into the range in which the curve is monotone."""
         return replace(self, params=project(self.family, np.asarray(params, np.float64)))
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """f(x): float64, shape of x; any real x."""
+        """Compute f(x) for any real x: float64, shape of x."""
         return self._evaluate(x)[0]
 
     def derivative(self, x: np.ndarray) -> np.ndarray:
-        """df/dx: float64, shape of x, > 0."""
+        """Compute df/dx > 0: float64, shape of x."""
         return self._evaluate(x)[1]
 
     def evaluate(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """f, df/dx and df/dparams in one pass: shapes x, x, x + (P,); float64."""
+        """Compute f, df/dx and df/dparams in one pass: float64 of the shapes x, x, x + (P,)."""
         return self._evaluate(x, True)
 
     def inverse(self, y: np.ndarray) -> np.ndarray:
-        """x with f(x) = y: float64, shape of y; any real y (straight lines outside [0, 1]).
+        """Find x with f(x) = y for any real y: float64, shape of y.
 
-        A value at the top of the sensor's range only says x >= inverse(y): treat it as censored (METHOD H30).
+        A value at the top of the sensor's range only bounds x from below and is treated as censored (Eq. C.10,
+        docs/method/numerics.md#saturated-pixels).
         """
         y = np.asarray(y, np.float64)
         if self.family == "identity":
@@ -105,7 +106,7 @@ class Response:
         return np.stack([self.channel(c)._inverse_shared(y[..., c]) for c in range(channels)], -1)
 
     def channel(self, index: int) -> Response:
-        """The response of one channel."""
+        """Return the response of one channel."""
         params = self.params[index] if self.params.ndim == 2 else self.params
         samples = self.samples
         if samples is not None and samples[1].ndim == 2:
@@ -119,7 +120,7 @@ class Response:
         x = np.asarray(x, np.float64)
         inside = np.clip(x, 0.0, 1.0)
         f, slope, dparams, dslope = self._core(inside, jacobian)
-        # Beyond an end: f(end) + f'(end) (x - end); the parameters move the end slope.
+        # Beyond an end: f(end) + f'(end) (x - end); the slope of the end depends on the parameters.
         beyond = x - inside
         f = f + slope * beyond
         if jacobian and dparams.shape[-1]:
@@ -127,7 +128,7 @@ class Response:
         return f, slope, dparams
 
     def _core(self, x: np.ndarray, jacobian: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """f, f', df/dparams, df'/dparams on [0, 1]; the last is only filled at the two ends."""
+        """f, f', df/dparams, df'/dparams on [0, 1]; the last is filled at the two ends only."""
         none = np.zeros((*x.shape, 0))
         if self.family == "identity":
             return x, np.ones_like(x), none, none
@@ -154,7 +155,7 @@ class Response:
         return low + slope * (x - grid[j]), slope
 
     def _power(self, x: np.ndarray, jacobian: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """x^p(x) and its derivatives, with the parabola below the toe."""
+        """x^p(x) and its derivatives, with the parabola near 0."""
         theta = self.params
         count = theta.shape[-1]
         z = np.maximum(x, _TOE)
@@ -205,8 +206,10 @@ class Response:
         return rise, height / height[..., -1:], np.exp(self.params[..., bins - 1 :])
 
     def _spline(self, x: np.ndarray, jacobian: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """S(u), u = x^0.45 (parabola below the toe); within a bin, with s = h K and q = xi (1 - xi),
-        S = y + h [s xi^2 + d0 q] / [s + (d0 + d1 - 2 s) q]."""
+        """S(u) with u = x^0.45 and its derivatives (Eq. C.14).
+
+        Within a bin, with s = h K and q = xi (1 - xi): S = y + h [s xi^2 + d0 q] / [s + (d0 + d1 - 2 s) q].
+        """
         rise, height, slopes = self._knots()
         bins = rise.shape[-1]
         t = np.minimum(x / _TOE, 1.0)
@@ -236,7 +239,7 @@ class Response:
         # df/d rise_i = [i < j] + [i = j] by_h; the softmax turns it into r_i (df/d rise_i - sum_k r_k df/d rise_k).
         by_rise = (knot[:-1] < j[..., None]) + by_h[..., None] * (knot[:-1] == j[..., None])
         df[..., : bins - 1] = (rise * (by_rise - (rise * by_rise).sum(-1, keepdims=True)))[..., :-1]
-        for k, where in ((0, x <= 0.0), (bins, x >= 1.0)):  # the slope there is that knot's
+        for k, where in ((0, x <= 0.0), (bins, x >= 1.0)):  # the slope at an end is that of its knot
             dslope[..., bins - 1 + k] = np.where(where, end * rate, 0.0)
         return f, end * rate, df, dslope
 
@@ -272,7 +275,7 @@ class Response:
         return x + (y - inside) / np.where(y < 0, ends[0], ends[1])
 
     def _invert_by_table(self, y: np.ndarray) -> np.ndarray:
-        """Bracket by a table of 2049 values, then Newton steps that a bisection keeps inside the bracket."""
+        """Bracket the solution with a table of 2049 values and refine it by Newton steps safeguarded by bisection."""
         grid = np.linspace(0.0, 1.0, 2049) ** 4
         table = self(grid)
         j = np.clip(np.searchsorted(table, y, side="right") - 1, 0, len(grid) - 2)
@@ -287,14 +290,18 @@ class Response:
 
 
 def response(family: str, params: np.ndarray | None = None) -> Response:
-    """A response of a named family, at its starting parameters unless given.
+    """Make a response of a named family.
 
-    The starting parameters are near sRGB: gamma 2.2; ggcm (-0.8, 0, 0), i.e. x^0.449; spline 0, i.e. x^0.45.
-
-    Example: `response("gamma")(0.5)` is 0.7297.
+    Args:
+        family: any of `FAMILIES` but `sampled`.
+        params: parameters, (P,) or (C, P); those of `START`, which are near sRGB, if None.
 
     Raises:
-        InputError: unknown family, wrong number of parameters, or a non-finite parameter.
+        InputError: unknown family, wrong number of parameters, or a parameter that is not finite.
+
+    Example:
+        >>> round(float(response("gamma")(0.5)), 4)
+        0.7297
     """
     if family not in FAMILIES or family == "sampled":
         allowed = ", ".join(f for f in FAMILIES if f != "sampled")
@@ -309,7 +316,7 @@ def response(family: str, params: np.ndarray | None = None) -> Response:
 
 
 def parameter_names(family: str, size: int) -> tuple[str, ...]:
-    """Names of the `size` parameters of a family."""
+    """Return the names of the `size` parameters of a family."""
     if family == "spline":
         bins = size // 2
         return (*(f"rise_{k}" for k in range(1, bins)), *(f"slope_{k}" for k in range(bins + 1)))
@@ -317,15 +324,15 @@ def parameter_names(family: str, size: int) -> tuple[str, ...]:
 
 
 def sampled_response(x: np.ndarray, y: np.ndarray) -> Response:
-    """A measured curve: straight lines between samples, made strictly increasing and scaled to f(0) = 0, f(1) = 1.
+    """Make the response of a measured curve: straight lines between samples, made increasing and scaled to f(0) = 0, f(1) = 1.
 
     Args:
         x: (S,) exposed radiance, strictly increasing, from 0 to 1, S >= 2.
-        y: (S,) shared, or (C, S) one row a channel: sensor value; falling pieces are flattened (increments of at least
-            1e-6, METHOD H29).
+        y: (S,) shared, or (C, S), one row per channel: sensor value. Increments below 1e-6 of the range are raised to it
+            (docs/method/numerics.md#flat-pieces-of-a-response).
 
     Raises:
-        InputError: wrong shapes, x not from 0 to 1, non-finite samples, or a curve that never rises.
+        InputError: wrong shapes, x not from 0 to 1, samples that are not finite, or a curve that never rises.
     """
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     shapes_ok = x.ndim == 1 and len(x) >= 2 and y.ndim in (1, 2) and y.shape[-1] == len(x)
@@ -344,7 +351,7 @@ def sampled_response(x: np.ndarray, y: np.ndarray) -> Response:
 
 
 def project(family: str, params: np.ndarray) -> np.ndarray:
-    """Nearest parameters (by clipping) for which the curve is strictly monotone on [0, 1]."""
+    """Clip parameters to the range in which the curve is strictly monotone on [0, 1]."""
     theta = np.array(params, np.float64)
     if family == "gamma":
         theta = np.clip(theta, *_GAMMA_BOUNDS)
@@ -359,7 +366,7 @@ def project(family: str, params: np.ndarray) -> np.ndarray:
 
 
 def response_facts(curve: Response) -> dict[str, Any]:
-    """A response as plain values for a JSON file; `response_from_facts` reads them."""
+    """Convert a response to plain values for a JSON file; the inverse of `response_from_facts`."""
     facts: dict[str, Any] = {"family": curve.family, "names": list(curve.names), "parameters": curve.params.tolist()}
     if curve.samples is not None:
         facts["samples"] = {"x": curve.samples[0].tolist(), "y": curve.samples[1].tolist()}
@@ -367,7 +374,7 @@ def response_facts(curve: Response) -> dict[str, Any]:
 
 
 def response_from_facts(facts: dict[str, Any]) -> Response:
-    """The response that `response_facts` wrote."""
+    """Convert the result of `response_facts` back to a response."""
     if facts["family"] == "sampled":
         return sampled_response(facts["samples"]["x"], facts["samples"]["y"])
     return response(facts["family"], np.asarray(facts["parameters"], np.float64))

@@ -1,9 +1,9 @@
-"""How a camera makes a photograph of rendered radiance: exposure, response curve, eight bits.
+"""Simulated photographs: rendered radiance through exposure, response curve and eight bits (Eq. C.34).
 
-    I_c = round(255 f_c(clip(e_v L_c, 0, 1))) / 255          (METHOD 1.3, 4.1; rounded, not truncated)
+    I_c = round(255 f_c(clip(e_v L_c, 0, 1))) / 255
 
-The curves here are S-shaped tone curves over a gamma and belong to none of the families in
-`iif_core.camera.response`, so that a solver which recovers them has not been handed the answer's form.
+The curves are S-shaped tone curves over a gamma (Eq. C.35). They belong to none of the families of `iif_core.camera.response`,
+so that a solver that estimates the response is not given the form of the answer.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from iif_core.errors import InputError
 from iif_core.numerics.color import luminance, srgb_from_linear
 
 STOPS = (0.25, 0.5, 1.0, 2.0, 4.0)
-"""Exposures of the five groups of views, brightest group first (METHOD 4.1)."""
+"""Exposures of the five groups of views, brightest group first (docs/method/camera.md#simulated-photographs)."""
 
 _THIRD = 2.0 ** (-1 / 3)
 
 
 @dataclass(frozen=True)
 class ResponseCurve:
-    """f_c(x) = y + s_c y (1 - y) (2 y - p_c), y = sRGB(x^g_c): an S-curve of strength s, pivot p over sRGB.
+    """f_c(x) = y + s_c y (1 - y) (2 y - p_c), y = sRGB(x^g_c): an S-curve of strength s and pivot p (Eq. C.35).
 
-    Strictly increasing with f(0) = 0 and f(1) = 1 for s_c max(p_c, 2 - p_c) < 1, which is checked.
+    It increases strictly from f(0) = 0 to f(1) = 1 for s_c max(p_c, 2 - p_c) < 1, which is checked.
 
     Attributes:
-        name: what `response_curve` knows it by.
-        gamma, strength, pivot: one value a channel; all-one gamma and zero strength is sRGB itself.
-        linear: leave out sRGB (y = x^g), for a camera that stores radiance.
+        name: name for `response_curve`.
+        gamma, strength, pivot: one value per channel; gamma 1 and strength 0 give sRGB itself.
+        linear: use y = x^g without sRGB, for a camera that stores radiance.
     """
 
     name: str
@@ -56,7 +56,7 @@ class ResponseCurve:
         return y + np.array(self.strength) * y * (1 - y) * (2 * y - np.array(self.pivot))
 
     def samples(self, count: int = 101) -> np.ndarray:
-        """(3, count) float64: f of `count` even steps from 0 to 1."""
+        """f at `count` even steps from 0 to 1, (3, count) float64."""
         return self(np.linspace(0, 1, count)[:, None] * np.ones(3)).T
 
 
@@ -72,9 +72,7 @@ _CURVES = {
 
 
 def response_curve(name: str = "filmic") -> ResponseCurve:
-    """A camera's response by name: `filmic` and `soft` differ from channel to channel; `srgb`; `linear`.
-
-    Example: `response_curve("srgb")([0.5, 0.5, 0.5])` is 0.7354 thrice.
+    """Look up a response by name: `filmic` and `soft` differ between channels; `srgb`; `linear`.
 
     Raises:
         InputError: unknown name.
@@ -91,24 +89,22 @@ def exposures(
     grey: float = 0.18,
     saturated: float = 0.03,
 ) -> np.ndarray:
-    """Exposure of every view: the brightest views get the shortest (METHOD 4.1), few pixels clip.
+    """Choose the exposure of every view, shorter for brighter views.
 
-    Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of near-equal
-    size, the brightest group with stops[0]. One common gain puts the geometric mean over views of stop x
-    median luminance at `grey`. A view with more than the share `saturated` of its valid pixels above 1 in
-    any channel is then closed by whole thirds of a stop until it has no more than that. A black view keeps
-    its group's exposure.
+    Views are sorted by the mean luminance of their valid pixels and cut into len(stops) groups of nearly equal size, the
+    brightest group with stops[0]. One common gain puts the geometric mean over views of stop x median luminance at `grey`. A
+    view with more than the share `saturated` of its valid pixels above 1 in any channel is then reduced by whole thirds of
+    a stop. A black view keeps the exposure of its group.
 
     Args:
-        radiance: one (..., 3) array of linear radiance a view (sizes may differ; small metering pictures do),
-            or one stack (V, ..., 3), or mean radiances (V, 3).
-        valid: masks (...) of the pixels that should not clip, i.e. not lamps and windows; default: all.
+        radiance: linear radiance, one (..., 3) array per view, or one stack (V, ..., 3), or mean radiances (V, 3).
+        valid: masks (...) of the pixels that should not clip, i.e. neither lamps nor windows; all if None.
         stops: relative exposures of the groups, ascending, positive.
-        grey: linear value that a typical view's median luminance lands on.
+        grey: linear value of the median luminance of a typical view.
         saturated: share of pixels in [0, 1).
 
     Returns:
-        (V,) float64, positive: e_v that multiplies radiance before the response.
+        (V,) float64, the factors that multiply radiance before the response.
 
     Raises:
         InputError: no view, shapes that do not match, negative or non-finite radiance, stops not ascending.
@@ -149,7 +145,7 @@ def _valid_pixels(view: int, radiance: np.ndarray, mask: np.ndarray | None) -> n
 
 
 def _closing(exposure: float, pixels: np.ndarray, saturated: float) -> float:
-    """Factor 2^(-n/3), smallest n >= 0, by which at most the share `saturated` of the pixels exceeds 1."""
+    """Factor 2^(-n/3) with the smallest n >= 0 such that at most the share `saturated` of the pixels exceeds 1."""
     if not len(pixels):
         return 1.0
     peak = np.sort(pixels.max(-1))
@@ -158,14 +154,15 @@ def _closing(exposure: float, pixels: np.ndarray, saturated: float) -> float:
 
 
 def expose(radiance: np.ndarray, exposure: float, curve: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
-    """The photograph: round(255 f(clip(e L, 0, 1))) / 255, (..., 3) float32 in [0, 1], one of 256 values.
-
-    Rounded to nearest: the truncation of METHOD 4.1 would darken by half a step. No sensor noise.
+    """Simulate a photograph: round(255 f(clip(e L, 0, 1))) / 255, without sensor noise (Eq. C.34).
 
     Args:
-        radiance: (..., 3) linear; below 0 counts as 0.
+        radiance: (..., 3) linear; negative values count as 0.
         exposure: e > 0.
-        curve: a `ResponseCurve` or any f of (..., 3) into [0, 1]; default `response_curve()`.
+        curve: a `ResponseCurve` or any function of (..., 3) into [0, 1]; `response_curve()` if None.
+
+    Returns:
+        (..., 3) float32 in [0, 1], multiples of 1 / 255.
 
     Raises:
         InputError: exposure not positive and finite, or non-finite radiance.

@@ -1,7 +1,7 @@
-"""LDR-FLIP, the difference that an observer sees when two images alternate (Andersson et al. 2020, HPG).
+"""LDR-FLIP, the difference that an observer sees when two images alternate (Andersson et al. 2020, HPG; Eq. E.5, E.6).
 
-Both images are filtered with the contrast sensitivity of the eye, compared in a uniform colour space (HyAB distance of
-Hunt-adjusted L*a*b*), and the difference is raised where edges and points differ: flip = colour^(1 - feature).
+Both images are filtered with the contrast sensitivity of the eye and compared in a uniform colour space (HyAB distance of
+Hunt-adjusted L*a*b*). The difference is increased where edges and points differ: flip = colour^(1 - feature).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from iif_core.numerics.filters import correlate
 Array = np.ndarray
 
 PIXELS_PER_DEGREE = 67.0
-"""Of the observer: a screen of 0.7 m and 3840 pixels seen from 0.7 m, as in the publication."""
+"""Resolution for the observer: a screen of 0.7 m and 3840 pixels seen from 0.7 m, as in the publication."""
 
 _CHROMATICITIES = ((0.64, 0.33), (0.30, 0.60), (0.15, 0.06))  # sRGB
 _WHITE = (0.3127, 0.3290)
@@ -29,7 +29,7 @@ _KNEE, _AT_KNEE = 0.4, 0.95  # colour differences up to 0.4 of the largest take 
 
 @lru_cache(None)
 def _matrices() -> tuple[Array, Array]:
-    """Linear sRGB -> XYZ relative to white, and back."""
+    """Linear sRGB -> XYZ relative to white, and its inverse."""
     x, y = np.array([*_CHROMATICITIES, _WHITE]).T
     xyz = np.stack([x / y, np.ones(4), (1 - x - y) / y])
     white = xyz[:, 3]
@@ -39,7 +39,7 @@ def _matrices() -> tuple[Array, Array]:
 
 @lru_cache(None)
 def _sensitivity_filters() -> tuple[tuple[Array, ...], ...]:
-    """For each opponent channel the 1-D weights whose products with themselves add up to the filter."""
+    """For each opponent channel the 1-D weights whose outer products with themselves sum to the filter."""
     widest = max(b for terms in _SENSITIVITY for _, b in terms)
     radius = int(np.ceil(3 * np.sqrt(widest / (2 * np.pi**2)) * PIXELS_PER_DEGREE))
     x = np.arange(-radius, radius + 1) / PIXELS_PER_DEGREE
@@ -53,7 +53,7 @@ def _sensitivity_filters() -> tuple[tuple[Array, ...], ...]:
 
 @lru_cache(None)
 def _feature_filters() -> tuple[Array, Array, Array]:
-    """1-D Gaussian, its first and its second derivative; positive and negative weights of the latter add up to 1 and -1."""
+    """1-D Gaussian and its first two derivatives; their positive and negative weights sum to 1 and -1."""
     deviation = 0.5 * _FEATURE_WIDTH * PIXELS_PER_DEGREE
     radius = int(np.ceil(3 * deviation))
     x = np.arange(-radius, radius + 1, dtype=np.float64)
@@ -66,13 +66,15 @@ def _feature_filters() -> tuple[Array, Array, Array]:
 class Seen:
     """An image as the observer sees it.
 
+    Args:
+        image: (H, W, 3) in [0, 1]; encoded: sRGB-encoded instead of linear.
+
     Attributes:
         lab: (3, H, W) float32, Hunt-adjusted L*a*b* of the filtered image.
         edges, points: (H, W) float32, strength of the features.
     """
 
     def __init__(self, image: Array, encoded: bool):
-        """`image`: (H, W, 3) in [0, 1]; `encoded`: sRGB-encoded, else linear."""
         planes = np.ascontiguousarray(np.moveaxis(np.asarray(image, np.float32), -1, 0))
         linear = linear_from_srgb(planes).astype(np.float32) if encoded else planes
         to_xyz, to_rgb = (m.astype(np.float32) for m in _matrices())
@@ -109,13 +111,13 @@ def _colour_distance(p: Array, q: Array) -> Array:
 
 @lru_cache(None)
 def _largest_distance() -> float:
-    """Green against blue."""
+    """Distance between green and blue."""
     green, blue = _hunt_lab(np.eye(3)[:, 1]), _hunt_lab(np.eye(3)[:, 2])
     return float(_colour_distance(green, blue))
 
 
 def difference(prediction: Seen, truth: Seen) -> Array:
-    """(H, W) float32 FLIP of every pixel; 0 = same, 1 = as different as can be."""
+    """Compute the FLIP of every pixel, (H, W) float32: 0 = same, 1 = the largest difference."""
     largest = _largest_distance()
     distance = _colour_distance(prediction.lab, truth.lab) / np.float32(largest)
     colour = np.where(

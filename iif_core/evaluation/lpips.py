@@ -1,9 +1,9 @@
-"""LPIPS v0.1, the learned distance of image patches (Zhang et al. 2018), from weights that the caller gives.
+"""LPIPS v0.1, the learned distance of image patches (Zhang et al. 2018), with weights that the caller supplies (Eq. E.7).
 
     d(x, y) = sum_l mean_p sum_c w_lc (f_lc(x, p) - f_lc(y, p))^2
 
-f_l: activations of layer l of a classification network, scaled to unit length per pixel p; w_l >= 0: the learned head.
-torch is imported where it is used; how many threads it takes is the caller's choice (`torch.set_num_threads`).
+f_l are the activations of layer l of a classification network, scaled to unit length per pixel p; w_l >= 0 is the learned head.
+torch is imported where it is used; the caller chooses its number of threads (`torch.set_num_threads`).
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ Weights = Mapping[str, Array]
 """`conv<i>.weight` (out, in, height, width), `conv<i>.bias` (out,), `head<l>` (channels,): float16 or float32."""
 
 MIN_SIZE = 64
-"""Pixels each way; below, the deepest layer has no more than a few of them (METHOD H38)."""
+"""Smallest width and height in pixels (docs/method/numerics.md#small-images)."""
 
-# Of each network: the convolutions in order as (stride, padding) with "pool" between them, the size of the pooling window
+# For each network: the convolutions in order as (stride, padding) with "pool" between them, the size of the pooling window
 # (its stride is 2), and the convolutions whose activations are compared.
 _ALEX = ((4, 2), "pool", (1, 2), "pool", (1, 1), (1, 1), (1, 1))
 _VGG = ((1, 1),) * 2 + ("pool",) + ((1, 1),) * 2 + ("pool",) + (((1, 1),) * 3 + ("pool",)) * 2 + ((1, 1),) * 3
@@ -34,37 +34,26 @@ NETWORKS: dict[str, tuple[tuple[Any, ...], int, tuple[int, ...]]] = {
 # Means and deviations of the training images, for inputs in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-_EPSILON = 1e-10  # of the unit length; black activations stay 0
+_EPSILON = 1e-10  # added to the length of activations; black activations stay 0
 
 
-def lpips(prediction: Array, truth: Array, weights: Weights, mask: Array | None = None, network: str = "alex") -> Array:
-    """LPIPS of one or several predictions against one truth; 0 = same, about 0.7 = unrelated.
+class Lpips:
+    """LPIPS against one truth, which passes through the network once: 0 = same, about 0.7 = unrelated.
 
-    Pixels outside `mask` get the truth on both sides, and each layer's map of distances is averaged with the mask, reduced
-    to the layer's size by area, as weight: without a mask, or with a full one, it is the published number.
+    Pixels outside `mask` get the truth on both sides. The map of distances of each layer is averaged with the mask, reduced to
+    the size of the layer by area, as weight; without a mask the result is the published number.
 
     Args:
-        prediction: (H, W, 3) or (H, W), or (n, ...) of either; values are clamped to [0, 1] and taken as they are, linear or
-            encoded. One channel is repeated to three.
-        truth: (H, W, 3) or (H, W).
+        truth: (H, W, 3) or (H, W), as every prediction, linear or encoded; values are clamped to [0, 1]. One channel is
+            repeated to three.
         weights: of `network`.
         mask: (H, W) bool, not empty.
         network: `alex` or `vgg`.
-
-    Returns:
-        () or (n,) float64.
 
     Raises:
         InputError: unknown network, fewer than 64 pixels each way, empty mask, shapes that do not match, values that are not
             finite.
     """
-    several = np.ndim(prediction) > np.ndim(truth)
-    distance = Lpips(truth, weights, mask, network)
-    return np.array([distance(image) for image in prediction], np.float64) if several else np.float64(distance(prediction))
-
-
-class Lpips:
-    """LPIPS against one truth, which goes through the network once; arguments and errors as of `lpips`."""
 
     def __init__(self, truth: Array, weights: Weights, mask: Array | None = None, network: str = "alex"):
         import torch
@@ -121,12 +110,12 @@ def _as_torch(weights: Weights, network: str) -> dict[str, Any]:
     if missing:
         raise InputError(f"LPIPS weights of {network}: {missing[0]} is missing ({len(missing)} of {len(names)})")
     parts = {name: torch.from_numpy(np.array(weights[name], np.float32)) for name in names}
-    # Channels last: a quarter faster on a CPU.
+    # This memory layout is faster on CPUs.
     return {name: p.contiguous(memory_format=torch.channels_last) if p.ndim == 4 else p for name, p in parts.items()}
 
 
 def _input(images: Array) -> Any:
-    """(n, H, W, 3) in [0, 1] -> (n, 3, H, W) as the networks were trained on."""
+    """Convert (n, H, W, 3) in [0, 1] to (n, 3, H, W) with the normalisation of the training images."""
     import torch
 
     scale, shift = np.array(_SCALE), np.array(_SHIFT)

@@ -1,18 +1,17 @@
-"""Scores of one image: L2, PSNR, SSIM, FLIP, LPIPS for maps; log-L2 and IoU for emission; three protocols (METHOD 2.11).
+"""Scores of one image (docs/method/evaluation.md): L2, PSNR, SSIM, FLIP and LPIPS of maps; log-L2 and IoU of emission.
 
-Protocols say what the prediction may be forgiven before it is compared:
+A protocol says what a prediction is forgiven before it is compared:
 
 | protocol | the prediction is |
 |---|---|
-| `raw` | taken as it is |
-| `scaled` | multiplied by one gain per image and channel, sum truth / sum prediction (albedo, emission, radiance) |
-| `oracle_affine` | mapped by each object's best affine to the truth: 3x4 for albedo, 1x2 for roughness, metallic |
+| `raw` | used as it is |
+| `scaled` | multiplied by one gain per image and channel, sum truth / sum prediction (Eq. E.9) |
+| `oracle_affine` | mapped by each object's best affine to the truth, 3x4 for albedo, 1x2 for roughness and metallic (Eq. E.10) |
 
-Which pixels count is METHOD 2.11 (B), masks from the *truth*: emitters count for no material, mirrors (roughness below
-0.05) not for albedo, nor pixels without a hit or without meaningful truth. A prediction cannot change its own mask.
-
-All images are linear float (H, W) or (H, W, 3); `mask` is (H, W) bool. A score that cannot be computed is a `Score`
-with `value=None` and the reason, never a NaN. Not quantised to 8 bits (the reference is; that moves L2 by 1e-6).
+The masks of the pixels that count come from the truth (Eq. E.1), so a prediction cannot change its own mask. All images are
+linear float (H, W) or (H, W, 3), not quantised to 8 bits; `mask` is (H, W) bool. A score that cannot be computed is a `Score`
+with `value=None` and the reason, never NaN. The functions of single metrics take prediction, truth and a mask that is not
+empty; `Target` shares what several predictions of one truth need.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from functools import cached_property
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.evaluation.catalogue import LPIPS_NETWORKS, METRICS_OF, PERCEPTUAL, PROTOCOLS, PROTOCOLS_OF
 from iif_core.evaluation.flip import Seen, difference
 from iif_core.evaluation.lpips import Lpips, Weights
 from iif_core.numerics.filters import correlate
@@ -31,36 +31,14 @@ from iif_core.numerics.filters import correlate
 Array = np.ndarray
 
 PSNR_CAP = 100.0
-"""PSNR of identical images, as in the reference; it would be infinite."""
+"""PSNR of identical images, which would be infinite (docs/method/numerics.md#psnr-of-identical-images)."""
 
 MIRROR_ROUGHNESS = 0.05
-"""Below this true roughness the albedo of a surface is not visible and not scored."""
+"""True roughness below which the albedo of a surface is not visible and not scored."""
 
 SSIM_WINDOW = 11
-PROTOCOLS = ("raw", "scaled", "oracle_affine")
-PROTOCOLS_OF = {
-    "albedo": PROTOCOLS,
-    "roughness": ("raw", "oracle_affine"),
-    "metallic": ("raw", "oracle_affine"),
-    "emission": ("raw", "scaled"),
-    "rgb": ("raw",),
-}
-"""Roughness and metallic have no gain that the photographs leave open; emission x albedo has one (LDR)."""
-
-METRICS_OF = {
-    "albedo": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
-    "roughness": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
-    "metallic": ("l2", "psnr", "ssim", "lpips", "lpips_vgg"),
-    "emission": ("l2", "log_l2", "iou"),
-    "rgb": ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg"),
-}
-LPIPS_NETWORKS = {"lpips": "alex", "lpips_vgg": "vgg"}
-"""The paper reports LPIPS with VGG16; AlexNet is what its authors recommend, and a twentieth of the work."""
-
-PERCEPTUAL = ("flip", *LPIPS_NETWORKS)
-
-_MIN_MEAN = 1e-4  # H36: a darker prediction is not scaled
-_SCORED_MIN = 1e-6  # emission below this is no emission
+_MIN_MEAN = 1e-4  # darker predictions are not scaled (docs/method/numerics.md#scaling-a-black-image)
+_MIN_EMISSION = 1e-6  # smaller radiance does not count as emission
 
 
 @dataclass(frozen=True)
@@ -73,15 +51,12 @@ class Score:
     reason: str = ""
 
 
-# --------------------------------------------------------------------------------------------------------------- masks
-
-
 def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) -> dict[str, Array]:
-    """Pixels that count for each quantity, METHOD 2.11 (B).
+    """Find the pixels that count for each quantity (Eq. E.1).
 
     Args:
-        valid: (H, W) bool, the truth means something here.
-        hit: (H, W) bool, the pixel sees the mesh.
+        valid: (H, W) bool, whether the truth is meaningful.
+        hit: (H, W) bool, whether the pixel sees the mesh.
         emission: (H, W, 3) true radiance; more than 0 in any channel = emitter.
         roughness: (H, W) true perceptual roughness.
 
@@ -98,17 +73,14 @@ def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) 
     }
 
 
-# ------------------------------------------------------------------------------------------------------------- metrics
-
-
 def l2(prediction: Array, truth: Array, mask: Array) -> float:
-    """Mean squared error over the masked pixels and the channels (not a root). The mask must not be empty."""
+    """Compute the mean squared error over the masked pixels and the channels (Eq. E.2)."""
     difference = prediction[mask].astype(np.float64) - truth[mask]
     return float(np.mean(difference * difference))
 
 
 def psnr(prediction: Array, truth: Array, mask: Array) -> float:
-    """10 log10(1 / MSE) in dB, data range 1, at most 100. Example: every pixel 0.1 off -> 20."""
+    """Compute 10 log10(1 / MSE) in dB for data range 1, at most 100 (Eq. E.3). Example: every pixel 0.1 off -> 20."""
     return _decibel(l2(prediction, truth, mask))
 
 
@@ -117,12 +89,11 @@ def _decibel(error: float) -> float:
 
 
 def ssim(prediction: Array, truth: Array, mask: Array) -> float:
-    """Structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, range 1 (Wang et al. 2004).
+    """Compute structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, range 1 (Eq. E.4).
 
-    Pixels that do not count get the truth on both sides, and the map of local similarities is averaged over pixels
-    that count: a window that reaches over the border of the mask sees agreement there, so such pixels score slightly
-    too well. As in the common implementations, the 5 pixels next to the image border are windows only, unless nothing
-    else counts.
+    Pixels that do not count get the truth on both sides. A window that reaches over the border of the mask sees agreement
+    there, so such pixels score slightly too well. The 5 pixels next to the image border are part of windows only, unless
+    nothing else counts.
 
     Raises:
         InputError: an image smaller than the window.
@@ -153,7 +124,7 @@ class _Structure:
         return correlate(plane, self.window, self.window, "symmetric")
 
     def similarity(self, filled: Array) -> float:
-        """`filled`: the prediction, with the truth where the mask does not count."""
+        """SSIM of `filled`, the prediction with the truth where the mask does not count."""
         total = 0.0
         for p, t, (mean_t, square_t) in zip(_planes(filled), self.truth, self.moments, strict=True):
             mean_p, square_p, product = self._mean(p), self._mean(p * p), self._mean(p * t)
@@ -171,9 +142,15 @@ def _planes(image: Array) -> Array:
 
 
 def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) -> float:
-    """LDR-FLIP (`iif_core.evaluation.flip`), mean over the masked pixels, 0 = same.
+    """Compute LDR-FLIP, the mean over the masked pixels, 0 = same (Eq. E.6).
 
-    Pixels that do not count get the truth on both sides. `encoded`: the images are sRGB-encoded, else linear.
+    Args:
+        prediction, truth: (H, W, 3); pixels that do not count get the truth on both sides.
+        mask: (H, W) bool.
+        encoded: whether the images are sRGB-encoded instead of linear.
+
+    Returns:
+        Mean in [0, 1].
     """
     truth = np.where(np.isfinite(truth), truth, 0)
     filled = np.where(mask[..., None], prediction, truth)
@@ -182,26 +159,31 @@ def flip(prediction: Array, truth: Array, mask: Array, encoded: bool = False) ->
 
 
 def log_l2(prediction: Array, truth: Array, mask: Array) -> float:
-    """Mean squared error of log(1 + x), for radiance (negative values count as 0)."""
+    """Compute the mean squared error of log(1 + x) of radiance; negative values count as 0 (Eq. E.8)."""
     difference = np.log1p(np.maximum(prediction[mask].astype(np.float64), 0)) - np.log1p(np.maximum(truth[mask], 0))
     return float(np.mean(difference * difference))
 
 
 def iou(prediction: Array, truth: Array, mask: Array) -> float:
-    """Intersection over union of the emitting pixels (any channel above 1e-6); 1 when neither image emits."""
-    p, t = ((image[mask] > _SCORED_MIN).any(-1) for image in (prediction, truth))
+    """Compute intersection over union of the emitting pixels (any channel above 1e-6); 1 if neither image emits (Eq. E.8)."""
+    p, t = ((image[mask] > _MIN_EMISSION).any(-1) for image in (prediction, truth))
     union = np.count_nonzero(p | t)
     return np.count_nonzero(p & t) / union if union else 1.0
 
 
-# ----------------------------------------------------------------------------------------------------------- protocols
-
-
 def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1.0) -> Array:
-    """Prediction times one gain per channel, sum truth / sum prediction over the mask; clamped to [0, limit].
+    """Multiply the prediction by one gain per channel, sum truth / sum prediction over the mask (Eq. E.9).
 
-    A channel whose mean prediction is below 1e-4 keeps gain 1 (METHOD H36), and so does one whose truth is black: a gain of
-    0 would erase what was wrongly found there. `limit=None`: not clamped above.
+    A channel whose mean prediction is below 1e-4 or whose truth is black keeps the gain 1
+    (docs/method/numerics.md#scaling-a-black-image).
+
+    Args:
+        prediction, truth: (H, W, 3).
+        mask: (H, W) bool.
+        limit: upper limit of the result; None = no limit.
+
+    Returns:
+        (H, W, 3) float64, >= 0.
     """
     prediction = np.asarray(prediction, np.float64)
     return _gained(prediction, prediction[mask].mean(0), np.asarray(truth, np.float64)[mask].mean(0), limit)
@@ -214,15 +196,19 @@ def _gained(values: Array, mean_prediction: Array, mean_truth: Array, limit: flo
 
 
 def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
-    """Prediction mapped by the affine of each object that is nearest to the truth: an upper bound, not a result.
+    """Map the prediction by the affine of each object that is nearest to the truth: an upper bound, not a result (Eq. E.10).
 
-    Least squares per image and object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's
-    pixels in `mask`; 3x4 for three channels, 1x2 for one; clamped to [0, 1]. Where the prediction is constant, A tends
-    to 0 and the object gets its mean. Pixels outside the mask are left as they are.
+    Least squares per object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's pixels in `mask`.
+    Where the prediction is constant, A tends to 0 and the object gets its true mean.
 
     Args:
+        prediction, truth: (H, W, 3), or (H, W).
+        mask: (H, W) bool; pixels outside are unchanged.
         object_id: (H, W) int; -1 forms one object.
-        ridge: added variance; 1e-6 = differences of 0.001 are not stretched.
+        ridge: added variance; with 1e-6 differences of 0.001 are not stretched.
+
+    Returns:
+        float64 in the shape of the prediction, within [0, 1] in the mask.
     """
     x = np.array(prediction, np.float64).reshape(*mask.shape, -1)
     y = np.asarray(truth, np.float64).reshape(*mask.shape, -1)
@@ -242,13 +228,13 @@ class _Groups:
         self.mean_y, self.dy = self._centred(truth)
 
     def _centred(self, values: Array) -> tuple[Array, Array]:
-        """Means (groups, channels), and what is left, (channels, n) in the order of the groups."""
+        """Means (groups, channels), and the deviations from them, (channels, n) in the order of the groups."""
         ordered = np.ascontiguousarray(values[self.order].T)
         mean = np.add.reduceat(ordered, self.starts, 1) / self.count
         return mean.T, ordered - np.repeat(mean, self.count, 1)
 
     def nearest(self, values: Array, ridge: float = 1e-6) -> Array:
-        """(n, channels) `values` mapped by the affine of their group that is nearest to the truth, in [0, 1]."""
+        """Map `values` (n, channels) by the affine of their group that is nearest to the truth, clamped to [0, 1]."""
         _, dx = self._centred(values)
         n, m = len(dx), len(self.dy)
         s_xx, s_xy = np.empty((len(self.count), n, n)), np.empty((len(self.count), n, m))
@@ -267,9 +253,6 @@ class _Groups:
         return out
 
 
-# ----------------------------------------------------------------------------------------------------------- one image
-
-
 def score_map(
     quantity: str,
     prediction: Array,
@@ -280,19 +263,27 @@ def score_map(
     encoded: bool = False,
     networks: Mapping[str, Weights] | None = None,
 ) -> list[Score]:
-    """Every score of one map under every protocol that applies to its quantity; see `Target`."""
+    """Compute every score of one map under every protocol of its quantity.
+
+    Args:
+        quantity, truth, mask, object_id, encoded, networks: as of `Target`.
+        prediction, metrics: as of `Target.scores`.
+
+    Returns:
+        Scores in the order of the protocols.
+    """
     return Target(quantity, truth, mask, object_id, encoded, networks).scores(prediction, metrics)
 
 
 class Target:
-    """A true map and the pixels that count; what the scores need of them is computed once, for any number of predictions.
+    """A true map and the pixels that count, prepared for scoring any number of predictions.
 
     Args:
         quantity: `albedo`, `roughness`, `metallic`, `emission` or `rgb`.
         truth: (H, W, 3), or (H, W) for roughness and metallic.
         mask: (H, W) bool, pixels that count.
-        object_id: (H, W) int, for `oracle_affine`; without it that protocol is left out.
-        encoded: images are sensor values, not linear (matters to FLIP only; LPIPS takes every image as it is).
+        object_id: (H, W) int for `oracle_affine`; without it that protocol is left out.
+        encoded: whether the images are sensor values instead of linear; used by FLIP only.
         networks: `alex` and `vgg` -> weights of LPIPS (`iif_core.evaluation.lpips`).
 
     Raises:
@@ -321,11 +312,15 @@ class Target:
     def scores(
         self, prediction: Array, metrics: Iterable[str] | None = None, perceptual: Container[str] = PROTOCOLS
     ) -> list[Score]:
-        """Scores of one prediction, (H, W, 3) or (H, W) as the truth, under every protocol that applies to the quantity.
+        """Score one prediction, (H, W, 3) or (H, W) as the truth, under every protocol of the quantity.
 
         Args:
-            metrics: default: all of the quantity; LPIPS only where its network is given.
-            perceptual: protocols under which FLIP and LPIPS, which take most of the time, are computed.
+            prediction: map of the shape of the truth.
+            metrics: all of the quantity if None; LPIPS only where its network is given.
+            perceptual: protocols under which FLIP and LPIPS are computed, which take most of the time.
+
+        Returns:
+            Scores in the order of the protocols.
 
         Raises:
             InputError: shapes that do not match.
@@ -343,7 +338,7 @@ class Target:
             for protocol in PROTOCOLS_OF[self.quantity]
             if protocol != "oracle_affine" or self._object_id is not None
             for metric in wanted
-            if (metric != "iou" or protocol == "raw")  # a mask has no scale
+            if (metric != "iou" or protocol == "raw")  # IoU does not depend on the scale
             and (metric not in PERCEPTUAL or protocol in perceptual)
         ]
         values = self._at(prediction)
@@ -386,7 +381,7 @@ class Target:
 
     @cached_property
     def _everywhere(self) -> Array:
-        """The truth, 0 where it is not finite (such pixels do not count)."""
+        """The truth, 0 where it is not finite; such pixels do not count."""
         return np.where(np.isfinite(self.truth), self.truth, 0).astype(np.float64)
 
     @cached_property
@@ -438,7 +433,7 @@ class _Candidate:
 
     @cached_property
     def filled(self) -> Array:
-        """The whole image, the truth where a pixel does not count."""
+        """The whole image, with the truth where a pixel does not count."""
         image = self.target._everywhere.copy()
         image[self.target.mask] = self.values if image.ndim == 3 else self.values[:, 0]
         return image

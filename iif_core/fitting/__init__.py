@@ -1,1 +1,6 @@
-"""One affine correction per object and the camera response, fitted to the photographs over cached shading (METHOD 2.8, 7b)."""
+"""Fitting materials to the photographs over cached shading (Eq. M.1, M.14; docs/method/fitting.md).
+
+`direct.fit_affines` fits one affine map for each object and the camera response; `sgd` is the paper's optimiser for the same
+`problem`, judged by `reference_loss`. `gauge` settles the level of all albedos. `baselines` fits the material models of earlier
+methods over the same light.
+"""

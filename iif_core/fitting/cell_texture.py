@@ -1,17 +1,14 @@
-"""Texture of surface cells from the photographs, once light, response and the objects' affines are known.
+"""Texture of surface cells from the photographs, once light, response and affine maps are known (Eq. M.41 to M.43).
 
-A prior that was made from the photographs alone (retinex) had to divide by a light that was not known yet. With the light that
-was found, the last step is done again: what the photographs show beyond the corrected base,
+A prior that was made from the photographs alone (retinex) divided by a light that was not known yet. With the light that was
+found, the division is done again. Over the pixels of a cell and of the cells of its object that touch it, G and h from cached
+shading (L = a G + h),
 
-    r_i = sum w G (y - h - a_i G),      b_i = sum w G^2,      L = a G + h,
+    r_i = sum w G (y - h - a_i G),      b_i = sum w G^2,
 
-over the pixels of cell i and of the cells that touch it (a pixel is wider than a cell), G and h from cached shading. What of
-r / b changes slowly inside an object cannot be told from an error of the light and is left to
-it, so levels and slow changes stay those of the affine fit:
-
-    a_i + (r_i - b_i slow(r / b)_i) / (b_i + SHRINK g),      slow: mean over the surroundings inside the object (`REACH`),
-
-g the mean of w G^2 over the pixels.
+and the albedo becomes a_i + (r_i - b_i slow(r / b)_i) / (b_i + BASE_WEIGHT g), g the mean of w G^2 over the pixels. The part
+slow(r / b) that changes slowly inside an object cannot be told from an error of the light and is left to it, so levels and slow
+changes stay those of the affine fit.
 """
 
 from __future__ import annotations
@@ -20,15 +17,14 @@ import numpy as np
 
 from iif_core.surface.cells import pack_keys, voxel_indices
 
-SHRINK = 2.0
-"""Pull of a cell to the corrected base, in pixels of average sensitivity (a border pixel counts a tenth). With 0.1 Red Kitchen's
-held-out photographs gain 0.13 dB and the built-in kitchen's albedo, same prior, loses 1 dB."""
-REACH = 0.2
-"""Metres over which errors of the light change. Of the Gaussian of that width only the nearest 16 boxes count (`slow_part`): in
-effect its width is 0.12 m, and that of BLUR 0.03 m."""
-BLUR = 0.05
-"""Metres over which diffuse light is averaged: cached light is noisy, and dividing by noise makes it texture."""
-_LARGEST = 0.5
+BASE_WEIGHT = 2.0
+"""Weight of the corrected base in a cell, in pixels of average sensitivity (a border pixel counts a tenth)."""
+SLOW_SCALE = 0.2
+"""Metres over which errors of the light change. Only the nearest 16 boxes of that Gaussian count (`slow_part`), so its effective
+width is 0.12 m, and that of `LIGHT_SMOOTHING` 0.03 m."""
+LIGHT_SMOOTHING = 0.05
+"""Metres over which diffuse light is averaged (docs/method/numerics.md#dividing-by-noisy-light)."""
+_LARGEST_CHANGE = 0.5
 """Largest change of an albedo."""
 
 
@@ -42,11 +38,15 @@ def textured_albedo(
     points: np.ndarray,
     object_id: np.ndarray,
 ) -> np.ndarray:
-    """(C, 3) albedo in [0, 1].
+    """Add the texture of the photographs to the albedo of cells (Eq. M.42).
 
     Args:
-        albedo: (C, 3) of the affine fit; square, cross: (C, 3) sums of w G^2 and w G (y - h); pixels: (C,) their weight.
-        ijk: (C, 3) voxels; pairs: (m, 2) rows of cells of one object that touch; points: (C, 3) metres; object_id: (C,).
+        albedo: (C, 3) of the affine fit; square, cross: (C, 3) sums of w G^2 and w G (y - h); pixels: (C,) weight of the pixels.
+        ijk: (C, 3) voxels; pairs: (m, 2) rows of cells of one object that touch.
+        points: (C, 3) positions, m; object_id: (C,) int.
+
+    Returns:
+        (C, 3) linear albedo in [0, 1].
     """
     albedo = np.asarray(albedo, np.float64)
     average = square.sum(0) / max(float(pixels.sum()), 1e-300)
@@ -55,23 +55,24 @@ def textured_albedo(
     weight = np.exp(-0.5 * ((ijk[pairs[:, 0]] - ijk[pairs[:, 1]]) ** 2).sum(1))
     below = _spread(square, pairs, weight)
     shown = _spread(cross - square * albedo, pairs, weight)
-    delta = np.clip(np.divide(shown, below, out=np.zeros_like(shown), where=below > 0), -_LARGEST, _LARGEST)
-    slow = slow_part(delta, (below / average).mean(1), points, object_id, REACH)
-    # Slow changes go before the pull: a cell that is hardly seen keeps its base instead of losing what its neighbours show.
-    change = (shown - below * slow) / (below + SHRINK * average)
-    return np.clip(albedo + np.clip(change, -_LARGEST, _LARGEST), 0.0, 1.0)
+    delta = np.clip(np.divide(shown, below, out=np.zeros_like(shown), where=below > 0), -_LARGEST_CHANGE, _LARGEST_CHANGE)
+    slow = slow_part(delta, (below / average).mean(1), points, object_id, SLOW_SCALE)
+    # Slow changes are removed before cells are drawn to the base, so cells that are hardly seen keep it.
+    change = (shown - below * slow) / (below + BASE_WEIGHT * average)
+    return np.clip(albedo + np.clip(change, -_LARGEST_CHANGE, _LARGEST_CHANGE), 0.0, 1.0)
 
 
 def smooth_light(light: np.ndarray, points: np.ndarray, object_id: np.ndarray) -> np.ndarray:
-    """(C, 3) geometric mean of diffuse light (C, 3) over `BLUR` inside an object; cells without light stay as they are."""
+    """Return the geometric mean of diffuse light (C, 3) over `LIGHT_SMOOTHING` inside an object; cells without light are kept."""
     known = (light > 0).all(1)
     out = np.array(light, np.float64)
-    out[known] = np.exp(slow_part(np.log(out[known]), np.ones(int(known.sum())), points[known], object_id[known], BLUR))
+    ones = np.ones(int(known.sum()))
+    out[known] = np.exp(slow_part(np.log(out[known]), ones, points[known], object_id[known], LIGHT_SMOOTHING))
     return out.astype(np.float32)
 
 
 def _spread(values: np.ndarray, pairs: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Each row and what its neighbours add to it."""
+    """Add to each row the weighted rows of its neighbours."""
     out = values.astype(np.float64)
     for c in range(values.shape[1]):
         for here, there in ((0, 1), (1, 0)):
@@ -80,9 +81,15 @@ def _spread(values: np.ndarray, pairs: np.ndarray, weight: np.ndarray) -> np.nda
 
 
 def slow_part(values: np.ndarray, weight: np.ndarray, points: np.ndarray, object_id: np.ndarray, reach: float) -> np.ndarray:
-    """(n, c) weighted Gaussian mean of values (n, c) over `reach` metres inside an object, from boxes of half of that.
+    """Return the weighted Gaussian mean of values inside each object, from boxes of half its width (Eq. M.43).
 
-    weight: (n,) >= 0; points: (n, 3); object_id: (n,) int >= 0. A point whose surroundings have no weight gets 0.
+    Args:
+        values: (n, c); weight: (n,) >= 0.
+        points: (n, 3) positions, m; object_id: (n,) int >= 0.
+        reach: standard deviation of the Gaussian, m.
+
+    Returns:
+        (n, c) float64; 0 where the surroundings have no weight.
     """
     from scipy.spatial import cKDTree
 

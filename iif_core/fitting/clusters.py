@@ -1,22 +1,23 @@
-"""Groups of pixels that share errors: neighbours on the surface, seen by whichever view."""
+"""Groups of pixels that share errors: neighbours on the surface, in whichever view (docs/method/fitting.md#uncertainty)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-_PIXELS = 48  # of a cluster, about
-_FEWEST, _MOST = 12, 200  # clusters of an object
+_PIXELS_OF_PATCH = 48
+_FEWEST_PATCHES, _MOST_PATCHES = 12, 200
+"""Of an object."""
 
 
 def patches(object_id: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """(n,) int: number of the patch of its object that a pixel lies in.
+    """Number the patches of each object and return the patch of every pixel, (n,) int32.
 
-    An object's pixels are put in order along a Z-curve through its bounding box and cut into equal runs, of about 48 pixels and
-    between 12 and 200 an object: near on the surface is near in the order, and an object of few pixels still has enough patches
+    The pixels of an object are ordered along a Z-curve through its bounding box and cut into equal runs of about 48 pixels, 12 to
+    200 for each object. Neighbours on the surface are near in that order, and an object of few pixels still has enough patches
     for a variance between them.
 
     Args:
-        object_id: (n,) int; position: (n, 3) any unit, e.g. the indices of surface cells.
+        object_id: (n,) int; position: (n, 3) in any unit, e.g. indices of surface cells.
     """
     object_id = np.asarray(object_id)
     if not len(object_id):
@@ -32,12 +33,12 @@ def patches(object_id: np.ndarray, position: np.ndarray) -> np.ndarray:
     count = np.bincount(owner)
     place = np.empty(len(owner), np.int64)
     place[order] = np.arange(len(owner)) - np.repeat(np.r_[0, np.cumsum(count)[:-1]], count)
-    runs = np.minimum(np.clip(count // _PIXELS, _FEWEST, _MOST), np.maximum(count, 1))
+    runs = np.minimum(np.clip(count // _PIXELS_OF_PATCH, _FEWEST_PATCHES, _MOST_PATCHES), np.maximum(count, 1))
     return (place * runs[owner] // count[owner]).astype(np.int32)
 
 
 def _interleaved(grid: np.ndarray) -> np.ndarray:
-    """Morton code of (n, 3) integers below 1024."""
+    """Return the Morton code of (n, 3) integers below 1024."""
     code = np.zeros(len(grid), np.int64)
     for bit in range(10):
         for axis in range(3):

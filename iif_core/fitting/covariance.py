@@ -1,18 +1,16 @@
 """Covariance of every fitted number and of the response: a sandwich over clusters of pixels that share errors.
 
-With u_k the gradient of cluster k, H the normal matrix, W the pull and B = (H + W)^-1, an object's numbers have the covariance
+With u_k the gradient of cluster k, H the normal matrix, W the weight of the prior and B = (H + W)^-1, the numbers of an object
+have the covariance (Eq. M.32)
 
     B (sum_k v_k v_k' + W S W) B,    v_k = (1 - H_k B)^(-1/2) u_k,
 
-where S is the covariance of the pull's centre: the pull is an observation that errs by that much. A cluster has pulled the fit
-towards itself, which makes its gradient too small; v_k has the size that errors in proportion to H_k would have had (Bell and
-McCaffrey 2002, "CR2"). What the few clusters of an object say about their own scatter is uncertain too: the first term is larger
-by (1 + 1 / (2 nu))^2, so that one standard deviation either way holds Student's t of nu degrees of freedom 68 % of the time;
-nu = (sum_k l_k)^2 / sum_k l_k^2, l_k = trace(H_k B).
+where S is the covariance of the prior's centre. A cluster has drawn the fit towards itself, which makes its gradient too small;
+v_k has the size that errors in proportion to H_k would have had (Bell and McCaffrey 2002, "CR2"). The first term is enlarged
+for the uncertainty of a scatter that is estimated from few clusters (Eq. M.33). The response, common to all objects, is
+eliminated as in the descent (Eq. M.34).
 
-The response, shared by all objects, is eliminated as in the descent: cluster k moves it by d_k, and every object by
--B (C - W c) d_k on top of its own move, c how the pull's centre moves with the response; so do the errors of every pull, and that
-of the response's own prior. What is not in it: errors of light and geometry that all clusters of an object share.
+Errors of light and geometry that all clusters of an object share are not in it.
 """
 
 from __future__ import annotations
@@ -22,55 +20,69 @@ from dataclasses import replace
 
 import numpy as np
 
-from iif_core.fitting.descent import Arrowhead, Pull, ResponsePrior, State
+from iif_core.fitting.descent import Arrowhead, DescentState, GaussianPrior, ResponsePrior
 from iif_core.fitting.pixels import Pixels, evaluate
-from iif_core.fitting.problem import PARAMETERS, FitOptions
+from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.tone import Tone
+from iif_core.reflectance.material import NUMBERS
 
-_CLUSTERS = 1000  # whose systems are held at once
-_LEVER = 0.95  # largest share that one cluster is taken to have in a direction
+_CLUSTERS_AT_ONCE = 1000
+"""Clusters whose systems are held in memory at once."""
+_MAX_LEVERAGE = 0.95
+"""Largest share of one cluster in a direction (docs/method/numerics.md#leverage-near-one)."""
 
 
-def sandwich(
-    px: Pixels, state: State, system: Arrowhead, pull: Pull, prior: ResponsePrior, tone: Tone, opt: FitOptions
+def sandwich_covariance(
+    px: Pixels,
+    state: DescentState,
+    system: Arrowhead,
+    prior: GaussianPrior,
+    curve_prior: ResponsePrior,
+    tone: Tone,
+    opt: FitOptions,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(O, 16, 16) of the objects and (P, P) of the response.
+    """Return the covariances of the objects' numbers (O, 16, 16) and of the response (P, P).
 
     Args:
-        system: undamped, at the solution `state`; tone: there.
+        px: pixels; state: the solution; system: undamped, at the solution.
+        prior: of the objects; curve_prior: of the response; tone: curve at the solution; opt: options.
+
+    Returns:
+        Both float64; 0 for numbers that were not free.
     """
-    free, through, schur = state.free, system.through, system.schur
-    if pull.drift is not None:
-        through = through - system.inverse @ pull.drift
+    free, by_response, schur = state.free, system.by_response, system.schur
+    if prior.drift is not None:
+        by_response = by_response - system.inverse @ prior.drift
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
-    alone, reduced = np.zeros((len(owner), PARAMETERS)), np.zeros((len(owner), len(schur)))
-    lever = np.zeros(len(owner))
+    alone, reduced = np.zeros((len(owner), NUMBERS)), np.zeros((len(owner), len(schur)))
+    leverage = np.zeros(len(owner))
     for part, scores, h in _clusters(px, state, tone, opt):
-        alone[part], reduced[part], lever[part] = _grown(scores, h, system.inverse, system.coupling, free, owner[part])
+        corrected = _correct_leverage(scores, h, system.inverse, system.coupling, free, owner[part])
+        alone[part], reduced[part], leverage[part] = corrected
     moved = reduced @ schur
-    leaned = np.zeros((px.n_objects, PARAMETERS, PARAMETERS))
-    if pull.scatter is not None:
-        leaned = np.where(free[:, :, None] & free[:, None, :], pull.scatter, 0.0)
-    # what each object's pull moves the response by
-    swayed = schur @ through.transpose(0, 2, 1) @ leaned @ through @ schur
-    total = moved.T @ moved + swayed.sum(0) + schur @ prior.scatter @ schur
-    out = np.zeros((px.n_objects, PARAMETERS, PARAMETERS))
+    prior_scatter = np.zeros((px.n_objects, NUMBERS, NUMBERS))
+    if prior.scatter is not None:
+        prior_scatter = np.where(free[:, :, None] & free[:, None, :], prior.scatter, 0.0)
+    # Covariance that the prior of each object causes in the response.
+    of_priors = schur @ by_response.transpose(0, 2, 1) @ prior_scatter @ by_response @ schur
+    total = moved.T @ moved + of_priors.sum(0) + schur @ curve_prior.scatter @ schur
+    out = np.zeros((px.n_objects, NUMBERS, NUMBERS))
     for o in np.flatnonzero(np.diff(px.first)):
         part = slice(px.first[o], px.first[o + 1])
         d = moved[part]
-        p = alone[part] - d @ through[o].T
-        both = system.inverse[o] + through[o] @ schur @ through[o].T
-        others = total - d.T @ d - swayed[o]
-        few = (lever[part] ** 2).sum() / max(lever[part].sum() ** 2, 1e-100)  # 1 / nu
-        out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ leaned[o] @ both + through[o] @ others @ through[o].T
+        p = alone[part] - d @ by_response[o].T
+        both = system.inverse[o] + by_response[o] @ schur @ by_response[o].T
+        others = total - d.T @ d - of_priors[o]
+        few = (leverage[part] ** 2).sum() / max(leverage[part].sum() ** 2, 1e-100)  # 1 / nu
+        out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ prior_scatter[o] @ both + by_response[o] @ others @ by_response[o].T
     return out, total
 
 
-def _clusters(px: Pixels, state: State, tone: Tone, opt: FitOptions) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Clusters of some objects at a time: which, their gradients (c, 16 + P) and systems (c, 16 + P, 16 + P)."""
+def _clusters(px: Pixels, state: DescentState, tone: Tone, opt: FitOptions) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Yield the clusters of some objects at a time: their slice, gradients (c, 16 + P) and systems (c, 16 + P, 16 + P)."""
     low = 0
     while low < px.n_objects:
-        high = max(low + 1, int(np.searchsorted(px.first, px.first[low] + _CLUSTERS, side="right")) - 1)
+        high = max(low + 1, int(np.searchsorted(px.first, px.first[low] + _CLUSTERS_AT_ONCE, side="right")) - 1)
         some = px.only(np.arange(low, high))
         count = len(some.starts) - 1
         each = np.repeat(np.arange(count), np.diff(some.starts))
@@ -80,27 +92,27 @@ def _clusters(px: Pixels, state: State, tone: Tone, opt: FitOptions) -> Iterator
         low = high
 
 
-def _grown(
+def _correct_leverage(
     scores: np.ndarray, h: np.ndarray, inverse: np.ndarray, coupling: np.ndarray, free: np.ndarray, owner: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """B v_k (c, 16), the cluster's gradient of the reduced response (c, P) and its l_k (c,).
+    """Return B v_k (c, 16), the gradient of the reduced response (c, P) and l_k (c,) of each cluster.
 
-    B = R R, M = R H_k R: B v_k = R (1 - M)^(-1/2) R u_k. The response's part of the gradient has lost C_k' R g(M) R u_k with
-    g(x) = ((1 - x)^(-1/2) - 1) / x.
+    With B = R R and M = R H_k R, B v_k = R (1 - M)^(-1/2) R u_k. The part of the gradient that belongs to the response gains
+    C_k' R g(M) R u_k with g(x) = ((1 - x)^(-1/2) - 1) / x.
     """
     values, vectors = np.linalg.eigh(inverse)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]) @ vectors.transpose(0, 2, 1)
-    own = np.where(free[owner], scores[:, :PARAMETERS], 0.0)
+    own = np.where(free[owner], scores[:, :NUMBERS], 0.0)
     r = root[owner]
-    lever, basis = np.linalg.eigh(r @ h[:, :PARAMETERS, :PARAMETERS] @ r)
-    lever = np.clip(lever, 1e-9, _LEVER)
-    grow = 1.0 / np.sqrt(1.0 - lever)
+    leverage, basis = np.linalg.eigh(r @ h[:, :NUMBERS, :NUMBERS] @ r)
+    leverage = np.clip(leverage, 1e-9, _MAX_LEVERAGE)
+    enlarge = 1.0 / np.sqrt(1.0 - leverage)
     inner = np.einsum("kji,kj->ki", basis, np.einsum("kij,kj->ki", r, own))
 
     def out(factor: np.ndarray) -> np.ndarray:
         return np.einsum("kij,kj->ki", r, np.einsum("kij,kj->ki", basis, factor * inner))
 
-    lost = np.einsum("kip,ki->kp", h[:, :PARAMETERS, PARAMETERS:], out((grow - 1.0) / lever))
-    alone = out(grow)
-    reduced = scores[:, PARAMETERS:] + lost - np.einsum("kip,ki->kp", coupling[owner], alone)
-    return alone, reduced, lever.sum(1)
+    lost = np.einsum("kip,ki->kp", h[:, :NUMBERS, NUMBERS:], out((enlarge - 1.0) / leverage))
+    alone = out(enlarge)
+    reduced = scores[:, NUMBERS:] + lost - np.einsum("kip,ki->kp", coupling[owner], alone)
+    return alone, reduced, leverage.sum(1)

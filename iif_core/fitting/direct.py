@@ -1,12 +1,8 @@
-"""One affine correction per object and the camera response, fitted to the photographs over cached shading (METHOD 7b).
+"""One affine map for each object and the camera response, fitted to the photographs over cached shading (Eq. M.14).
 
-Pixel p of object o shows I = f(e L), L = (1 - m) a D + [0.04 (1 - m) + m a] S0(r) + S1(r), with a, r, m corrected by the sixteen
-numbers of the object.
-
-Noise in the cached shading flattens the slope of log I over log L: a plain fit overestimates gamma and shrinks gains. With two
-independent halves 1, 2 of the cache we minimise sum rho(e1 e2) instead of sum rho(e^2): the expectation of the product of two
-residuals with independent noise is the squared noise-free residual, and its Gauss-Newton system is
-H = (J1' W J2 + J2' W J1) / 2, g = (J1' W e2 + J2' W e1) / 2.
+Noise in the cached shading flattens the slope of log I over log L, so a plain fit overestimates gamma and shrinks gains. The
+cache comes in two independent halves, and the objective is built on the product of their residuals, whose expectation is the
+square of the residual without noise (Eq. M.7 and M.8; docs/method/numerics.md#noise-in-cached-shading).
 """
 
 from __future__ import annotations
@@ -16,60 +12,82 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting.covariance import sandwich
-from iif_core.fitting.descent import Pull, State, arrowhead, descend, object_blocks, response_prior
-from iif_core.fitting.pixels import Pixels, evaluate, evenly, prepare, residuals
-from iif_core.fitting.population import Population, before, centre_of, lean, learn, pull_of
-from iif_core.fitting.problem import GAINS, IDENTITY, MATTE, PARAMETERS, FitOptions, FitProblem, FitResult
-from iif_core.fitting.selection import DISCOUNT, KINDS, Choice, Texture, choose, describe, profile, row_noise, texture_of
+from iif_core.fitting.covariance import sandwich_covariance
+from iif_core.fitting.descent import (
+    DescentState,
+    GaussianPrior,
+    decompose_objects,
+    descend,
+    eliminate_objects,
+    make_response_prior,
+)
+from iif_core.fitting.pixels import Pixels, choose_evenly, evaluate, prepare_pixels, residuals
+from iif_core.fitting.population import (
+    Population,
+    ProfiledRoughness,
+    initial_population,
+    population_mean,
+    population_prior,
+    update_population,
+    with_profiled_roughness,
+)
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
+from iif_core.fitting.selection import (
+    EVIDENCE_DISCOUNT,
+    KINDS,
+    Choice,
+    Texture,
+    choose_kinds,
+    describe_models,
+    measure_texture,
+    profile_roughness,
+    row_variance,
+)
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.brdf import R_MIN
+from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_GLOSS, NUMBERS
 
-_FEW = 300  # pixels of an object that are enough to choose a valley
-_ENOUGH = 12000  # more say no more: what their patches share is what the fit errs by
-_MANY = 1500  # that are enough to learn what objects have in common
-_LEAST = 0.02  # weight of the pixels of an object that looks like what it is not taken for
-_SHARP = 0.05  # half the distance of two points of the profile's grid: how far the profile is to be trusted
-_MOST_BIAS = 0.1  # of the sensor value, that noise of the cache may be taken to shift it
-_EARLY = 10  # steps of the descents whose end is only a start
-_RIDGE = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1, 0.1]
-"""Without a population: pull of each number relative to `FitOptions.ridge`. Cross terms are weakly determined (METHOD 7b)."""
+SELECTION_PIXELS = 300
+"""Pixels of an object in the selection; enough to choose between local minima in roughness."""
+MAX_PIXELS_PER_OBJECT = 12000
+"""Pixels of an object in the fit. The error is dominated by what neighbouring pixels have in common, so more do not reduce it."""
+POPULATION_PIXELS = 1500
+"""Pixels of an object from which the population is learnt."""
+WARM_START_STEPS = 10
+"""Largest number of steps of the descents whose result is a start."""
+LEAST_RESPONSE_WEIGHT = 0.02
+"""Smallest weight of an object in the response (Eq. M.25)."""
+LEAST_ROUGHNESS_DEVIATION = 0.05
+"""Smallest standard deviation of a profiled roughness: half the spacing of the profile's grid (Eq. M.29)."""
+LARGEST_BIAS = 0.1
+"""Largest shift of a target for the noise of the cache, as a share of its value (Eq. M.13)."""
+RIDGE_OF_NUMBER = np.r_[np.where(np.isin(np.arange(12), GAINS), 0.1, 1.0), 2.0, 0.5, 0.1, 0.1]
+"""Weight of each number relative to `FitOptions.ridge`, which holds only without population and selection."""
 
 
 @dataclass(frozen=True)
-class _Profiled:
-    """What the profile said about roughness, and how far it is to be believed.
+class FitProgress:
+    """State of the fit between its steps.
 
     Attributes:
-        choice: the posterior; error: (O,) standard deviation of its mean, of noise alone (`choice.deviation` is discounted);
-            shared: (O,) what a unit of its weight has in common with the gradient of the pixels.
-        params: (P,) the response at which it was made; sway: (O, P) how it moves with the response.
+        state: numbers and response; prior: of the objects; population: None if it is not used.
+        metallic: (O, 2) gain and bias of the metallic.
+        profiled: roughness from the profile, once it was made.
+        response_weight: (O,) weight q of each object's pixels (Eq. M.25); None: 1.
     """
 
-    choice: Choice
-    error: np.ndarray
-    shared: np.ndarray
-    params: np.ndarray
-    sway: np.ndarray
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Where the fit stands between its steps."""
-
-    state: State
-    pull: Pull
+    state: DescentState
+    prior: GaussianPrior
     population: Population | None
     metallic: np.ndarray
-    profiled: _Profiled | None = None
-    vote: np.ndarray | None = None
+    profiled: ProfiledRoughness | None = None
+    response_weight: np.ndarray | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
-    """Sixteen numbers per object and the response, by Gauss-Newton on all pixels at once.
+    """Fit sixteen numbers for each object, and the response, by Gauss-Newton on all pixels at once.
 
-    Which numbers are free follows the texture (METHOD 8): a constant object gets three gains, one with a single direction of
-    colour gains and biases, others the full map. Objects with too few pixels take what the others have in common.
+    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels take what the others have in common.
 
     Args:
         problem: pixels, base values, cached shading.
@@ -77,57 +95,64 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
         options: see `FitOptions`.
 
     Returns:
-        `FitResult`, always finite. The gauge is that of the given light (`gauge.pin` sets another).
+        `FitResult`, always finite. The gauge is that of the given light (`gauge.apply_gauge` sets another).
     """
     opt = options or FitOptions()
-    everything, tone = prepare(problem, response, opt.min_pixels, _ENOUGH)
-    texture_of_all = texture_of(everything, opt)
+    everything, tone = prepare_pixels(problem, response, opt.min_pixels, MAX_PIXELS_PER_OBJECT)
+    texture_of_all = measure_texture(everything, opt)
     members = np.flatnonzero(texture_of_all.enough)
     px, texture = everything.only(members), texture_of_all.only(members)
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
-    fit = _begin(px, texture, start_params, opt)
+    fit = _start(px, texture, start_params, opt)
     if len(members):
         fit = _descend_all(px, fit, tone, texture, opt, start_params)
     return result_of(px, fit, tone, texture, opt, start_params, members, everything.usable)
 
 
-def _descend_all(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
+def _descend_all(
+    px: Pixels, fit: FitProgress, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
+) -> FitProgress:
+    """Select the kinds, learn the population, and descend on all pixels."""
     if opt.select and not opt.matte:
-        fit = _select(px, fit, tone, texture, opt, start_params)
+        fit = _select_kinds(px, fit, tone, texture, opt, start_params)
     if opt.population:
-        index = evenly(px.obj, px.offsets, _MANY)
-        some = px.take(index)
-        measured = some.target
+        some = px.take(choose_evenly(px.obj, px.offsets, POPULATION_PIXELS))
+        measured, roughness = some.target, texture.mean[:, 3]
         for _ in range(2):
-            weigh(some, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
-            state, _ = descend(some, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+            weigh_by_halves(some, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
+            state, _ = descend(some, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
             terms = evaluate(some, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
-            noise = row_noise(terms, some, state.free)
-            mean = texture.mean[:, 3]
-            population = learn(fit.population, terms, some, state.affine, state.free, noise, mean, fit.metallic, DISCOUNT)
+            noise = row_variance(terms, some, state.free)
+            population = update_population(
+                fit.population, terms, state.affine, state.free, noise, roughness, fit.metallic, EVIDENCE_DISCOUNT
+            )
             fit = replace(fit, state=state, population=population)
-            fit = replace(fit, pull=_pull(fit, noise, mean))
+            fit = replace(fit, prior=_make_prior(fit, noise, roughness))
     measured = px.target
     if not opt.population:
-        weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
-        state, _ = descend(px, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+        weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
+        state, _ = descend(px, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
         fit = replace(fit, state=state)
-    weigh(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.vote)
-    state, _ = descend(px, fit.state, fit.pull, tone, opt, None, None, start_params)
+    weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
+    state, _ = descend(px, fit.state, fit.prior, tone, opt, None, None, start_params)
     return replace(fit, state=state)
 
 
-def weigh(
-    px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions, vote: np.ndarray | None = None
+def weigh_by_halves(
+    px: Pixels, measured: np.ndarray, affine: np.ndarray, tone: Tone, opt: FitOptions, response_weight: np.ndarray | None = None
 ) -> None:
-    """Weights and bias that follow from the distance between the halves, at `affine`; they are held during a descent.
+    """Set weights and targets from the distance between the halves (Eq. M.12, M.13); they are held during a descent.
 
-    Fireflies are three robust widths apart. The mean of a bent curve over noise is not the curve at the mean: each half's f(e L)
-    is off by f'' var(e L) / 2 = (f'' / f'^2) d^2 on average, d half the distance; `measured` is moved by as much.
+    Pixels whose halves are far apart are fireflies and get a smaller weight. The mean of a curved function over noise is not the
+    function at the mean, so targets are moved by the difference. Saturated values bound the prediction only below their noise.
 
-    `vote` (O,): weight of an object's pixels beside those of the others, with which it shares the response.
+    Args:
+        px: pixels, whose `trust` and `target` are replaced.
+        measured: (n, 3) targets before any shift; affine: (O, 16) numbers at which the halves are compared.
+        tone: curve with the current response; opt: options.
+        response_weight: (O,) factor on the weights of each object's pixels; None: 1.
     """
-    own = np.ones(px.n_objects) if vote is None else vote
+    own = np.ones(px.n_objects) if response_weight is None else response_weight
     if px.diffuse.shape[1] < 2:
         px.trust = np.repeat(own, px.counts)[:, None] * np.ones((1, 3), px.trust.dtype)
         return
@@ -137,50 +162,51 @@ def weigh(
     trust = 1.0 / (1.0 + (apart / (3.0 * opt.robust_width)) ** 2)
     px.trust = np.ascontiguousarray(trust * np.repeat(own, px.counts)[:, None], px.trust.dtype)
     shown = measured + errors.mean(1)
-    bias = tone.bend(shown) * np.minimum(apart, opt.robust_width) ** 2
-    bias = np.where(px.saturated, 0.0, np.clip(bias, -_MOST_BIAS * np.abs(measured), _MOST_BIAS * np.abs(measured)))
-    # A one-sided row takes the low side of the noise for a violation; bounds count below their noise only.
+    bias = tone.curvature_ratio(shown) * np.minimum(apart, opt.robust_width) ** 2
+    bias = np.where(px.saturated, 0.0, np.clip(bias, -LARGEST_BIAS * np.abs(measured), LARGEST_BIAS * np.abs(measured)))
     px.target = np.ascontiguousarray(np.where(px.saturated, measured - 3.0 * apart, measured + bias), measured.dtype)
 
 
-def _begin(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) -> Fit:
-    """The identity, or the population nobody was seen of: a rough dielectric."""
+def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) -> FitProgress:
+    """Start at the mean of the first population, a rough dielectric, or without one at the identity."""
     n = px.n_objects
     free = texture.albedo_numbers()
     if opt.select or opt.population:
         metallic = np.tile(KINDS[0] if opt.select else [1.0, 0.0], (n, 1))
-        population = before()
+        population = initial_population()
         noise = np.full(n, (0.05 * opt.robust_width + 0.005) ** 2 if len(px.obj) else 1.0)
-        pull = pull_of(population, noise, texture.mean[:, 3], metallic)
-        affine = pull.centre.copy()
+        prior = population_prior(population, noise, texture.mean[:, 3], metallic)
+        affine = prior.centre.copy()
         if not opt.select:
             affine[:, 12:] = IDENTITY[12:]
     else:
         metallic, population = np.tile([1.0, 0.0], (n, 1)), None
         affine = np.tile(IDENTITY, (n, 1))
-        weight = np.einsum("o,i,ij->oij", px.counts.astype(np.float64), opt.ridge * _RIDGE, np.eye(PARAMETERS))
-        pull = Pull(affine.copy(), weight)
+        weight = np.einsum("o,i,ij->oij", px.counts.astype(np.float64), opt.ridge * RIDGE_OF_NUMBER, np.eye(NUMBERS))
+        prior = GaussianPrior(affine.copy(), weight)
     if not opt.select:
         metal = texture.enough & (texture.mean[:, 4] > opt.metallic_prior)
         free[:, 12], free[:, 13] = texture.enough & texture.varied[:, 0], texture.enough
         free[:, 14], free[:, 15] = metal & texture.varied[:, 1], metal
     if opt.matte:
-        affine[:, 12:], free[:, 12:] = MATTE, False
-    return Fit(State(affine, free, params.copy(), np.full(n, 1e-2)), pull, population, metallic)
+        affine[:, 12:], free[:, 12:] = MATTE_GLOSS, False
+    return FitProgress(DescentState(affine, free, params.copy(), np.full(n, 1e-2)), prior, population, metallic)
 
 
-def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray) -> Fit:
-    """Kind and valley of every object on a few of its pixels; then all numbers of the chosen kind are free."""
-    few = px.take(evenly(px.obj, px.offsets, _FEW))
-    weigh(few, few.target, fit.state.affine, tone, opt)
-    # Bounds alone cannot tell one valley from another.
+def _select_kinds(
+    px: Pixels, fit: FitProgress, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
+) -> FitProgress:
+    """Choose kind and roughness of every object on a few of its pixels; then free the numbers of that kind."""
+    few = px.take(choose_evenly(px.obj, px.offsets, SELECTION_PIXELS))
+    weigh_by_halves(few, few.target, fit.state.affine, tone, opt)
+    # Bounds alone cannot tell one local minimum from another.
     measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
-    state, _ = descend(few, fit.state, fit.pull, tone, opt, _EARLY, None, start_params)
+    state, _ = descend(few, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
-    noise = row_noise(terms, few, state.free)
-    pull = pull_of(before(), noise, texture.mean[:, 3], fit.metallic)
-    found = profile(few, state, pull, tone.at(state.params), opt, state.free, measured & texture.mixed)
-    choice = choose(found, measured)
+    noise = row_variance(terms, few, state.free)
+    prior = population_prior(initial_population(), noise, texture.mean[:, 3], fit.metallic)
+    found = profile_roughness(few, state, prior, tone.at(state.params), opt, state.free, measured & texture.mixed)
+    choice = choose_kinds(found, measured)
     metallic = KINDS[choice.kind]
     affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
     affine[:, 12:] = np.concatenate([np.zeros((px.n_objects, 1)), choice.roughness[:, None], metallic], 1)
@@ -188,61 +214,64 @@ def _select(px: Pixels, fit: Fit, tone: Tone, texture: Texture, opt: FitOptions,
     free = state.free.copy()
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
-    state = State(affine, free, state.params, np.full(px.n_objects, 1e-3))
-    seen = _believed(few, state, pull, tone, opt, found.noise, choice)
-    fit = replace(fit, state=state, metallic=metallic, profiled=seen, vote=np.maximum(choice.sure, _LEAST))
+    state = DescentState(affine, free, state.params, np.full(px.n_objects, 1e-3))
+    profiled = _profile_errors(few, state, prior, tone, opt, found.noise, choice)
+    weight = np.maximum(choice.allowed_share, LEAST_RESPONSE_WEIGHT)
+    fit = replace(fit, state=state, metallic=metallic, profiled=profiled, response_weight=weight)
     if opt.population:
-        fit = replace(fit, population=before(*choice.population))
-        return replace(fit, pull=_pull(fit, noise, texture.mean[:, 3]))
-    # as weakly as the ridge says
-    return replace(fit, pull=Pull(np.concatenate([fit.pull.centre[:, :12], affine[:, 12:]], 1), fit.pull.weight))
+        fit = replace(fit, population=initial_population(*choice.population))
+        return replace(fit, prior=_make_prior(fit, noise, texture.mean[:, 3]))
+    # Without a population the roughness keeps the weight of the first prior, around the selected value.
+    return replace(fit, prior=GaussianPrior(np.concatenate([fit.prior.centre[:, :12], affine[:, 12:]], 1), fit.prior.weight))
 
 
-def _believed(few: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice) -> _Profiled:
-    """With the curvature H of the objective and its coupling C to the response, the albedo eliminated, and the precision V of the
-    profile's prior, the profile's roughness has the error H noise / (H + V)^2 of the pixels, V / (H + V) of the histogram's
-    width, and that of its grid; it moves with the response by - C / (H + V)."""
-    albedo = state.free & (np.arange(PARAMETERS) < 12)
+def _profile_errors(
+    few: Pixels, state: DescentState, prior: GaussianPrior, tone: Tone, opt: FitOptions, noise: np.ndarray, choice: Choice
+) -> ProfiledRoughness:
+    """Find error and derivative by the response of each profiled roughness, albedo numbers eliminated (Eq. M.30, M.31)."""
+    albedo = state.free & (np.arange(NUMBERS) < 12)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, scores=True)
-    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], object_blocks(terms.h, albedo, pull).inverse(), 0.0)
-    h, c = terms.h[:, 13, :PARAMETERS], terms.h[:, :, PARAMETERS:]
+    inverse = np.where(albedo[:, :, None] & albedo[:, None, :], decompose_objects(terms.h, albedo, prior).inverse(), 0.0)
+    h, c = terms.h[:, 13, :NUMBERS], terms.h[:, :, NUMBERS:]
     row = np.einsum("oi,oij->oj", h, inverse)
-    coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :PARAMETERS])
-    width = max(choice.population[1], _SHARP)
-    prior = DISCOUNT * noise / width**2
+    coupling = c[:, 13] - np.einsum("oi,oip->op", row, c[:, :NUMBERS])
+    width = max(choice.population[1], LEAST_ROUGHNESS_DEVIATION)
+    precision = EVIDENCE_DISCOUNT * noise / width**2
     curvature = np.maximum(h[:, 13] - (row * h).sum(1), 0.0)
-    total = curvature + prior
-    share = 1.0 - prior / total
+    total = curvature + precision
+    share = 1.0 - precision / total
     clusters = np.diff(few.first)
     owner = np.repeat(np.arange(few.n_objects), clusters)
-    own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :PARAMETERS])
+    own = terms.scores[:, 13] - np.einsum("ki,ki->k", row[owner], terms.scores[:, :NUMBERS])
     own -= (np.bincount(owner, own, few.n_objects) / np.maximum(clusters, 1))[owner]
-    # the variance of a row that matters here: that of the direction of roughness
+    # The variance of a row that matters here is that of the direction of roughness.
     squares = np.bincount(owner, own**2, few.n_objects) * clusters / np.maximum(clusters - 1, 1)
     scatter = np.minimum(squares / np.maximum(curvature, 1e-12 * total), noise)
-    spacing = 2.0 * _SHARP
+    spacing = 2.0 * LEAST_ROUGHNESS_DEVIATION
     grid = 0.225 * spacing * np.exp(-2.0 * (np.pi * choice.deviation / spacing) ** 2)
     error = np.sqrt(share * scatter / total + ((1.0 - share) * width) ** 2 + grid**2)
-    sway = np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
-    return _Profiled(choice, error, share * scatter, state.params, sway)
+    d_level_d_response = np.where(state.free[:, 13:14], -coupling / total[:, None], 0.0)
+    return ProfiledRoughness(choice.roughness, choice.deviation, error, share * scatter, state.params, d_level_d_response)
 
 
-def _pull(fit: Fit, noise: np.ndarray, roughness: np.ndarray) -> Pull:
-    """Towards the population; roughness towards where the profile saw it (the descent sees one valley and its slope), had it
-    known the response of today."""
+def _make_prior(fit: FitProgress, noise: np.ndarray, roughness: np.ndarray) -> GaussianPrior:
+    """Make the prior of the population; the roughness of profiled objects is moved to the response of today (Eq. M.29).
+
+    A descent sees one local minimum and its slope, the profile saw all of them."""
     assert fit.population is not None
     population, seen = fit.population, fit.profiled
-    pull = pull_of(population, noise, roughness, fit.metallic, DISCOUNT)
+    prior = population_prior(population, noise, roughness, fit.metallic, EVIDENCE_DISCOUNT)
     if seen is None:
-        return pull
-    deviation = np.clip(seen.choice.deviation, _SHARP, population.spread[3])
-    level = np.clip(seen.choice.roughness + seen.sway @ (fit.state.params - seen.params), R_MIN, 1.0)
-    return lean(pull, level, deviation, seen.error, seen.shared, seen.sway, noise, roughness, population.contrast, DISCOUNT)
+        return prior
+    deviation = np.clip(seen.deviation, LEAST_ROUGHNESS_DEVIATION, population.spread[3])
+    level = np.clip(seen.level + seen.d_level_d_response @ (fit.state.params - seen.params), R_MIN, 1.0)
+    seen = replace(seen, level=level, deviation=deviation, params=fit.state.params)
+    return with_profiled_roughness(prior, seen, noise, roughness, population.contrast, EVIDENCE_DISCOUNT)
 
 
 def result_of(
     px: Pixels,
-    fit: Fit,
+    fit: FitProgress,
     tone: Tone,
     texture: Texture,
     opt: FitOptions,
@@ -250,22 +279,31 @@ def result_of(
     members: np.ndarray,
     counts: np.ndarray,
 ) -> FitResult:
-    """The result of all objects; `members`: the objects of `px`, `counts` (O,): usable pixels of every object."""
+    """Collect the result of all objects, with covariances.
+
+    Args:
+        px: pixels of the fitted objects; fit: where the fit ended; tone: curve at the start; texture: of the fitted objects.
+        opt: options; start_params: (P,) response at the start.
+        members: indices of the fitted objects; counts: (O,) usable pixels of every object.
+
+    Returns:
+        Numbers of all objects; those that were not fitted have the mean of the population, or the identity without one.
+    """
     state, n_objects = fit.state, len(counts)
-    affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, PARAMETERS), bool)
+    affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, NUMBERS), bool)
     if fit.population is not None and len(members):
-        affine[:] = centre_of(fit.population, np.zeros(1), KINDS[:1])
+        affine[:] = population_mean(fit.population, np.zeros(1), KINDS[:1])
         affine[:, 12] = 0.0
-    covariance, residual = np.zeros((n_objects, PARAMETERS, PARAMETERS)), np.zeros(n_objects)
+    covariance, residual = np.zeros((n_objects, NUMBERS, NUMBERS)), np.zeros(n_objects)
     affine[members], free[members] = state.affine, state.free
     final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
     if len(px.obj):
         terms = evaluate(px, state.affine, final, opt, True)
         fitted = bool(opt.free_response and tone.size)
-        blocks = object_blocks(terms.h, state.free, fit.pull)
-        prior = response_prior(opt, len(px.obj), start_params)
-        system = arrowhead(terms, state, fit.pull, prior, fitted, blocks, damped=False)
-        covariance[members], of_response = sandwich(px, state, system, fit.pull, prior, final, opt)
+        blocks = decompose_objects(terms.h, state.free, fit.prior)
+        curve_prior = make_response_prior(opt, len(px.obj), start_params)
+        system = eliminate_objects(terms, state, fit.prior, curve_prior, fitted, blocks, damped=False)
+        covariance[members], of_response = sandwich_covariance(px, state, system, fit.prior, curve_prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
@@ -278,7 +316,7 @@ def result_of(
         free,
         counts.astype(np.int64),
         residual,
-        describe(rank, free, affine, counts),
+        describe_models(rank, free, affine, counts),
         final.response,
         1.0,
         list(state.history) or [0.0],

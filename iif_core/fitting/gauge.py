@@ -1,12 +1,10 @@
-"""The scale between light and albedo (METHOD 7a, degeneracy 3).
+"""The factor between light and albedo (docs/method/fitting.md#level-of-all-albedos).
 
-A fit returns albedos that go with the light that it was given. Multiplying the light by s and dividing every albedo by s leaves
-the light of the first bounce as it is, so from direct light alone only the product is known. Indirect light tells them apart:
-what surfaces send to each other was photographed, in the same units as everything else, and is a part of what a pixel reflects.
-In pixels with much of it and pixels with little, albedo x (direct + photographed indirect light) fits for one direct light only.
-Stage emission solves for that light (its radiance cache) and says how sure its level is. By default it is weighed against the
-other witness, the mean albedo of the base texture, by their variances; this is the only place where another scale - a
-convention, or something that is known - enters.
+Multiplying all light by s and dividing all albedos by s leaves direct light as it is, so from direct light alone only the product
+is known. Indirect light tells them apart: it was photographed in the units of all photographs, and direct plus indirect light
+times one albedo fits pixels with much and with little of it for one level of the light only. Stage emission solves for that level
+and states its error. By default it is averaged with the level that the mean albedo of the base texture implies, weighted by the
+variances (Eq. M.37). This is the only place where another scale, a convention or something known, enters.
 """
 
 from __future__ import annotations
@@ -17,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.fitting.problem import FitProblem, FitResult, raw_values
+from iif_core.fitting.problem import FitProblem, FitResult
 from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.reflectance.material import unclamped_material
 
 KINDS = ("found", "prior", "mean_albedo", "white_patch", "lamp")
 _DARKEST = 1e-3
@@ -29,11 +28,11 @@ class Gauge:
     """What fixes the scale.
 
     Attributes:
-        kind: `found`: the light as given, leaning on `prior` where its level is not sure; `prior`: the mean albedo of the base
-            texture stays; `mean_albedo`: the mean albedo of the fitted pixels is `albedo`; `white_patch`: that of `patch` is;
+        kind: `found`: the weighted mean of the given light and of `prior`; `prior`: the mean albedo of the base texture stays;
+            `mean_albedo`: the mean albedo of the fitted pixels is `albedo`; `white_patch`: that of the pixels of `patch` is;
             `lamp`: the light is multiplied by `factor`.
-        albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0;
-            error: standard error of the logarithm of the level of the found light; infinite: not known.
+        albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0.
+        error: standard error of the logarithm of the level of the found light; infinite: not known.
     """
 
     kind: str
@@ -53,17 +52,17 @@ class Gauge:
             raise InputError(f"scale lamp: the light would be multiplied by {self.factor}; name a lamp that was found to shine")
 
 
-def pin(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
-    """The same fit in the gauge: albedo numbers divided by one factor, `light_scale` multiplied by it.
+def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
+    """Divide the albedo numbers of a fit by the factor of the gauge and multiply `light_scale` by it (Eq. M.36).
 
-    `facts["scale"]` says how: `kind`, `factor`, and `relative_error`, the standard deviation of the factor that comes from the
-    fitted numbers (not from how true the convention is).
+    `facts["scale"]` records `kind`, `factor` and `relative_error`. For conventions the error is that of the fitted numbers alone
+    (Eq. M.38); it does not say how true the convention is.
     """
     factor, error = _factor(problem, fit, gauge)
     facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}
     if factor == 1.0:
         return replace(fit, facts=facts)
-    # Objects that nobody fitted kept their base: it is in the prior's gauge already.
+    # Objects that were not fitted keep their base, which is in the gauge of the prior already.
     fitted = ~np.array([model.startswith("identity") for model in fit.model], bool)
     affine, covariance = fit.affine.copy(), fit.covariance.copy()
     affine[fitted, :12] /= factor
@@ -72,8 +71,8 @@ def pin(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
 
 
-def _weighed(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, float]:
-    """log factor = log of the prior's x e^2 / (e^2 + p^2), e and p the standard errors of found level and prior's level."""
+def _weigh_levels(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, float]:
+    """Return factor and error of the weighted mean of found level and prior's level (Eq. M.37)."""
     if error <= 0:
         return 1.0, 0.0
     share = 1.0 / (1.0 + (LEVEL_OF_PRIOR / error) ** 2) if np.isfinite(error) else 1.0
@@ -82,8 +81,9 @@ def _weighed(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, 
 
 
 def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:
+    """Return the factor on the light and its relative standard error."""
     if gauge.kind == "found":
-        return _weighed(problem, fit, gauge.error)
+        return _weigh_levels(problem, fit, gauge.error)
     if gauge.kind == "lamp":
         return float(gauge.factor), 0.0
     use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)
@@ -95,14 +95,14 @@ def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, f
             raise InputError("scale white_patch: the patch has too few pixels to be fitted; choose a larger one")
         return 1.0, 0.0
     object_id, base = problem.object_id[use], problem.base[use].astype(np.float64)
-    # Not clamped to 1: in the light's own gauge an albedo may be larger.
-    mean = float(np.maximum(raw_values(fit.affine[object_id], base)[:, :3], 0.0).mean())
+    # Not clamped to 1: in the gauge of the light an albedo may be larger.
+    mean = float(np.maximum(unclamped_material(fit.affine[object_id], base)[:, :3], 0.0).mean())
     wanted = float(base[:, :3].mean()) if gauge.kind == "prior" else gauge.albedo
     return max(mean, _DARKEST) / max(wanted, _DARKEST), _mean_error(fit, object_id, base) / max(mean, _DARKEST)
 
 
 def _mean_error(fit: FitResult, object_id: np.ndarray, base: np.ndarray) -> float:
-    """Standard deviation of the mean fitted albedo, objects taken as independent."""
+    """Return the standard deviation of the mean fitted albedo, objects taken as independent (Eq. M.38)."""
     n_objects = len(fit.affine)
     slope = np.zeros((n_objects, 16))
     one = np.concatenate([base[:, :3], np.ones((len(base), 1))], 1)

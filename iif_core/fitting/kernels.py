@@ -1,23 +1,122 @@
 """Compiled loops of the fit over the pixels of whole objects; each call is single-threaded and releases the interpreter.
 
-Pixels are sorted by (object, cluster). An object is worked through in pieces of `PIECE` pixels: what the Gauss-Newton system
-needs of a pixel is laid out column by column, so that the sums over pixels become vector instructions. `reassoc` lets the
-compiler add a piece in lanes; the order is fixed when the code is compiled. An object's sums are made by one thread in one
-order: the bytes do not depend on the number of threads.
+Pixels are sorted by (object, cluster). An object is worked through in pieces of `PIECE` pixels: what the Gauss-Newton
+system needs of a pixel is laid out column by column, so that the sums over pixels become vector instructions. `reassoc`
+lets the compiler add a piece in lanes; the order is fixed when the code is compiled. The sums of an object are made by one
+thread in one order, so the bytes do not depend on the number of threads.
 
-Source of the formulae: METHOD 2.7, 7b; the cubic in r: `levels`; the tables of the response: `tone`.
+Model of a pixel: Eq. M.1 and M.2; residuals, loss and derivatives: Eq. M.6 to M.10; interpolation in r: Eq. M.4, M.5; tables
+of the response: `tone`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 PIECE = 64
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
-# What other loops call is inlined: see iif_core.fusion.kernels.
+# Functions that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
 _inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
+
+
+class PixelArrays(NamedTuple):
+    """Pixels of a fit, sorted by (object, cluster): n pixels, O objects, C clusters, J levels, h = 1 or 2 halves."""
+
+    obj: NDArray
+    """(n,) int64 object."""
+    base: NDArray
+    """(n, 5) base material."""
+    diffuse: NDArray
+    """(n, h, 3) cached diffuse light D."""
+    lobes: NDArray
+    """(n, J, 2, 6 h) values (0) and slopes in r (1) of S0 and S1 at the levels; per half: S0 in R G B, then S1."""
+    levels: NDArray
+    """(J,) roughness of the levels."""
+    target: NDArray
+    """(n, 3) what the prediction is compared with, in units of the curve."""
+    exposure: NDArray
+    """(n,) e."""
+    saturated: NDArray
+    """(n, 3) bool: `target` bounds the prediction from below."""
+    trust: NDArray
+    """(n, 3) weight tau of the loss (Eq. M.7)."""
+    starts: NDArray
+    """(C + 1,) first pixel of each cluster."""
+    first: NDArray
+    """(O + 1,) first cluster of each object."""
+
+
+class ResponseTables(NamedTuple):
+    """Curve f of the residuals; N nodes, P parameters, q of them for each channel (`tone.Tone.tables`)."""
+
+    knee: float
+    """Above 0: f(x) = gain log(1 + x / knee) (Eq. M.3), without parameters."""
+    gain: float
+    curve: NDArray
+    """(3, N + 1, 2) f and df/du at the nodes of u = x^(1/4)."""
+    ends: NDArray
+    """(3, 1 + q) df/dx at 1, and its derivatives by the parameters."""
+    by_params: NDArray
+    """(3, N + 1, q) derivatives of f by the parameters."""
+    per_channel: bool
+    """Each channel has parameters of its own."""
+
+
+class Penalties(NamedTuple):
+    """Loss and limits of the objective."""
+
+    robust_width: float
+    """c of Eq. M.7."""
+    brightest: float
+    """Largest albedo."""
+    box: float
+    """Weight of the squared distance to the allowed range (Eq. M.11)."""
+    roughness_weight: float
+    metallic_weight: float
+    """Weights of 1 - r and of m in the mean squared error (Eq. M.39)."""
+
+
+class Sums(NamedTuple):
+    """What `sums` writes; arrays that are not wanted may be empty. P parameters of the response."""
+
+    cost: NDArray
+    """(O,) objective."""
+    data: NDArray
+    """(O,) data term alone."""
+    size: NDArray
+    """(O,) sum of the moduli of the data terms."""
+    h: NDArray
+    """(O, 16 + P, 16 + P) Gauss-Newton matrix."""
+    g: NDArray
+    """(O, 16 + P) gradient."""
+    scores: NDArray
+    """(C, 16 + P) gradient of each cluster."""
+    errors: NDArray
+    """(n, h, 3) residuals."""
+
+
+class _Columns(NamedTuple):
+    """Which numbers move a channel: column i < used[c] of channel c is kind[c, i] (0 to 3 albedo, 4 and 5 roughness, 6 and 7
+    metallic, then the response) and belongs to row place[c, i] of the system."""
+
+    kind: NDArray
+    place: NDArray
+    used: NDArray
+
+
+class _Piece(NamedTuple):
+    """Up to `PIECE` pixels: Jacobian columns (2, 3, columns, PIECE), weight (3, PIECE) and error (2, 3, PIECE) of the halves,
+    room for products (2, PIECE)."""
+
+    columns: NDArray
+    weight: NDArray
+    error: NDArray
+    weighted: NDArray
 
 
 @_inlined
@@ -41,7 +140,7 @@ def _end(mean, beyond, h, h_beyond):
 
 @_compiled
 def slopes(shading, levels, out):
-    """Slopes at the levels of the monotone cubic through them: shading (n, J, 3) -> out (n, J, 3)."""
+    """Write the slopes of the monotone cubic at the levels (Eq. M.5): shading (n, J, 3) -> out (n, J, 3)."""
     last = len(levels) - 1
     for p in range(len(shading)):
         for c in range(3):
@@ -70,8 +169,8 @@ def slopes(shading, levels, out):
 
 
 @_inlined
-def _bracket(levels, r):
-    """Where r lies among the levels: node below, and what y0, y1, y0', y1' weigh there in the value and in the slope."""
+def _interpolation_weights(levels, r):
+    """Return the level below r, and the weights of y0, y1, y0', y1' in value and slope there (Eq. M.4)."""
     last = len(levels) - 2
     j = 0
     while j < last and r >= levels[j + 1]:
@@ -85,8 +184,8 @@ def _bracket(levels, r):
 
 
 @_inlined
-def _shine(nodes, j, w, out):
-    """Both lobes in all channels of all halves at weights w: nodes (J, 2, halves x 2 x 3) of a pixel, y and y'."""
+def _interpolate_lobes(nodes, j, w, out):
+    """Interpolate both lobes in all channels and halves of a pixel with the weights w: nodes (J, 2, 6 h) hold y and y'."""
     w0, w1, v0, v1 = w
     y0, y1 = nodes[j, 0], nodes[j + 1, 0]
     d0, d1 = nodes[j, 1], nodes[j + 1, 1]
@@ -95,8 +194,8 @@ def _shine(nodes, j, w, out):
 
 
 @_inlined
-def _tone(x, knee, gain, curve, end):
-    """f, df/dx, node and share of the table."""
+def _apply_curve(x, knee, gain, curve, end):
+    """Return f, df/dx, and node and share of the table at x."""
     if knee > 0.0:
         x = max(x, 0.0)
         return gain * np.log1p(x / knee), gain / (knee + x), 0, 0.0
@@ -119,219 +218,232 @@ def _tone(x, knee, gain, curve, end):
 
 @_compiled
 def sums(
-    base,
-    diffuse,  # (n, halves, 3)
-    lobes,  # (n, J, 2, halves x 2 x 3): value and slope of s0 and s1
-    levels,
-    target,
-    exposure,
-    saturated,
-    trust,
-    starts,  # (clusters + 1,) first pixel of each cluster
-    first,  # (O + 1,) first cluster of each object
-    affine,
-    free,  # (O, 16) numbers that the system is wanted for
-    knee,
-    gain,
-    curve,
-    ends,
-    by_params,
-    per_channel,
-    robust_width,
-    roughness_weight,
-    metallic_weight,
-    brightest,
-    box,
-    objects,
-    want,  # 0: objective; 1: and its Gauss-Newton system; 2: and the clusters' gradients; 3: objective and residuals
-    cost,  # (O,)
-    data,  # (O,)
-    size,  # (O,) sum of the moduli of the data terms
-    h,  # (O, 16 + P, 16 + P)
-    g,  # (O, 16 + P)
-    scores,  # (clusters, 16 + P)
-    errors,  # (n, halves, 3)
-):
-    """Objective, system and residuals of some objects, written into the last seven arrays."""
-    halves = diffuse.shape[1]
-    per = by_params.shape[2]
-    cols = 8 + per
-    c2 = robust_width * robust_width
-    last_half = halves - 1
-    columns = np.zeros((2, 3, cols, PIECE), lobes.dtype)
-    weight = np.zeros((3, PIECE), lobes.dtype)
-    error = np.zeros((2, 3, PIECE), lobes.dtype)
-    weighted = np.zeros((2, PIECE), lobes.dtype)
-    kind = np.zeros((3, cols), np.int64)  # column -> 0 ... 3 albedo, 4, 5 roughness, 6, 7 metallic, then the response
-    place = np.zeros((3, cols), np.int64)
-    used = np.zeros(3, np.int64)
-    raw = np.zeros(5)
-    value = np.zeros(5)
-    is_free = np.zeros(5)
-    slope_at = np.zeros(8)
-    shine = np.zeros(lobes.shape[3])
-    shine_slope = np.zeros(lobes.shape[3])
-    jacobian = want == 1 or want == 2
+    pixels: PixelArrays,
+    tone: ResponseTables,
+    penalties: Penalties,
+    affine: NDArray,
+    free: NDArray,
+    objects: NDArray,
+    want: int,
+    out: Sums,
+) -> None:
+    """Sum objective, Gauss-Newton system (Eq. M.8) and residuals of some objects.
+
+    Args:
+        pixels, tone, penalties: the problem.
+        affine: (O, 16) float64 numbers of the objects.
+        free: (O, 16) bool, the numbers that the system is wanted for.
+        objects: indices of the objects to sum.
+        want: 0: objective; 1: and its system; 2: and the gradients of the clusters; 3: objective and residuals.
+        out: arrays that receive the sums of these objects.
+    """
+    h = out.h
+    per = tone.by_params.shape[2]
+    width, kind = 8 + per, pixels.lobes.dtype
+    layout = _Columns(np.zeros((3, width), np.int64), np.zeros((3, width), np.int64), np.zeros(3, np.int64))
+    columns, error = np.zeros((2, 3, width, PIECE), kind), np.zeros((2, 3, PIECE), kind)
+    piece = _Piece(columns, np.zeros((3, PIECE), kind), error, np.zeros((2, PIECE), kind))
+    system = want == 1 or want == 2
     for x in range(len(objects)):
         o = objects[x]
-        t = affine[o]
-        cost_o = 0.0
-        data_o = 0.0
-        size_o = 0.0
-        if jacobian:
+        if system:
             h[o] = 0.0
-            g[o] = 0.0
-            for c in range(3):
-                used[c] = 0
-                for i in range(cols):
-                    at = 4 * c + i if i < 4 else (8 + i if i < 8 else 8 + i + (c * per if per_channel else 0))
-                    if i >= 8 or free[o, at]:
-                        kind[c, used[c]] = i
-                        place[c, used[c]] = at
-                        used[c] += 1
-        k = first[o]
-        end = starts[first[o + 1]]
-        begin = starts[k]
-        while begin < end:
-            stop = min(begin + PIECE, end)
-            m_pixels = stop - begin
-            k_begin = k
-            for q in range(m_pixels):
-                p = begin + q
-                while p >= starts[k + 1]:
-                    k += 1
-                b = base[p]
-                for c in range(3):
-                    raw[c] = t[4 * c] * b[0] + t[4 * c + 1] * b[1] + t[4 * c + 2] * b[2] + t[4 * c + 3]
-                raw[3] = t[12] * b[3] + t[13]
-                raw[4] = t[14] * b[4] + t[15]
-                for i in range(5):
-                    floor = 0.02 if i == 3 else 0.0
-                    value[i] = min(max(raw[i], floor), brightest if i < 3 else 1.0)
-                    beyond = raw[i] - value[i]
-                    is_free[i] = 1.0 if beyond == 0.0 else 0.0
-                    if beyond != 0.0:
-                        cost_o += 0.5 * box * beyond * beyond
-                        if jacobian:
-                            _add_beyond(h[o], g[o], i, b, box, beyond)
-                            if want == 2:
-                                _add_pull(scores[k], i, b, box * beyond)
-                r = value[3]
-                m = value[4]
-                cost_o += 1.5 * (roughness_weight * (1.0 - r) + metallic_weight * m)
-                if jacobian:
-                    if is_free[3] > 0.0:
-                        _add_pull(g[o], 3, b, -1.5 * roughness_weight)
-                        if want == 2:
-                            _add_pull(scores[k], 3, b, -1.5 * roughness_weight)
-                    if is_free[4] > 0.0:
-                        _add_pull(g[o], 4, b, 1.5 * metallic_weight)
-                        if want == 2:
-                            _add_pull(scores[k], 4, b, 1.5 * metallic_weight)
-                j, of_value, of_slope = _bracket(levels, r)
-                _shine(lobes[p], j, of_value, shine)
-                if jacobian:
-                    _shine(lobes[p], j, of_slope, shine_slope)
-                e = exposure[p]
-                for c in range(3):
-                    a = value[c]
-                    ks = 0.04 * (1.0 - m) + m * a
-                    for half in range(halves):
-                        d = float(diffuse[p, half, c])
-                        s0 = shine[6 * half + c]
-                        s1 = shine[6 * half + 3 + c]
-                        x_shown = e * ((1.0 - m) * a * d + ks * s0 + s1)
-                        f, df, node, part = _tone(x_shown, knee, gain, curve[c], ends[c, 0])
-                        left = f - target[p, c]
-                        idle = saturated[p, c] and left > 0.0
-                        if idle:
-                            left = 0.0
-                        error[half, c, q] = left
-                        if want == 3:
-                            errors[p, half, c] = left
-                        if jacobian:
-                            slope = 0.0 if idle else df * e
-                            da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
-                            dr = slope * (ks * shine_slope[6 * half + c] + shine_slope[6 * half + 3 + c]) * is_free[3]
-                            dm = slope * (-a * d + (a - 0.04) * s0) * is_free[4]
-                            slope_at[0] = da * b[0]
-                            slope_at[1] = da * b[1]
-                            slope_at[2] = da * b[2]
-                            slope_at[3] = da
-                            slope_at[4] = dr * b[3]
-                            slope_at[5] = dr
-                            slope_at[6] = dm * b[4]
-                            slope_at[7] = dm
-                            own = used[c] - per
-                            for i in range(own):
-                                columns[half, c, i, q] = slope_at[kind[c, i]]
-                            for i in range(per):
-                                if idle:
-                                    columns[half, c, own + i, q] = 0.0
-                                elif node == curve.shape[1] - 1:
-                                    columns[half, c, own + i, q] = by_params[c, node, i] + part * ends[c, 1 + i]
-                                else:
-                                    columns[half, c, own + i, q] = (1.0 - part) * by_params[c, node, i] + part * by_params[
-                                        c, node + 1, i
-                                    ]
-                    # Odd in the product: were only positive ones damped, loud noise of opposite signs would pay, and the
-                    # response would be bent until it amplifies the noise.
-                    product = float(error[0, c, q]) * float(error[last_half, c, q])
-                    modulus = abs(product)
-                    rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
-                    size_o += rho
-                    data_o += rho if product >= 0.0 else -rho
-                    weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
-            if jacobian:
-                _add_piece(columns, weight, error, last_half, m_pixels, used, place, weighted, h[o], g[o])
-            if want == 2:
-                low_q = 0
-                for y in range(k_begin, k + 1):
-                    high_q = min(starts[y + 1] - begin, m_pixels)
-                    _add_scores(columns, weight, error, last_half, low_q, high_q, used, place, scores[y])
-                    low_q = high_q
-            begin = stop
-        cost[o] = cost_o + data_o
-        data[o] = data_o
-        size[o] = size_o
-        if jacobian:
+            out.g[o] = 0.0
+            _choose_columns(free[o], per, tone.per_channel, layout)
+        cost, data, size = _sum_object(pixels, tone, penalties, affine[o], o, want, layout, piece, out)
+        out.cost[o] = cost + data
+        out.data[o] = data
+        out.size[o] = size
+        if system:
             for i in range(h.shape[1]):
                 for j in range(i):
                     h[o, i, j] = h[o, j, i]
 
 
 @_inlined
-def _add_pull(g, i, b, pull):
-    """Gradient of a term whose derivative with respect to material number i (0 ... 4) of a pixel is `pull`."""
+def _choose_columns(free, per, per_channel, layout):
+    """Lay out the free numbers of an object and the parameters of the response."""
+    for c in range(3):
+        layout.used[c] = 0
+        for i in range(8 + per):
+            at = 4 * c + i if i < 4 else (8 + i if i < 8 else 8 + i + (c * per if per_channel else 0))
+            if i >= 8 or free[at]:
+                layout.kind[c, layout.used[c]] = i
+                layout.place[c, layout.used[c]] = at
+                layout.used[c] += 1
+
+
+@_inlined
+def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
+    """Sum over the pixels of object o with the map t; returns the terms of the objective that depend on the material alone, the
+    data term, and the sum of its moduli."""
+    base, diffuse, lobes, levels, target = pixels.base, pixels.diffuse, pixels.lobes, pixels.levels, pixels.target
+    exposure, saturated, trust, starts = pixels.exposure, pixels.saturated, pixels.trust, pixels.starts
+    curve, ends, h, g = tone.curve, tone.ends, out.h[o], out.g[o]
+    columns, weight, error, kind, used = piece.columns, piece.weight, piece.error, layout.kind, layout.used
+    c2 = penalties.robust_width * penalties.robust_width
+    halves, per = diffuse.shape[1], tone.by_params.shape[2]
+    last_half = halves - 1
+    value, beyond, is_free = np.zeros(5), np.zeros(5), np.zeros(5)
+    slope_at, lobe, lobe_slope = np.zeros(8), np.zeros(lobes.shape[3]), np.zeros(lobes.shape[3])
+    system = want == 1 or want == 2
+    cost = data = size = 0.0
+    k = pixels.first[o]
+    end = starts[pixels.first[o + 1]]
+    begin = starts[k]
+    while begin < end:
+        stop = min(begin + PIECE, end)
+        m_pixels = stop - begin
+        k_begin = k
+        for q in range(m_pixels):
+            p = begin + q
+            while p >= starts[k + 1]:
+                k += 1
+            b = base[p]
+            cost = _clamp(b, t, penalties, value, beyond, is_free, cost)
+            if system:
+                _add_material_slopes(g, b, penalties, beyond, is_free)
+                _add_range_curvature(h, b, penalties.box, beyond)
+                if want == 2:
+                    _add_material_slopes(out.scores[k], b, penalties, beyond, is_free)
+            j, of_value, of_slope = _interpolation_weights(levels, value[3])
+            _interpolate_lobes(lobes[p], j, of_value, lobe)
+            if system:
+                _interpolate_lobes(lobes[p], j, of_slope, lobe_slope)
+            e = exposure[p]
+            m = value[4]
+            for c in range(3):
+                a = value[c]
+                ks = 0.04 * (1.0 - m) + m * a
+                for half in range(halves):
+                    d = float(diffuse[p, half, c])
+                    s0 = lobe[6 * half + c]
+                    s1 = lobe[6 * half + 3 + c]
+                    x_shown = e * ((1.0 - m) * a * d + ks * s0 + s1)
+                    f, df, node, part = _apply_curve(x_shown, tone.knee, tone.gain, curve[c], ends[c, 0])
+                    left = f - target[p, c]
+                    idle = saturated[p, c] and left > 0.0
+                    if idle:
+                        left = 0.0
+                    error[half, c, q] = left
+                    if want == 3:
+                        out.errors[p, half, c] = left
+                    if system:
+                        slope = 0.0 if idle else df * e
+                        da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
+                        dr = slope * (ks * lobe_slope[6 * half + c] + lobe_slope[6 * half + 3 + c]) * is_free[3]
+                        dm = slope * (-a * d + (a - 0.04) * s0) * is_free[4]
+                        _write_slopes(slope_at, b, da, dr, dm)
+                        own = used[c] - per
+                        for i in range(own):
+                            columns[half, c, i, q] = slope_at[kind[c, i]]
+                        for i in range(per):
+                            columns[half, c, own + i, q] = 0.0 if idle else _by_param(tone, c, node, part, i)
+                # The loss is odd in the product. If only positive products were damped, large noise of opposite signs would pay,
+                # and the response would be bent until it amplifies the noise.
+                product = float(error[0, c, q]) * float(error[last_half, c, q])
+                modulus = abs(product)
+                rho = 0.5 * trust[p, c] * c2 * np.log1p(modulus / c2)
+                size += rho
+                data += rho if product >= 0.0 else -rho
+                weight[c, q] = trust[p, c] / (1.0 + modulus / c2)
+        if system:
+            _add_piece(piece, last_half, m_pixels, layout, h, g)
+        if want == 2:
+            low_q = 0
+            for y in range(k_begin, k + 1):
+                high_q = min(starts[y + 1] - begin, m_pixels)
+                _add_scores(piece, last_half, low_q, high_q, layout, out.scores[y])
+                low_q = high_q
+        begin = stop
+    return cost, data, size
+
+
+@_inlined
+def _clamp(b, t, penalties, value, beyond, is_free, cost):
+    """Write the clamped material of base value b under map t, its distance beyond the allowed range, and 1.0 where it lies
+    within. Returns `cost` plus the terms of the objective that depend on the material alone (Eq. M.11, M.39)."""
+    for i in range(5):
+        if i < 3:
+            raw = t[4 * i] * b[0] + t[4 * i + 1] * b[1] + t[4 * i + 2] * b[2] + t[4 * i + 3]
+        else:
+            raw = t[6 + 2 * i] * b[i] + t[7 + 2 * i]
+        value[i] = min(max(raw, 0.02 if i == 3 else 0.0), penalties.brightest if i < 3 else 1.0)
+        beyond[i] = raw - value[i]
+        is_free[i] = 1.0 if beyond[i] == 0.0 else 0.0
+        if beyond[i] != 0.0:
+            cost += 0.5 * penalties.box * beyond[i] * beyond[i]
+    return cost + 1.5 * (penalties.roughness_weight * (1.0 - value[3]) + penalties.metallic_weight * value[4])
+
+
+@_inlined
+def _add_material_slopes(g, b, penalties, beyond, is_free):
+    """Add the gradient of the terms that depend on the material alone."""
+    for i in range(5):
+        if beyond[i] != 0.0:
+            _add_slope(g, i, b, penalties.box * beyond[i])
+    if is_free[3] > 0.0:
+        _add_slope(g, 3, b, -1.5 * penalties.roughness_weight)
+    if is_free[4] > 0.0:
+        _add_slope(g, 4, b, 1.5 * penalties.metallic_weight)
+
+
+@_inlined
+def _add_slope(g, i, b, slope):
+    """Add the gradient of a term whose derivative by channel i (0 to 4) of a pixel's material is `slope`."""
     if i < 3:
         for x in range(3):
-            g[4 * i + x] += pull * b[x]
-        g[4 * i + 3] += pull
+            g[4 * i + x] += slope * b[x]
+        g[4 * i + 3] += slope
     else:
-        g[6 + 2 * i] += pull * b[i]
-        g[7 + 2 * i] += pull
+        g[6 + 2 * i] += slope * b[i]
+        g[7 + 2 * i] += slope
 
 
 @_inlined
-def _add_beyond(h, g, i, b, box, beyond):
-    """Squared distance to the allowed range: gives clamped values a way back (METHOD H13)."""
-    _add_pull(g, i, b, box * beyond)
-    if i < 3:
-        for x in range(4):
-            bx = b[x] if x < 3 else 1.0
-            for y in range(x, 4):
-                by = b[y] if y < 3 else 1.0
-                h[4 * i + x, 4 * i + y] += box * bx * by
-        return
-    at = 6 + 2 * i
-    h[at, at] += box * b[i] * b[i]
-    h[at, at + 1] += box * b[i]
-    h[at + 1, at + 1] += box
+def _add_range_curvature(h, b, box, beyond):
+    """Add the curvature of the squared distance to the allowed range (Eq. M.11; docs/method/numerics.md#gradients-at-clamps)."""
+    for i in range(5):
+        if beyond[i] == 0.0:
+            continue
+        if i < 3:
+            for x in range(4):
+                bx = b[x] if x < 3 else 1.0
+                for y in range(x, 4):
+                    by = b[y] if y < 3 else 1.0
+                    h[4 * i + x, 4 * i + y] += box * bx * by
+        else:
+            at = 6 + 2 * i
+            h[at, at] += box * b[i] * b[i]
+            h[at, at + 1] += box * b[i]
+            h[at + 1, at + 1] += box
 
 
 @_inlined
-def _add_scores(columns, weight, error, last_half, low, high, used, place, g):
-    """g += (J1' W e2 + J2' W e1) / 2 of the pixels low ... high - 1 of a piece."""
+def _write_slopes(slope_at, b, da, dr, dm):
+    """Write the derivatives by the eight numbers that a channel depends on."""
+    slope_at[0] = da * b[0]
+    slope_at[1] = da * b[1]
+    slope_at[2] = da * b[2]
+    slope_at[3] = da
+    slope_at[4] = dr * b[3]
+    slope_at[5] = dr
+    slope_at[6] = dm * b[4]
+    slope_at[7] = dm
+
+
+@_inlined
+def _by_param(tone, c, node, part, i):
+    """Derivative of f by parameter i of channel c, at share `part` behind a node of the table."""
+    if node == tone.curve.shape[1] - 1:
+        return tone.by_params[c, node, i] + part * tone.ends[c, 1 + i]
+    return (1.0 - part) * tone.by_params[c, node, i] + part * tone.by_params[c, node + 1, i]
+
+
+@_inlined
+def _add_scores(piece, last_half, low, high, layout, g):
+    """Add (J1' W e2 + J2' W e1) / 2 over the pixels low to high - 1 of a piece to g (Eq. M.8)."""
+    columns, weight, error, used, place = piece.columns, piece.weight, piece.error, layout.used, layout.place
     for c in range(3):
         one = columns[0, c]
         two = columns[last_half, c]
@@ -346,8 +458,10 @@ def _add_scores(columns, weight, error, last_half, low, high, used, place, g):
 
 
 @_inlined
-def _add_piece(columns, weight, error, last_half, m, used, place, weighted, h, g):
-    """Upper triangle of H += (J1' W J2 + J2' W J1) / 2, and g."""
+def _add_piece(piece, last_half, m, layout, h, g):
+    """Add (J1' W J2 + J2' W J1) / 2 over a piece to the upper triangle of h, and the gradient to g (Eq. M.8)."""
+    columns, weight, error, weighted = piece.columns, piece.weight, piece.error, piece.weighted
+    used, place = layout.used, layout.place
     none = columns[0, 0, 0, 0] * 0
     for c in range(3):
         one = columns[0, c]
@@ -377,36 +491,26 @@ def _add_piece(columns, weight, error, last_half, m, used, place, weighted, h, g
 
 @_compiled
 def gradient(
-    obj,
-    base,
-    diffuse,  # (n, 1, 3)
-    lobes,  # (n, J, 2, 2 x 3)
-    levels,
-    target,
-    exposure,
-    saturated,
-    rows,
-    affine,
-    knee,
-    gain,
-    curve,
-    ends,
-    by_params,
-    per_channel,
-    roughness_weight,
-    metallic_weight,
-    g,  # (O, 16 + P)
-):
-    """Sum over the pixels `rows` of the gradient of (sum over channels of e^2) / 3 + w_r (1 - r) + w_m m, added to g."""
-    per = by_params.shape[2]
-    last = curve.shape[1] - 1
+    pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, affine: NDArray, rows: NDArray, g: NDArray
+) -> None:
+    """Sum the gradient of the paper's loss over some pixels: (sum over channels of e^2) / 3 + w_r (1 - r) + w_m m (Eq. M.39).
+
+    Args:
+        pixels: with one half of the cache; tone, penalties: the problem.
+        affine: (O, 16) float64 numbers of the objects.
+        rows: indices of the pixels.
+        g: (O, 16 + P) to which the gradient is added.
+    """
+    base, diffuse, lobes, target, saturated = pixels.base, pixels.diffuse, pixels.lobes, pixels.target, pixels.saturated
+    curve, ends = tone.curve, tone.ends
+    per = tone.by_params.shape[2]
     value = np.zeros(5)
     is_free = np.zeros(5)
-    shine = np.zeros(6)
-    shine_slope = np.zeros(6)
+    lobe = np.zeros(6)
+    lobe_slope = np.zeros(6)
     for row in range(len(rows)):
         p = rows[row]
-        o = obj[p]
+        o = pixels.obj[p]
         t = affine[o]
         b = base[p]
         for i in range(5):
@@ -418,36 +522,34 @@ def gradient(
             is_free[i] = 1.0 if raw == value[i] else 0.0
         r = value[3]
         m = value[4]
-        j, of_value, of_slope = _bracket(levels, r)
-        _shine(lobes[p], j, of_value, shine)
-        _shine(lobes[p], j, of_slope, shine_slope)
-        e = exposure[p]
-        slope_r = -roughness_weight
-        slope_m = metallic_weight
+        j, of_value, of_slope = _interpolation_weights(pixels.levels, r)
+        _interpolate_lobes(lobes[p], j, of_value, lobe)
+        _interpolate_lobes(lobes[p], j, of_slope, lobe_slope)
+        e = pixels.exposure[p]
+        slope_r = -penalties.roughness_weight
+        slope_m = penalties.metallic_weight
         for c in range(3):
             a = value[c]
             ks = 0.04 * (1.0 - m) + m * a
             d = float(diffuse[p, 0, c])
-            s0, s1 = shine[c], shine[3 + c]
-            f, df, node, part = _tone(e * ((1.0 - m) * a * d + ks * s0 + s1), knee, gain, curve[c], ends[c, 0])
+            s0, s1 = lobe[c], lobe[3 + c]
+            x_shown = e * ((1.0 - m) * a * d + ks * s0 + s1)
+            f, df, node, part = _apply_curve(x_shown, tone.knee, tone.gain, curve[c], ends[c, 0])
             error = f - target[p, c]
             if saturated[p, c] and error > 0.0:
                 continue
-            pull = 2.0 / 3.0 * error
-            slope = pull * df * e
+            by_value = 2.0 / 3.0 * error
+            slope = by_value * df * e
             da = slope * ((1.0 - m) * d + m * s0) * is_free[c]
             g[o, 4 * c] += da * b[0]
             g[o, 4 * c + 1] += da * b[1]
             g[o, 4 * c + 2] += da * b[2]
             g[o, 4 * c + 3] += da
-            slope_r += slope * (ks * shine_slope[c] + shine_slope[3 + c])
+            slope_r += slope * (ks * lobe_slope[c] + lobe_slope[3 + c])
             slope_m += slope * (-a * d + (a - 0.04) * s0)
-            at = 16 + (c * per if per_channel else 0)
+            at = 16 + (c * per if tone.per_channel else 0)
             for i in range(per):
-                if node == last:
-                    g[o, at + i] += pull * (by_params[c, node, i] + part * ends[c, 1 + i])
-                else:
-                    g[o, at + i] += pull * ((1.0 - part) * by_params[c, node, i] + part * by_params[c, node + 1, i])
+                g[o, at + i] += by_value * _by_param(tone, c, node, part, i)
         g[o, 12] += slope_r * b[3] * is_free[3]
         g[o, 13] += slope_r * is_free[3]
         g[o, 14] += slope_m * b[4] * is_free[4]

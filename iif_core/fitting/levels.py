@@ -1,8 +1,8 @@
-"""Shading at any roughness between the cached levels.
+"""Shading at any roughness between the cached levels (Eq. M.4, M.5).
 
-Monotone cubic (Fritsch and Carlson 1980, slopes of Fritsch and Butland 1984) in r: passes through the levels, never
-overshoots, and has a continuous derivative, so that a descent in r meets no kinks at the levels (METHOD 7b.ii). The compiled
-fit has the same formulae one pixel at a time (`kernels`).
+The monotone cubic of Fritsch and Carlson (1980), with the slopes of Fritsch and Butland (1984), passes through the levels,
+never overshoots, and has a continuous derivative (docs/method/numerics.md#kinks-at-the-roughness-levels). The compiled fit
+evaluates the same formulae one pixel at a time (`kernels`).
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import numpy as np
 
 
 def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shading at any roughness and its derivative: (n, 3), (n, 3) float64.
+    """Return shading at any roughness, and its derivative by the roughness, (n, 3) float64 each.
 
     Args:
-        shading: (n, J, 3); levels: (J,) increasing; roughness: (n,), clamped to the levels' range.
+        shading: (n, J, 3); levels: (J,) increasing; roughness: (n,), clamped to the range of the levels.
     """
     levels, r = np.asarray(levels, np.float64), np.clip(np.asarray(roughness, np.float64), levels[0], levels[-1])
     j = np.clip(np.searchsorted(levels, r, side="right") - 1, 0, len(levels) - 2)
@@ -22,9 +22,9 @@ def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.nd
     y0, y1 = (shading[k, i].astype(np.float64) for i in (j, j + 1))
     h = (levels[j + 1] - levels[j])[:, None]
     mean = (y1 - y0) / h
-    before, after = np.maximum(j - 1, 0), np.minimum(j + 2, len(levels) - 1)
-    h_before, h_after = (levels[j] - levels[before])[:, None], (levels[after] - levels[j + 1])[:, None]
-    mean_before = (y0 - shading[k, before]) / np.where(h_before > 0, h_before, 1.0)
+    initial_population, after = np.maximum(j - 1, 0), np.minimum(j + 2, len(levels) - 1)
+    h_before, h_after = (levels[j] - levels[initial_population])[:, None], (levels[after] - levels[j + 1])[:, None]
+    mean_before = (y0 - shading[k, initial_population]) / np.where(h_before > 0, h_before, 1.0)
     mean_after = (shading[k, after] - y1) / np.where(h_after > 0, h_after, 1.0)
     inner0, inner1 = _slope(mean_before, mean, h_before, h), _slope(mean, mean_after, h, h_after)
     d0 = np.where(h_before > 0, inner0, _end(mean, mean_after, h, h_after))
@@ -37,14 +37,14 @@ def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.nd
 
 
 def _slope(left: np.ndarray, right: np.ndarray, h_left: np.ndarray, h_right: np.ndarray) -> np.ndarray:
-    """Slope at a level between two intervals: weighted harmonic mean, 0 at an extremum."""
+    """Return the slope at a level between two intervals: weighted harmonic mean, 0 at an extremum."""
     w_left, w_right = 2 * h_right + h_left, h_right + 2 * h_left
     alike = left * right > 0
     return np.where(alike, (w_left + w_right) * left * right / np.where(alike, w_left * right + w_right * left, 1.0), 0.0)
 
 
 def _end(mean: np.ndarray, beyond: np.ndarray, h: np.ndarray, h_beyond: np.ndarray) -> np.ndarray:
-    """Slope at an outermost level: that of a parabola, bent back where it would leave the monotone range."""
+    """Return the slope at an outermost level: that of a parabola, limited to the monotone range."""
     slope = ((2 * h + h_beyond) * mean - h * beyond) / (h + h_beyond)
     slope = np.where(h_beyond > 0, slope, mean)
     slope = np.where(slope * mean <= 0, 0.0, slope)

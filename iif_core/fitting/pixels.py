@@ -10,23 +10,24 @@ import numpy as np
 
 from iif_core.camera.response import Response
 from iif_core.fitting import kernels
-from iif_core.fitting.problem import PARAMETERS, FitOptions, FitProblem
+from iif_core.fitting.problem import FitOptions, FitProblem
 from iif_core.fitting.tone import Tone, make_tone
+from iif_core.reflectance.material import NUMBERS
 
-BOX = 0.05  # weight of the squared distance to the allowed range
-_RUNS = 64  # clusters of an object when the caller names none
+RANGE_WEIGHT = 0.05
+"""Weight of the squared distance to the allowed range (Eq. M.11)."""
+_DEFAULT_CLUSTERS = 64
+"""Clusters of an object if the problem names none."""
 
 
 @dataclass
 class Pixels:
-    """Sorted by (object, cluster); n pixels, C clusters.
+    """Usable pixels, sorted by (object, cluster); n pixels, C clusters.
 
     Attributes:
-        index: (n,) place in the problem; obj: (n,); base: (n, 5); diffuse: (n, halves, 3); lobes: (n, J, 2, halves x 2 x 3) value
-            and slope in r of s0 and s1 at the levels; levels: (J,); target: (n, 3) in units of the tone; exposure: (n,);
-            saturated: (n, 3); trust: (n, 3) weights;
-        starts: (C + 1,) first pixel of each cluster; first: (O + 1,) first cluster of each object; usable: (O,) pixels of each
-            object, also those that were left out for their number.
+        index: (n,) place in the problem.
+        usable: (O,) usable pixels of each object, including those left out because of the limit on their number.
+        others: see `kernels.PixelArrays`.
     """
 
     index: np.ndarray
@@ -49,15 +50,20 @@ class Pixels:
 
     @property
     def offsets(self) -> np.ndarray:
-        """(O + 1,) first pixel of each object."""
+        """First pixel of each object, (O + 1,)."""
         return self.starts[self.first]
 
     @property
     def counts(self) -> np.ndarray:
         return np.diff(self.offsets)
 
+    @property
+    def arrays(self) -> kernels.PixelArrays:
+        """The pixels as the compiled loops take them."""
+        return kernels.PixelArrays(*(getattr(self, name) for name in kernels.PixelArrays._fields))
+
     def take(self, index: np.ndarray | slice) -> Pixels:
-        """A subset; `index` increasing. Every cluster stays, perhaps empty."""
+        """Return a subset; `index` increases. Every cluster stays, possibly empty."""
         begin, end = (index.start, index.stop) if isinstance(index, slice) else (0, 0)
         starts = np.clip(self.starts, begin, end) - begin if end else np.searchsorted(index, self.starts)
         return replace(
@@ -75,7 +81,7 @@ class Pixels:
         )
 
     def only(self, objects: np.ndarray) -> Pixels:
-        """The pixels of some objects (increasing), which are numbered anew."""
+        """Return the pixels of some objects (increasing), which are numbered anew."""
         counts = np.diff(self.first)[objects]
         clusters = np.concatenate([np.arange(self.first[o], self.first[o + 1]) for o in objects] or [np.zeros(0, np.int64)])
         sizes = np.diff(self.starts)[clusters]
@@ -83,7 +89,7 @@ class Pixels:
         number[objects] = np.arange(len(objects))
         index = np.flatnonzero(number[self.obj] >= 0)
         run = len(index) and index[-1] - index[0] == len(index) - 1
-        part = self.take(slice(index[0], index[-1] + 1) if run else index)  # without a copy where they come in a row
+        part = self.take(slice(index[0], index[-1] + 1) if run else index)  # consecutive pixels need no copy
         return replace(
             part,
             obj=number[part.obj],
@@ -93,17 +99,18 @@ class Pixels:
         )
 
     def sum_by_object(self, values: np.ndarray) -> np.ndarray:
+        """Return the sum of values (n,) over the pixels of each object, (O,)."""
         return np.bincount(self.obj, values, self.n_objects)
 
 
 @dataclass
 class Terms:
-    """Objective per object, and its Gauss-Newton system when asked for; P response parameters.
+    """Objective of each object, and its Gauss-Newton system if wanted; P response parameters.
 
     Attributes:
         cost: (O,); data: (O,) the data term alone; size: (O,) sum of the moduli of its terms.
-        h: (O, 16 + P, 16 + P); g: (O, 16 + P); scores: (C, 16 + P) gradient of each cluster, when asked for. What belongs to
-            numbers that the system is not wanted for is 0, but for the distance to the allowed range.
+        h: (O, 16 + P, 16 + P); g: (O, 16 + P); scores: (C, 16 + P) gradient of each cluster, if wanted. Rows of numbers that the
+            system is not wanted for hold the distance to the allowed range alone.
     """
 
     cost: np.ndarray
@@ -113,15 +120,25 @@ class Terms:
     g: np.ndarray
     scores: np.ndarray
 
-    def put(self, other: Terms, objects: np.ndarray) -> None:
-        """Take over the objective and system of some objects; gradients of clusters are not."""
+    def update(self, other: Terms, objects: np.ndarray) -> None:
+        """Copy objective and system of some objects from `other`; the gradients of clusters stay."""
         for name in ("cost", "data", "size", "h", "g"):
             getattr(self, name)[objects] = getattr(other, name)[objects]
 
 
-def prepare(problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None) -> tuple[Pixels, Tone]:
-    """Usable pixels: finite, lit, and of an object; of objects with at least `fewest`; at most `most` of each, evenly spread over
-    its clusters. Pixels that get next to no light have all leverage and no information (METHOD H59)."""
+def prepare_pixels(problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None) -> tuple[Pixels, Tone]:
+    """Select and sort the usable pixels: finite, lit, and of an object.
+
+    Pixels that receive almost no light are left out (docs/method/numerics.md#pixels-without-light).
+
+    Args:
+        problem: pixels with base values and cached shading; response: start of the fit.
+        fewest: objects with fewer usable pixels are left out; most: largest number of pixels of an object, spread evenly over its
+            clusters; None: all.
+
+    Returns:
+        The pixels, and the curve that residuals are measured in.
+    """
     ids = np.asarray(problem.object_id)
     use = np.isfinite(problem.base).all(1) & np.isfinite(problem.value).all(1)
     use &= np.isfinite(problem.exposure) & (problem.exposure > 1e-6) & (ids >= 0) & (ids < problem.n_objects)
@@ -134,12 +151,12 @@ def prepare(problem: FitProblem, response: Response, fewest: int = 0, most: int 
     usable = np.bincount(ids[use], minlength=problem.n_objects)
     use &= (usable >= fewest)[np.where(use, ids, 0)] if len(usable) else False
     index = np.flatnonzero(use)
-    cluster = problem.cluster[index] if problem.cluster is not None else _runs(ids[index])
+    cluster = problem.cluster[index] if problem.cluster is not None else _equal_runs(ids[index])
     order = np.lexsort((cluster, ids[index]))
     index, cluster = index[order], cluster[order]
     if most is not None:
         first = np.searchsorted(ids[index], np.arange(problem.n_objects + 1))
-        some = evenly(ids[index].astype(np.int64), first, most)
+        some = choose_evenly(ids[index].astype(np.int64), first, most)
         index, cluster = index[some], cluster[some]
     obj = ids[index].astype(np.int64)
     fresh = np.flatnonzero(np.r_[True, (np.diff(obj) != 0) | (np.diff(cluster) != 0)]) if len(index) else np.zeros(0, np.int64)
@@ -175,22 +192,41 @@ def prepare(problem: FitProblem, response: Response, fewest: int = 0, most: int 
     return pixels, tone
 
 
-def evenly(obj: np.ndarray, offsets: np.ndarray, most: int) -> np.ndarray:
-    """Places of at most so many of the pixels of each object, in equal strides: obj (n,) sorted, offsets (O + 1,) first pixel of
-    each."""
+def choose_evenly(obj: np.ndarray, offsets: np.ndarray, most: int) -> np.ndarray:
+    """Return the places of at most `most` pixels of each object, in equal strides: obj (n,) sorted, offsets (O + 1,) first pixel
+    of each object."""
     place, stride = np.arange(len(obj)) - offsets[obj], np.maximum(1, -(-np.diff(offsets) // most))
     return np.flatnonzero(place % stride[obj] == 0)
 
 
-def _runs(ids: np.ndarray) -> np.ndarray:
-    """Up to `_RUNS` equal runs of each object's pixels, in the order in which they come."""
+def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
+    """Return the share of each object's pixels to keep, (O,), so that about `budget` remain.
+
+    Objects keep the same number of pixels; those that have fewer keep all.
+
+    Example:
+        >>> fair_shares(np.array([2, 10, 100]), 22).tolist()
+        [1.0, 1.0, 0.1]
+    """
+    counts = np.asarray(counts, np.float64)
+    if counts.sum() <= budget:
+        return np.ones(len(counts))
+    order = np.sort(counts)
+    below = np.r_[0.0, np.cumsum(order)[:-1]]
+    limits = (budget - below) / np.arange(len(order), 0, -1)
+    limit = limits[np.argmax(limits <= order)]
+    return np.minimum(1.0, limit / np.maximum(counts, 1.0))
+
+
+def _equal_runs(ids: np.ndarray) -> np.ndarray:
+    """Number up to `_DEFAULT_CLUSTERS` equal runs of the pixels of each object, in their given order."""
     order = np.argsort(ids, kind="stable")
     ordered = ids[order]
     begin = np.flatnonzero(np.r_[True, np.diff(ordered) != 0]) if len(ids) else np.zeros(0, np.int64)
     count = np.diff(np.r_[begin, len(ids)])
     place = np.arange(len(ids)) - np.repeat(begin, count)
     out = np.empty(len(ids), np.int64)
-    out[order] = place * _RUNS // np.repeat(np.maximum(count, _RUNS), count)
+    out[order] = place * _DEFAULT_CLUSTERS // np.repeat(np.maximum(count, _DEFAULT_CLUSTERS), count)
     return out
 
 
@@ -204,17 +240,29 @@ def evaluate(
     objects: np.ndarray | None = None,
     scores: bool = False,
 ) -> Terms:
-    """Objective at `affine` (O, 16).
+    """Evaluate the objective without the priors (Eq. M.7, M.11).
 
     Args:
-        system: with its Gauss-Newton system; free: (O, 16) bool, the numbers that it is wanted for (None: all); objects: the only
-            ones that are looked at (None: all), the others have zeros; scores: with the gradients of the clusters.
+        px: pixels; affine: (O, 16) numbers of the objects; tone: curve with the current response; opt: loss and limits.
+        system: also sum the Gauss-Newton system (Eq. M.8); scores: and the gradient of each cluster.
+        free: (O, 16) bool, the numbers that the system is wanted for; None: all.
+        objects: indices of the objects to evaluate, increasing; the others have zeros; None: all.
+
+    Returns:
+        Sums in float64; they do not depend on `opt.threads`.
     """
     return _run(px, affine, tone, opt, (2 if scores else 1) if system else 0, free, objects)[0]
 
 
 def residuals(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> np.ndarray:
-    """f(e L) - I of each half, (n, halves, 3) float64; 0 where a bound is met."""
+    """Return the residuals f(e L) - I (Eq. M.6).
+
+    Args:
+        px: pixels; affine: (O, 16); tone: curve with the current response; opt: limits.
+
+    Returns:
+        (n, halves, 3) float64 in units of the curve; 0 where a saturated value is exceeded.
+    """
     return _run(px, affine, tone, opt, 3, None, None)[1]
 
 
@@ -227,7 +275,7 @@ def _run(
     free: np.ndarray | None,
     objects: np.ndarray | None,
 ) -> tuple[Terms, np.ndarray]:
-    n_objects, width, halves = px.n_objects, PARAMETERS + tone.size, px.diffuse.shape[1]
+    n_objects, width, halves = px.n_objects, NUMBERS + tone.size, px.diffuse.shape[1]
     system = n_objects if want in (1, 2) else 0
     terms = Terms(
         *(np.zeros(n_objects) for _ in range(3)),
@@ -237,51 +285,29 @@ def _run(
     )
     errors = np.zeros((len(px.obj) if want == 3 else 0, halves, 3))
     affine = np.ascontiguousarray(affine, np.float64)
-    free = np.ones((n_objects, PARAMETERS), bool) if free is None else np.ascontiguousarray(free)
-    curve, ends, by_params = tone.tables
+    free = np.ones((n_objects, NUMBERS), bool) if free is None else np.ascontiguousarray(free)
+    out = kernels.Sums(terms.cost, terms.data, terms.size, terms.h, terms.g, terms.scores, errors)
+    penalties = penalties_of(opt)
 
     def work(part: np.ndarray) -> None:
-        kernels.sums(
-            px.base,
-            px.diffuse,
-            px.lobes,
-            px.levels,
-            px.target,
-            px.exposure,
-            px.saturated,
-            px.trust,
-            px.starts,
-            px.first,
-            affine,
-            free,
-            tone.knee,
-            tone.gain,
-            curve,
-            ends,
-            by_params,
-            tone.per_channel,
-            opt.robust_width,
-            opt.roughness_weight,
-            opt.metallic_weight,
-            opt.brightest,
-            BOX,
-            part,
-            want,
-            terms.cost,
-            terms.data,
-            terms.size,
-            terms.h,
-            terms.g,
-            terms.scores,
-            errors,
-        )
+        kernels.sums(px.arrays, tone.tables, penalties, affine, free, part, want, out)
 
-    in_threads(work, px, np.arange(n_objects) if objects is None else objects, opt.threads)
+    run_in_threads(work, px, np.arange(n_objects) if objects is None else objects, opt.threads)
     return terms, errors
 
 
-def in_threads(work: Callable[[np.ndarray], None], px: Pixels, objects: np.ndarray, threads: int) -> None:
-    """`work` on runs of `objects` (increasing) with about as many pixels each."""
+def penalties_of(opt: FitOptions) -> kernels.Penalties:
+    """Loss and limits of the objective as the compiled loops take them."""
+    return kernels.Penalties(opt.robust_width, opt.brightest, RANGE_WEIGHT, opt.roughness_weight, opt.metallic_weight)
+
+
+def run_in_threads(work: Callable[[np.ndarray], None], px: Pixels, objects: np.ndarray, threads: int) -> None:
+    """Call a function on consecutive parts of the objects, in threads.
+
+    Args:
+        work: called with each part; px: pixels, by whose number the parts are made equal.
+        objects: increasing indices; threads: number of parts.
+    """
     done = np.cumsum(px.counts[objects])
     if threads < 2 or len(objects) < 2:
         work(objects)

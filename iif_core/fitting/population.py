@@ -1,10 +1,9 @@
-"""What the objects of a scene have in common, and how strongly each leans on it (empirical Bayes).
+"""What the objects of a scene have in common, as a prior of each of them (empirical Bayes; docs/method/fitting.md#population).
 
-Numbers of an object are draws from the scene's population: gains around one value a channel (which carries the open scale of
-light x albedo: nothing pulls towards 1), biases and cross terms around 0, the level and the contrast of roughness around their
-means. Means and spreads are those that the objects' own answers support, by EM on the quadratic model of the objective around
-where the fit stands; two objects' worth of the default keeps a scene of one object finite. Student's weights keep odd objects
-from deciding. The pull of an object is (variance of its rows) / (spread of the population)^2.
+The numbers of an object are draws from the population of the scene: gains around one mean in each channel, which carries the
+open level of light times albedo; biases and cross terms around 0; level and contrast of roughness around their means. Means and
+spreads are learnt by EM on the quadratic model of the objective. The first spreads count as two values, which keeps a scene of
+one object finite, and Student's weights keep outliers from deciding.
 """
 
 from __future__ import annotations
@@ -13,24 +12,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.fitting.descent import Pull, spectrum
-from iif_core.fitting.pixels import Pixels, Terms
-from iif_core.fitting.problem import BIASES, CROSS, GAINS, PARAMETERS, ROUGHNESS
+from iif_core.fitting.descent import GaussianPrior, decompose
+from iif_core.fitting.pixels import Terms
+from iif_core.reflectance.material import BIASES, CROSS_TERMS, GAINS, NUMBERS, ROUGHNESS
 
 _GROUPS = ("gain", "bias", "cross", "level", "contrast")
-_DEFAULT = np.array([0.3, 0.05, 0.1, 0.25, 0.1])  # spreads before any object was seen
-_FLOOR = np.array([0.02, 0.004, 0.01, 0.03, 0.03])
-_CEILING = np.array([0.4, 0.1, 0.2, 0.3, 0.15])  # beyond, gain and bias of nearly constant textures trade without limit
-_PSEUDO = 2.0  # objects' worth of the default
-_FREEDOM = 4.0  # of Student's t
-_ROUNDS = 12
+_FIRST_SPREADS = np.array([0.3, 0.05, 0.1, 0.25, 0.1])
+"""Spreads of the groups before any object was fitted."""
+_LEAST_SPREADS = np.array([0.02, 0.004, 0.01, 0.03, 0.03])
+_LARGEST_SPREADS = np.array([0.4, 0.1, 0.2, 0.3, 0.15])
+"""Beyond these, gain and bias of nearly constant textures would trade without limit."""
+_PSEUDO_OBJECTS = 2.0
+"""Weight of the first spread, in values."""
+_DEGREES_OF_FREEDOM = 4.0
+"""Of Student's t."""
+_EM_ROUNDS = 12
 
 
 @dataclass(frozen=True)
 class Population:
-    """Attributes:
-    gain: (3,) mean gains; level, contrast: mean roughness and gain of its texture; spread: (5,) standard deviations of
-        gain, bias, cross term, level, contrast.
+    """Means and spreads of the numbers over the objects.
+
+    Attributes:
+        gain: (3,) mean gains; level, contrast: mean roughness and mean gain of its texture.
+        spread: (5,) standard deviations of gain, bias, cross term, level, contrast.
     """
 
     gain: np.ndarray
@@ -39,7 +44,7 @@ class Population:
     spread: np.ndarray
 
     def facts(self) -> dict[str, object]:
-        """For `affines.json`."""
+        """Return the population for `affines.json`."""
         return {
             "gain": [float(x) for x in self.gain],
             "roughness": float(self.level),
@@ -48,20 +53,24 @@ class Population:
         }
 
 
-def before(level: float = 0.6, width: float = 0.25) -> Population:
-    """Nothing seen yet but, perhaps, the histogram of roughness."""
-    spread = _DEFAULT.copy()
-    spread[3] = np.clip(width, _FLOOR[3], _CEILING[3])
+def initial_population(level: float = 0.6, width: float = 0.25) -> Population:
+    """Return the population before any object has been fitted, optionally with mean and width of the roughness histogram."""
+    spread = _FIRST_SPREADS.copy()
+    spread[3] = np.clip(width, _LEAST_SPREADS[3], _LARGEST_SPREADS[3])
     return Population(np.ones(3), level, 0.0, spread)
 
 
-def centre_of(population: Population, roughness: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """(O, 16) numbers of an object that says nothing itself.
+def population_mean(population: Population, roughness: np.ndarray, metallic: np.ndarray) -> np.ndarray:
+    """Return the mean of the numbers of each object under the population.
 
     Args:
-        roughness: (O,) mean r~ of the objects; metallic: (O, 2) their (g_m, h_m), which is chosen and not pulled.
+        population: means and spreads; roughness: (O,) mean base roughness of the objects.
+        metallic: (O, 2) their gain and bias of the metallic, which are selected.
+
+    Returns:
+        (O, 16) float64.
     """
-    out = np.zeros((len(roughness), PARAMETERS))
+    out = np.zeros((len(roughness), NUMBERS))
     out[:, GAINS] = population.gain
     out[:, 12] = population.contrast
     out[:, 13] = population.level - population.contrast * roughness
@@ -69,77 +78,99 @@ def centre_of(population: Population, roughness: np.ndarray, metallic: np.ndarra
     return out
 
 
-def pull_of(
+def population_prior(
     population: Population, noise: np.ndarray, roughness: np.ndarray, metallic: np.ndarray, discount: float = 1.0
-) -> Pull:
-    """Weight noise / spread^2 on each number; on roughness, on its level at the object's mean and on its contrast.
+) -> GaussianPrior:
+    """Make the prior of the objects (Eq. M.26): weight noise / spread^2 on each number.
+
+    For roughness the weight is on its level at the mean base roughness of the object, and on its contrast.
 
     Args:
-        noise: (O,) variance of a row; roughness: (O,) mean r~; metallic: (O, 2) chosen (g_m, h_m); discount: by which the
-            evidence of roughness is too confident.
+        population: means and spreads; noise: (O,) variance of a row; roughness: (O,) mean base roughness.
+        metallic: (O, 2) gain and bias of the metallic; discount: factor by which the evidence of roughness is too confident.
+
+    Returns:
+        The prior; its scatter is W S W with S the covariance of the population.
     """
     precision = 1.0 / population.spread**2
-    diagonal = np.zeros(PARAMETERS)
-    diagonal[GAINS], diagonal[BIASES], diagonal[CROSS] = precision[:3]
-    diagonal[14:] = 1.0 / 0.3**2  # metalness: only if someone freed it
-    inverse = np.zeros((len(noise), PARAMETERS, PARAMETERS))
+    diagonal = np.zeros(NUMBERS)
+    diagonal[GAINS], diagonal[BIASES], diagonal[CROSS_TERMS] = precision[:3]
+    diagonal[14:] = 1.0 / 0.3**2  # counts only where metallic is free
+    inverse = np.zeros((len(noise), NUMBERS, NUMBERS))
     inverse[:] = np.diag(diagonal)
     level = np.stack([roughness, np.ones_like(roughness)], 1)
     inverse[:, 12:14, 12:14] = precision[3] * level[:, :, None] * level[:, None, :]
     inverse[:, 12, 12] += precision[4]
-    return Pull(centre_of(population, roughness, metallic), *_weighted(inverse, noise, discount))
+    return GaussianPrior(population_mean(population, roughness, metallic), *_weight_and_scatter(inverse, noise, discount))
 
 
-def _row_variance(noise: np.ndarray, discount: float) -> np.ndarray:
-    """(O, 16): that of what each number is fitted to."""
-    return np.where(np.isin(np.arange(PARAMETERS), ROUGHNESS), discount, 1.0) * noise[:, None]
+def _variance_by_number(noise: np.ndarray, discount: float) -> np.ndarray:
+    """Return the variance of the rows that each number is fitted to, (O, 16)."""
+    return np.where(np.isin(np.arange(NUMBERS), ROUGHNESS), discount, 1.0) * noise[:, None]
 
 
-def _weighted(inverse: np.ndarray, noise: np.ndarray, discount: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weight and scatter of a pull with the inverse covariance `inverse`: noise S^-1 and W S W."""
-    size = _row_variance(noise, discount)
-    weight = inverse * size[:, :, None]  # roughness and albedo do not meet in `inverse`
+def _weight_and_scatter(inverse: np.ndarray, noise: np.ndarray, discount: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return weight noise S^-1 and scatter W S W of a prior with the inverse covariance S^-1 = `inverse`."""
+    size = _variance_by_number(noise, discount)
+    weight = inverse * size[:, :, None]  # `inverse` does not couple roughness and albedo
     return weight, weight * size[:, :, None]
 
 
-def lean(
-    pull: Pull,
-    level: np.ndarray,
-    deviation: np.ndarray,
-    error: np.ndarray,
-    shared: np.ndarray,
-    sway: np.ndarray,
-    noise: np.ndarray,
-    roughness: np.ndarray,
-    contrast: float,
-    discount: float,
-) -> Pull:
-    """The pull with each object's own level of roughness (O,) +- `deviation` (O,) in place of the population's.
+@dataclass(frozen=True)
+class ProfiledRoughness:
+    """Roughness of each object from its profile, and how far it is to be believed.
 
-    `error` (O,) is the standard deviation of that level: with w the weight, its scatter is w^2 error^2. The pixels that it was
-    made of pull again by themselves: 2 w `shared` (O,) is what both have in common. `sway` (O, P): how the level moves with the
-    response.
+    Attributes:
+        level: (O,) posterior mean; deviation: (O,) its posterior standard deviation, from discounted evidence.
+        error: (O,) standard deviation of `level` from noise alone (Eq. M.31).
+        gradient_covariance: (O,) covariance of `level`, for a unit of its weight, with the gradient of the pixels.
+        params: (P,) response at which the profile was made; d_level_d_response: (O, P) derivative of `level` (Eq. M.30).
+    """
+
+    level: np.ndarray
+    deviation: np.ndarray
+    error: np.ndarray
+    gradient_covariance: np.ndarray
+    params: np.ndarray
+    d_level_d_response: np.ndarray
+
+
+def with_profiled_roughness(
+    prior: GaussianPrior, profiled: ProfiledRoughness, noise: np.ndarray, roughness: np.ndarray, contrast: float, discount: float
+) -> GaussianPrior:
+    """Replace the population's level of roughness by the profiled one of each object (Eq. M.29).
+
+    The pixels that made the profile also enter the descent. With w the weight of the level, the scatter of the prior is therefore
+    w^2 error^2 + 2 w `gradient_covariance`.
+
+    Args:
+        prior: of the population; profiled: levels at the current response.
+        noise: (O,) variance of a row; roughness: (O,) mean base roughness.
+        contrast: mean gain of the roughness texture; discount: factor by which the evidence of roughness is too confident.
+
+    Returns:
+        The prior, which moves with the response.
     """
     own = np.stack([roughness, np.ones_like(roughness)], 1)
     outer = own[:, :, None] * own[:, None, :]
     size = discount * noise
-    strength = size / deviation**2
-    weight, scatter = pull.weight.copy(), pull.scatter.copy() if pull.scatter is not None else np.zeros_like(pull.weight)
+    strength = size / profiled.deviation**2
+    weight, scatter = prior.weight.copy(), prior.scatter.copy() if prior.scatter is not None else np.zeros_like(prior.weight)
     weight[:, 12:14, 12:14] = strength[:, None, None] * outer
-    scatter[:, 12:14, 12:14] = (strength**2 * error**2 + 2.0 * strength * shared)[:, None, None] * outer
-    weight[:, 12, 12] += size / _DEFAULT[4] ** 2
-    scatter[:, 12, 12] += size**2 / _DEFAULT[4] ** 2
-    centre = pull.centre.copy()
-    centre[:, 13] = level - contrast * roughness
-    drift = np.zeros((*centre.shape, sway.shape[1]))
-    drift[:, 12:14] = strength[:, None, None] * own[:, :, None] * sway[:, None]
-    return Pull(centre, weight, scatter, drift)
+    both = strength**2 * profiled.error**2 + 2.0 * strength * profiled.gradient_covariance
+    scatter[:, 12:14, 12:14] = both[:, None, None] * outer
+    weight[:, 12, 12] += size / _FIRST_SPREADS[4] ** 2
+    scatter[:, 12, 12] += size**2 / _FIRST_SPREADS[4] ** 2
+    centre = prior.centre.copy()
+    centre[:, 13] = profiled.level - contrast * roughness
+    drift = np.zeros((*centre.shape, profiled.d_level_d_response.shape[1]))
+    drift[:, 12:14] = strength[:, None, None] * own[:, :, None] * profiled.d_level_d_response[:, None]
+    return GaussianPrior(centre, weight, scatter, drift)
 
 
-def learn(
+def update_population(
     population: Population,
     terms: Terms,
-    px: Pixels,
     affine: np.ndarray,
     free: np.ndarray,
     noise: np.ndarray,
@@ -147,33 +178,43 @@ def learn(
     metallic: np.ndarray,
     discount: float,
 ) -> Population:
-    """EM for means and spreads; the data of an object are the quadratic model of its objective at `affine`."""
+    """Learn means and spreads by EM (Eq. M.27, M.28); the data of an object are the quadratic model of its objective.
+
+    Args:
+        population: start; terms: objective and system at `affine`; affine: (O, 16); free: (O, 16) bool.
+        noise: (O,) variance of a row; roughness: (O,) mean base roughness; metallic: (O, 2) gain and bias of the metallic.
+        discount: factor by which the evidence of roughness is too confident.
+
+    Returns:
+        The population; `population` itself if nothing is free.
+    """
     use = free.any(1)
     if not use.any():
         return population
-    g = np.where(free, terms.g[:, :PARAMETERS], 0.0)[use]
+    g = np.where(free, terms.g[:, :NUMBERS], 0.0)[use]
     keep = (free[:, :, None] & free[:, None, :])[use]
-    h = np.where(keep, terms.h[use][:, :PARAMETERS, :PARAMETERS], 0.0)
+    h = np.where(keep, terms.h[use][:, :NUMBERS, :NUMBERS], 0.0)
     here, own_free, own_noise = affine[use], free[use], noise[use]
     r, m = roughness[use], metallic[use]
     fixed = ~own_free
-    size = np.sqrt(_row_variance(own_noise, discount))
-    i = np.arange(PARAMETERS)
-    for _ in range(_ROUNDS):
-        pull = pull_of(population, own_noise, r, m, discount)
-        block = np.where(keep, h + pull.weight, 0.0)
+    size = np.sqrt(_variance_by_number(own_noise, discount))
+    i = np.arange(NUMBERS)
+    for _ in range(_EM_ROUNDS):
+        prior = population_prior(population, own_noise, r, m, discount)
+        block = np.where(keep, h + prior.weight, 0.0)
         block[:, i, i] += fixed
-        inverse = np.where(keep, spectrum(block).inverse(), 0.0)
-        right = np.where(own_free, g + pull.gradient(here), 0.0)
+        inverse = np.where(keep, decompose(block).inverse(), 0.0)
+        right = np.where(own_free, g + prior.gradient(here), 0.0)
         theta = here - np.einsum("oij,oj->oi", inverse, right)
         covariance = inverse * size[:, :, None] * size[:, None, :]
-        population = _moments(population, theta, covariance, own_free, r)
+        population = _update_moments(population, theta, covariance, own_free, r)
     return population
 
 
-def _moments(
+def _update_moments(
     population: Population, theta: np.ndarray, covariance: np.ndarray, free: np.ndarray, roughness: np.ndarray
 ) -> Population:
+    """Return the population given numbers theta (O, 16) and covariances (O, 16, 16) of the objects (Eq. M.28)."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     level = theta[:, 12] * roughness + theta[:, 13]
     jacobian = np.stack([roughness, np.ones_like(roughness)], 1)
@@ -182,21 +223,21 @@ def _moments(
     gain = population.gain.copy()
 
     def group(k: int, value: np.ndarray, own: np.ndarray, centre: np.ndarray | float, moves: bool) -> np.ndarray | float:
-        """New spread of one group and, if it has one, its new centre; value, own (variance): (objects, columns)."""
+        """Set the spread of group k and return its centre, which moves if asked; value and variance `own`: (objects, columns)."""
         away = value - centre
-        weight = (_FREEDOM + 1) / (_FREEDOM + away**2 / spread[k] ** 2)
+        weight = (_DEGREES_OF_FREEDOM + 1) / (_DEGREES_OF_FREEDOM + away**2 / spread[k] ** 2)
         if moves:
             closeness = weight / (spread[k] ** 2 + own)
             centre = (closeness * value).sum(0) / closeness.sum(0)
             away = value - centre
-        squares = (weight * away**2 + own).sum() + _PSEUDO * _DEFAULT[k] ** 2
-        spread[k] = np.clip(np.sqrt(squares / (value.size + _PSEUDO)), _FLOOR[k], _CEILING[k])
+        squares = (weight * away**2 + own).sum() + _PSEUDO_OBJECTS * _FIRST_SPREADS[k] ** 2
+        spread[k] = np.clip(np.sqrt(squares / (value.size + _PSEUDO_OBJECTS)), _LEAST_SPREADS[k], _LARGEST_SPREADS[k])
         return centre
 
     seen = free[:, GAINS].all(1)
     if seen.any():
         gain = np.asarray(group(0, theta[seen][:, GAINS], variance[seen][:, GAINS], gain, True))
-    for k, columns in ((1, BIASES), (2, CROSS)):
+    for k, columns in ((1, BIASES), (2, CROSS_TERMS)):
         seen = free[:, columns].all(1)
         if seen.any():
             group(k, theta[seen][:, columns], variance[seen][:, columns], 0.0, False)

@@ -1,7 +1,6 @@
-"""What is fitted and to what: the problem, the options and the result that every solver shares (METHOD 2.8, 7b).
+"""The problem, the options and the result that every solver of the material fit shares (Eq. M.1, R.14).
 
-The order of the sixteen numbers of an object: A and b row by row [A00 A01 A02 b0 A10 ...], then (g_r, h_r), then
-(g_m, h_m); a = A a~ + b, r = g_r r~ + h_r, m = g_m m~ + h_m.
+The sixteen numbers of an object are ordered as in `iif_core.reflectance.material`.
 """
 
 from __future__ import annotations
@@ -13,19 +12,7 @@ import numpy as np
 
 from iif_core.camera.response import Response
 from iif_core.errors import InputError
-from iif_core.reflectance.brdf import R_MIN
 
-PARAMETERS = 16
-
-IDENTITY = np.r_[np.eye(3, 4).ravel(), 1.0, 0.0, 1.0, 0.0]
-GAINS = np.array([0, 5, 10])
-BIASES = np.array([3, 7, 11])
-CROSS = np.array([1, 2, 4, 6, 8, 9])
-ROUGHNESS = np.array([12, 13])
-METALLIC = np.array([14, 15])
-MATTE = np.array([0.0, 1.0, 0.0, 0.0])
-"""The last four numbers of a matte object."""
-LOW = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
 SOLVERS = ("direct", "sgd", "adam")
 
 
@@ -36,14 +23,14 @@ class FitProblem:
     Attributes:
         object_id: (n,) int in [0, n_objects); -1 is left out.
         n_objects: O.
-        base: (n, 5) albedo, roughness, metallic of the base texture.
-        diffuse: h arrays (n, 3); s0, s1: h arrays (n, J, 3), shading of METHOD 2.7.
+        base: (n, 5) linear albedo, roughness, metallic of the base texture.
+        diffuse: h arrays (n, 3), D of Eq. M.1; s0, s1: h arrays (n, J, 3), S0 and S1 at the levels.
         levels: (J,) roughness of the levels, increasing.
-        value: (n, 3) sensor value f(e L).
+        value: (n, 3) sensor value f(e L); HDR: linear radiance.
         exposure: (n,) e.
         saturated: (n, 3) bool: `value` is a lower bound.
-        cluster: (n,) int, pixels of an object with the same number share errors (see `patches`); None = 64 runs of an object's
-            pixels as they come.
+        cluster: (n,) int, pixels of an object with the same number share errors (see `clusters.patches`); None: 64 runs of the
+            pixels of an object in their given order.
     """
 
     object_id: np.ndarray
@@ -75,7 +62,7 @@ class FitProblem:
             raise InputError("fit: needs at least two increasing roughness levels")
 
     def take(self, index: np.ndarray | slice) -> FitProblem:
-        """Some of the pixels."""
+        """Return some of the pixels."""
         changed: dict[str, Any] = {}
         for name, value in self.__dict__.items():
             if name in ("n_objects", "levels") or value is None:
@@ -84,11 +71,11 @@ class FitProblem:
         return replace(self, **changed)
 
     def merged(self) -> FitProblem:
-        """The same with the mean of the halves as the only one: what the paper's loss sees."""
+        """Return the problem with the mean of the halves as the only one, as the paper's loss has it."""
         if len(self.diffuse) == 1:
             return self
         means = {
-            name: (0.5 * (getattr(self, name)[0] + getattr(self, name)[1]),)  # keeps the type of the cache
+            name: (0.5 * (getattr(self, name)[0] + getattr(self, name)[1]),)  # keeps the dtype of the cache
             for name in ("diffuse", "s0", "s1")
         }
         return replace(self, **means)
@@ -99,32 +86,28 @@ class FitOptions:
     """How to fit.
 
     Attributes:
-        iterations: most Gauss-Newton steps of each descent; a descent ends when the step would move nothing (see
-            `tolerance`).
-        tolerance: converged when the objective is expected to fall, or fell in three steps, by less than this share: far
-            below what moves a number by its standard error.
-        robust_width: Cauchy width of the residual in sensor units.
-        min_pixels: objects with fewer keep the population's gain and nothing else of their own.
+        iterations: largest number of Gauss-Newton steps of each descent.
+        tolerance: a descent has converged when the objective is expected to fall, or fell in three steps, by less than this share
+            of its size.
+        robust_width: Cauchy width c of the residual in sensor units (Eq. M.7).
+        min_pixels: objects with fewer usable pixels have no numbers of their own.
         free_response: fit the response parameters too.
-        response_prior: mean (P,) and precision (P, P) of the response parameters, row by row, from their calibration.
-            None: the start, and precision one.
-        response_ridge: weight of that prior per pixel. 1e-5 is a residual of 0.05 squared over 250 independent errors:
-            those of the shading go together over an object in a view, so pixels are no measure of what is known.
-            RMS of the curve before and after the joint fit, worst channel, in per cent of the range: built-in kitchen 0.47
-            and 0.59, Country Kitchen 0.60 and 0.62; with precision one instead of the calibration's 4.6 and 8.7.
-        roughness_weight, metallic_weight: of |r - 1| and |m| in the mean squared error, as in the paper's loss (1e-3, 5e-3
-            there); 0 here, because the population decides (`population`).
-        population: pull each object towards what the well-determined objects of the scene have in common, as strongly as
-            they agree (empirical Bayes); otherwise `ridge` pulls to the identity.
-        ridge: pull to the identity per pixel, without `population`.
-        select: choose dielectric or metal and the valley of the roughness by their evidence; otherwise descend from the
-            identity with metalness free where it was predicted above `metallic_prior`.
+        response_prior: mean (P,) and precision (P, P) of the response parameters, row by row, from their calibration; None: the
+            start, with precision 1.
+        response_ridge: weight lambda of that prior for each pixel (Eq. M.14). 1e-5 is the square of a residual of 0.05 over 250
+            independent errors; errors of the shading are common to an object in a view, so the pixels are not independent.
+        roughness_weight, metallic_weight: weights of |r - 1| and |m| in the mean squared error, 1e-3 and 5e-3 in the paper's loss
+            (Eq. M.39).
+        population: draw each object towards what the objects of the scene have in common (empirical Bayes).
+        ridge: without population and selection, weight for each pixel of a prior at the identity.
+        select: choose between dielectric and metal, and the local minimum of the roughness, by their evidence; otherwise start at
+            the identity, with metallic free where its predicted mean exceeds `metallic_prior`.
         metallic_prior: see `select`.
-        matte: no gloss at all: roughness 1 and no metal, not fitted.
-        texture_sigma: standard deviation (albedo) above which a direction of the texture is real (2 / 255).
-        brightest: largest albedo in the fit, above 1 because the light is not known that well: a white wall in light that is a
-            little too dim could show what it shows only by a gloss that it does not have. Albedos are published within [0, 1].
-        threads: of the compiled loops; the result does not depend on it.
+        matte: fit no gloss: roughness 1 and no metal.
+        texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
+        brightest: largest albedo in the fit. It exceeds 1 because in light that is a little too dim a white wall would otherwise
+            be explained by a gloss that it does not have. Published albedos lie within [0, 1].
+        threads: number of threads; the result does not depend on it.
     """
 
     iterations: int = 60
@@ -147,24 +130,49 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
+class SgdOptions:
+    """Schedule of the paper's optimiser; the defaults are published, but for `adam`.
+
+    Attributes:
+        method: `sgd` or `adam`; rate: step size, None: 10, or 0.01 for adam.
+        epochs: passes over the pixels; batch: pixels of a step; decay: factor on the rate after each epoch.
+        seed: of the order of the pixels; free_response: fit the response too.
+        steps: steps over all epochs, for which the pixels are gone through as often as needed; None: one pass an epoch.
+    """
+
+    method: str = "sgd"
+    rate: float | None = None
+    epochs: int = 3
+    batch: int = 32768
+    decay: float = 0.2
+    seed: int = 0
+    free_response: bool = True
+    steps: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in ("sgd", "adam"):
+            raise InputError(f"solver {self.method!r}; allowed: sgd, adam")
+
+
+@dataclass(frozen=True)
 class FitResult:
     """Result of a solver.
 
     Attributes:
-        affine: (O, 16) float64.
-        covariance: (O, 16, 16): sandwich over clusters of pixels that share errors, with the spread of the population where
-            an object leans on it, and with the error of the response; 0 for fixed numbers.
+        affine: (O, 16) float64 numbers of the objects.
+        covariance: (O, 16, 16) of these numbers (Eq. M.32), given light and geometry; 0 for numbers that were not fitted.
         free: (O, 16) bool, which numbers were fitted.
-        pixels: (O,) int, pixels in the fit.
-        residual: (O,) root mean square of f(e L) - I in sensor units over unsaturated channels (HDR: in units of the
-            logarithmic tone curve of the fit); 0 without pixels.
-        model: O strings, e.g. `gain+bias, roughness`; `identity (12 pixels)`.
-        response: the fitted response; response_covariance: (P, P) of its parameters, channel by channel.
-        light_scale: light must be multiplied by this to go with the albedos (1 unless a gauge was set).
+        pixels: (O,) int, usable pixels.
+        residual: (O,) root mean square of f(e L) - I over unsaturated channels, in sensor units (HDR: in units of the curve of
+            Eq. M.3); 0 without pixels.
+        model: O strings, e.g. `gain+bias, roughness` or `identity (12 pixels)`.
+        response: the fitted response.
+        light_scale: factor on the light that goes with the albedos (1 unless a gauge was applied).
         history: objective after each step of the last descent, never rising.
-        converged: the last descent met `FitOptions.tolerance`.
-        iterations: steps of the last descent.
-        reason: why the last descent ended.
+        converged: whether the last descent met `FitOptions.tolerance`.
+        response_covariance: (P, P) of the response parameters, channel by channel.
+        iterations: steps of the last descent; reason: why it ended.
+        facts: further numbers for `affines.json`.
     """
 
     affine: np.ndarray
@@ -183,35 +191,17 @@ class FitResult:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
-def raw_values(affine: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Affine without clamping: affine (n, 16), base (n, 5) -> (n, 5)."""
-    a = np.einsum("nci,ni->nc", affine[:, :12].reshape(-1, 3, 4)[:, :, :3], base[:, :3]) + affine[:, BIASES]
-    r = affine[:, 12] * base[:, 3] + affine[:, 13]
-    m = affine[:, 14] * base[:, 4] + affine[:, 15]
-    return np.concatenate([a, r[:, None], m[:, None]], 1)
-
-
-def apply_affines(affine: np.ndarray, object_id: np.ndarray, base: np.ndarray) -> np.ndarray:
-    """Materials of base values: (n, 5) float64, albedo and metallic clamped to [0, 1], roughness to [0.02, 1].
-
-    Args:
-        affine: (O, 16); object_id: (n,), -1 keeps the base (clamped); base: (n, 5).
-    """
-    own = np.broadcast_to(IDENTITY, (len(base), PARAMETERS))
-    if len(affine):
-        own = np.where((object_id >= 0)[:, None], affine[object_id], IDENTITY)
-    return np.clip(raw_values(own, np.asarray(base, np.float64)), LOW, 1.0)
-
-
 def albedo_uncertainty(
     affine: np.ndarray, covariance: np.ndarray, object_id: np.ndarray, base: np.ndarray, base_deviation: np.ndarray
 ) -> np.ndarray:
-    """Standard deviation of the fitted albedo, mean over the channels: (n,) float64.
-
-    Adds the fit's covariance at the base colour and the base's own standard deviation through A.
+    """Propagate the covariances of the fit and of the base texture to the fitted albedo.
 
     Args:
-        affine: (O, 16); covariance: (O, 16, 16); object_id: (n,), -1 = no fit; base: (n, 5); base_deviation: (n, 3).
+        affine: (O, 16) numbers; covariance: (O, 16, 16) of the numbers.
+        object_id: (n,) int, -1 = no fit; base: (n, 5); base_deviation: (n, 3) standard deviation of the base albedo.
+
+    Returns:
+        (n,) float64 standard deviation, mean over the channels.
     """
     known = object_id >= 0
     o = np.where(known, object_id, 0)

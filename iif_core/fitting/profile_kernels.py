@@ -1,53 +1,77 @@
-"""Compiled loop of the profile: the albedo numbers of one object at one roughness and one metalness.
+"""Compiled loop of the profile: the albedo numbers of one object at one roughness and one metallic (Eq. M.20).
 
-With both held, a pixel shows e L = a U + V in each channel, U = e ((1 - m) D + m S0), V = e (0.04 (1 - m) S0 + S1): the three
-channels part, and each is a problem of at most four numbers over numbers that are at hand. Descended one object and channel at a
-time: an object's pixels stay in the cache of the processor. Order of the sums: as in `kernels`.
+With both held, a pixel shows e L = a U + V in each channel, U = e ((1 - m) D + m S0), V = e (0.04 (1 - m) S0 + S1). The three
+channels separate, and each is a problem of at most four numbers with known coefficients. Each object and channel is descended
+on its own, so the pixels of an object stay in the cache of the processor. Order of the sums: as in `kernels`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
-from iif_core.fitting.kernels import _bracket, _compiled, _inlined, _shine, _tone
+from iif_core.fitting.kernels import (
+    Penalties,
+    PixelArrays,
+    ResponseTables,
+    _apply_curve,
+    _compiled,
+    _inlined,
+    _interpolate_lobes,
+    _interpolation_weights,
+)
 
-_DAMPED = 1e-3  # Levenberg-Marquardt's first damping
+_FIRST_DAMPING = 1e-3  # of Levenberg-Marquardt
+
+
+class AlbedoTask(NamedTuple):
+    """Which albedo numbers are fitted at which gloss; O objects."""
+
+    free: NDArray
+    """(O, 12 or more) bool, the numbers that move."""
+    centre: NDArray
+    """(O, 12 or more) mean of the prior."""
+    weight: NDArray
+    """(O, 12) diagonal of its weight."""
+    metallic: NDArray
+    """(2,) gain and bias of the metallic."""
+    roughness: float
+    """Roughness; negative: no specular lobe at all."""
+    steps: int
+    """Largest number of Gauss-Newton steps."""
+    tolerance: float
+    """Expected fall of the objective, as a share of its size, at which a descent ends."""
 
 
 @_compiled
 def fit_albedo(
-    base,
-    diffuse,
-    lobes,
-    levels,
-    target,
-    exposure,
-    saturated,
-    trust,
-    offsets,  # (O + 1,) first pixel of each object
-    knee,
-    gain,
-    curve,
-    ends,
-    robust_width,
-    brightest,
-    box,
-    free,  # (O, 12) bool
-    centre,  # (O, 12) and
-    weight,  # (O, 12), of the pull
-    metallic,  # (2,) gain and bias
-    roughness,  # negative: no lobe at all
-    steps,
-    tolerance,
-    objects,
-    affine,  # (O, 12) from where, and where it ends
-    cost,  # (O,) data term and pull there
-):
-    """Damped Gauss-Newton of the albedo of some objects; `affine` and `cost` are written."""
+    pixels: PixelArrays,
+    tone: ResponseTables,
+    penalties: Penalties,
+    task: AlbedoTask,
+    objects: NDArray,
+    affine: NDArray,
+    cost: NDArray,
+) -> None:
+    """Fit the albedo numbers of some objects by damped Gauss-Newton.
+
+    Args:
+        pixels, tone, penalties: the problem.
+        task: numbers, prior and gloss.
+        objects: indices of the objects to fit.
+        affine: (O, 12) start; the rows of these objects are overwritten with the result.
+        cost: (O,) receives data term plus prior at the result.
+    """
+    base, diffuse, lobes, exposure = pixels.base, pixels.diffuse, pixels.lobes, pixels.exposure
+    target, saturated, trust = pixels.target, pixels.saturated, pixels.trust
+    starts, first = pixels.starts, pixels.first
+    free, centre, weight, metallic, roughness = task.free, task.centre, task.weight, task.metallic, task.roughness
     halves = diffuse.shape[1]
     most = 0
     for x in range(len(objects)):
-        most = max(most, offsets[objects[x] + 1] - offsets[objects[x]])
+        most = max(most, starts[first[objects[x] + 1]] - starts[first[objects[x]]])
     u = np.zeros((3, halves, most))
     v = np.zeros((3, halves, most))
     g = np.zeros(4)
@@ -57,27 +81,27 @@ def fit_albedo(
     lower = np.zeros((4, 4))
     theta = np.zeros(4)
     tried = np.zeros(4)
-    j, weights, _ = _bracket(levels, max(roughness, 0.02))
-    shine = np.zeros(lobes.shape[3])
+    j, weights, _ = _interpolation_weights(pixels.levels, max(roughness, 0.02))
+    lobe = np.zeros(lobes.shape[3])
     for x in range(len(objects)):
         o = objects[x]
-        low = offsets[o]
-        n = offsets[o + 1] - low
+        low = starts[first[o]]
+        n = starts[first[o + 1]] - low
         cost[o] = 0.0
         for q in range(n):
             p = low + q
             m = min(max(metallic[0] * base[p, 4] + metallic[1], 0.0), 1.0)
             if roughness >= 0.0:
-                _shine(lobes[p], j, weights, shine)
+                _interpolate_lobes(lobes[p], j, weights, lobe)
             for half in range(halves):
                 for c in range(3):
-                    s0 = shine[6 * half + c]
+                    s0 = lobe[6 * half + c]
                     u[c, half, q] = exposure[p] * ((1.0 - m) * diffuse[p, half, c] + m * s0)
-                    v[c, half, q] = exposure[p] * (0.04 * (1.0 - m) * s0 + shine[6 * half + 3 + c])
+                    v[c, half, q] = exposure[p] * (0.04 * (1.0 - m) * s0 + lobe[6 * half + 3 + c])
         for c in range(3):
             own = free[o, 4 * c : 4 * c + 4]
             middle = centre[o, 4 * c : 4 * c + 4]
-            pull = weight[o, 4 * c : 4 * c + 4]
+            prior = weight[o, 4 * c : 4 * c + 4]
             given = (
                 base[low : low + n],
                 u[c],
@@ -86,18 +110,18 @@ def fit_albedo(
                 saturated[low : low + n, c],
                 trust[low : low + n, c],
             )
-            curves = (knee, gain, curve[c], ends[c, 0], robust_width, brightest, box)
+            curve = (tone.knee, tone.gain, tone.curve[c], tone.ends[c, 0])
             for i in range(4):
                 theta[i] = affine[o, 4 * c + i]
-            total, shown, size = _system(theta, given, curves, own, middle, pull, g, h)
-            damping = _DAMPED
-            for _ in range(steps):
+            total, shown, size = _system(theta, given, curve, penalties, middle, prior, g, h)
+            damping = _FIRST_DAMPING
+            for _ in range(task.steps):
                 expected = _solve(h, g, own, damping, lower, tried)
-                if 0.5 * expected <= tolerance * size:
+                if 0.5 * expected <= task.tolerance * size:
                     break
                 for i in range(4):
                     tried[i] = theta[i] - tried[i]
-                new_total, new_shown, new_size = _system(tried, given, curves, own, middle, pull, new_g, new_h)
+                new_total, new_shown, new_size = _system(tried, given, curve, penalties, middle, prior, new_g, new_h)
                 if new_total < total:
                     total, shown, size = new_total, new_shown, new_size
                     theta[:] = tried
@@ -112,11 +136,12 @@ def fit_albedo(
 
 
 @_inlined
-def _system(theta, given, curves, own, middle, pull, g, h):
-    """Objective, its data term with the pull, and its size at theta (4,); gradient and curvature into g, h."""
+def _system(theta, given, curve, penalties, middle, prior, g, h):
+    """Return objective, data term plus prior, and size of the terms at theta (4,); write gradient and curvature."""
     base, u, v, target, saturated, trust = given
-    knee, gain, curve, end, robust_width, brightest, box = curves
-    c2 = robust_width * robust_width
+    knee, gain, table, end = curve
+    brightest, box = penalties.brightest, penalties.box
+    c2 = penalties.robust_width * penalties.robust_width
     last_half = len(u) - 1
     t0, t1, t2, t3 = theta[0], theta[1], theta[2], theta[3]
     g0 = g1 = g2 = g3 = 0.0
@@ -130,13 +155,13 @@ def _system(theta, given, curves, own, middle, pull, g, h):
         b2 = float(base[q, 2])
         raw = t0 * b0 + t1 * b1 + t2 * b2 + t3
         a = min(max(raw, 0.0), brightest)
-        e1, d1, _, _ = _tone(a * u[0, q] + v[0, q], knee, gain, curve, end)
+        e1, d1, _, _ = _apply_curve(a * u[0, q] + v[0, q], knee, gain, table, end)
         e1 -= target[q]
         d1 *= u[0, q]
         e2 = e1
         d2 = d1
         if last_half > 0:
-            e2, d2, _, _ = _tone(a * u[1, q] + v[1, q], knee, gain, curve, end)
+            e2, d2, _, _ = _apply_curve(a * u[1, q] + v[1, q], knee, gain, table, end)
             e2 -= target[q]
             d2 *= u[1, q]
         if saturated[q]:
@@ -176,19 +201,21 @@ def _system(theta, given, curves, own, middle, pull, g, h):
     g[0], g[1], g[2], g[3] = g0, g1, g2, g3
     h[0, 0], h[1, 0], h[2, 0], h[3, 0] = h00, h01, h02, h03
     h[1, 1], h[2, 1], h[3, 1], h[2, 2], h[3, 2], h[3, 3] = h11, h12, h13, h22, h23, h33
-    leaned = 0.0
+    prior_cost = 0.0
     for i in range(4):
         away = theta[i] - middle[i]
-        leaned += 0.5 * pull[i] * away * away
-        g[i] += pull[i] * away
-        h[i, i] += pull[i]
-    return data + outside + leaned, data + leaned, size + leaned
+        prior_cost += 0.5 * prior[i] * away * away
+        g[i] += prior[i] * away
+        h[i, i] += prior[i]
+    return data + outside + prior_cost, data + prior_cost, size + prior_cost
 
 
 @_inlined
 def _solve(h, g, own, damping, lower, step):
-    """step = (H + damping diag H)^-1 g over the free numbers, by Cholesky; returns g' step. H is read below its diagonal.
-    It has no negative directions: light and slopes of both halves are positive."""
+    """Solve step = (H + damping diag H)^-1 g over the free numbers by Cholesky and return g' step.
+
+    Only the lower triangle of H is read. H has no negative directions, because light and slopes of both halves are positive.
+    """
     for i in range(4):
         for j in range(i + 1):
             total = h[i, j] if own[i] and own[j] else (1.0 if i == j else 0.0)

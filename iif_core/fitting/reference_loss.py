@@ -1,10 +1,10 @@
-"""The loss of the paper's material stage, by which all solvers are judged (METHOD 2.8).
+"""The loss of the paper's material stage, by which all solvers are judged (Eq. M.39).
 
-    mean over pixels and channels of e^2 + 1e-3 mean |r - 1| + 5e-3 mean |m|,
+    mean over pixels and channels of e^2 + 1e-3 mean |r - 1| + 5e-3 mean |m|
 
-e = f(e L) - I where I < 0.9 and min(f(e L) - 0.9, 0) elsewhere: the reference clamps both at 0.9, which leaves predictions that
-are too bright without a gradient (METHOD H32). L is the mean of the cache's halves. The terms of the paper's own response basis
-have no counterpart here: every family is monotone as it is. HDR: e in the logarithmic tone curve of the fit.
+e = f(e L) - I where I < 0.9, and min(f(e L) - 0.9, 0) elsewhere (Eq. M.9; docs/method/numerics.md#clamped-loss). L is the mean of
+the halves of the cache. The terms of the paper's own response basis have no counterpart, because every family is monotone. For
+HDR, e is measured in the curve of Eq. M.3.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting.pixels import prepare, residuals
-from iif_core.fitting.problem import FitOptions, FitProblem, apply_affines
+from iif_core.fitting.pixels import prepare_pixels, residuals
+from iif_core.fitting.problem import FitOptions, FitProblem
+from iif_core.reflectance.material import apply_affines
 
 CLAMP = 0.9
 ROUGHNESS_WEIGHT = 1e-3
@@ -33,7 +34,7 @@ class ReferenceLoss:
 
 
 def reference_problem(problem: FitProblem, response: Response) -> FitProblem:
-    """The problem as the reference sees it: mean of the halves, values from 0.9 on are bounds."""
+    """Return the problem of the paper's loss: mean of the halves, values from 0.9 on as bounds."""
     merged = problem.merged()
     if response.family == "identity":
         return merged
@@ -42,7 +43,7 @@ def reference_problem(problem: FitProblem, response: Response) -> FitProblem:
 
 
 def reference_options(**changes: object) -> FitOptions:
-    """Options with which the direct solver minimises this loss and nothing else."""
+    """Return options with which the direct solver minimises this loss and nothing else."""
     own = FitOptions(
         robust_width=1e6,
         roughness_weight=ROUGHNESS_WEIGHT,
@@ -57,8 +58,8 @@ def reference_options(**changes: object) -> FitOptions:
 
 
 def reference_loss(problem: FitProblem, affine: np.ndarray, response: Response) -> ReferenceLoss:
-    """Loss of a solution, in the gauge of the cached light: affine (O, 16)."""
-    px, tone = prepare(reference_problem(problem, response), response)
+    """Return the loss of a solution affine (O, 16) in the gauge of the cached light."""
+    px, tone = prepare_pixels(reference_problem(problem, response), response)
     if not len(px.obj):
         return ReferenceLoss(0.0, 0.0, 0.0, 0.0)
     data = float(np.mean(residuals(px, affine, tone, FitOptions()) ** 2))

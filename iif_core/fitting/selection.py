@@ -1,9 +1,9 @@
-"""Which numbers each object can carry, and in which valley its roughness and metalness lie.
+"""Which numbers each object can carry, and its kind and local minimum of roughness.
 
-The objective has a dielectric and a metallic valley and several in r, so one descent is not enough (METHOD 7b.ii). Roughness
-is therefore profiled: for a dielectric, for a metal, for metalness as predicted (where the prediction says both), and for each of
-a few r the albedo numbers are fitted, which gives the evidence of every pair. What the objects of the scene have in common (a
-histogram over the pairs, by EM) is the prior.
+The objective has a dielectric and a metallic local minimum and several in the roughness, so one descent is not enough
+(docs/method/fitting.md#selection-of-kind-and-roughness). Roughness is therefore profiled: for each kind of material and each of a
+few roughness values the albedo numbers are fitted, which gives the evidence of the pair. A histogram over the pairs, common to
+the objects of the scene and learnt by EM, is the prior.
 """
 
 from __future__ import annotations
@@ -12,26 +12,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.fitting.descent import Pull, State, spectrum
-from iif_core.fitting.pixels import BOX, Pixels, Terms, evaluate, in_threads
-from iif_core.fitting.problem import BIASES, CROSS, GAINS, IDENTITY, METALLIC, PARAMETERS, ROUGHNESS, FitOptions
-from iif_core.fitting.profile_kernels import fit_albedo
+from iif_core.fitting.descent import DescentState, GaussianPrior, decompose
+from iif_core.fitting.pixels import Pixels, Terms, evaluate, penalties_of, run_in_threads
+from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.profile_kernels import AlbedoTask, fit_albedo
 from iif_core.fitting.tone import Tone
+from iif_core.reflectance.material import BIASES, CROSS_TERMS, GAINS, IDENTITY, METALLIC, NUMBERS, ROUGHNESS
 
-GRID = np.array([0.05, 0.13, 0.22, 0.32, 0.44, 0.57, 0.7, 0.84, 0.98])
-_STEPS = 3  # Gauss-Newton steps of the albedo at each point of the profile, from its neighbour's
-_SMOOTHING = np.array([0.25, 0.5, 0.25])  # of the population's histogram: neighbours of what was seen are possible too
-_PSEUDO = 0.5  # objects' worth of every pair before any was seen
+ROUGHNESS_GRID = np.array([0.05, 0.13, 0.22, 0.32, 0.44, 0.57, 0.7, 0.84, 0.98])
+"""Roughness values of the profile."""
+_STEPS_PER_POINT = 3
+"""Gauss-Newton steps of the albedo at each point of the profile, from the result of its neighbour."""
+_SMOOTHING = np.array([0.25, 0.5, 0.25])
+"""Kernel over neighbouring roughness values of the histogram (Eq. M.23)."""
+_PSEUDO_OBJECTS = 0.5
+"""Weight of the first histogram, in objects for each pair."""
 KINDS = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
-"""(g_m, h_m) of a dielectric, a metal, and of metalness as predicted."""
+"""Gain and bias of the metallic of a dielectric, of a metal, and of metallic as predicted."""
 ROUGHEST_METAL = 0.6
-"""A rougher metal and a dielectric of another albedo look alike (METHOD 7b, degeneracy 2), and errors of the light would decide
-between them: what could best be a rough metal is taken for a dielectric."""
-_SHARES = np.array([[0.85], [0.1], [0.05]])  # of the three before any object was seen
-DISCOUNT = 10.0
-"""The scatter between clusters shows what varies over an object; the errors of light and geometry that it does not show are as
-real. On the built-in kitchen (LDR) the profile's errors are 9 claimed standard deviations without a discount of the evidence, 3.4
-with 10 and 1.4 with 30; on Modern Hall (HDR, better light) 6 costs nothing and 16 doubles the error of roughness."""
+"""A rougher metal and a dielectric of another albedo look alike, and errors of the light would decide between them. Objects whose
+best metal is rougher are taken for dielectrics."""
+_PRIOR_OF_KINDS = np.array([[0.85], [0.1], [0.05]])
+"""Shares of the kinds before any object was fitted."""
+EVIDENCE_DISCOUNT = 10.0
+"""Factor on the variance of a row in the evidence (Eq. M.21). The scatter between clusters shows what varies over an object, but
+not the errors of light and geometry that the whole object shares."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +44,10 @@ class Texture:
     """What the base texture of each object can determine.
 
     Attributes:
-        enough: (O,) bool, has `min_pixels`; rank: (O,) directions of its colours; varied: (O, 2) roughness, metalness vary;
-        mean: (O, 5); mixed: (O,) bool, metalness is predicted below 0.25 here and above 0.75 there.
+        enough: (O,) bool, has `FitOptions.min_pixels`.
+        rank: (O,) number of directions in which its colours vary; varied: (O, 2) bool, roughness and metallic vary.
+        mean: (O, 5) mean base material.
+        mixed: (O,) bool, the predicted metallic is below 0.25 in 5 % of the pixels and above 0.75 in another 5 %.
     """
 
     enough: np.ndarray
@@ -50,20 +57,20 @@ class Texture:
     mixed: np.ndarray
 
     def only(self, objects: np.ndarray) -> Texture:
-        """Of some objects."""
+        """Return the rows of some objects."""
         return Texture(*(getattr(self, name)[objects] for name in ("enough", "rank", "varied", "mean", "mixed")))
 
     def albedo_numbers(self) -> np.ndarray:
-        """(O, 16) bool: gains; biases from one direction of colour on; cross terms from two on (METHOD 8)."""
-        free = np.zeros((len(self.enough), PARAMETERS), bool)
+        """Return which albedo numbers are free (Eq. M.19), (O, 16) bool."""
+        free = np.zeros((len(self.enough), NUMBERS), bool)
         free[:, GAINS] = self.enough[:, None]
         free[:, BIASES] = (self.enough & (self.rank >= 1))[:, None]
-        free[:, CROSS] = (self.enough & (self.rank >= 2))[:, None]
+        free[:, CROSS_TERMS] = (self.enough & (self.rank >= 2))[:, None]
         return free
 
 
-def texture_of(px: Pixels, opt: FitOptions) -> Texture:
-    """Directions of colour whose standard deviation exceeds `texture_sigma`."""
+def measure_texture(px: Pixels, opt: FitOptions) -> Texture:
+    """Measure the base texture of each object; a direction counts if its standard deviation exceeds `opt.texture_sigma`."""
     base = px.base.astype(np.float64)
     counts = np.maximum(px.counts, 1)[:, None]
     mean = np.stack([px.sum_by_object(base[:, c]) for c in range(5)], 1) / counts
@@ -78,19 +85,19 @@ def texture_of(px: Pixels, opt: FitOptions) -> Texture:
     return Texture(px.counts >= opt.min_pixels, rank, spread > opt.texture_sigma**2, mean, (ends > 0.05).all(1))
 
 
-def row_noise(terms: Terms, px: Pixels, free: np.ndarray) -> np.ndarray:
-    """(O,) effective variance of one row: how much larger the gradient's scatter between clusters is than the curvature says.
+def row_variance(terms: Terms, px: Pixels, free: np.ndarray) -> np.ndarray:
+    """Return the effective variance of a row of each object, (O,), from the scatter of the gradient between clusters (Eq. M.22).
 
-    trace(H^-1 J) / k over the k free numbers, J = sum over clusters of the outer product of their scores. With independent
-    errors it is their variance; errors that a cluster shares make it larger. Objects without an answer get the median.
+    With independent errors this is their variance; errors that the pixels of a cluster share make it larger. Objects with fewer
+    than four clusters get the median over the others.
     """
     centred, counts = _centred_scores(terms, px)
     out = np.full(px.n_objects, np.nan)
     for o in np.flatnonzero((counts >= 4) & free.any(1)):
         k = free[o]
-        own = centred[px.first[o] : px.first[o + 1]][:, :PARAMETERS][:, k]
-        block = terms.h[o][:PARAMETERS, :PARAMETERS][np.ix_(k, k)]
-        inverse = spectrum(block[None]).inverse(1e-6)[0]
+        own = centred[px.first[o] : px.first[o + 1]][:, :NUMBERS][:, k]
+        block = terms.h[o][:NUMBERS, :NUMBERS][np.ix_(k, k)]
+        inverse = decompose(block[None]).inverse(1e-6)[0]
         out[o] = np.einsum("ci,ij,cj->", own, inverse, own) / k.sum() * counts[o] / (counts[o] - 1)
     known = np.isfinite(out) & (out > 0)
     middle = float(np.median(out[known])) if known.any() else 1e-6
@@ -98,7 +105,7 @@ def row_noise(terms: Terms, px: Pixels, free: np.ndarray) -> np.ndarray:
 
 
 def _centred_scores(terms: Terms, px: Pixels) -> tuple[np.ndarray, np.ndarray]:
-    """Scores of the clusters without their object's mean, and the number of clusters with pixels of each object."""
+    """Return the scores of the clusters minus the mean of their object, and each object's number of clusters with pixels."""
     filled = np.diff(px.starts) > 0
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     counts = np.bincount(owner[filled], minlength=px.n_objects)
@@ -108,12 +115,12 @@ def _centred_scores(terms: Terms, px: Pixels) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Profile:
-    """Evidence of every kind at each roughness of `GRID`.
+    """Evidence of every kind at each roughness of `ROUGHNESS_GRID`.
 
     Attributes:
-        cost: (O, 3, R) data term with the albedo fitted, infinite where not tried; that of the roughest dielectric is the better
-            one of its own and of none with no lobe; affine: (O, 3, R, 16); noise: (O,) variance
-            of a row.
+        cost: (O, 3, R) data term plus prior with the albedo fitted; infinite where not tried. The roughest dielectric has the
+            better of its own cost and that without a specular lobe.
+        affine: (O, 3, R, 16) numbers; noise: (O,) variance of a row.
     """
 
     cost: np.ndarray
@@ -121,35 +128,52 @@ class Profile:
     noise: np.ndarray
 
 
-def profile(px: Pixels, state: State, pull: Pull, tone: Tone, opt: FitOptions, free: np.ndarray, mixed: np.ndarray) -> Profile:
-    """Fit the albedo numbers at every pair; the response is held. `mixed` (O,) bool: metalness as predicted is possible."""
+def profile_roughness(
+    px: Pixels,
+    state: DescentState,
+    prior: GaussianPrior,
+    tone: Tone,
+    opt: FitOptions,
+    free: np.ndarray,
+    mixed: np.ndarray,
+) -> Profile:
+    """Fit the albedo numbers for every kind and roughness, with the response held (Eq. M.20).
+
+    Args:
+        px: pixels; state: start; prior: only its diagonal counts; tone: curve with the current response; opt: options.
+        free: (O, 16) bool numbers, of which the albedo is fitted; mixed: (O,) bool, metallic as predicted is tried.
+
+    Returns:
+        The evidence; roughness is worked through from rough to smooth, each value starting from its neighbour.
+    """
     n_objects = px.n_objects
-    cost = np.full((n_objects, 3, len(GRID)), np.inf)
-    affine = np.zeros((n_objects, 3, len(GRID), PARAMETERS))
+    cost = np.full((n_objects, 3, len(ROUGHNESS_GRID)), np.inf)
+    affine = np.zeros((n_objects, 3, len(ROUGHNESS_GRID), NUMBERS))
     everything = np.arange(n_objects)
     for kind in range(3):
         tried = np.flatnonzero(mixed) if kind == 2 else everything
         current = state.affine[:, :12].copy()
-        for at in range(len(GRID) - 1, -1, -1):
-            first = at == len(GRID) - 1
-            steps = 2 * _STEPS if first else _STEPS
-            found = _fitted(px, current, pull, tone, opt, free, KINDS[kind], GRID[at], steps, tried)
-            if kind == 0 and first:  # no lobe, or one so wide that it looks like none
-                found = np.minimum(found, _fitted(px, current.copy(), pull, tone, opt, free, KINDS[0], -1.0, steps, tried))
+        for at in range(len(ROUGHNESS_GRID) - 1, -1, -1):
+            first = at == len(ROUGHNESS_GRID) - 1
+            steps = 2 * _STEPS_PER_POINT if first else _STEPS_PER_POINT
+            found = _fit_albedo_at(px, current, prior, tone, opt, free, KINDS[kind], ROUGHNESS_GRID[at], steps, tried)
+            if kind == 0 and first:  # without a specular lobe, which a very wide one resembles
+                bare = _fit_albedo_at(px, current.copy(), prior, tone, opt, free, KINDS[0], -1.0, steps, tried)
+                found = np.minimum(found, bare)
             cost[tried, kind, at] = found[tried]
             affine[:, kind, at, :12] = current
-            affine[:, kind, at, 13:] = [GRID[at], *KINDS[kind]]
+            affine[:, kind, at, 13:] = [ROUGHNESS_GRID[at], *KINDS[kind]]
     best = cost.reshape(n_objects, -1).argmin(1)
-    where = affine.reshape(n_objects, -1, PARAMETERS)[everything, best]
-    albedo = free & (np.arange(PARAMETERS) < 12)
+    where = affine.reshape(n_objects, -1, NUMBERS)[everything, best]
+    albedo = free & (np.arange(NUMBERS) < 12)
     terms = evaluate(px, where, tone, opt, True, albedo, scores=True)
-    return Profile(cost, affine, row_noise(terms, px, albedo))
+    return Profile(cost, affine, row_variance(terms, px, albedo))
 
 
-def _fitted(
+def _fit_albedo_at(
     px: Pixels,
     affine: np.ndarray,
-    pull: Pull,
+    prior: GaussianPrior,
     tone: Tone,
     opt: FitOptions,
     free: np.ndarray,
@@ -158,54 +182,29 @@ def _fitted(
     steps: int,
     objects: np.ndarray,
 ) -> np.ndarray:
-    """Move the albedo numbers `affine` (O, 12) of some objects to where they fit at one roughness (negative: no lobe) and one
-    metalness; (O,) data term and pull there."""
+    """Fit the albedo numbers `affine` (O, 12) of some objects in place, at one roughness (negative: no lobe) and one metallic.
+    Returns data term plus prior of the objects, (O,)."""
     cost = np.zeros(px.n_objects)
-    curve, ends, _ = tone.tables
-    weight = np.diagonal(pull.weight, axis1=1, axis2=2)[:, :12]  # before anything is known, numbers lean one by one
+    weight = np.diagonal(prior.weight, axis1=1, axis2=2)[:, :12]  # the first prior has no correlations
+    task = AlbedoTask(free, prior.centre, weight, metallic, roughness, steps, opt.tolerance)
 
     def work(part: np.ndarray) -> None:
-        fit_albedo(
-            px.base,
-            px.diffuse,
-            px.lobes,
-            px.levels,
-            px.target,
-            px.exposure,
-            px.saturated,
-            px.trust,
-            px.offsets,
-            tone.knee,
-            tone.gain,
-            curve,
-            ends,
-            opt.robust_width,
-            opt.brightest,
-            BOX,
-            free,
-            pull.centre,
-            weight,
-            metallic,
-            roughness,
-            steps,
-            opt.tolerance,
-            part,
-            affine,
-            cost,
-        )
+        fit_albedo(px.arrays, tone.tables, penalties_of(opt), task, part, affine, cost)
 
-    in_threads(work, px, objects, opt.threads)
+    run_in_threads(work, px, objects, opt.threads)
     return cost
 
 
 @dataclass(frozen=True)
 class Choice:
-    """Posterior of the profile.
+    """Posterior of the profile (Eq. M.24).
 
     Attributes:
-        kind: (O,) int, row of `KINDS`; probability: (O, 3); roughness, deviation: (O,) posterior mean and standard deviation
-            given the kind; at: (O,) nearest point of `GRID`; population: mean and standard deviation of r over the objects;
-            sure: (O,) share of the evidence that speaks for what was not ruled out (`ROUGHEST_METAL`).
+        kind: (O,) int, row of `KINDS`; probability: (O, 3) of the kinds.
+        roughness, deviation: (O,) posterior mean and standard deviation given the kind; at: (O,) nearest index in
+            `ROUGHNESS_GRID`.
+        population: mean and standard deviation of the roughness over the objects.
+        allowed_share: (O,) share of the evidence for pairs that are not excluded by `ROUGHEST_METAL` (Eq. M.25).
     """
 
     kind: np.ndarray
@@ -214,41 +213,51 @@ class Choice:
     deviation: np.ndarray
     at: np.ndarray
     population: tuple[float, float]
-    sure: np.ndarray
+    allowed_share: np.ndarray
 
 
-def choose(found: Profile, counts: np.ndarray) -> Choice:
-    """EM for the population's histogram, then the posterior of each object; `counts` (O,) bool, objects that have a say."""
+def choose_kinds(found: Profile, counts: np.ndarray) -> Choice:
+    """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
+
+    `counts` (O,) bool: objects that enter the histogram.
+    """
     cost = found.cost.copy()
-    scale = DISCOUNT * found.noise[:, None, None]
-    everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _SHARES
-    cost[GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
-    cost[:, 1, GRID > ROUGHEST_METAL] = np.inf
-    sure = np.where(np.isfinite(cost), everything, 0.0).sum((1, 2)) / everything.sum((1, 2))
+    scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
+    everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _PRIOR_OF_KINDS
+    cost[ROUGHNESS_GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
+    cost[:, 1, ROUGHNESS_GRID > ROUGHEST_METAL] = np.inf
+    allowed_share = np.where(np.isfinite(cost), everything, 0.0).sum((1, 2)) / everything.sum((1, 2))
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
-    flat = _SHARES / len(GRID) * np.ones(len(GRID))
+    flat = _PRIOR_OF_KINDS / len(ROUGHNESS_GRID) * np.ones(len(ROUGHNESS_GRID))
     prior = flat
     for _ in range(50):
         posterior = likelihood * prior
         posterior /= posterior.sum((1, 2), keepdims=True)
         seen = np.stack([np.convolve(row, _SMOOTHING, "same") for row in posterior[counts].sum(0)])
-        prior = seen + _PSEUDO * flat * flat.size
+        prior = seen + _PSEUDO_OBJECTS * flat * flat.size
         prior /= prior.sum()
     probability = posterior.sum(2)
     kind = probability.argmax(1)
     given = posterior[np.arange(len(kind)), kind]
     given = given / np.maximum(given.sum(1, keepdims=True), 1e-300)
-    mean = given @ GRID
-    deviation = np.sqrt(np.maximum(given @ GRID**2 - mean**2, 0.0))
-    at = np.abs(GRID[None] - mean[:, None]).argmin(1)
-    level = float(prior.sum(0) @ GRID)
-    width = float(np.sqrt(max(prior.sum(0) @ GRID**2 - level**2, 0.0)))
-    return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, sure, 1.0))
+    mean = given @ ROUGHNESS_GRID
+    deviation = np.sqrt(np.maximum(given @ ROUGHNESS_GRID**2 - mean**2, 0.0))
+    at = np.abs(ROUGHNESS_GRID[None] - mean[:, None]).argmin(1)
+    level = float(prior.sum(0) @ ROUGHNESS_GRID)
+    width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
+    return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
 
 
-def describe(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:
-    """One line an object: `full, roughness, metal`; `population (12 pixels)`: what the other objects have in common."""
+def describe_models(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:
+    """Describe in words what was fitted for each object.
+
+    Args:
+        rank: (O,) directions of colour; free: (O, 16) bool; affine: (O, 16); pixels: (O,) usable pixels.
+
+    Returns:
+        E.g. `full, roughness, metal`, or `population (12 pixels)` where nothing was free.
+    """
     out = []
     for o in range(len(pixels)):
         if not free[o].any():

@@ -1,4 +1,4 @@
-"""The usable pixels of a view in segment order: what the compiled loops of the direct solver read."""
+"""The usable pixels of a view in segment order, which the compiled loops of the direct solver read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.fusion import kernels
-from iif_core.fusion.problem import BaseProblem, Dropped, usable_pixels
+from iif_core.fusion.problem import Dropped, FusionProblem, usable_pixels
 
 _T = TypeVar("_T")
 
@@ -23,9 +23,9 @@ class Block:
     Attributes:
         values: (K, 5, n) words (kernels.as_words), clamped to [0, 1]; predictions that cannot be used are 0.
         cell: (n,) int32; weight: (n,) float32.
-        segments: (S,) int32 ids, ascending; start: (S + 1,) int64, pixels of segment s are start[s] ... start[s + 1] - 1.
+        segments: (s,) int32 ids, ascending; start: (s + 1,) int64, the pixels of segments[j] are start[j] ... start[j + 1] - 1.
         usable: (K,) bool.
-        inside: (K, n) bool, no albedo channel is exactly 0 or 1; (0, 0) when that holds for all.
+        inside: (K, n) bool, no albedo channel is exactly 0 or 1; (0, 0) if that holds for all.
     """
 
     values: NDArray
@@ -41,21 +41,20 @@ class Block:
         return sum(getattr(self, name).nbytes for name in ("values", "cell", "weight", "segments", "start", "inside"))
 
 
-def shared_weight(views: NDArray, floor: float) -> NDArray:
-    """(n_cells,) float32 weight of a cell's pixels in the fit of the corrections: 1 - 1 / n + floor, n viewpoints.
+def covisibility_weight(viewpoints: NDArray, floor: float) -> NDArray:
+    """Return the factor 1 - 1 / V + floor (n_cells,) float32 on a cell's pixels in the fit of the maps (Eq. F.24).
 
-    With the cell's value eliminated (it is the mean of n observations u_j), what remains of the squares is, as a function of
-    one observation, (1 - 1/n) (u - mean of the others)^2: a cell seen once says nothing about the corrections. The floor
-    keeps segments that share no cell; without it they would collapse to a constant.
+    The value of a cell that one viewpoint sees is the view's own mixture and carries no evidence about the view's maps. The
+    floor keeps a value for segments that share no cell; without it their texture would collapse to a constant.
     """
-    return (1 - 1 / np.maximum(views, 1) + floor).astype(np.float32)
+    return (1 - 1 / np.maximum(viewpoints, 1) + floor).astype(np.float32)
 
 
-def make_block(problem: BaseProblem, view: int) -> tuple[Block, list[Dropped]]:
-    """The block of a view, and what of its predictions was left out and why.
+def make_block(problem: FusionProblem, view: int) -> tuple[Block, list[Dropped]]:
+    """Read the block of a view, and say which of its predictions were left out and why.
 
     Raises:
-        InputError: an id beyond its table.
+        InputError: shapes that do not match, an id beyond its table.
     """
     maps = problem.view(view)
     words = kernels.as_words(maps)
@@ -75,29 +74,23 @@ def make_block(problem: BaseProblem, view: int) -> tuple[Block, list[Dropped]]:
 
 
 class Blocks:
-    """Blocks of all views; kept in memory as far as `memory` bytes go, made again each time beyond."""
+    """Blocks of all views; `memory` bytes of them stay in memory, the others are read again each time."""
 
-    def __init__(self, problem: BaseProblem, memory: int):
+    def __init__(self, problem: FusionProblem, memory: int):
         self.problem, self._left, self._kept = problem, memory, {}
 
     def __call__(self, view: int) -> Block:
-        return self.first(view)[0]
-
-    def first(self, view: int) -> tuple[Block, list[Dropped]]:
-        """Block and what was left out."""
-        if view in self._kept:
-            return self._kept[view], []
-        return make_block(self.problem, view)
+        return self._kept[view] if view in self._kept else make_block(self.problem, view)[0]
 
     def keep(self, view: int, block: Block) -> None:
-        """Remember a block if there is room (call in the order of the views, so that the same ones are kept each time)."""
+        """Keep a block if there is room. Call in the order of the views, so that the same ones are kept each time."""
         if block.nbytes <= self._left:
             self._left -= block.nbytes
             self._kept[view] = block
 
 
-def in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T]:
-    """work(0), work(1), ... in this order, `threads` of them under way at a time."""
+def map_in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T]:
+    """Yield work(0), ..., work(n - 1) in this order while `threads` of them are computed at a time."""
     if threads <= 1:
         yield from map(work, range(n))
         return

@@ -1,36 +1,27 @@
-"""Direct solver: alternating closed forms on surface cells (METHOD 7c).
+"""Direct solver: alternating closed forms on surface cells (docs/method/fusion.md#direct).
 
-Each segment i (one object in one view) and prediction k has an affine correction T_ik (albedo 3x4, roughness and
-metallic 1x2) and, per property, a selection weight alpha_ik. One pass over the views a sweep:
+A sweep is one pass over the views. For each view it
 
-1. T: least squares of the corrected prediction against the texture of the sweep before, with a ridge to identity
-   that grows with the pixel count (without it, a constant texture would be a perfect fit). Pixels count by how much
-   their cell can say (blocks.shared_weight): next to nothing where only this view sees it, for there the texture is
-   this view's own mixture and would hold back the agreement with the others;
-2. alpha: softmax over k of minus the segment's mean squared error, at a temperature that falls from sweep to sweep
-   to a last one at which only predictions nearly as good as the best count (0 = the best alone);
-3. texture: weighted mean (or M-estimate) in each cell of the mixture sum_k alpha_ik T_ik v_nk;
-4. gauge: an affine map of a part's texture and its inverse on all T cancel, so the level of a part would drift from
-   sweep to sweep. It is moved back to that of the predictions' median (gauge.anchor_shifts; their mean was
-   0.8 dB worse on Country Kitchen: bad predictions are bad upwards). Contrast is held by the
-   ridge: with predictions of variance v that correlate by rho it settles at about ridge / (ridge + v (1 - rho)) of
-   theirs, it cannot collapse; `history` has the mean gain. Stretching it back every sweep was tried and only
-   amplified the noise of plain objects, with no gain elsewhere. At the end, seams between the parts of an object
-   are closed (gauge.seam_shifts).
+1. fits the affine maps of every segment and prediction to the texture of the previous sweep by least squares with a ridge
+   towards the identity (Eq. F.25); pixels count by the number of viewpoints that see their cell (Eq. F.24);
+2. sets the selection weights from the mean squared errors of the segment at a temperature that falls from sweep to sweep
+   (Eqs. F.27 to F.29);
+3. forms the mixture of the corrected predictions, whose weighted mean (or M-estimate) in each cell is the new texture
+   (Eq. F.30).
 
-`objective="distribution"` then minimises the paper's own loss from there, for the selection found (matching.py).
+After the sweep the level of each part returns to that of the median prediction (Eq. F.40). The ridge holds the contrast,
+whose mean gain is in `history`. At the end, seams between the parts of an object are closed (gauge.seam_shifts), and the
+Laplace scales of the cells follow in closed form (Eq. F.31). `objective="distribution"` instead continues with the paper's
+loss for the selection found (polish.py).
 
-Given T, errors follow from sums over the segment (Gram matrices, made once) and are not a pass of their own. A segment
-lies in one view, so T, alpha and the mixture of a view need only the previous texture: memory is one view's predictions
-a thread plus the sums, plus what `memory` allows to keep. Last, the Laplace scale of a cell in closed form
-(laplace.closed_form_scale).
-
-The same bytes whatever the number of threads; the order of the predictions matters to rounding alone.
+Errors follow from sums over the segment, without another pass over the pixels. A segment lies in one view, so the maps and
+the mixture of a view need only the previous texture: memory holds the predictions of one view per thread, the sums, and
+what `memory` allows to keep. The bytes of the result do not depend on the number of threads; the order of the predictions
+changes it by rounding only.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -40,92 +31,78 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion import kernels
-from iif_core.fusion.blocks import Block, Blocks, in_order, shared_weight
-from iif_core.fusion.gauge import Parts, anchor_shifts, covisible_parts, seam_shifts
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.outcome import measure_errors, result_of
-from iif_core.fusion.polish import polished, select
-from iif_core.fusion.problem import LOWEST, NEUTRAL, BaseProblem, BaseResult, Dropped, object_means
+from iif_core.fusion.blocks import Block
+from iif_core.fusion.fusion_pass import FusionPass, first_pass
+from iif_core.fusion.gauge import Parts, anchor_shifts, seam_shifts
+from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.outcome import build_result, measure_errors
+from iif_core.fusion.polish import fix_selection, minimise_distribution_loss
+from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult, object_means
 from iif_core.fusion.selection import selection_weights
-from iif_core.fusion.sums import IDENTITY, NO_MASK, PROPERTY_OF_ENTRY, CellSums, Counts, State, Sums, summary
+from iif_core.fusion.sums import NO_MASK, PROPERTY_OF_ENTRY, CellSums, SegmentState, SegmentSums, sweep_summary
 from iif_core.numerics import laplace
 
 _BIAS = [3, 7, 11, 13, 15]  # entries of the CROSS layout that multiply 1
 
 
-def solve_base(
-    problem: BaseProblem,
-    options: BaseOptions | None = None,
+def solve_direct(
+    problem: FusionProblem,
+    options: FusionOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 1,
     chosen: NDArray | None = None,
-) -> BaseResult:
-    """Base texture of a problem by alternating closed forms; deterministic.
+) -> FusionResult:
+    """Solve a problem by alternating closed forms; deterministic.
 
-    `chosen` (S, 3) int: with `objective="distribution"`, the prediction of each segment and property to use instead of
-    those that the solver would select (twins are compared at one selection).
+    Args:
+        problem: predictions on cells.
+        options: how to solve; None = the defaults.
+        progress: called as progress(done, total) after every pass over the views.
+        threads: views that are worked on (and held in memory) at a time; the result does not depend on it.
+        chosen: (S, 3) int, with `objective="distribution"`: prediction of each segment and property to use in place of the
+            solver's own selection, for comparing solvers at one selection.
 
-    `progress(done, total)` is called after every pass over the views. `threads` views are worked on at a time (and are
-    in memory); the result does not depend on it.
+    Returns:
+        The base texture with its maps, selection and uncertainty.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
-    options = options or BaseOptions()
+    options = options or FusionOptions()
     if chosen is not None and options.objective != "distribution":
         raise InputError("a given selection needs objective `distribution`; least squares selects for itself")
     means = options.variant in ("texel_mean", "object_mean")
     sweeps = 1 if means or chosen is not None else options.sweeps
-    n_views = len(problem.cell_of_pixel)
     polishing = options.polish if options.objective == "distribution" and not means else 0
     total = sweeps + polishing + 2
-    blocks = Blocks(problem, options.memory)
 
     def notify(done: int) -> None:
         if progress is not None:
             progress(done, total)
 
-    sums, state, first, dropped, counts, parts = _first_pass(problem, blocks, options, threads)
-    texture = first
+    run, texture = first_pass(problem, options, threads)
     notify(1)
-    history: list[dict[str, float]] = []
-    for sweep in range(sweeps):
-        temperature = max(options.temperature * options.anneal**sweep, options.final_temperature)
-        if sweep == sweeps - 1:
-            temperature = options.final_temperature
-        cells = CellSums(problem.n_cells)
-        work = partial(_sweep_view, blocks, options, sums, texture, temperature, state)
-        for block, mixed in in_order(work, n_views, threads):
-            cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
-        updated = cells.mean(texture)
-        if not means:
-            shift = anchor_shifts(parts, first, updated, counts.weight)
-            updated = _shifted(parts, shift, updated, state)
-        seen = counts.weight > 0
-        change = float(np.sqrt(np.mean((updated - texture)[seen] ** 2, dtype=np.float64))) if seen.any() else 0.0
-        texture = updated
-        history.append({"temperature": temperature, **summary(sums, state), "change": change})
-        notify(len(history) + 1)
-
+    texture, history = _alternate(run, texture, sweeps, notify)
     if polishing:
-        chosen = select(state, sums, chosen)
-        texture = polished(blocks, problem, options, sums, state, chosen, texture, threads, history, notify)
+        chosen = fix_selection(run.state, run.sums, chosen)
+        texture = minimise_distribution_loss(run, chosen, texture, history, notify)
     elif options.seams and not means and problem.neighbours is not None:
-        shift, _ = seam_shifts(parts, texture, counts.weight, problem.neighbours, _level_spread(parts, sums))
-        texture = _shifted(parts, shift, texture, state)
+        spread = _level_spread(run.parts, run.sums)
+        shift, _ = seam_shifts(run.parts, texture, run.counts.weight, problem.neighbours, spread)
+        texture = _shifted(run.parts, shift, texture, run.state)
     texture = np.clip(texture, LOWEST, 1.0)
     if polishing:
-        measure_errors(problem, blocks, sums, state, texture, threads)
+        measure_errors(run, texture)
     if options.variant == "object_mean":
-        object_value, _ = object_means(texture, problem.object_of_cell, counts.weight)
+        object_value, _ = object_means(texture, problem.object_of_cell, run.counts.weight)
         texture = object_value[problem.object_of_cell]
-    result = result_of(problem, blocks, options, sums, parts, counts, texture, state, threads)
+    result = build_result(run, texture, history)
     notify(total)
-    return replace(result, dropped=dropped, history=history)
+    return result
 
 
 def describe_fit(
-    problem: BaseProblem,
+    problem: FusionProblem,
     value: NDArray,
     scale: NDArray,
     affine: NDArray,
@@ -133,33 +110,64 @@ def describe_fit(
     history: list[dict[str, float]] | None = None,
     threads: int = 1,
     memory: int = 1 << 30,
-) -> BaseResult:
-    """The result of another solver described like that of `solve_base`, so that both can be compared.
+) -> FusionResult:
+    """Describe what another solver found in the way that `solve_direct` describes its own result.
 
     Args:
-        value, scale: (n_cells, 5) texture and its Laplace scale; affine: (S, K, CROSS) corrections; weight: (S, K, 3).
+        problem: predictions on cells.
+        value, scale: (n_cells, 5) texture and its Laplace scale, which is kept as the solver found it.
+        affine: (S, K, CROSS) affine maps; weight: (S, K, 3) selection weights.
+        history: entries for the result.
+        threads: views at a time; memory: bytes of predictions that stay in memory.
 
-    Errors, votes, counts and fills are measured on the problem; `scale` is kept as the solver found it.
+    Returns:
+        The result, with errors, votes, counts and fills measured on the problem.
+
+    Raises:
+        InputError: shapes that do not match, ids out of range, a segment in two views.
     """
-    options = BaseOptions(memory=memory)
-    blocks = Blocks(problem, memory)
-    sums, state, _, dropped, counts, parts = _first_pass(problem, blocks, replace(options, variant="texel_mean"), threads)
-    state.affine, state.alpha = affine.astype(np.float64), weight.astype(np.float64)
+    run, _ = first_pass(problem, FusionOptions("texel_mean", memory=memory), threads)
+    run.state.affine, run.state.alpha = affine.astype(np.float64), weight.astype(np.float64)
     texture = np.clip(value, LOWEST, 1.0).astype(np.float32)
-    measure_errors(problem, blocks, sums, state, texture, threads)
-    result = result_of(problem, blocks, options, sums, parts, counts, texture, state, threads)
-    own = np.where((counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
-    return replace(result, scale=own, dropped=dropped, history=history or [])
+    measure_errors(run, texture)
+    result = build_result(run, texture, history or [])
+    own = np.where((run.counts.weight > 0)[:, None], scale, result.scale).astype(np.float32)
+    return replace(result, scale=own)
 
 
-def _sweep_view(
-    blocks: Blocks, options: BaseOptions, sums: Sums, texture: NDArray, temperature: float, state: State, view: int
-) -> tuple[Block, NDArray]:
-    """T, error and alpha of a view's segments against the texture; the mixture at its pixels.
+def _alternate(
+    run: FusionPass, first: NDArray, sweeps: int, notify: Callable[[int], None]
+) -> tuple[NDArray, list[dict[str, float]]]:
+    """Texture (n_cells, 5) and history after the sweeps, from the first texture on."""
+    options, counts, state = run.options, run.counts, run.state
+    texture = first
+    history: list[dict[str, float]] = []
+    for sweep in range(sweeps):
+        temperature = max(options.temperature * options.anneal**sweep, options.final_temperature)
+        if sweep == sweeps - 1:
+            temperature = options.final_temperature
+        cells = CellSums(run.problem.n_cells)
+        for block, mixed in run.map_views(partial(_sweep_view, run, texture, temperature)):
+            cells.add(block.cell, mixed, _robust_weight(block, mixed, texture, options) if sweep else block.weight)
+        updated = cells.mean(texture)
+        if options.variant not in ("texel_mean", "object_mean"):
+            shift = anchor_shifts(run.parts, first, updated, counts.weight)
+            updated = _shifted(run.parts, shift, updated, state)
+        seen = counts.weight > 0
+        change = float(np.sqrt(np.mean((updated - texture)[seen] ** 2, dtype=np.float64))) if seen.any() else 0.0
+        texture = updated
+        history.append({"temperature": temperature, **sweep_summary(run.sums, state), "change": change})
+        notify(len(history) + 1)
+    return texture, history
 
-    Writes only the rows of its own segments in `state`, so views can run side by side.
+
+def _sweep_view(run: FusionPass, texture: NDArray, temperature: float, view: int) -> tuple[Block, NDArray]:
+    """Fit maps, errors and selection of a view's segments to the texture; return the mixture (5, n) at its pixels.
+
+    Writes only the rows of its own segments in `run.state`, so views can run side by side.
     """
-    block = blocks(view)
+    options, sums, state = run.options, run.sums, run.state
+    block = run.blocks(view)
     rows = block.segments
     values, target = block.values, kernels.texture_at(texture, block.cell)
     weight = sums.fit_weight(block)
@@ -180,57 +188,8 @@ def _sweep_view(
     return block, kernels.mixture(values, blend, block.start, LOWEST)
 
 
-def _first_pass(
-    problem: BaseProblem, blocks: Blocks, options: BaseOptions, threads: int
-) -> tuple[Sums, State, NDArray, list[Dropped], Counts, Parts]:
-    """Gram matrices, the first texture (cell mean of the predictions' median), what was dropped, counts, parts."""
-    counts = Counts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.int32, np.float64)))
-    cells, n_k = CellSums(problem.n_cells), 0
-    dropped: list[Dropped] = []
-    known: set[bytes] = set()
-    pairs = []
-    n_views = len(problem.cell_of_pixel)
-
-    def start_of(view: int) -> tuple[Block, list[Dropped], NDArray]:
-        block, left_out = blocks.first(view)
-        if options.variant in ("texel_mean", "object_mean"):
-            share = np.float32(block.usable / max(block.usable.sum(), 1))
-            blend = np.broadcast_to(share[:, None] * np.float32(IDENTITY), (len(block.segments), len(share), kernels.CROSS))
-            start = kernels.mixture(block.values, np.ascontiguousarray(blend), block.start, LOWEST)
-        else:
-            start = kernels.medians(block.values, block.usable, kernels.sorting_network(int(block.usable.sum())))
-        return block, left_out, start
-
-    for view, (block, left_out, start) in enumerate(in_order(start_of, n_views, threads)):
-        n_k = n_k or len(block.usable)
-        if len(block.usable) != n_k:
-            raise InputError(
-                f"view {view} has {len(block.usable)} predictions, view 0 has {n_k}; give every view the same number"
-            )
-        blocks.keep(view, block)
-        dropped += left_out
-        cells.add(block.cell, start, block.weight)
-        counts.observations += np.bincount(block.cell, minlength=problem.n_cells).astype(np.int32)
-        seen = np.unique(block.cell)
-        counts.views[seen] += 1
-        digest = hashlib.sha256(block.cell.tobytes()).digest()
-        if digest not in known:  # the same photograph twice is one viewpoint
-            known.add(digest)
-            counts.viewpoints[seen] += 1
-        pairs.append((np.repeat(block.segments, np.diff(block.start)), block.cell))
-    counts.weight = cells.total[:, 0]
-    sums = Sums(problem.n_segments, max(n_k, 1), shared_weight(counts.viewpoints, options.alone))
-    for block in in_order(blocks, n_views, threads):
-        sums.add(block, options)
-    state = State(problem.n_segments, max(n_k, 1))
-    share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
-    state.alpha = np.repeat(share[:, :, None], 3, 2)
-    parts = covisible_parts(problem.n_segments, problem.n_cells, pairs)
-    return sums, state, cells.mean(NEUTRAL), dropped, counts, parts
-
-
-def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: State) -> NDArray:
-    """Texture with each part moved by its shift (parts, 5); corrections in `state` move along."""
+def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: SegmentState) -> NDArray:
+    """Texture with each part moved by its shift (parts, 5); the offsets of the maps in `state` move along (Eq. F.40)."""
     if not parts.count:
         return texture
     state.affine[..., _BIAS] += shift[parts.of_segment][:, None, :]
@@ -238,8 +197,8 @@ def _shifted(parts: Parts, shift: NDArray, texture: NDArray, state: State) -> ND
     return texture + of_cell.astype(np.float32)
 
 
-def _level_spread(parts: Parts, sums: Sums) -> NDArray:
-    """(parts, 5) standard deviation over the predictions of a segment's mean, pixel-weighted mean over the part's segments."""
+def _level_spread(parts: Parts, sums: SegmentSums) -> NDArray:
+    """(parts, 5) standard deviation over the predictions of a segment's mean, weighted mean over the part's segments."""
     means = sums.gram[:, :, [6, 7, 8, 10, 12]] / np.maximum(sums.weight, 1e-30)[:, None, None]
     share = sums.usable / np.maximum(sums.usable.sum(1, keepdims=True), 1)
     centre = np.einsum("sk,skc->sc", share, means)
@@ -249,8 +208,8 @@ def _level_spread(parts: Parts, sums: Sums) -> NDArray:
     return summed / np.maximum(total, 1e-30)[:, None]
 
 
-def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: BaseOptions) -> NDArray:
-    """Weight of the pixels in their cells: as given, or (5, n) of the M-estimate about the texture."""
+def _robust_weight(block: Block, mixed: NDArray, texture: NDArray, options: FusionOptions) -> NDArray:
+    """Weight (n,) of the pixels in their cells; with `robust`, (5, n) by the distance from the texture (Eq. F.32)."""
     if not options.robust:
         return block.weight
     distance = mixed - kernels.texture_at(texture, block.cell)

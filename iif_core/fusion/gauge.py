@@ -1,10 +1,10 @@
-"""Levels that the predictions leave open (METHOD 7c, gauge freedoms G1 and G2).
+"""Levels that the predictions leave open, and how they are fixed (docs/method/fusion.md#gauge).
 
-A shift of the texture and the opposite shift of every correction cancel. Segments are tied to one another only through
-the cells that they share: a *part* is a set of segments and cells that hang together, and each part has a level of its
-own. `anchor_shifts` holds each part at the level of its predictions. Where an object falls into several parts (two sides
-of a cupboard that no photograph shows together), their levels differ by the error of the predictions, and an edge runs
-through the object that no correction per object can undo: `seam_shifts` closes it.
+A shift of the texture and the opposite shift of every affine map cancel (Eq. F.37). Segments are tied to one another only
+through the cells that they share: a *part* is a connected component of the graph of segments and cells, and every part has
+a level of its own. `anchor_shifts` holds each part at the level of its predictions. An object of which no two photographs
+share a cell, such as the two sides of a cupboard, falls into several parts whose levels differ by the error of the
+predictions. The difference draws an edge through the object that no later map per object can undo; `seam_shifts` removes it.
 """
 
 from __future__ import annotations
@@ -14,20 +14,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-SEAM_RIDGE = 5.0
-"""Pull of an object's parts to their own level, in seam pairs: an object's texture changes from cell to cell, so few
-pairs say little about the levels of two parts."""
+from iif_core.numerics.graph import component_labels
 
-PLAUSIBLE = 2.0
-"""Largest jump at a seam that is taken for a difference of levels, in standard deviations of the predictions' levels."""
+SEAM_RIDGE_PAIRS = 5.0
+"""Strength of the ridge that holds a part at its own level, in seam pairs (kappa of Eq. F.41). A texture changes from cell
+to cell, so a few pairs determine the difference of two levels badly."""
+
+MAX_LEVEL_JUMP = 2.0
+"""Largest mean jump at a seam that is treated as a difference of levels, in standard deviations of the predictions' levels
+(Eq. F.42)."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Connected parts of the graph of segments and cells.
+    """Connected components of the graph of segments and cells.
 
     Attributes:
-        of_segment: (S,) int32; of_cell: (n_cells,) int32, -1 for cells that no segment shows; count: number of parts.
+        of_segment: (S,) int32 part of each segment; of_cell: (n_cells,) int32, -1 for cells that no segment shows.
+        count: number of parts.
     """
 
     of_segment: NDArray
@@ -36,15 +40,10 @@ class Parts:
 
 
 def covisible_parts(n_segments: int, n_cells: int, pairs: list[tuple[NDArray, NDArray]]) -> Parts:
-    """Parts of the graph that (segment, cell) `pairs` of used pixels make: connected components (union-find)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
+    """Find the parts of the graph whose edges are the (segment, cell) `pairs` of used pixels."""
     keys = [np.unique(segment.astype(np.int64) * n_cells + cell) for segment, cell in pairs]
     segment, cell = np.divmod(np.concatenate([np.zeros(0, np.int64), *keys]), max(n_cells, 1))
-    size = n_segments + n_cells
-    graph = coo_matrix((np.ones(len(cell), np.int8), (segment, n_segments + cell)), (size, size))
-    _, label = connected_components(graph, directed=False)
+    label = component_labels(n_segments + n_cells, segment, n_segments + cell)
     of_segment, of_cell = label[:n_segments], label[n_segments:]
     seen = np.zeros(n_cells, bool)
     seen[cell] = True
@@ -55,10 +54,14 @@ def covisible_parts(n_segments: int, n_cells: int, pairs: list[tuple[NDArray, ND
 
 
 def anchor_shifts(parts: Parts, level: NDArray, texture: NDArray, weight: NDArray) -> NDArray:
-    """(parts, 5) shifts that give the texture the mean that `level` has over every part.
+    """Shift every part so that the texture has the mean that `level` has over it (Eq. F.38).
 
     Args:
-        level, texture: (n_cells, 5); weight: (n_cells,) pixel weight of each cell.
+        parts: parts of the graph of segments and cells.
+        level, texture: (n_cells, 5); weight: (n_cells,) summed pixel weight of each cell.
+
+    Returns:
+        (parts, 5) shifts to add to the texture.
     """
     seen = parts.of_cell >= 0
     of_cell, weight = parts.of_cell[seen], weight[seen]
@@ -69,21 +72,22 @@ def anchor_shifts(parts: Parts, level: NDArray, texture: NDArray, weight: NDArra
 
 
 def seam_shifts(
-    parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDArray, spread: NDArray, ridge: float = SEAM_RIDGE
+    parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDArray, spread: NDArray, ridge: float = SEAM_RIDGE_PAIRS
 ) -> tuple[NDArray, NDArray]:
-    """Shifts (parts, 5) that close the seams between parts, and the number of seam pairs of each part (parts,).
+    """Shift the parts of each object so that the jumps across their common seams vanish (Eqs. F.41, F.42).
 
-    Minimises, channel by channel and over each set of parts that touch,
-
-        sum over seam pairs (x, y) of (mu_x + s_part(x) - mu_y - s_part(y))^2 + sum over parts of ridge q_p s_p^2,
-
-    with q_p the share of the part in the pixels of its set: the small part moves, the large one stays. A seam between two
-    parts is left alone in a property whose mean jump is more than `PLAUSIBLE` times the spread of the predictions' levels
-    in both parts: predictions that agree on their level mean the edge that they show.
+    A seam between two parts is left unchanged in a property whose mean jump exceeds `MAX_LEVEL_JUMP` times the spread of
+    the predictions' levels: predictions that agree on their level show a true edge.
 
     Args:
-        texture: (n_cells, 5); weight: (n_cells,); neighbours: (m, 2) pairs of neighbouring cells of one object.
+        parts: parts of the graph of segments and cells.
+        texture: (n_cells, 5); weight: (n_cells,) summed pixel weight of each cell.
+        neighbours: (m, 2) pairs of neighbouring cells of one object.
         spread: (parts, 5) standard deviation over the predictions of the part's mean.
+        ridge: strength of the ridge towards no shift, in seam pairs.
+
+    Returns:
+        (parts, 5) shifts and (parts,) number of seam pairs of each part.
     """
     shift, count = np.zeros((parts.count, 5)), np.zeros(parts.count, np.int64)
     if parts.count == 0 or len(neighbours) == 0:
@@ -98,26 +102,25 @@ def seam_shifts(
     jump = texture[pairs[:, 1]].astype(np.float64) - texture[pairs[:, 0]]
     seams, of_pair, length = np.unique(a * parts.count + b, return_inverse=True, return_counts=True)
     mean = np.stack([np.bincount(of_pair, jump[:, c]) for c in range(5)], 1) / length[:, None]
-    limit = PLAUSIBLE * np.hypot(spread[seams // parts.count], spread[seams % parts.count])
+    limit = MAX_LEVEL_JUMP * np.hypot(spread[seams // parts.count], spread[seams % parts.count])
     plausible = np.abs(mean) <= limit + 1e-6
-    plausible[:, :3] = plausible[:, :3].all(1, keepdims=True)  # a colour moves as a whole
+    plausible[:, :3] = plausible[:, :3].all(1, keepdims=True)  # albedo is closed in all three channels or in none
     for channels in (slice(0, 3), slice(3, 4), slice(4, 5)):
         used = plausible[of_pair, channels.start]
         if used.any():
-            shift[:, channels], touched = _closed(parts, a[used], b[used], jump[used, channels], weight, ridge)
+            shift[:, channels], touched = _solve_shifts(parts, a[used], b[used], jump[used, channels], weight, ridge)
             count = np.maximum(count, touched)
     return shift, count
 
 
-def _closed(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: NDArray, ridge: float) -> tuple[NDArray, NDArray]:
-    """Shifts (parts, C) for seam pairs between parts a and b with jumps (m, C); pairs of each part."""
+def _solve_shifts(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: NDArray, ridge: float) -> tuple[NDArray, NDArray]:
+    """Solve Eq. F.43: shifts (parts, C) for seam pairs between parts a and b with jumps (m, C), and pairs of each part."""
     from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.sparse.linalg import splu
 
     n, ones = parts.count, np.ones(len(a))
     count = np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
-    _, group = connected_components(coo_matrix((ones, (a, b)), (n, n)), directed=False)
+    group = component_labels(n, a, b)
     seen = parts.of_cell >= 0
     size = np.bincount(parts.of_cell[seen], weight[seen], n)
     share = size / np.maximum(np.bincount(group, size)[group], 1e-30)
@@ -127,3 +130,16 @@ def _closed(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: NDArray
     shift = np.stack([solver.solve(r) for r in right], 1)
     shift[count == 0] = 0
     return shift, count
+
+
+def parts_per_object(object_of_cell: NDArray, part_of_cell: NDArray) -> dict[int, int]:
+    """Return the number of parts of every object that falls into more than one, by object id.
+
+    Example:
+        >>> parts_per_object(np.array([0, 0, 1, 1]), np.array([0, 1, 2, -1]))
+        {0: 2}
+    """
+    seen = part_of_cell >= 0
+    pairs = np.unique(np.stack([object_of_cell[seen], part_of_cell[seen]]), axis=1)
+    ids, count = np.unique(pairs[0], return_counts=True)
+    return {int(i): int(n) for i, n in zip(ids, count, strict=True) if n > 1}

@@ -1,17 +1,19 @@
-"""Compiled loops of the direct solver over the pixels of one view. Sums in, sums out; single-threaded each.
+"""Compiled loops of the direct solver over the pixels of one view; every loop is single-threaded.
 
-Layout: `values` (K, 5, n), pixels in segment order, segment s = pixels start[s] ... start[s + 1] - 1. It holds float32, or
-half precision as its bits in uint16 (the compiler has no half type), widened piece by piece on the way. A loop runs over
-the pixels of one plane, so the compiler turns it into vector instructions; it reads each prediction once.
+`values` (K, 5, n) holds the predictions of pixels in segment order: segment s is pixels start[s] ... start[s + 1] - 1. The
+numbers are float32, or half precision as its bits in uint16 (the compiler has no half type), which are widened piece by
+piece. A loop runs over the pixels of one plane, which the compiler turns into vector instructions, and reads each
+prediction once.
 
-Sums over pixels are float32 within pieces of `PIECE` pixels and float64 beyond (METHOD H45): the error is that of
-float32 over 256 terms whatever the size of the segment. `reassoc` lets the compiler add a piece in lanes; the order is
-fixed when the code is compiled, so a machine gives the same bytes every time.
-
-Source of the formulae: METHOD 2.3.2-2.3.4, 7c.
+Sums over pixels are float32 within pieces of `PIECE` pixels and float64 beyond
+(docs/method/numerics.md#sums-in-single-precision), so their error does not grow with the size of the segment. `reassoc`
+lets the compiler add a piece in lanes; the order is fixed when the code is compiled, so a machine gives the same bytes
+every time.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -19,26 +21,26 @@ from numba import types
 from numba.extending import overload
 from numpy.typing import NDArray
 
+from iif_core.reflectance import material
+
 PIECE = 256
 _MATHS = {"reassoc", "contract", "nsz", "arcp"}  # no assumption about NaN or infinity
 _compiled = numba.njit(nogil=True, cache=True, fastmath=_MATHS)
 _exact = numba.njit(nogil=True, cache=True)
-# Loops that other loops call are inlined. Where a copy in the caller and one of its own exist, the linker takes the one
-# or the other according to the state of the compiler's cache, and their sums may differ in the last bits.
+# Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
 _inlined = numba.njit(nogil=True, cache=True, fastmath=_MATHS, forceinline=True)
 _inlined_exact = numba.njit(nogil=True, cache=True, forceinline=True)
 
 GRAM = 14
-"""Sums that `gram` makes: aa ab ac bb bc cc a b c (albedo), rr r, mm m, 1."""
+"""Number of sums of `gram`: aa ab ac bb bc cc a b c (albedo), rr r, mm m, 1."""
 CROSS = 16
-"""Sums that `cross` makes: albedo 3 x 4 (row = output channel; inputs r g b 1), roughness (r, 1), metallic (m, 1).
-Corrections are kept in the same layout."""
-IDENTITY = np.zeros(CROSS, np.float32)
-"""The correction that changes nothing."""
-IDENTITY[[0, 5, 10, 12, 14]] = 1
+"""Number of sums of `cross`: albedo 3 x 4 (row = output channel; inputs r g b 1), roughness (r, 1), metallic (m, 1).
+Affine maps are kept in the same layout."""
+IDENTITY = np.float32(material.IDENTITY)
+"""The identity map."""
 
 
-# The four functions without a body of their own get one for each type from their `overload`, when a loop is compiled.
+# The four functions without a body get one for each type from their `overload` when a loop is compiled.
 def _widen(plane, bits, out, m):
     """out[:m] = plane[:m] as float32; `bits` is the memory of `out` seen as int32."""
     raise NotImplementedError
@@ -64,14 +66,14 @@ def _widen_of(plane, bits, out, m):
 
 
 def as_words(maps: NDArray) -> NDArray:
-    """Half precision as uint16 bits, everything else as float32: what the kernels read."""
+    """Return half precision as its bits in uint16 and everything else as float32, which the kernels read."""
     if maps.dtype == np.float16:
         return np.ascontiguousarray(maps).view(np.uint16)
     return np.ascontiguousarray(maps, np.float32)
 
 
 def as_floats(values: NDArray) -> NDArray:
-    """The inverse of `as_words`, always float32."""
+    """Return words (`as_words`) as float32 numbers."""
     return values.view(np.float16).astype(np.float32) if values.dtype == np.uint16 else values
 
 
@@ -114,7 +116,7 @@ def _is_inside_of(x):
 
 @_exact
 def finite_pixels(maps: NDArray) -> NDArray:
-    """(K, N) bool: all five values finite; `maps` (K, N, 5) words."""
+    """Return where all five values are finite, (K, N) bool; `maps` (K, N, 5) words."""
     out = np.empty(maps.shape[:2], np.bool_)
     for k in range(maps.shape[0]):
         for i in range(maps.shape[1]):
@@ -127,7 +129,8 @@ def finite_pixels(maps: NDArray) -> NDArray:
 
 @_exact
 def gather(maps: NDArray, pixels: NDArray, usable: NDArray) -> tuple[NDArray, NDArray]:
-    """Values (K, 5, n) of the pixels, clamped to [0, 1], 0 where not usable; and (K, n) bool: albedo inside (0, 1)."""
+    """Return the values (K, 5, n) of the pixels, clamped to [0, 1] and 0 where not usable, and (K, n) bool: no albedo
+    channel is 0 or 1."""
     n_k, n = maps.shape[0], len(pixels)
     out = np.zeros((n_k, 5, n), maps.dtype)
     inside = np.ones((n_k, n), np.bool_)
@@ -144,7 +147,7 @@ def gather(maps: NDArray, pixels: NDArray, usable: NDArray) -> tuple[NDArray, ND
 
 @_compiled
 def texture_at(texture: NDArray, cell: NDArray) -> NDArray:
-    """(5, n) values of a texture (n_cells, 5) at the cells of the pixels."""
+    """Return the values (5, n) float32 of a texture (n_cells, 5) at the cells of the pixels."""
     out = np.empty((5, len(cell)), np.float32)
     for i in range(len(cell)):
         for c in range(5):
@@ -155,9 +158,24 @@ def texture_at(texture: NDArray, cell: NDArray) -> NDArray:
 # -------------------------------------------------------------------------------------------------------------- sums
 
 
+@_inlined
+def _add(out, sums):
+    """out[i] += sums[i] for a tuple of sums."""
+    for i in range(len(sums)):
+        out[i] += sums[i]
+
+
 @_compiled
 def gram(values: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDArray:
-    """(S, K, GRAM) float64 weighted second moments; `keep` (K, n) bool: pixels that count, or (0, 0) for all."""
+    """Sum the weighted second moments of every segment and prediction.
+
+    Args:
+        values: (K, 5, n) words; weight: (n,) float32; start: (S + 1,) int64, first pixel of each segment.
+        keep: (K, n) bool, pixels that count, or (0, 0) for all.
+
+    Returns:
+        (S, K, GRAM) float64.
+    """
     n_k = values.shape[0]
     out = np.zeros((len(start) - 1, n_k, GRAM))
     masked = keep.shape[0] > 0
@@ -194,26 +212,21 @@ def gram(values: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDA
                     sq += wq
                     one += w[i]
                 o = out[s, k]
-                o[0] += aa
-                o[1] += ab
-                o[2] += ac
-                o[3] += bb
-                o[4] += bc
-                o[5] += cc
-                o[6] += sa
-                o[7] += sb
-                o[8] += sc
-                o[9] += rr
-                o[10] += sr
-                o[11] += qq
-                o[12] += sq
-                o[13] += one
+                _add(o, (aa, ab, ac, bb, bc, cc, sa, sb, sc, rr, sr, qq, sq, one))
     return out
 
 
 @_compiled
 def cross(values: NDArray, target: NDArray, weight: NDArray, start: NDArray, keep: NDArray) -> NDArray:
-    """(S, K, CROSS) float64 weighted products of predictions with `target` (5, n) float32; `keep` as in `gram`."""
+    """Sum the weighted products of predictions and texture for every segment and prediction.
+
+    Args:
+        values, weight, start, keep: as in `gram`.
+        target: (5, n) float32 texture at the pixels.
+
+    Returns:
+        (S, K, CROSS) float64.
+    """
     n_k = values.shape[0]
     out = np.zeros((len(start) - 1, n_k, CROSS))
     masked = keep.shape[0] > 0
@@ -256,28 +269,13 @@ def cross(values: NDArray, target: NDArray, weight: NDArray, start: NDArray, kee
                     qq += wq * v[4, i]
                     qd += wq
                 o = out[s, k]
-                o[0] += aa
-                o[1] += ab
-                o[2] += ac
-                o[3] += ad
-                o[4] += ba
-                o[5] += bb
-                o[6] += bc
-                o[7] += bd
-                o[8] += ca
-                o[9] += cb
-                o[10] += cc
-                o[11] += cd
-                o[12] += rr
-                o[13] += rd
-                o[14] += qq
-                o[15] += qd
+                _add(o, (aa, ab, ac, ad, ba, bb, bc, bd, ca, cb, cc, cd, rr, rd, qq, qd))
     return out
 
 
 @_compiled
 def square(target: NDArray, weight: NDArray, start: NDArray) -> NDArray:
-    """(S, 5) float64: weighted sums of the squares of `target` (5, n)."""
+    """Return the weighted sums (S, 5) float64 of the squares of `target` (5, n)."""
     out = np.zeros((len(start) - 1, 5))
     for s in range(len(start) - 1):
         for first in range(start[s], start[s + 1], PIECE):
@@ -310,7 +308,15 @@ def _correct(values, k, first, m, t, bits, v, out, add):
 
 @_compiled
 def mixture(values: NDArray, blend: NDArray, start: NDArray, low: NDArray) -> NDArray:
-    """(5, n) float32 sum_k alpha_k T_k v_k within [low, 1]; `blend` (S, K, CROSS) float32 = alpha_k T_k."""
+    """Form the mixture of the corrected predictions, clamped to [low, 1] (Eq. F.30).
+
+    Args:
+        values: (K, 5, n) words; blend: (S, K, CROSS) float32 maps times selection weights, alpha_k T_k.
+        start: (S + 1,) int64, first pixel of each segment; low: (5,) float32.
+
+    Returns:
+        (5, n) float32.
+    """
     out = np.zeros((5, values.shape[2]), np.float32)
     bits = np.empty((5, PIECE), np.int32)
     v = bits.view(np.float32)
@@ -330,9 +336,11 @@ def mixture(values: NDArray, blend: NDArray, start: NDArray, low: NDArray) -> ND
 
 @_exact
 def add_to_cells(total: NDArray, summed: NDArray, cell: NDArray, value: NDArray, weight: NDArray) -> None:
-    """Add pixels to their cells, in order: total (n_cells, 5) += weight, summed (n_cells, 5) += weight value.
+    """Add pixels to their cells, in order.
 
-    `value` is (5, n); `weight` (5, n), or (1, n) for all channels alike.
+    Args:
+        total, summed: (n_cells, 5) float64, to which weight and weight times value are added.
+        cell: (n,) int32; value: (5, n); weight: (5, n), or (1, n) for all channels alike.
     """
     same = weight.shape[0] == 1
     for i in range(len(cell)):
@@ -345,7 +353,7 @@ def add_to_cells(total: NDArray, summed: NDArray, cell: NDArray, value: NDArray,
 
 @_exact
 def cell_means(total: NDArray, summed: NDArray, fallback: NDArray) -> NDArray:
-    """(n_cells, 5) float32 summed / total; `fallback` (n_cells, 5) where there is no weight."""
+    """Return summed / total (n_cells, 5) as float32, and `fallback` (n_cells, 5) where there is no weight."""
     out = np.empty(summed.shape, np.float32)
     for x in range(len(summed)):
         for c in range(5):
@@ -357,9 +365,13 @@ def cell_means(total: NDArray, summed: NDArray, fallback: NDArray) -> NDArray:
 
 
 def sorting_network(n: int) -> NDArray:
-    """(m, 2) int64 comparators that sort n values: Batcher's odd-even merge sort, about n log^2 n / 4 of them.
+    """Return the comparators (m, 2) int64 of Batcher's odd-even merge sort of n values.
 
     All pixels of a piece are sorted at once, plane by plane, without a branch.
+
+    Example:
+        >>> sorting_network(3).tolist()
+        [[0, 1], [0, 2], [1, 2]]
     """
     pairs = []
     p = 1
@@ -387,7 +399,7 @@ def _sort_planes(planes, network, m):
 
 @_exact
 def medians(values: NDArray, usable: NDArray, network: NDArray) -> NDArray:
-    """(5, n) float32 median over the usable predictions of each pixel and channel (mean of the middle two if even)."""
+    """Return the median (5, n) float32 over the usable predictions, the mean of the middle two for an even number."""
     n = values.shape[2]
     which = np.flatnonzero(usable)
     n_used = len(which)
@@ -408,30 +420,37 @@ def medians(values: NDArray, usable: NDArray, network: NDArray) -> NDArray:
     return out
 
 
+class Pixels(NamedTuple):
+    """Pixels of a view in segment order, as `disagreement` reads them."""
+
+    values: NDArray
+    """(K, 5, n) words."""
+    mixed: NDArray
+    """(5, n) float32 mixture of the corrected predictions."""
+    target: NDArray
+    """(5, n) float32 texture."""
+    weight: NDArray
+    """(n,) float32."""
+    start: NDArray
+    """(S + 1,) int64, first pixel of each segment."""
+
+
 @_exact
 def disagreement(
-    values: NDArray,
-    affine: NDArray,
-    mixed: NDArray,
-    target: NDArray,
-    weight: NDArray,
-    start: NDArray,
-    usable: NDArray,
-    network: NDArray,
-    low: NDArray,
-    floor: float,
+    pixels: Pixels, affine: NDArray, usable: NDArray, network: NDArray, low: NDArray, floor: float
 ) -> tuple[NDArray, NDArray]:
-    """How far the corrected predictions of each pixel disagree with their mixture, and which is nearest to the texture.
+    """Measure how far the corrected predictions lie from their mixture and which one is the nearest to the texture.
 
     Args:
-        affine: (S, K, CROSS) float32 corrections; mixed: (5, n) the mixture; target: (5, n) the texture.
+        pixels: pixels of a view; affine: (S, K, CROSS) float32 maps; usable: (K,) bool.
         network: comparators for as many values as there are usable predictions.
+        low: (5,) float32 lower end of the values; floor: smallest reference scale.
 
     Returns:
-        b_ref (5, n) float32: max(lower median over k of |mixed - v_k|, floor) (METHOD 2.3.3);
-        votes (S, K, 3) float64: weight of the pixels at which prediction k is the nearest to the texture, in L1 as in
-        the label loss (METHOD 2.3.6); ties go to the first.
+        (5, n) float32 reference scale, the lower median of Eq. F.4, and (S, K, 3) float64 votes: weight of the pixels at
+        which prediction k is the nearest to the texture in L1 (Eq. F.11); of equal ones the first counts.
     """
+    values, mixed, target, weight, start = pixels
     which = np.flatnonzero(usable)
     n_used = len(which)
     b_ref = np.full(mixed.shape, np.float32(floor))
@@ -480,7 +499,7 @@ def disagreement(
 
 @_exact
 def choose(values: NDArray, chosen: NDArray, start: NDArray) -> NDArray:
-    """(5, n) float32 planes of the chosen predictions; `chosen` (S, 3) int64 of albedo, roughness, metallic."""
+    """Return the planes (5, n) float32 of the chosen predictions; `chosen` (S, 3) int64 of albedo, roughness, metallic."""
     out = np.empty((5, values.shape[2]), np.float32)
     bits = out.view(np.int32)
     for s in range(len(start) - 1):
@@ -492,10 +511,14 @@ def choose(values: NDArray, chosen: NDArray, start: NDArray) -> NDArray:
 
 @_compiled
 def channel_moments(chosen: NDArray, target: NDArray, weight: NDArray, start: NDArray) -> tuple[NDArray, NDArray]:
-    """Weighted moments of the chosen predictions, each output channel with its own weight (5, n).
+    """Sum moments of the chosen predictions, each output channel with its own weights.
 
-    Returns (S, 5, 10) float64: aa ab ac bb bc cc a b c 1 for channels 0-2, vv v 1 first for 3 and 4; and (S, 5, 4):
-    products with the target, [r g b 1] or [v 1].
+    Args:
+        chosen, target, weight: (5, n) float32; start: (S + 1,) int64, first pixel of each segment.
+
+    Returns:
+        (S, 5, 10) float64 second moments: aa ab ac bb bc cc a b c 1 for the albedo channels, vv v 1 in the first three
+        places for roughness and metallic; and (S, 5, 4) float64 products of [r g b 1] or [v 1] with the target.
     """
     second, first_ = np.zeros((len(start) - 1, 5, 10)), np.zeros((len(start) - 1, 5, 4))
     for s in range(len(start) - 1):
@@ -522,20 +545,8 @@ def channel_moments(chosen: NDArray, target: NDArray, weight: NDArray, start: ND
                     tc += wc * t
                     td += w * t
                 o, q = second[s, ch], first_[s, ch]
-                o[0] += aa
-                o[1] += ab
-                o[2] += ac
-                o[3] += bb
-                o[4] += bc
-                o[5] += cc
-                o[6] += sa
-                o[7] += sb
-                o[8] += sc
-                o[9] += one
-                q[0] += ta
-                q[1] += tb
-                q[2] += tc
-                q[3] += td
+                _add(o, (aa, ab, ac, bb, bc, cc, sa, sb, sc, one))
+                _add(q, (ta, tb, tc, td))
             for ch in range(3, 5):
                 vv = sv = one = tv = td = np.float32(0)
                 for i in range(begin, end):
@@ -546,9 +557,6 @@ def channel_moments(chosen: NDArray, target: NDArray, weight: NDArray, start: ND
                     tv += w * v * t
                     td += w * t
                 o, q = second[s, ch], first_[s, ch]
-                o[0] += vv
-                o[1] += sv
-                o[2] += one
-                q[0] += tv
-                q[1] += td
+                _add(o, (vv, sv, one))
+                _add(q, (tv, td))
     return second, first_

@@ -1,21 +1,13 @@
-"""The paper's objective minimised directly, for a given selection (METHOD 2.3.3-2.3.7, 7c).
+"""Affine maps that minimise the paper's loss for a given selection (docs/method/fusion.md#distribution).
 
-With one prediction chosen per segment and property, the reference loss
+With one prediction chosen per segment and property, data term and identity regulariser are minimised by majorisation: the
+divergence of two Laplace distributions lies below a quadratic of weight `laplace.kl_weight` (Eq. F.32) that touches it at
+the present distance. The maps then follow from one linear system per segment (Eqs. F.34, F.35), the texture is a weighted
+mean (Eq. F.36) and the Laplace scale of a cell has a closed form (Eq. F.31).
 
-    (1 / 5N) sum_n sum_ch KL(u_n, b_ref || mu, b)  +  (100 / NK) sum_i n_i R(T_ik)
-
-is minimised by majorisation: the divergence lies below a quadratic of weight `laplace.kl_weight` that touches it at the
-present distance, so that
-
-1. T: one linear system per segment; the quartic ||AA' - I||^2 of R by Gauss-Newton (12 unknowns for albedo, 2 and 2);
-2. texture: weighted mean of the chosen corrected predictions in each cell;
-3. Laplace scale of the cell: closed form.
-
-Each step lowers the loss for the reference scale b_ref of the sweep. b_ref depends on T and is renewed every sweep but its
-slope is not followed (METHOD H3: the median's subgradient moves one arbitrary prediction); clamps are not followed
-either. The sum of the terms may therefore rise a little in a sweep (by 1e-4 of itself). An optimiser that does follow the
-median's slope gets below, by moving predictions that are not chosen: see docs/base.md. Predictions that are not chosen stay
-at the identity, where the regulariser has its minimum.
+Each step lowers the loss for the reference scale b_ref of the sweep. b_ref depends on the maps and is computed again every
+sweep, but neither its derivative (docs/method/numerics.md#median-subgradient) nor clamps are followed, so the loss may rise
+a little from sweep to sweep. Predictions that are not chosen stay at the identity, where the regulariser has its minimum.
 """
 
 from __future__ import annotations
@@ -23,32 +15,38 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from iif_core.reflectance.material import IDENTITY
+
 REGULARISER = 100.0
-"""Weight of the identity regulariser against the data term (METHOD 2.3.8)."""
+"""Weight of the identity regulariser relative to the data term (Eq. F.16)."""
 
 
 def identity_penalty(affine: NDArray) -> NDArray:
-    """R of albedo corrections (..., 3, 4): ||A - I||^2 + ||b||^2 + ||AA' - I||^2 (METHOD 2.3.7)."""
+    """Return the regulariser of albedo maps (..., 3, 4), ||A - I||^2 + ||t||^2 + ||AA' - I||^2 (Eq. F.14)."""
     a, b = affine[..., :3], affine[..., 3]
     eye = np.eye(3)
     return ((a - eye) ** 2).sum((-1, -2)) + (b**2).sum(-1) + ((a @ np.swapaxes(a, -1, -2) - eye) ** 2).sum((-1, -2))
 
 
 def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: NDArray, steps: int = 4) -> NDArray:
-    """Albedo corrections (S, 3, 4): argmin of 1/2 sum_ch (t' G_ch t - 2 t' c_ch) + strength R(T).
+    """Fit albedo maps: argmin of 1/2 sum_ch (t' G_ch t - 2 t' c_ch) + strength R(T), by Gauss-Newton on R (Eq. F.35).
+
+    A step is halved up to three times where the objective would rise, and not taken if it still does.
 
     Args:
-        gram: (S, 3, 4, 4) weighted second moments of [v; 1] per output channel; cross: (S, 3, 4) with the target.
-        start: (S, 3, 4); strength: (S,) > 0.
+        gram: (S, 3, 4, 4) weighted second moments of [v; 1] per output channel.
+        cross: (S, 3, 4) products with the target.
+        start: (S, 3, 4) maps to start from; strength: (S,) > 0; steps: number of Gauss-Newton steps.
 
-    Gauss-Newton on R with halved steps where the objective would rise.
+    Returns:
+        (S, 3, 4) float64.
     """
     n = len(gram)
     full = np.zeros((n, 12, 12))
     for c in range(3):
         full[:, 4 * c : 4 * c + 4, 4 * c : 4 * c + 4] = gram[:, c]
     right = cross.reshape(n, 12)
-    identity = np.eye(3, 4).ravel()
+    identity = IDENTITY[:12]
 
     def objective(t: NDArray) -> NDArray:
         quadratic = 0.5 * np.einsum("si,sij,sj->s", t, full, t) - (t * right).sum(1)
@@ -77,7 +75,7 @@ def penalised_affine(gram: NDArray, cross: NDArray, start: NDArray, strength: ND
 
 
 def _quartic_jacobian(t: NDArray) -> tuple[NDArray, NDArray]:
-    """AA' - I as (S, 9) and its derivative (S, 9, 12) by the entries of T."""
+    """AA' - I as (S, 9) and its derivative (S, 9, 12) with respect to the entries of T."""
     n = len(t)
     a = t.reshape(n, 3, 4)[:, :, :3]
     residual = (a @ a.swapaxes(1, 2) - np.eye(3)).reshape(n, 9)
@@ -90,6 +88,6 @@ def _quartic_jacobian(t: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def penalised_gain(gram: NDArray, cross: NDArray, strength: NDArray) -> NDArray:
-    """(S, 2) gain and bias: argmin of 1/2 t'Gt - t'c + strength ((g - 1)^2 + h^2)."""
+    """Fit gain and offset (S, 2): argmin of 1/2 t'Gt - t'c + strength ((g - 1)^2 + o^2) (Eq. F.34)."""
     ridge = 2 * strength[:, None]
     return np.linalg.solve(gram + ridge[..., None] * np.eye(2), (cross + ridge * [1.0, 0.0])[..., None])[..., 0]

@@ -1,4 +1,4 @@
-"""How the direct solver is to solve."""
+"""Options of the direct solver; their defaults are those of the settings of section `base`."""
 
 from __future__ import annotations
 
@@ -12,26 +12,27 @@ OBJECTIVES = ("least_squares", "distribution")
 
 
 @dataclass(frozen=True)
-class BaseOptions:
-    """How to solve.
+class FusionOptions:
+    """How the direct solver solves.
 
     Attributes:
-        variant: `full`; `uniform` = corrections, but all predictions alike (no selection); `texel_mean` = mean of all
-            predictions a cell; `object_mean` = mean of all predictions an object.
-        sweeps: alternations.
-        temperature, anneal, final_temperature: selection temperature of the first sweep, in units of the segment's
-            median error, its factor per sweep, and where it stops. At the default 0.1 a prediction whose error exceeds
-            the best by a tenth of the median has 1/e of its weight: averaging near-ties is worth 0.7-1.4 dB over
-            the single best one (0).
-        ridge: pull of T to identity, times the segment's weight in the fit; more for segments below `ridge_pixels` pixels.
-        robust: cells take the M-estimate of the Laplace divergence instead of the mean.
-        clip_share, clip_pixels: predicted albedo at exactly 0 or 1 is left out of the fit of T where at most this
-            share of the segment is, and at least so many pixels remain.
+        variant: `full`; `uniform` = affine maps without selection, all usable predictions count alike; `texel_mean` =
+            mean of all predictions of a cell; `object_mean` = mean of all predictions of an object.
+        sweeps: number of alternations.
+        temperature, anneal, final_temperature: selection temperature of the first sweep in units of the segment's
+            median error, factor on it per sweep, and its lower end (Eq. F.29). A final temperature above 0 averages
+            predictions that are nearly as good as the best one; 0 takes the best one alone.
+        ridge: strength of the ridge towards the identity map, relative to the segment's weight; it grows for segments
+            of fewer than `ridge_pixels` pixels (Eq. F.26).
+        robust: cells take an M-estimate with the weight of the Laplace divergence instead of the mean.
+        clip_share, clip_pixels: predicted albedo of exactly 0 or 1 is left out of the fit of the albedo map where it
+            makes up at most this share of the segment and at least so many pixels remain.
         scale_floor: smallest Laplace scale.
-        objective: `least_squares`, or `distribution`: afterwards `polish` sweeps on the paper's loss, hard selection.
-        alone: weight in the fit of T of cells that one viewpoint sees (1 - 1/n + this for n viewpoints); must not be 0.
-        seams: close seams between parts of an object (needs `BaseProblem.neighbours`).
-        memory: bytes of predictions that may stay in memory between sweeps; the others are read again.
+        objective: `least_squares`, or `distribution` to minimise the paper's loss afterwards for the selection found.
+        polish: sweeps on the paper's loss.
+        single_view_weight: weight in the fit of the maps of cells that one viewpoint sees (Eq. F.24); must not be 0.
+        seams: close seams between the parts of an object (needs `FusionProblem.neighbours`).
+        memory: bytes of predictions that stay in memory between sweeps; further views are read again every time.
     """
 
     variant: str = "full"
@@ -47,9 +48,9 @@ class BaseOptions:
     memory: int = 1 << 30
     final_temperature: float = 0.1
     objective: str = "least_squares"
-    polish: int = 20
+    polish: int = 25
     seams: bool = True
-    alone: float = 0.01
+    single_view_weight: float = 0.01
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
@@ -61,8 +62,8 @@ class BaseOptions:
                 f"base options: temperature {self.temperature} must not be below final_temperature {self.final_temperature}"
                 f" (>= 0), polish {self.polish} must be >= 1"
             )
-        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1 or not self.alone > 0:
+        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1 or not self.single_view_weight > 0:
             raise InputError(
                 f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1),"
-                f" alone {self.alone} (> 0)"
+                f" single_view_weight {self.single_view_weight} (> 0)"
             )

@@ -1,4 +1,4 @@
-"""What every base solver reads and returns: predictions on surface cells in, a texture with its uncertainty out."""
+"""What every fusion solver reads (predictions on surface cells) and returns (a texture with its uncertainty)."""
 
 from __future__ import annotations
 
@@ -9,35 +9,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from iif_core.reflectance import material
 
-CHANNELS = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
-PROPERTIES = ("albedo", "roughness", "metallic")
-LOWEST = np.float32([0, 0, 0, 0.02, 0])
-"""Smallest value of each channel; the largest is 1."""
-NEUTRAL = np.float32([0.5, 0.5, 0.5, 0.9, 0.0])
-"""Material of surface that no prediction shows (METHOD H40)."""
+LOWEST, NEUTRAL = np.float32(material.LOWEST), np.float32(material.NEUTRAL)
+"""Smallest value of each channel, and the material of an object that no prediction shows, in single precision."""
 
 
 Predictions = Callable[[int], NDArray] | Sequence[NDArray]
 
 
 @dataclass(frozen=True)
-class BaseProblem:
-    """Predictions on surface cells; what every base solver reads.
+class FusionProblem:
+    """Predictions on surface cells.
 
     Attributes:
-        predictions: view -> (K, N, 5) or (K, H, W, 5) half or float: albedo R G B linear, perceptual roughness,
-            metallic, in [0, 1]; a sequence or a callable (then read once a sweep). Not-finite values are dropped.
+        predictions: view -> (K, N, 5) or (K, H, W, 5) half or float: linear albedo R G B, perceptual roughness and
+            metallic, in [0, 1]; a sequence, or a callable that is read once per sweep. Pixels that are not finite are
+            left out.
         cell_of_pixel: per view (N,) or (H, W) int32, -1 = no surface.
-        segment_of_pixel: per view, same shape, int32, -1 = none; a segment lies in one view.
+        segment_of_pixel: per view, same shape, int32, -1 = none; a segment is one object in one view.
         n_cells: number of cells.
         object_of_cell: (n_cells,) int32.
         object_of_segment: (S,) int32.
-        weight: per view, same shape, >= 0: how much a pixel counts (low near object borders, 0 = ignore); default 1.
-        point: view -> (N, 3) float32 surface points of the pixels in world coordinates, m; textures that are functions of
-            space read them, any value where there is no surface.
+        weight: per view, same shape, >= 0: weight w_n of a pixel (Eq. F.21), 0 = ignore; default 1.
+        point: view -> (N, 3) float32 surface points of the pixels in world coordinates, m, with any value where there is
+            no surface; read by textures that are functions of space.
+        tangent: view -> (N, 2, 3) float32 displacement of the surface point over one pixel to the right and down, m.
         neighbours: (m, 2) int32 pairs of neighbouring cells of one object, for closing seams between its parts.
-        tangent: view -> (N, 2, 3) float32 how the surface point moves over one pixel to the right and down, m.
     """
 
     predictions: Predictions
@@ -56,7 +54,7 @@ class BaseProblem:
         return len(self.object_of_segment)
 
     def view(self, view: int) -> NDArray:
-        """Predictions of a view, (K, N, 5)."""
+        """Return the predictions of a view, (K, N, 5); raises InputError for another shape or an integer type."""
         maps = self.predictions(view) if callable(self.predictions) else self.predictions[view]
         if maps.ndim not in (3, 4) or maps.shape[-1] != 5 or maps.shape[0] == 0:
             raise InputError(f"predictions of view {view} have shape {maps.shape}; (K, H, W, 5) with K >= 1 is needed")
@@ -72,7 +70,7 @@ class BaseProblem:
 
 @dataclass(frozen=True)
 class Dropped:
-    """A prediction that was not used, and why; `k` = -1: the whole view."""
+    """A prediction that was not used, and the reason; `k` = -1 stands for all predictions of the view."""
 
     view: int
     k: int
@@ -80,29 +78,29 @@ class Dropped:
 
 
 @dataclass(frozen=True)
-class BaseResult:
-    """The base texture and how it came about.
+class FusionResult:
+    """The base texture, the maps and selection that it belongs to, and what is known about its error.
 
     Attributes:
-        value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells nobody saw have their object's mean,
-            objects nobody saw `NEUTRAL`.
-        scale: (n_cells, 5) float32 Laplace scale b of the cell's distribution, same units (METHOD 2.3.4).
-        uncertainty: (n_cells, 5) float32 standard deviation of the location's error, calibrated (uncertainty.py).
+        value: (n_cells, 5) float32, albedo linear, within [LOWEST, 1]; cells without observations have their object's
+            mean, objects without observations have `NEUTRAL`.
+        scale: (n_cells, 5) float32 Laplace scale b of the cell's distribution, in units of `value` (Eq. F.31).
+        uncertainty: (n_cells, 5) float32 calibrated standard deviation of the error of the location (Eq. F.45).
         observations: (n_cells,) int32 pixels; views: (n_cells,) int32 views that saw the cell.
-        coverage: (n_cells,) float32 pixels weighted by how well they see the cell; 0 = `value` is a fill.
-        part_of_cell: (n_cells,) int32 part that the cell hangs together with through shared cells (gauge.py), or -1.
-        object_value: (O, 5) float32 mean of each object id up to the largest; object_cells: (O,) int32 cells behind it.
-        weight: (S, K, 3) float32 selection weights of albedo, roughness, metallic; sum over k is 1 (0 where the
-            segment has no usable pixel).
-        probability: (S, K, 3) float32 share of the segment's pixels at which prediction k is the nearest to the texture:
-            the stationary point of the paper's label loss as its temperature goes to 0 (METHOD 2.3.8).
+        coverage: (n_cells,) float32 summed weight of the cell's pixels; 0 = `value` is a fill.
+        part_of_cell: (n_cells,) int32 connected part of segments and cells that the cell belongs to (gauge.py), or -1.
+        object_value: (O, 5) float32 mean of each object id up to the largest; object_cells: (O,) int32 its seen cells.
+        weight: (S, K, 3) float32 selection weights of albedo, roughness, metallic; they sum to 1 over k, or to 0 where
+            the segment has no usable pixel.
+        probability: (S, K, 3) float32 share of the segment's pixels at which prediction k is the nearest to the texture
+            (Eq. F.13 as the temperature goes to 0).
         margin: (S, 3) float32 how clear the selection is, 0 = a tie, 1 = one prediction fits exactly.
-        effective: (S, 3) float32 exp(entropy of `probability`): how many predictions share the segment, 1 ... K.
+        effective: (S, 3) float32 effective number of predictions of the segment, 1 ... K (Eq. F.49).
         affine_albedo: (S, K, 3, 4); affine_roughness, affine_metallic: (S, K, 2) = (gain, bias); float32.
         error: (S, K, 3) float32 mean squared error of each corrected prediction against the texture before the last
             update.
         dropped: predictions that were not used.
-        history: one entry a sweep: temperature, error of each property, entropy, gain, change.
+        history: one entry per sweep: temperature, error of each property, entropy, gain, change.
     """
 
     value: NDArray
@@ -126,16 +124,16 @@ class BaseResult:
     history: list[dict[str, float]] = field(default_factory=list)
 
 
-def one_segment_per_view(problem: BaseProblem) -> BaseProblem:
-    """The same predictions with one correction an image instead of one an object and image (the paper's ablation)."""
+def one_segment_per_view(problem: FusionProblem) -> FusionProblem:
+    """Return the problem with one affine map per photograph instead of one per object and photograph (an ablation)."""
     segments = [
         np.where(np.asarray(segment) >= 0, view, -1).astype(np.int32) for view, segment in enumerate(problem.segment_of_pixel)
     ]
     return replace(problem, segment_of_pixel=segments, object_of_segment=np.full(len(segments), -1, np.int32))
 
 
-def check_ids(problem: BaseProblem, view: int) -> None:
-    """Raise InputError where a cell or segment id of a view has no row in its table."""
+def check_ids(problem: FusionProblem, view: int) -> None:
+    """Raise InputError if a cell or segment id of a view has no row in its table."""
     for name, ids, n in (
         ("cell", problem.cell_of_pixel[view], problem.n_cells),
         ("segment", problem.segment_of_pixel[view], problem.n_segments),
@@ -148,12 +146,20 @@ def check_ids(problem: BaseProblem, view: int) -> None:
 def prediction_faults(
     maps: NDArray, finite: NDArray | None = None, counted: NDArray | None = None, not_finite_share: float = 0.01
 ) -> list[str]:
-    """Why each of the K predictions of a view cannot be used; "" for those that can.
+    """Say why each of the K predictions of a view cannot be used.
 
-    `maps` (K, ..., 5); `finite` (K, pixels) bool where it is known already; `counted` (pixels,) bool: pixels whose values
-    matter (default all). Faults (METHOD H51, half-precision overflow
-    of a diffusion model): more than `not_finite_share` of the pixels not finite; albedo constant over the picture while
-    that of another prediction is not.
+    A prediction is unusable if more than `not_finite_share` of its pixels are not finite, or if its albedo is constant
+    over the picture while that of another prediction is not: signs that a diffusion model overflowed half precision
+    (docs/method/numerics.md#half-precision-overflow).
+
+    Args:
+        maps: (K, ..., 5) predictions.
+        finite: (K, pixels) bool, where all five values are finite; computed if None.
+        counted: (pixels,) bool, pixels whose values matter; None = all.
+        not_finite_share: largest share of counted pixels that may be not finite.
+
+    Returns:
+        K texts, "" for a prediction that can be used.
     """
     maps = maps.reshape(len(maps), -1, 5)
     finite = np.isfinite(maps).all(-1) if finite is None else finite
@@ -182,8 +188,9 @@ def prediction_faults(
 class UsablePixels:
     """Pixels of a view with a cell, a segment, weight > 0 and finite predictions, in segment order.
 
-    pixel: (n,) index into the flattened view; cell, segment (n,); weight (n,) float64; usable (K,) predictions;
-    dropped: what was left out and why.
+    Attributes:
+        pixel: (n,) index into the flattened view; cell, segment: (n,) ids; weight: (n,) float64.
+        usable: (K,) bool predictions; dropped: what was left out and the reason.
     """
 
     pixel: NDArray
@@ -194,10 +201,16 @@ class UsablePixels:
     dropped: list[Dropped]
 
 
-def usable_pixels(problem: BaseProblem, view: int, maps: NDArray | None = None, finite: NDArray | None = None) -> UsablePixels:
-    """The pixels and predictions of a view that every base solver uses.
+def usable_pixels(problem: FusionProblem, view: int, maps: NDArray | None = None, finite: NDArray | None = None) -> UsablePixels:
+    """Find the pixels and predictions of a view that every fusion solver uses.
 
-    `maps`: problem.view(view), if at hand; `finite` (K, N) bool, all five values finite, if known.
+    Args:
+        problem: predictions on cells; view: index of the view.
+        maps: `problem.view(view)`, if at hand.
+        finite: (K, N) bool, all five values finite, if known.
+
+    Returns:
+        Pixels in segment order, the usable predictions and what was left out.
 
     Raises:
         InputError: shapes that do not match, an id beyond its table.
@@ -223,10 +236,16 @@ def usable_pixels(problem: BaseProblem, view: int, maps: NDArray | None = None, 
 def object_means(
     value: NDArray, object_of_cell: NDArray, weight: NDArray | None = None, n_objects: int = 0
 ) -> tuple[NDArray, NDArray]:
-    """Mean value of every object and the cells behind it: (O, 5) float32, (O,) int32.
+    """Average the value of every object over its cells.
 
-    O is the largest object id + 1, or `n_objects` if that is more. `weight` (n_cells,): pixels (0 = not seen, does not
-    count). Objects without a cell that counts get `NEUTRAL`: albedo 0.5, roughness 0.9, metallic 0.
+    Args:
+        value: (n_cells, 5); object_of_cell: (n_cells,) int >= 0.
+        weight: (n_cells,) weight of each cell, 0 = not seen; None = 1.
+        n_objects: smallest number of rows to return.
+
+    Returns:
+        (O, 5) float32 means and (O,) int32 numbers of cells with weight > 0; O is the largest object id + 1 or
+        `n_objects`, whichever is more. Objects without such a cell get `NEUTRAL`.
     """
     weight = np.ones(len(value)) if weight is None else weight
     n_objects = max(n_objects, int(np.max(object_of_cell, initial=-1)) + 1)
@@ -235,3 +254,10 @@ def object_means(
     mean = mean / np.where(total > 0, total, 1.0)[:, None]
     cells = np.bincount(object_of_cell, weight > 0, n_objects)
     return np.where((total > 0)[:, None], mean, NEUTRAL).astype(np.float32), cells.astype(np.int32)
+
+
+def with_every_object(result: FusionResult, n_objects: int) -> FusionResult:
+    """Return the result with `NEUTRAL` rows for objects up to `n_objects` that no prediction shows."""
+    missing = max(0, n_objects - len(result.object_value))
+    value = np.concatenate([result.object_value, np.tile(NEUTRAL, (missing, 1))])
+    return replace(result, object_value=value, object_cells=np.pad(result.object_cells, (0, missing)))

@@ -1,7 +1,7 @@
-"""The published loss of the material base, exactly, over all pixels: the judge of every base solver (METHOD 2.3.2-2.3.8).
+"""The published loss over all pixels, which judges every solver (docs/method/fusion.md#judge).
 
-Slow and plain on purpose: NumPy, float64, one view at a time, every formula from its one place (laplace.py). A solver
-that minimises something else (the direct one) or on batches (the paper's) is judged by the same number (METHOD 7e).
+Plain NumPy in float64, one view at a time. Solvers that minimise something else (the direct one) or draw batches (the
+paper's optimiser) are compared by this number.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion.matching import REGULARISER, identity_penalty
-from iif_core.fusion.problem import LOWEST, BaseProblem, BaseResult, usable_pixels
+from iif_core.fusion.problem import LOWEST, FusionProblem, FusionResult, usable_pixels
 from iif_core.numerics import laplace
 
 if TYPE_CHECKING:
@@ -29,15 +29,19 @@ _ENTRIES = 1 << 17  # (pixel, prediction) pairs in float64 at a time: about 20 M
 Corrections = tuple[NDArray, NDArray, NDArray]
 """Affine maps of albedo (S, K, 3, 4), roughness (S, K, 2) and metallic (S, K, 2); the last column is the bias."""
 Texture = NDArray | Callable[[int], NDArray]
-"""(n_cells, 5), or view -> (N, 5) for textures that are not one value per cell."""
+"""(n_cells, 5), or a callable view -> (N, 5) for textures that are not one value per cell."""
 
 
 @dataclass(frozen=True)
 class ReferenceLoss:
-    """Terms of the loss; `total` = data + label (if any) + 100 (albedo + roughness + metallic regulariser).
+    """Terms of the loss (Eq. F.16).
 
-    data: mean KL over pixels and the 5 channels; label: cross entropy of the selection, None when not asked for;
-    regulariser_*: mean over pixels and predictions of the distance of T to identity, without the factor 100.
+    Attributes:
+        data: mean divergence over pixels and channels (Eq. F.10).
+        label: cross entropy of the selection (Eq. F.12), None if it was not asked for.
+        regulariser_albedo, regulariser_roughness, regulariser_metallic: mean over pixels and predictions of the distance
+            of the maps from the identity (Eq. F.15), without the factor 100.
+        total: data + label + 100 regularisers; n_pixels: number of pixels.
     """
 
     data: float
@@ -50,14 +54,13 @@ class ReferenceLoss:
 
 
 def identity_regulariser(corrections: Corrections) -> NDArray:
-    """Distance of every correction to identity, (S, K, 3) float64 (METHOD 2.3.7): `matching.identity_penalty` of albedo,
-    (g - 1)^2 + h^2 of roughness and metallic."""
+    """Return the distance of every affine map from the identity, (S, K, 3) float64 (Eq. F.14)."""
     albedo, roughness, metallic = (np.asarray(c, np.float64) for c in corrections)
     return np.stack([identity_penalty(albedo), *(((c - [1.0, 0.0]) ** 2).sum(-1) for c in (roughness, metallic))], -1)
 
 
 def reference_loss(
-    problem: BaseProblem,
+    problem: FusionProblem,
     value: Texture,
     scale: Texture,
     corrections: Corrections,
@@ -69,19 +72,21 @@ def reference_loss(
     regulariser: float = REGULARISER,
     floor: float = laplace.SCALE_FLOOR,
 ) -> ReferenceLoss:
-    """The published loss of a texture, corrections and selection, over every usable pixel.
-
-    data = mean_n,c KL(mu_ref, b_ref; mu, max(b, floor)), mu_ref = sum_k alpha_k clamp(T_k v_k),
-    b_ref = max(lower median_k |mu_ref - clamp(T_k v_k)|, floor).
+    """Evaluate the published loss of a texture, affine maps and selection over every usable pixel (Eqs. F.1 to F.16).
 
     Args:
-        value, scale: texture location and Laplace scale, (n_cells, 5) or view -> (N, 5).
-        corrections: (albedo (S, K, 3, 4), roughness (S, K, 2), metallic (S, K, 2)).
+        problem: predictions on cells.
+        value, scale: location and Laplace scale of the texture, (n_cells, 5) or view -> (N, 5).
+        corrections: affine maps (albedo (S, K, 3, 4), roughness (S, K, 2), metallic (S, K, 2)).
         weight: (S, K, 3) selection weights alpha, one-hot or soft; rows of segments without pixels are not read.
-        weighted: pixels count by `problem.weight` instead of 1 each (the paper's).
-        log_weight, temperature: log alpha (S, K, 3) and the temperature of the errors: asks for the label loss
-            -(1/3) mean_n sum_c,k q log alpha, q = softmax_k(-e / temperature), e the L1 error of the corrected
-            prediction against the texture. Infinite where alpha is 0 and q is not (METHOD H4).
+        weighted: pixels count by `problem.weight` instead of 1 each, as they do in the paper.
+        log_weight: (S, K, 3) log alpha, for the label loss, which is infinite where alpha is 0 and q of Eq. F.11 is not
+            (docs/method/numerics.md#cold-temperatures); None = no label loss.
+        temperature: of the errors in the label loss, together with `log_weight`.
+        floor: smallest Laplace scale; regulariser: factor on the regulariser.
+
+    Returns:
+        The terms and their sum.
 
     Raises:
         InputError: arrays that do not fit the problem; no usable pixel.
@@ -129,14 +134,14 @@ def reference_loss(
     return ReferenceLoss(data, label, *(float(p) for p in penalty), total, n_pixels)
 
 
-def loss_of_result(problem: BaseProblem, result: BaseResult | SgdFit, *, weighted: bool = False) -> ReferenceLoss:
-    """`reference_loss` of what a solver returned, one value per cell."""
+def loss_of_result(problem: FusionProblem, result: FusionResult | SgdFit, *, weighted: bool = False) -> ReferenceLoss:
+    """Evaluate `reference_loss` of what a solver returned, with one value per cell."""
     corrections = (result.affine_albedo, result.affine_roughness, result.affine_metallic)
     return reference_loss(problem, result.value, result.scale, corrections, result.weight, weighted=weighted)
 
 
 def _check(
-    problem: BaseProblem,
+    problem: FusionProblem,
     value: Texture,
     scale: Texture,
     corrections: Corrections,
@@ -161,7 +166,7 @@ def _check(
 
 
 def _corrected(values: NDArray, corrections: Corrections, segment: NDArray, k: NDArray) -> NDArray:
-    """(k, n, 5) clamp(T v) in [LOWEST, 1] (METHOD 2.3.2)."""
+    """Corrected predictions (k, n, 5), clamped to [LOWEST, 1] (Eq. F.1)."""
     albedo, roughness, metallic = (c[segment][:, k].swapaxes(0, 1) for c in corrections)
     out = np.empty_like(values)
     out[..., :3] = np.einsum("knij,knj->kni", albedo[..., :3], values[..., :3]) + albedo[..., 3]
@@ -171,7 +176,7 @@ def _corrected(values: NDArray, corrections: Corrections, segment: NDArray, k: N
 
 
 def _label(error: NDArray, log_weight: NDArray, temperature: float, count: NDArray) -> float:
-    """Sum over pixels of the label loss; `error` (k, n, 5), `log_weight` (n, k, 3)."""
+    """Label loss summed over pixels; `error` (k, n, 5), `log_weight` (n, k, 3)."""
     e = np.stack([error[..., :3].mean(-1), error[..., 3], error[..., 4]], -1)
     q = np.exp(-(e - e.min(0)) / temperature)
     q /= q.sum(0)

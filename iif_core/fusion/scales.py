@@ -1,4 +1,4 @@
-"""Laplace scales: how far mixture and texture are apart, and how far the predictions are."""
+"""Laplace scales: the distance between mixture and texture, and the disagreement of the predictions."""
 
 from __future__ import annotations
 
@@ -6,40 +6,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.fusion import kernels
-from iif_core.fusion.blocks import Block, Blocks, in_order
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import LOWEST, BaseProblem
-from iif_core.fusion.sums import PROPERTY_OF_ENTRY, CellSums, State
+from iif_core.fusion.blocks import Block
+from iif_core.fusion.fusion_pass import FusionPass
+from iif_core.fusion.problem import LOWEST
+from iif_core.fusion.sums import PROPERTY_OF_ENTRY, CellSums
 from iif_core.numerics import laplace
 
 
-def cell_scales(
-    blocks: Blocks, problem: BaseProblem, options: BaseOptions, texture: NDArray, state: State, threads: int
-) -> tuple[NDArray, NDArray]:
-    """(n_cells, 5) float32: weighted mean of d + b_r e^(-d/b_r) over a cell's pixels; and the votes (S, K, 3)."""
-    votes = np.zeros(state.alpha.shape)
+def cell_scales(run: FusionPass, texture: NDArray) -> tuple[NDArray, NDArray]:
+    """Return the Laplace scales (n_cells, 5) float32 of the cells (Eq. F.31) and the votes (S, K, 3)."""
+    votes = np.zeros(run.state.alpha.shape)
+    floor = run.options.scale_floor
 
     def one_view(view: int) -> tuple[Block, NDArray, NDArray]:
-        block = blocks(view)
+        block = run.blocks(view)
         target = kernels.texture_at(texture, block.cell)
-        mixed, b_ref, votes_of = against(block, state, target, options)
-        return block, laplace.scale_contribution(mixed - target, b_ref, options.scale_floor), votes_of
+        mixed, b_ref, votes_of = reference_distribution(run, block, target)
+        return block, laplace.scale_contribution(mixed - target, b_ref, floor), votes_of
 
-    cells = CellSums(problem.n_cells)
-    for block, part, votes_of in in_order(one_view, len(problem.cell_of_pixel), threads):
+    cells = CellSums(run.problem.n_cells)
+    for block, part, votes_of in run.map_views(one_view):
         votes[block.segments] = votes_of
         cells.add(block.cell, part, block.weight)
-    return laplace.floored(cells.mean(np.zeros(5)), np.float32(options.scale_floor)), votes
+    return laplace.floored(cells.mean(np.zeros(5)), np.float32(floor)), votes
 
 
-def against(block: Block, state: State, target: NDArray, options: BaseOptions) -> tuple[NDArray, NDArray, NDArray]:
-    """Mixture and reference scale (5, n) of a view under the present corrections, and the votes (s, K, 3) of its segments."""
-    rows = block.segments
+def reference_distribution(run: FusionPass, block: Block, target: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Return location and scale of the reference distributions of a view's pixels under the present maps.
+
+    Args:
+        run: state of the solver; block: pixels of the view; target: (5, n) texture at the pixels.
+
+    Returns:
+        Mixture (5, n) of Eq. F.30, reference scale (5, n) of Eq. F.4, and votes (s, K, 3): weight of the pixels of each
+        segment at which prediction k is the nearest to the texture.
+    """
+    rows, state = block.segments, run.state
     affine = state.affine[rows].astype(np.float32)
     blend = (state.affine[rows] * state.alpha[rows][..., PROPERTY_OF_ENTRY]).astype(np.float32)
     mixed = kernels.mixture(block.values, blend, block.start, LOWEST)
     network = kernels.sorting_network(int(block.usable.sum()))
-    b_ref, votes = kernels.disagreement(
-        block.values, affine, mixed, target, block.weight, block.start, block.usable, network, LOWEST, options.scale_floor
-    )
-    return mixed, b_ref, votes
+    floor = run.options.scale_floor
+    pixels = kernels.Pixels(block.values, mixed, target, block.weight, block.start)
+    return mixed, *kernels.disagreement(pixels, affine, block.usable, network, LOWEST, floor)

@@ -1,4 +1,4 @@
-"""Which of K predictions of a segment to believe: weights by error."""
+"""Selection among the K predictions of a segment by their errors."""
 
 from __future__ import annotations
 
@@ -7,11 +7,20 @@ from numpy.typing import NDArray
 
 
 def selection_weights(error: NDArray, temperature: float, usable: NDArray | None = None) -> NDArray:
-    """Weights of K predictions by their error: alpha_k ~ exp(-(E_k - min E) / (temperature * median E)).
+    """Return the weights of K predictions by their errors (Eq. F.28).
 
-    `error` (..., K), K last, >= 0; `usable` (..., K) bool. Temperature 0 is the limit: the smallest error takes all,
-    equal ones (to an rms of 1e-6) share, so that the result does not depend on the order. Sum 1, or 0 where nothing is
-    usable.
+    Temperature 0 is the limit: the smallest error takes all weight, and errors that are equal (to an rms of 1e-6) share it,
+    so the result does not depend on the order.
+
+    Args:
+        error: (..., K) >= 0; temperature: in units of the median error; usable: (..., K) bool, None = all.
+
+    Returns:
+        (..., K) float64; sum 1 over the last axis, or 0 where nothing is usable.
+
+    Example:
+        >>> selection_weights([0.1, 0.4, 0.1], 0.0).tolist()
+        [0.5, 0.0, 0.5]
     """
     error = np.asarray(error, np.float64)
     usable = np.ones(error.shape, bool) if usable is None else np.broadcast_to(usable, error.shape)
@@ -32,9 +41,9 @@ def selection_weights(error: NDArray, temperature: float, usable: NDArray | None
 
 
 def margin(error: NDArray, usable: NDArray) -> NDArray:
-    """How clear the choice is: (second smallest error - smallest) / second smallest, in [0, 1], over the last axis.
+    """Return how clear a selection is, 1 - smallest error / second smallest error over the last axis.
 
-    `error` (..., K) >= 0; `usable` (..., K) bool. 0 = a tie (or nothing usable); 1 = one prediction fits exactly, or only
+    `error` (..., K) >= 0; `usable` (..., K) bool. 0 = a tie, or nothing is usable; 1 = one prediction fits exactly, or only
     one is usable.
     """
     counted = np.where(usable, np.asarray(error, np.float64), np.inf)
@@ -48,7 +57,8 @@ def margin(error: NDArray, usable: NDArray) -> NDArray:
 
 
 def effective_number(probability: NDArray) -> NDArray:
-    """exp(entropy) of probabilities over the last axis: 1 = one prediction, K = all alike; 0 where all are 0."""
+    """Return exp(entropy) of probabilities over the last axis (Eq. F.49): 1 = one prediction, K = all alike; 0 where all
+    are 0."""
     p = np.asarray(probability, np.float64)
     entropy = -(p * np.log(np.where(p > 0, p, 1.0))).sum(-1)
     return np.where(p.sum(-1) > 0, np.exp(entropy), 0.0)

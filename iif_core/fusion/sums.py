@@ -1,4 +1,4 @@
-"""What the direct solver keeps between its passes: sums by segment and prediction, sums by cell, and what a sweep changes."""
+"""Sums by segment and by cell that the direct solver keeps between its passes, and the state that a sweep changes."""
 
 from __future__ import annotations
 
@@ -10,19 +10,18 @@ from numpy.typing import NDArray
 from iif_core.errors import InputError
 from iif_core.fusion import kernels
 from iif_core.fusion.blocks import Block
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import PROPERTIES
+from iif_core.fusion.options import FusionOptions
+from iif_core.reflectance.material import IDENTITY, PROPERTIES
 
 PROPERTY_OF_ENTRY = np.repeat([0, 1, 2], [12, 2, 2])  # of the CROSS layout
 _GRAM_4 = np.array([[0, 1, 2, 6], [1, 3, 4, 7], [2, 4, 5, 8], [6, 7, 8, 13]])  # where a 4x4 entry is in the GRAM layout
 _GRAM_R = np.array([[9, 10], [10, 13]])
 _GRAM_M = np.array([[11, 12], [12, 13]])
-IDENTITY = kernels.IDENTITY.astype(np.float64)
 NO_MASK = np.zeros((0, 0), bool)
 
 
-class State:
-    """What a sweep changes, by segment and prediction: corrections (S, K, CROSS), alpha and error (S, K, 3)."""
+class SegmentState:
+    """What a sweep changes: affine maps (S, K, CROSS), selection weights alpha and errors (S, K, 3), all float64."""
 
     def __init__(self, n_segments: int, k: int):
         self.affine = np.tile(IDENTITY, (n_segments, k, 1))
@@ -30,24 +29,27 @@ class State:
         self.error = np.zeros((n_segments, k, 3))
 
 
-class Sums:
-    """What does not change: Gram matrices of every (segment, prediction) and the regularised inverses."""
+class SegmentSums:
+    """What no sweep changes: Gram matrices of every segment and prediction and the regularised inverses (Eq. F.25).
 
-    def __init__(self, n_segments: int, k: int, fit_of_cell: NDArray):
-        self.fit_of_cell = fit_of_cell
+    `covisibility` (n_cells,): factor on the weight of a cell's pixels in the fit of the maps.
+    """
+
+    def __init__(self, n_segments: int, k: int, covisibility: NDArray):
+        self.covisibility = covisibility
         self.weight = np.zeros(n_segments)
         self.gram = np.zeros((n_segments, k, kernels.GRAM))
         self.usable = np.zeros((n_segments, k), bool)
-        self.masked = np.zeros((n_segments, k), bool)  # fitted without its clipped pixels
+        self.masked = np.zeros((n_segments, k), bool)  # whose albedo map is fitted without clipped pixels
         self.ridge = np.zeros(n_segments)
         self.inverse = (np.zeros((n_segments, k, 4, 4)), np.zeros((n_segments, k, 2, 2)), np.zeros((n_segments, k, 2, 2)))
 
     def fit_weight(self, block: Block) -> NDArray:
-        """(n,) float32 weight of the pixels of a view in the fit of the corrections."""
-        return block.weight * self.fit_of_cell[block.cell]
+        """Return the weight (n,) float32 of the pixels of a view in the fit of the maps (Eq. F.24)."""
+        return block.weight * self.covisibility[block.cell]
 
-    def add(self, block: Block, options: BaseOptions) -> None:
-        """Sums of the segments of one view."""
+    def add(self, block: Block, options: FusionOptions) -> None:
+        """Add the segments of one view; raises InputError for a segment that another view has already added."""
         rows = block.segments
         if not len(rows):
             return
@@ -64,13 +66,16 @@ class Sums:
             enough = (remain >= options.clip_pixels) & (remain >= (1 - options.clip_share) * count[:, None])
             self.masked[rows] = block.usable & enough & (remain < count[:, None])
             fit = np.where(self.masked[rows][..., None], kernels.gram(block.values, weight, block.start, block.inside), gram)
-        few = np.maximum(1, options.ridge_pixels / np.diff(block.start))  # small segments are held more
+        few = np.maximum(1, options.ridge_pixels / np.diff(block.start))  # Eq. F.26
         self.ridge[rows] = options.ridge * self.weight[rows] * few
         for out, where, source in zip(self.inverse, (_GRAM_4, _GRAM_R, _GRAM_M), (fit, gram, gram), strict=True):
             out[rows] = np.linalg.inv(source[..., where] + self.ridge[rows, None, None, None] * np.eye(len(where)))
 
     def corrections(self, rows: NDArray, cross: NDArray, cross_albedo: NDArray) -> NDArray:
-        """(s, K, CROSS) ridge regression of the predictions on the texture: (G + lambda I)^-1 (phi'W t + lambda T_id)."""
+        """Fit the maps (s, K, CROSS) of the segments `rows` by ridge regression (Eq. F.25) from products with the texture.
+
+        `cross` (s, K, CROSS) over all pixels; `cross_albedo`: the same over the pixels that the albedo map is fitted to.
+        """
         ridge = self.ridge[rows, None, None]
         out = np.empty(cross.shape)
         right = cross_albedo[..., :12] + ridge * IDENTITY[:12]
@@ -81,7 +86,14 @@ class Sums:
         return out
 
     def errors(self, rows: NDArray, affine: NDArray, cross: NDArray, square: NDArray) -> NDArray:
-        """(s, K, 3) mean squared error per property of phi T - t from sums: (T G T' - 2 T c + t't) / weight."""
+        """Return the mean squared errors of corrected predictions against the texture, from sums (Eq. F.27).
+
+        Args:
+            rows: (s,) segments; affine: (s, K, CROSS) maps; cross: (s, K, CROSS) and square: (s, 5) of the kernels.
+
+        Returns:
+            (s, K, 3) float64.
+        """
         gram, weight = self.gram[rows], self.weight[rows, None]
         out = np.zeros((*affine.shape[:2], 3))
         for p, part, where in ((0, slice(0, 12), _GRAM_4), (1, slice(12, 14), _GRAM_R), (2, slice(14, 16), _GRAM_M)):
@@ -95,24 +107,24 @@ class Sums:
 
 
 class CellSums:
-    """Weighted sums per cell, per channel; added in pixel order, so the result is the same every time."""
+    """Weighted sums per cell and channel, added in pixel order, so that the bytes do not depend on threads."""
 
     def __init__(self, n_cells: int):
         self.sum = np.zeros((n_cells, 5))
         self.total = np.zeros((n_cells, 5))
 
     def add(self, cell: NDArray, value: NDArray, weight: NDArray) -> None:
-        """`value` (5, n); `weight` (n,), or (5, n) by channel."""
+        """Add pixels: `cell` (n,), `value` (5, n), `weight` (n,), or (5, n) by channel."""
         kernels.add_to_cells(self.total, self.sum, cell, value, np.atleast_2d(weight))
 
     def mean(self, fallback: NDArray) -> NDArray:
-        """(n_cells, 5) float32; cells without weight keep the fallback."""
+        """Return the weighted mean (n_cells, 5) float32; cells without weight take the fallback."""
         return kernels.cell_means(self.total, self.sum, np.broadcast_to(fallback, self.sum.shape))
 
 
 @dataclass
-class Counts:
-    """Per cell: pixels, views, different viewpoints, weight of the pixels."""
+class CellCounts:
+    """Per cell: pixels, views, different viewpoints (int32), summed weight of the pixels (float64)."""
 
     observations: NDArray
     views: NDArray
@@ -120,10 +132,11 @@ class Counts:
     weight: NDArray
 
 
-def summary(sums: Sums, state: State) -> dict[str, float]:
-    """Error of each property after selection, entropy of the selection in nats, and mean gain; weighted by pixels.
+def sweep_summary(sums: SegmentSums, state: SegmentState) -> dict[str, float]:
+    """Return the error of each property after selection, the entropy of the selection in nats and the mean gain.
 
-    The gain (trace of A / 3 of the selected albedo corrections) is to be watched: METHOD H14.
+    All are weighted by pixels. The gain, tr(A) / 3 of the selected albedo maps, shows whether the contrast of the texture
+    collapses (docs/method/numerics.md#collapse-of-contrast).
     """
     total = max(sums.weight.sum(), 1e-30)
     mixed = (sums.weight[:, None] * (state.alpha * state.error).sum(1)).sum(0) / total

@@ -1,20 +1,19 @@
-"""How far the base is from the truth, per cell and property, calibrated (and how that was done).
+"""Calibrated uncertainty of the base texture per cell and property (docs/method/fusion.md#uncertainty).
 
-The Laplace scale b of a cell says how much the corrected predictions of a pixel and the views of a cell disagree. It is
-the scale of one observation, not the error of the cell's location, which the views average. The error of the location
-has the standard deviation
+The Laplace scale b of a cell measures the disagreement of the corrected predictions and of the views. It is the scale of
+one observation, not the error of the cell's location, over which the views are averaged. The error of the location has the
+standard deviation
 
-    s = c b^g V^-h K^-q P^-p          V viewpoints, K predictions, P pixels of the cell a viewpoint
+    s = c b^g V^-h K^-q P^-p          V viewpoints, K predictions, P pixels of the cell per viewpoint     (Eq. F.45)
 
-and an exponential power distribution of shape beta (1 = Laplace, 2 = normal), which nears the normal as K grows. The
-numbers are fitted to cells of one scene with truth over K = 1 ... 16 and three sizes of cells (`fit_calibration`).
+and an exponential power distribution of shape beta (1 = Laplace, 2 = normal) that tends to the normal as K grows.
 
-The error is that of the location *after its object's affine gauge*: e = mu - (A t + b), with the affine per object that
-takes the truth t nearest to mu. The base leaves that affine open and the photographs decide it (METHOD 7c, G1); no
-disagreement between predictions can tell a bias that all of them share.
+The error is that of the location *after the affine gauge of its object* (Eq. F.44). The photographs decide that gauge
+later; no disagreement between predictions can reveal an error that all of them share.
 
-Valid for `direct`, `variant: full`, least squares, and for predictions whose errors are like those of the simulated prior
-at strength 1; other variants and solvers get the same formula, which then is a ranking, not an interval.
+The law is valid for `direct`, `variant: full`, least squares, and for predictions whose errors resemble those of the
+simulated prior at strength 1. Other variants and solvers use the same formula, which then ranks cells but does not give
+calibrated intervals.
 """
 
 from __future__ import annotations
@@ -26,13 +25,13 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 
-LEVELS = (0.50, 0.80, 0.95)
-"""Nominal coverages that studies report."""
+NOMINAL_COVERAGES = (0.50, 0.80, 0.95)
+"""Probabilities of the central intervals whose observed coverage studies report."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """s = c b^g V^-h K^-q P^-p; shape beta = beta_1 + beta_2 log2 K."""
+    """Constants of one property: s = c b^g V^-h K^-q P^-p, shape beta = beta_1 + beta_2 log2 K."""
 
     c: float
     g: float
@@ -43,14 +42,19 @@ class Calibration:
     beta_2: float
 
     def deviation(self, b: NDArray, viewpoints: NDArray, pixels: NDArray, predictions: NDArray | int) -> NDArray:
-        """Standard deviation of the location's error.
+        """Return the standard deviation of the error of the location (Eq. F.45).
 
-        `b` > 0; `viewpoints` (0 counts as 1); `pixels` of the cell over all viewpoints; `predictions` a photograph.
+        Args:
+            b: Laplace scale, > 0; viewpoints: number of viewpoints, 0 counts as 1.
+            pixels: pixels of the cell over all viewpoints; predictions: number of predictions per photograph.
+
+        Returns:
+            Array of the broadcast shape, in the unit of b.
         """
         return self.c * np.exp(_features(b, viewpoints, pixels, predictions) @ [self.g, self.h, self.q, self.p])
 
     def beta(self, predictions: NDArray | int) -> NDArray:
-        """Shape of the distribution."""
+        """Return the shape of the distribution."""
         return self.beta_1 + self.beta_2 * np.log2(predictions)
 
 
@@ -65,16 +69,22 @@ CALIBRATION = {
     "roughness": Calibration(0.4715, 0.496, 0.602, 0.592, -0.131, 0.8, 0.15),
     "metallic": Calibration(0.4884, 0.502, 0.602, 0.596, -0.133, 0.8, 0.15),
 }
-"""Fitted to the built-in kitchen (24 views of 256 x 256; K = 1, 2, 4, 8, 16 at 0.4 footprints, K = 16 at 0.8 and 1.6, K = 4
-at 1.6; prior seed 0). On Country Kitchen, which had no part in it, observed coverages at 50 / 80 / 95 % are within 5 points
-for K = 16 at the default cells and within 9 points for all of these."""
+"""Fitted by `fit_calibration` to one scene with ground truth; data and check on another scene: docs/results/fusion.md."""
 
-SMALLEST = 100
-"""Cells of an object below which its affine follows the errors; such objects are not judged."""
+MIN_OBJECT_CELLS = 100
+"""Fewest cells of an object that is judged; with fewer, the affine gauge follows the errors themselves."""
 
 
 def location_uncertainty(scale: NDArray, viewpoints: NDArray, pixels: NDArray, predictions: int) -> NDArray:
-    """(n, 5) float32 standard deviation of each location's error: see `Calibration.deviation`; `scale` (n, 5)."""
+    """Return the standard deviation of the error of every location.
+
+    Args:
+        scale: (n, 5) Laplace scales; viewpoints: (n,); pixels: (n,) over all viewpoints.
+        predictions: number of predictions per photograph.
+
+    Returns:
+        (n, 5) float32.
+    """
     out = np.empty(scale.shape, np.float32)
     for name, channels in (("albedo", slice(0, 3)), ("roughness", slice(3, 4)), ("metallic", slice(4, 5))):
         law = CALIBRATION[name]
@@ -83,10 +93,14 @@ def location_uncertainty(scale: NDArray, viewpoints: NDArray, pixels: NDArray, p
 
 
 def interval(level: float | NDArray, beta: float = 1.0) -> NDArray:
-    """Half width of the central interval that holds the share `level`, in standard deviations.
+    """Return the half width, in standard deviations, of the central interval of probability `level` (Eq. F.47).
 
-    Exponential power distribution: P(|e| < x) = P(1 / beta, (x / a)^beta) with the regularised incomplete gamma function
-    and a^2 = Gamma(1 / beta) / Gamma(3 / beta) s^2. Examples: 95 % -> 1.96 for beta = 2, 2.12 for beta = 1.
+    Raises:
+        InputError: a level that is not between 0 and 1.
+
+    Example:
+        >>> round(float(interval(0.95, 2.0)), 2), round(float(interval(0.95, 1.0)), 2)
+        (1.96, 2.12)
     """
     from scipy.special import gamma, gammaincinv
 
@@ -96,11 +110,14 @@ def interval(level: float | NDArray, beta: float = 1.0) -> NDArray:
 
 
 def gauge_free_error(value: NDArray, truth: NDArray, object_id: NDArray, ridge: float = 1e-6) -> NDArray:
-    """(n, c) value - (A truth + b), the affine of each object that brings the truth nearest to the value.
+    """Return the error of values after the affine gauge of each object, value - (B truth + s) (Eq. F.44).
 
     Args:
-        value, truth: (n, c) cells, c channels of one property; object_id: (n,) >= 0.
-        ridge: variance added to the truth's, so that an object of one colour has A = 0, not 0 / 0.
+        value, truth: (n, c) cells, c channels of one property; object_id: (n,) int >= 0.
+        ridge: variance added to that of the truth, so that an object of one colour has B = 0 and not 0 / 0.
+
+    Returns:
+        (n, c) float64.
     """
     value, truth = np.asarray(value, np.float64), np.asarray(truth, np.float64)
     out = np.empty_like(value)
@@ -113,8 +130,18 @@ def gauge_free_error(value: NDArray, truth: NDArray, object_id: NDArray, ridge: 
     return out
 
 
-def coverage(error: NDArray, deviation: NDArray, beta: float = 1.0, levels: tuple[float, ...] = LEVELS) -> list[float]:
-    """Share of the errors inside each central interval; an empty input is an error."""
+def coverage(error: NDArray, deviation: NDArray, beta: float = 1.0, levels: tuple[float, ...] = NOMINAL_COVERAGES) -> list[float]:
+    """Return the share of the errors inside each central interval.
+
+    Args:
+        error, deviation: arrays that broadcast; beta: shape of the distribution; levels: nominal probabilities.
+
+    Returns:
+        One share per level.
+
+    Raises:
+        InputError: no errors.
+    """
     if error.size == 0:
         raise InputError("coverage of no errors; give at least one")
     ratio = np.abs(error) / deviation
@@ -122,11 +149,10 @@ def coverage(error: NDArray, deviation: NDArray, beta: float = 1.0, levels: tupl
 
 
 def fit_calibration(samples: list[tuple[NDArray, NDArray, NDArray, NDArray, int]]) -> Calibration:
-    """The law for one property from several runs, each (error, b, viewpoints, pixels, predictions), arrays (n,).
+    """Fit the law of one property to several runs, each (error, b, viewpoints, pixels, predictions) with arrays (n,).
 
-    The exponents have the largest likelihood for beta = 1, the minimum of mean(log s + |e| / s); for given exponents the best
-    c is a mean, so four numbers are searched (Nelder-Mead). c and beta are then those for which the coverage at `LEVELS` of
-    the worst run is off by as little as possible.
+    The exponents maximise the likelihood for beta = 1 (Eq. F.48) by Nelder-Mead. Then c and beta minimise the largest
+    deviation of the observed coverage from `NOMINAL_COVERAGES` over all runs.
     """
     from scipy.optimize import minimize
 
@@ -147,8 +173,8 @@ def fit_calibration(samples: list[tuple[NDArray, NDArray, NDArray, NDArray, int]
         for beta_2 in np.linspace(0, 0.35, 8) if np.ptp(k) > 0 else [0.0]:
             worst = np.zeros(len(around))
             for ratio, log_k in zip(ratios, k, strict=True):
-                widths = around[:, None] * interval(np.float64(LEVELS), beta_1 + beta_2 * log_k)
-                off = np.abs(np.searchsorted(ratio, widths, "right") / len(ratio) - LEVELS).max(1)
+                widths = around[:, None] * interval(np.float64(NOMINAL_COVERAGES), beta_1 + beta_2 * log_k)
+                off = np.abs(np.searchsorted(ratio, widths, "right") / len(ratio) - NOMINAL_COVERAGES).max(1)
                 worst = np.maximum(worst, off)
             i = int(worst.argmin())
             best = min(best, (float(worst[i]), float(around[i]), float(beta_1), float(beta_2)))

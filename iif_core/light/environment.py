@@ -1,8 +1,7 @@
-"""A latitude-longitude map of the light around a scene: directions, texels, solid angles, densities (METHOD 2.6).
+"""A latitude-longitude map of the light around a scene: directions, texels and solid angles (Eq. L.6, L.7).
 
-Row 0 is up (+z): theta = acos(d_z), phi = atan2(d_y, d_x) mod 2 pi, row = floor(theta / pi H), column =
-floor(phi / 2 pi W); radiance is constant in a texel. A direction drawn in texel e with probability p(e), uniform
-in z and in phi, has the density p(e) / Omega_e per steradian, Omega_e the texel's solid angle.
+Row 0 is up (+z); radiance is constant in a texel. A direction drawn in texel e with probability p(e), uniform in z and in
+azimuth, has the density p(e) / Omega_e per steradian, Omega_e the solid angle of the texel.
 """
 
 from __future__ import annotations
@@ -19,7 +18,11 @@ Array = np.ndarray
 
 
 def solid_angles(height: int, width: int) -> Array:
-    """(H, W) float64 in steradians, 2 pi / W (cos theta_row - cos theta_row+1); they sum to 4 pi."""
+    """Return the solid angles (H, W) float64 of all texels in steradians (Eq. L.7); they sum to 4 pi.
+
+    >>> bool(abs(solid_angles(4, 8).sum() - 4 * np.pi) < 1e-12)
+    True
+    """
     # 2 sin sin instead of the difference of two cosines: no cancellation at the poles.
     row = np.arange(height)
     band = 2 * np.sin(np.pi * (row + 0.5) / height) * np.sin(0.5 * np.pi / height)
@@ -27,7 +30,16 @@ def solid_angles(height: int, width: int) -> Array:
 
 
 def texel_of(xp: Namespace, direction: tuple[Any, Any, Any], height: int, width: int) -> tuple[Any, Any]:
-    """(row, column), whole numbers in the float type of the unit direction; poles and the seam belong to a texel too."""
+    """Find the texel of a direction (Eq. L.6; docs/method/numerics.md#poles-of-the-environment-map).
+
+    Args:
+        xp: array namespace.
+        direction: unit vector, three arrays.
+        height, width: of the map.
+
+    Returns:
+        Row and column, whole numbers in the float type of the direction.
+    """
     x, y, z = direction
     theta = xp.acos(xp.minimum(xp.maximum(z, -1.0), 1.0))
     phi = xp.atan2(y, x)
@@ -37,7 +49,17 @@ def texel_of(xp: Namespace, direction: tuple[Any, Any, Any], height: int, width:
 
 
 def direction_in(xp: Namespace, row: Any, column: Any, u1: Any, u2: Any, height: int, width: int) -> tuple[Any, Any, Any]:
-    """Unit direction in a texel, uniform per steradian for uniform u1, u2 in [0, 1]; (1/2, 1/2) is its middle."""
+    """Draw a direction in a texel, uniform per steradian.
+
+    Args:
+        xp: array namespace.
+        row, column: of the texel, as floats.
+        u1, u2: uniform in [0, 1]; (1/2, 1/2) is the middle.
+        height, width: of the map.
+
+    Returns:
+        Unit vector, three arrays.
+    """
     upper, lower = xp.cos(row * (xp.pi / height)), xp.cos((row + 1) * (xp.pi / height))
     z = upper + u1 * (lower - upper)
     phi = (column + u2) * (2 * xp.pi / width)
@@ -46,13 +68,13 @@ def direction_in(xp: Namespace, row: Any, column: Any, u1: Any, u2: Any, height:
 
 
 def texel_weights(radiance: ArrayLike) -> Array:
-    """(H, W) float64 mean radiance x solid angle of (H, W, 3): how often a texel is to be drawn."""
+    """Return (H, W) float64, how often each texel of (H, W, 3) is to be drawn: mean radiance x solid angle."""
     radiance = as_map(radiance)
     return radiance.mean(-1, dtype=np.float64) * solid_angles(*radiance.shape[:2])
 
 
 def as_map(radiance: ArrayLike) -> Array:
-    """(H, W, 3) float32 of a map or of one radiance (3,), which is the map (1, 1, 3). Raises InputError."""
+    """Check a map (H, W, 3), or one radiance (3,) as the map (1, 1, 3), and return it as float32. Raises InputError."""
     radiance = np.asarray(radiance, np.float32)
     if radiance.shape == (3,):
         radiance = radiance[None, None]
@@ -66,7 +88,7 @@ def as_map(radiance: ArrayLike) -> Array:
 
 
 def look_up(radiance: ArrayLike, direction: ArrayLike) -> Array:
-    """(n, 3) float32 radiance of a map along unit directions (n, 3)."""
+    """Return the radiance (n, 3) float32 of a map along unit directions (n, 3)."""
     radiance = as_map(radiance)
     height, width = radiance.shape[:2]
     row, column = texel_of(NUMPY, tuple(np.asarray(direction, np.float64).T), height, width)
@@ -74,10 +96,17 @@ def look_up(radiance: ArrayLike, direction: ArrayLike) -> Array:
 
 
 def resample(radiance: ArrayLike, map_from_world: ArrayLike, height: int, width: int, points: int = 4) -> Array:
-    """(H, W, 3) float32 mean over every texel of a map that is turned against the world.
+    """Average a map that is turned against the world over the texels of a new map.
 
-    map_from_world (3, 3): the map's axes (z up, x at the seam) as rows, in world axes. points^2 directions a texel, evenly
-    in z and phi; take enough of them that no bright texel of a finer map is missed.
+    Args:
+        radiance: (h, w, 3) or (3,), linear.
+        map_from_world: (3, 3), the map's axes (z up, x at the seam) as rows, in world axes.
+        height, width: of the new map.
+        points: points^2 directions per texel, evenly in z and azimuth; enough of them that no bright texel of a finer map is
+            missed.
+
+    Returns:
+        (height, width, 3) float32.
     """
     row, column, i, j = np.indices((height, width, points, points), np.float64)
     middle = (i + 0.5) / points, (j + 0.5) / points

@@ -1,15 +1,11 @@
-"""How much light arrives at surface, from what the photographs show of everything that the surface sees.
+"""Irradiance of surface, estimated from what the photographs show of everything that the surface sees
+(docs/method/light.md#irradiance-from-photographs).
 
-The radiance that reaches a point x with normal n from direction w is what the photographs show of the surface in that
-direction. So the light on a surface cell is measured rather than guessed,
-
-    m(x, n) = E_cos[ L(hit(x, w)) ] + sum_j F_j(x, n) e^theta_j,            w cosine-distributed about n,
-
-with F_j the cosine-weighted share of the hemisphere that unknown source j covers: lamps (surface whose photographs are
-saturated), sky (directions that leave the mesh) and surface that no photograph shows. Every group of cells (an object, a
-piece of the mesh) is taken to have one albedo up to texture, log L = log a_group + log m + texture, and theta and a are
-found by iteratively reweighted Gauss-Newton steps (Cauchy weights: texture is sparse, light is not). What is left of log L
-inside a group and changes slowly with position and normal is counted as light too (`residual_light`).
+The light on a surface cell is the photographed radiance of what its rays meet plus that of unknown sources: lamps (surface whose
+photographs are saturated), sky (directions that leave the mesh) and surface that no photograph shows (Eq. L.49). Every group of
+cells (an object, a piece of the mesh) is taken to have one albedo up to texture; sources and albedos are found by iteratively
+reweighted Gauss-Newton steps with Cauchy weights (Eq. L.51), since texture is sparse and light is not. What is left of the log
+radiance inside a group and changes slowly is counted as light too (`residual_light`).
 
 Radiance is taken as diffuse, and exposures and response as known; errors of either stay in the albedo.
 """
@@ -23,36 +19,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from iif_core.numerics.graph import component_labels
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 
 Trace = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
-"""Origins (n, 3) and directions (n, 3) -> face (n,), -1 = none, and distance (n,) in lengths of the direction."""
+"""(origins (n, 3), directions (n, 3)) -> face (n,), -1 = none, and distance (n,) in lengths of the direction."""
 
 MAX_CELLS = 30_000
 """More cells than this are merged, eight into one, so that memory does not grow with the scene."""
 DARKEST = 4e-3
-"""Linear sensor values below this are noise (8 bits: 4e-3^(1 / 2.2) is 0.08)."""
+"""Linear sensor values below this are noise (docs/method/numerics.md#logarithm-of-zero)."""
 RAYS, SHADOW_RAYS = 64, 12
-"""Directions a cell, and points a lamp."""
-MAX_LAMPS, SKY_PATCHES = 16, 16
+"""Directions per cell, and points per lamp."""
+MAX_LAMPS, SKY_PATCHES = 16, 16  # unknown sources
 WIDTH = 0.25
-"""Cauchy width of log radiance inside a group: texture beyond it hardly counts."""
-SWEEPS = 15
+"""Cauchy width of log radiance inside a group; texture beyond it hardly counts."""
+SWEEPS = 15  # Gauss-Newton steps
 SPREAD = {"lamp": 1.5, "sky": 1.0, "unseen": 0.3, "albedo": 0.9}
-"""Standard deviation, in log, of the weak priors; a lamp that is not saturated is known to 0.2."""
+"""Standard deviations of the priors of log radiance and log albedo; that of a lamp that is not saturated is 0.2."""
 BRIGHT_TIMES = 10.0
-"""Surface so many times brighter than the mean is a lamp, saturated or not: too small for rays that go everywhere."""
+"""Surface so many times brighter than the mean is a lamp, saturated or not: too small for rays in all directions."""
 LAMP_ABOVE = 2.0
-"""A saturated lamp is taken to be this many times brighter than what its saturated photographs show, to begin with."""
+"""First guess of the radiance of a saturated lamp, relative to what its photographs show."""
 CHROMA_SHARE = 0.5
-"""How much of the slow change of chromaticity inside a group counts as light; of luminance, all."""
+"""Share of the slow change of chromaticity inside a group that counts as light; of luminance, all counts."""
 _GROUPS = 10_000  # a key has 16 bits for group and side
 _OUTSIDE = 65535
 
 
 @dataclass(frozen=True)
 class SurfaceCells:
-    """Cells of surface: a voxel, a group, and one of six sides.
+    """Surface cells, n of them: a voxel, a group, and one of six sides.
 
     Attributes:
         edge: metres; origin: (3,).
@@ -78,9 +75,14 @@ class SurfaceCells:
 
 
 class SurfaceCellsBuilder:
-    """Sums over the pixels of views, view by view; cells grow where there would be more than MAX_CELLS.
+    """Sums over the pixels of views, view by view; cells grow when there would be more than MAX_CELLS.
 
-    Args: corners (n, 3) that span the scene; edge of a cell in metres.
+    Args:
+        corners: (n, 3) points that span the scene, metres.
+        edge: of a cell, metres.
+
+    Raises:
+        InputError: edge not positive.
     """
 
     def __init__(self, corners: NDArray, edge: float):
@@ -90,9 +92,17 @@ class SurfaceCellsBuilder:
         self.keys, self.group = np.zeros(0, np.uint64), np.zeros(0, np.int64)
         self.sums = np.zeros((0, 14))  # pixels, saturated, unsaturated, point, normal, log L of unsaturated (3 each), ...
 
-    def add(self, points: NDArray, normals: NDArray, group: NDArray, radiance: NDArray, saturated: NDArray, exposure: float):
-        """Pixels of one view: (n, 3), unit normals towards the camera (n, 3), group (n,) >= -1, linear radiance (n, 3) with
-        the exposure divided out, (n,) bool; exposure: of the view."""
+    def add(
+        self, points: NDArray, normals: NDArray, group: NDArray, radiance: NDArray, saturated: NDArray, exposure: float
+    ) -> None:
+        """Add the pixels of one view.
+
+        Args:
+            points, normals: (n, 3) metres, and unit vectors towards the camera.
+            group: (n,) >= -1, object or piece of the mesh.
+            radiance: (n, 3) linear, the exposure divided out.
+            saturated, exposure: (n,) bool, and of the view.
+        """
         group = np.asarray(group, np.int64)
         side = _sides(normals)
         keys = pack_keys(voxel_indices(points, self.edge, self.origin), ((group + 1) % _GROUPS) * 6 + side)
@@ -112,7 +122,7 @@ class SurfaceCellsBuilder:
         self.sums = _sums(row.ravel(), len(self.keys), sums)
 
     def finish(self) -> SurfaceCells:
-        """Means over the pixels."""
+        """Return the cells with means over their pixels."""
         count, shone, clear = self.sums[:, 0], self.sums[:, 1], self.sums[:, 0] - self.sums[:, 1]
         ijk, _ = unpack_keys(self.keys)
         voxel_key, voxel = np.unique(pack_keys(ijk, np.full(len(ijk), -1)), return_inverse=True)
@@ -147,7 +157,18 @@ class Gathered:
 
 
 def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = None) -> Gathered:
-    """Cosine-distributed rays (stratified, turned at random in each cell) and, for lamps, rays to points on them."""
+    """Estimate what each cell sees by cosine-distributed rays (stratified, turned at random in each cell) and, for lamps, rays to
+    points on them.
+
+    Args:
+        cells: the cells.
+        trace: intersects rays with the mesh.
+        seed: of the random numbers.
+        rays: per cell; None = RAYS.
+
+    Returns:
+        Known light and shares of the unknown sources: lamps, sky patches, unseen surface.
+    """
     rng, rays = np.random.default_rng(seed), rays or RAYS
     lamp_of_cell, guess, spread = _lamps(cells)
     lamps = len(guess)
@@ -185,11 +206,9 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
 
 
 def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
-    """(n,) lamp of each cell or -1; first guess of log radiance (lamps, 3); its spread (lamps,).
+    """(n,) lamp of each cell or -1; first guess of log radiance (lamps, 3); its standard deviation (lamps,).
 
     Lamps are cells mostly saturated, or BRIGHT_TIMES brighter than the mean, joined where they are within two edges."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     bright = cells.voxel_radiance.max(1)
@@ -199,10 +218,9 @@ def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
     if not len(own):
         return lamp, np.zeros((0, 3)), np.zeros(0)
     pairs = cKDTree(cells.points[own]).query_pairs(2 * cells.edge, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(own), len(own)))
-    _, label = connected_components(graph, directed=False)
+    label = component_labels(len(own), *pairs.T)
     rank = np.argsort(np.argsort(-np.bincount(label), kind="stable"), kind="stable")
-    lamp[own] = np.minimum(rank[label], MAX_LAMPS - 1)  # the small ones are one
+    lamp[own] = np.minimum(rank[label], MAX_LAMPS - 1)  # all small lamps are one
     count = int(lamp.max()) + 1
     size = np.maximum(np.bincount(lamp[own], minlength=count), 1)
     radiance = _sums(lamp[own], count, cells.voxel_radiance[cells.voxel[own]]) / size[:, None]
@@ -212,9 +230,7 @@ def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trace, rng: np.random.Generator) -> NDArray:
-    """(n,) cosine-weighted share of the hemisphere of every cell that the cells `lamp` cover, by points on them.
-
-    mean over points of cos cos' V / (pi r^2) x area, area = cells x edge^2, r at least half an edge; at most 1."""
+    """(n,) cosine-weighted share of the hemisphere of every cell that the cells `lamp` cover, by points on them (Eq. L.50)."""
     total, n = np.zeros(len(cells)), len(cells)
     for _ in range(SHADOW_RAYS):
         own = lamp[rng.integers(0, len(lamp), n)]
@@ -233,17 +249,18 @@ def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trac
 
 
 def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tuple[NDArray, NDArray]:
-    """Log light on every cell and log albedo of its group, (n, 3) each: diffuse radiance is e^(their sum), up to texture.
+    """Fit log light on every cell and log albedo of its group, (n, 3) each; diffuse radiance is e^(their sum), up to texture
+    (Eq. L.51).
 
-    A group of m cells has the weight of sqrt(m); its albedo leans, weakly, on `mean_albedo`, which fixes the scale where
-    nothing that was photographed lights anything.
+    A group of m cells has the weight of sqrt(m). The albedo has a weak prior at `mean_albedo`, which fixes the scale where no
+    photographed surface lights anything.
     """
     _, group = np.unique(cells.group, return_inverse=True)
     group = group.ravel()
     groups = int(group.max(initial=-1)) + 1
     use = cells.pixels >= 2
     weight0 = use / np.sqrt(np.maximum(np.bincount(group[use], minlength=groups)[group], 1))
-    hold = WIDTH**2 / SPREAD["albedo"] ** 2  # precision of the albedo's prior, in units of a cell's
+    prior_weight = WIDTH**2 / SPREAD["albedo"] ** 2  # precision of the albedo's prior, in units of a cell's
     light, albedo = np.zeros((len(cells), 3)), np.zeros((len(cells), 3))
     floor = 1e-3 * float(np.exp(gathered.start).mean()) if gathered.start.size else 1e-6
     active = gathered.share.max(0, initial=0) > 2e-3
@@ -256,15 +273,15 @@ def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tu
             source = np.exp(theta)
             mean = gathered.known[:, c] + share @ source + floor
             difference = cells.log_radiance[:, c] - np.log(mean)
-            total = np.bincount(group, weight, groups) + hold
-            level = (np.bincount(group, weight * difference, groups) + hold * np.log(mean_albedo)) / total
+            total = np.bincount(group, weight, groups) + prior_weight
+            level = (np.bincount(group, weight * difference, groups) + prior_weight * np.log(mean_albedo)) / total
             residual = difference - level[group]
             weight = weight0 / (1 + (residual / WIDTH) ** 2)
             slope = share * source / mean[:, None]
             # The level of a group follows theta: subtract the group's mean of every column.
-            total = np.bincount(group, weight, groups) + hold
+            total = np.bincount(group, weight, groups) + prior_weight
             centred = slope - (_sums(group, groups, weight[:, None] * slope) / total[:, None])[group]
-            # einsum, not BLAS: the sums must not depend on the number of threads
+            # einsum, not BLAS: the sums must not depend on the number of threads.
             matrix = np.einsum("ni,nj->ij", centred * weight[:, None], slope) + np.diag(precision)
             right = np.einsum("ni,n->i", centred, weight * residual) - precision * (theta - first)
             theta = theta + np.clip(np.linalg.solve(matrix, right), -1, 1) if len(theta) else theta
@@ -274,10 +291,11 @@ def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tu
 
 
 def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDArray:
-    """(n, 3) what of the residual log radiance (n, 3) changes slowly inside a group: light that `fit_light` could not explain.
+    """Extract what of the residual log radiance (n, 3) changes slowly inside a group: light that `fit_light` could not explain
+    (Eq. L.52).
 
-    Robust means over boxes of edge reach / 2 (same group and side), then a Gaussian over boxes: reach metres in position,
-    1 in the normal. All of the luminance, CHROMA_SHARE of the chromaticity.
+    Robust means over boxes of edge reach / 2 (same group and side), then a Gaussian over boxes of width `reach` metres in
+    position and 1 in the normal. All of the luminance is used, and CHROMA_SHARE of the chromaticity.
     """
     from scipy.spatial import cKDTree
 
@@ -308,7 +326,7 @@ def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDAr
 
 
 class LightField:
-    """Log light between the cells: mean over the 8 nearest in position (in edges) and normal."""
+    """Interpolates log light between the cells: a mean over the 8 nearest in position (in edges) and normal."""
 
     def __init__(self, cells: SurfaceCells):
         from scipy.spatial import cKDTree
@@ -320,7 +338,7 @@ class LightField:
         return np.concatenate([np.asarray(points, np.float64) / self.edge, 3.0 * np.asarray(normals, np.float64)], 1)
 
     def weights(self, points: NDArray, normals: NDArray) -> tuple[NDArray, NDArray]:
-        """Rows of the cells and their weights, (m, k) each, for points and unit normals (m, 3)."""
+        """Return rows of the cells and their weights, (m, k) each, for points and unit normals (m, 3)."""
         count = min(8, self.tree.n)
         distance, near = self.tree.query(self._place(points, normals), k=count, eps=0.2)
         weight = 1 / (np.reshape(distance, (len(points), count)) + 0.3) ** 2
@@ -328,7 +346,7 @@ class LightField:
 
 
 def sphere_points(count: int) -> NDArray:
-    """(count, 3) unit vectors spread evenly (Fibonacci)."""
+    """Return (count, 3) unit vectors spread evenly over the sphere (Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     z, angle = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
@@ -352,7 +370,7 @@ def _sides(normals: NDArray) -> NDArray:
 
 
 def _tangents(n: NDArray) -> tuple[NDArray, NDArray]:
-    """Two unit vectors (n, 3) that make a right-handed frame with each unit normal (Duff et al. 2017)."""
+    """Two unit vectors (n, 3) that form a right-handed frame with each unit normal (Duff et al. 2017)."""
     sign = np.where(n[:, 2] >= 0, 1.0, -1.0)
     a = -1 / (sign + n[:, 2])
     b = n[:, 0] * n[:, 1] * a
@@ -368,8 +386,21 @@ def _sums(row: NDArray, count: int, values: NDArray) -> NDArray:
     return out
 
 
-def with_light(cells: SurfaceCells, trace: Trace, mean_albedo: float, reaches: tuple[float, ...], seed: int = 0) -> NDArray:
-    """(len(reaches), n, 3) log light on the cells: gathered, fitted, with the residual light of each reach (in edges)."""
+def estimate_log_light(
+    cells: SurfaceCells, trace: Trace, mean_albedo: float, reaches: tuple[float, ...], seed: int = 0
+) -> NDArray:
+    """Estimate the light on the cells: gathered, fitted, and completed by the residual light.
+
+    Args:
+        cells: n cells.
+        trace: intersects rays with the mesh.
+        mean_albedo: prior mean of the albedos of groups.
+        reaches: scales of the residual light, in edges of a cell.
+        seed: of the random numbers.
+
+    Returns:
+        (len(reaches), n, 3) log light, one version for each reach.
+    """
     if not len(cells):
         return np.zeros((len(reaches), 0, 3))
     light, albedo = fit_light(cells, gather(cells, trace, seed), mean_albedo)

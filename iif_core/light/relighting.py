@@ -1,4 +1,5 @@
-"""Pure parts of relighting: camera paths, the inserted lamp, the exposure of a picture (METHOD 2.10)."""
+"""Numerical parts of relighting: camera paths, the inserted lamp, the exposure of pictures
+(docs/method/light.md#relighting)."""
 
 from __future__ import annotations
 
@@ -11,20 +12,24 @@ Array = np.ndarray
 
 
 def ease(t: ArrayLike) -> Array:
-    """Quadratic ease-in and -out of t in [0, 1]: 2 t^2, then 1 - 2 (1 - t)^2; speed is 0 at both ends."""
+    """Ease times in [0, 1] in and out: 2 t^2, then 1 - 2 (1 - t)^2, with speed 0 at both ends (Eq. L.46).
+
+    >>> ease([0.0, 0.25, 0.5, 1.0]).tolist()
+    [0.0, 0.125, 0.5, 1.0]
+    """
     t = np.clip(np.asarray(t, np.float64), 0, 1)
     return np.where(t < 0.5, 2 * t * t, 1 - 2 * (1 - t) ** 2)
 
 
 def frame_times(frames: int) -> Array:
-    """(frames,) eased times in [0, 1]; one frame is the start."""
+    """Return (frames,) eased times in [0, 1]; a single frame is at 0."""
     return ease(np.arange(frames) / max(frames - 1, 1))
 
 
 def camera_path(poses: ArrayLike, times: ArrayLike) -> Array:
-    """(n, 4, 4) poses at `times` (n,) in [0, 1] along key poses (k, 4, 4), evenly spaced in time.
+    """Interpolate poses (n, 4, 4) at `times` (n,) in [0, 1] between key poses (k, 4, 4) that are evenly spaced in time.
 
-    Rotations are interpolated on the shortest arc (slerp), positions by a natural cubic spline; keys are met exactly.
+    Rotations follow the shortest arc (slerp), positions a natural cubic spline; key poses are met exactly.
     """
     from scipy.interpolate import CubicSpline
     from scipy.spatial.transform import Rotation, Slerp
@@ -43,9 +48,9 @@ def camera_path(poses: ArrayLike, times: ArrayLike) -> Array:
 
 
 def sphere_mesh(centre: ArrayLike, radius: float, subdivisions: int = 3) -> tuple[Array, Array]:
-    """Icosphere with outward normals, (v, 3) float32 metres and (f, 3) int32; 20 x 4^subdivisions faces.
+    """Build an icosphere with outward normals: (v, 3) float32 metres and (f, 3) int32, 20 x 4^subdivisions faces.
 
-    Scaled so that its area is the sphere's, 4 pi radius^2: with a given radiance it sends out the sphere's power.
+    It is scaled to the area of the sphere, so that a given radiance sends out the power of the sphere (Eq. L.47).
     """
     golden = (1 + 5**0.5) / 2
     vertices = np.array([[0, s, t * golden] for s in (1, -1) for t in (1, -1)], np.float64)
@@ -66,7 +71,7 @@ def sphere_mesh(centre: ArrayLike, radius: float, subdivisions: int = 3) -> tupl
 
 
 def _split(vertices: Array, faces: Array) -> tuple[Array, Array]:
-    """Every triangle into four at the middles of its edges."""
+    """Split every triangle into four at the middles of its edges."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
     unique, index = np.unique(edges, axis=0, return_inverse=True)
     ab, bc, ca = np.split(index.ravel() + len(vertices), 3)
@@ -76,14 +81,14 @@ def _split(vertices: Array, faces: Array) -> tuple[Array, Array]:
 
 
 def exposure_for(radiance: ArrayLike, quantile: float = 0.95, level: float = 0.8) -> float:
-    """Factor that brings the `quantile` of the largest channel to `level` of the sensor's range; 1 for black pictures."""
+    """Return the factor that brings the `quantile` of the largest channel to `level`, 1 for black pictures (Eq. L.48)."""
     brightest = float(np.quantile(np.asarray(radiance, np.float64).max(-1), quantile))
     return level / brightest if brightest > 0 else 1.0
 
 
 def axes_of_map(up: ArrayLike, turn: float) -> Array:
-    """(3, 3) rows x, y, z of a map's axes in the world: z is `up`; x the world axis +x (or +y when x is up), turned by
-    `turn` degrees about up."""
+    """Return the axes x, y, z of a map in the world as rows (3, 3): z is `up`; x is the world axis +x (+y when x is up), made
+    orthogonal to up and turned by `turn` degrees about it."""
     z = np.asarray(up, np.float64) / np.linalg.norm(up)
     start = np.array([0.0, 1.0, 0.0]) if abs(z[0]) > 0.9 else np.array([1.0, 0.0, 0.0])
     x = start - z * (start @ z)

@@ -1,1 +1,1 @@
-"""Numerical ground: array namespaces, Laplace distributions, separable filters, colour transfer functions."""
+"""Numerical tools: array namespaces, Adam, Laplace distributions, connected components, image filters, colour conversion."""

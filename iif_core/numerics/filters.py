@@ -1,4 +1,4 @@
-"""Separable filters of images, compiled, and holes filled."""
+"""Separable filters of images, and filling of invalid pixels."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ Array = np.ndarray
 
 
 def correlate(image: Array, vertical: Array, horizontal: Array, border: str = "edge") -> Array:
-    """out[y, x] = sum_ij vertical[i] horizontal[j] image[y + i - r, x + j - r], r = half the (odd) number of weights.
+    """Correlate an image with a separable filter.
+
+    out[y, x] = sum_ij vertical[i] horizontal[j] image[y + i - r, x + j - r]
 
     Args:
-        image: (H, W) float32 or float64; the sums are made in its type.
-        vertical, horizontal: (2 r + 1,) each, of one length.
-        border: what is beyond the image, as `numpy.pad` names it.
+        image: (H, W) float32 or float64; the sums are made in this dtype.
+        vertical, horizontal: (2 r + 1,) weights; both filters have the same, odd length.
+        border: mode of `numpy.pad` for pixels outside the image.
 
     Returns:
-        (H, W), of the image's type.
+        (H, W), dtype of the image.
     """
     r = len(vertical) // 2
     padded = np.pad(image, r, mode=border)
@@ -45,7 +47,7 @@ def _correlate(padded, vertical, horizontal):
 
 
 def fill_from_neighbours(maps: np.ndarray) -> tuple[np.ndarray, int]:
-    """(H, W, C) with every pixel that is not finite replaced by the nearest one that is, and how many there were."""
+    """Replace every pixel of (H, W, C) maps that is not finite by the nearest finite pixel; also return how many there were."""
     from scipy.ndimage import distance_transform_edt
 
     lost = ~np.isfinite(maps).all(-1)

@@ -1,12 +1,13 @@
-"""Laplace distributions: divergence, its weights, and the closed-form scales of the material base.
+"""Laplace distributions: divergence, weights and closed-form scales of the fusion (docs/method/fusion.md).
 
-Every texture value is a Laplace distribution (location mu, scale b); the predictions of one pixel make a
-reference distribution and the surface cell the texture distribution. Matching the two is a Kullback-Leibler
-divergence that depends on the distance d = |mu_ref - mu_pred| and the two scales alone (METHOD 2.3.4), so the
-scale of a cell has a closed form (METHOD 7c, b-step) and the location an M-estimator with the weight `kl_weight`.
+Every texture value is a Laplace distribution (location mu, scale b). The predictions of one pixel make a reference
+distribution, and the surface cell has the texture distribution. Their Kullback-Leibler divergence (Eq. F.7) depends on the
+distance d = |mu_ref - mu_pred| and the two scales only. Therefore the scale of a cell has a closed form (Eq. F.31), and its
+location is an M-estimate with the weight `kl_weight` (Eq. F.32).
 
-Scales are floored where they enter: two predictions that agree exactly have scale 0, and a density of width 0 has
-no finite divergence. The floor 0.01 is the reference's; it is 2.5 steps of an 8-bit map.
+All functions floor the scales that they are given, because predictions that agree exactly have scale 0 and an infinite
+divergence (docs/method/numerics.md#laplace-scale-at-zero). Arrays may have any shapes that broadcast, float32 or float64;
+distances and scales have the unit of the texture values.
 """
 
 from __future__ import annotations
@@ -17,22 +18,32 @@ from numpy.typing import NDArray
 from iif_core.errors import InputError
 
 SCALE_FLOOR = 0.01
+"""Smallest scale; 2.5 steps of an 8-bit map."""
 
 
 def floored(scale: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
-    """Scales not below `floor`: max(b, floor), the hard clamp of the reference (exact for closed forms)."""
+    """Return max(b, floor)."""
     if not floor > 0:
         raise InputError(f"Laplace scale floor is {floor}; it must be positive, for example {SCALE_FLOOR}")
     return np.maximum(scale, floor)
 
 
 def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
-    """Divergence KL(reference || texture) of two Laplace distributions, element by element.
+    """Compute the divergence KL(reference || texture) of two Laplace distributions (Eq. F.7).
 
-    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1,   d = |mu_ref - mu_pred| >= 0.
+    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1, which is 0 for d = 0 and equal scales.
 
-    Any shapes that broadcast; the unit of `distance` and the scales is the unit of the values. The result is >= 0,
-    0 where d = 0 and the scales agree. Source: METHOD 2.3.4. Example: kl(0.3, 0.1, 0.2) = 1.2180407.
+    Args:
+        distance: |mu_ref - mu_pred|; the sign is ignored.
+        b_ref, b_pred: scales of the reference and of the texture.
+        floor: smallest scale, > 0.
+
+    Returns:
+        Divergence in nat, >= 0.
+
+    Example:
+        >>> round(float(kl(0.3, 0.1, 0.2)), 7)
+        1.2180407
     """
     d = np.abs(distance)
     b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
@@ -40,21 +51,31 @@ def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_
 
 
 def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
-    """Weight of the quadratic that majorises `kl` in d: w = (1 - e^(-d/b_r)) / (d b_p), 1 / (b_r b_p) at d = 0.
+    """Compute the weight of the quadratic function of d that majorises `kl` (Eq. F.32).
 
-    Reweighted least squares with this weight minimises the summed divergence over the location (METHOD 7c,
-    mu-step). It falls as 1/d, so an outlier pulls with a bounded force.
+    w = (1 - exp(-d / b_r)) / (d b_p), with the limit 1 / (b_r b_p) at d = 0 (docs/method/numerics.md#weight-of-a-zero-residual).
+    Least squares, reweighted with w, minimises the summed divergence over the location. The weight falls as 1 / d, so the
+    influence of an outlier is bounded.
+
+    Args:
+        distance, b_ref, b_pred, floor: as for `kl`.
+
+    Returns:
+        Weight > 0.
     """
     d = np.abs(distance)
     b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
     x = d / b_r
-    # below 1e-4 the series 1 - x/2 is exact to float32 and avoids 0/0
+    # Below 1e-4 the series 1 - x / 2 is exact in float32.
     ratio = np.where(x > 1e-4, -np.expm1(-x) / np.where(x > 1e-4, x, 1.0), 1.0 - 0.5 * x)
     return ratio / (b_r * b_p)
 
 
 def lower_median(values: NDArray, axis: int = 0) -> NDArray:
-    """Median that is always one of the values: for an even count the smaller of the two middle ones (METHOD H3)."""
+    """Return the median that is one of the values: for an even count the smaller of the two in the middle.
+
+    See docs/method/numerics.md#median-subgradient.
+    """
     count = values.shape[axis]
     if count == 0:
         raise InputError("lower median of no values; give at least one along the axis")
@@ -63,17 +84,17 @@ def lower_median(values: NDArray, axis: int = 0) -> NDArray:
 
 
 def reference_scale(mu_ref: NDArray, predictions: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
-    """Scale of the reference: b_ref = max(lower median over k of |mu_ref - v_k|, floor).
+    """Compute the scale of the reference, b_ref = lower median over k of |mu_ref - v_k|, floored (Eq. F.4).
 
-    `predictions` (K, ...), `mu_ref` (...); returns (...). K = 1 gives |mu_ref - v|. Source: METHOD 2.3.3.
+    `predictions` has shape (K, ...), `mu_ref` and the result (...).
     """
     return floored(lower_median(np.abs(predictions - mu_ref[None]), axis=0), floor)
 
 
 def scale_contribution(distance: NDArray, b_ref: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
-    """What one observation adds to a cell's scale: d + b_r e^(-d/b_r) = E|x - mu_pred| under the reference.
+    """Compute E|x - mu_pred| = d + b_r exp(-d / b_r) for x drawn from the reference (Eq. F.6).
 
-    The minimiser of the summed divergence over b_pred is the weighted mean of these (METHOD 7c, b-step).
+    The weighted mean of these values is the b_pred that minimises the summed divergence (Eq. F.31).
     """
     d = np.abs(distance)
     b_r = floored(b_ref, floor)
@@ -83,9 +104,16 @@ def scale_contribution(distance: NDArray, b_ref: NDArray, floor: float = SCALE_F
 def closed_form_scale(
     distance: NDArray, b_ref: NDArray, weight: NDArray | None = None, axis: int = 0, floor: float = SCALE_FLOOR
 ) -> NDArray:
-    """Scale that minimises the summed divergence of its observations, b_p = mean(d + b_r e^(-d/b_r)), floored.
+    """Compute the scale that minimises the summed divergence of its observations (Eq. F.31).
 
-    Observations lie along `axis`; `weight` broadcasts. Where the weights sum to 0 the result is the floor.
+    Args:
+        distance, b_ref: distance and reference scale of every observation.
+        weight: weights >= 0 that broadcast against the observations; equal weights if None.
+        axis: axis of the observations.
+        floor: smallest scale, > 0.
+
+    Returns:
+        Scale with `axis` removed; the floor where the weights sum to 0.
     """
     contribution = scale_contribution(distance, b_ref, floor)
     if weight is None:

@@ -1,14 +1,15 @@
-"""One namespace for three array libraries, so that a formula is written once and tested across all of them.
+"""Array namespaces: one set of elementwise functions for NumPy, Dr.Jit and torch.
 
-`NUMPY`, `DRJIT` and `TORCH` offer the same few elementwise functions; the two heavy ones are imported when
-first asked for. Comparisons and arithmetic are the operators of the arrays themselves.
+A formula that takes a `Namespace` is written once and tested in all three libraries. `NUMPY`, `DRJIT` and `TORCH` are
+attributes of this module; each library is imported when its namespace is first used. Arithmetic and comparisons are the
+operators of the arrays.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Namespace:
-    """Elementwise functions of one array library; Python scalars are allowed beside arrays and never widen
-    them."""
+    """Elementwise functions of one array library. Python scalars may be mixed with arrays and do not change their dtype."""
 
     name: str
     sqrt: Callable[[Any], Any]
@@ -35,42 +35,20 @@ class Namespace:
     pi: float = math.pi
 
 
+def _namespace(library: Any, **renamed: Callable) -> Namespace:
+    """Collect the functions that `library` offers under the same names; `renamed` gives those it calls differently."""
+    names = [entry.name for entry in fields(Namespace) if entry.name not in ("name", "pi", *renamed)]
+    return Namespace(library.__name__, **{name: getattr(library, name) for name in names}, **renamed)
+
+
 def _numpy() -> Namespace:
-    return Namespace(
-        "numpy",
-        np.sqrt,
-        np.exp,
-        np.log,
-        np.abs,
-        np.sin,
-        np.cos,
-        np.floor,
-        np.maximum,
-        np.minimum,
-        np.where,
-        np.arccos,
-        np.arctan2,
-    )
+    return _namespace(np, acos=np.arccos, atan2=np.arctan2)
 
 
 def _drjit() -> Namespace:
     import drjit as dr
 
-    return Namespace(
-        "drjit",
-        dr.sqrt,
-        dr.exp,
-        dr.log,
-        dr.abs,
-        dr.sin,
-        dr.cos,
-        dr.floor,
-        dr.maximum,
-        dr.minimum,
-        dr.select,
-        dr.acos,
-        dr.atan2,
-    )
+    return _namespace(dr, where=dr.select)
 
 
 def _torch() -> Namespace:
@@ -84,20 +62,10 @@ def _torch() -> Namespace:
 
         return apply
 
-    return Namespace(
-        "torch",
-        torch.sqrt,
-        torch.exp,
-        torch.log,
-        torch.abs,
-        torch.sin,
-        torch.cos,
-        torch.floor,
-        extremum(torch.maximum, lambda tensor, scalar: torch.clamp(tensor, min=scalar)),
-        extremum(torch.minimum, lambda tensor, scalar: torch.clamp(tensor, max=scalar)),
-        torch.where,
-        torch.acos,
-        torch.atan2,
+    return _namespace(
+        torch,
+        maximum=extremum(torch.maximum, lambda tensor, scalar: torch.clamp(tensor, min=scalar)),
+        minimum=extremum(torch.minimum, lambda tensor, scalar: torch.clamp(tensor, max=scalar)),
     )
 
 

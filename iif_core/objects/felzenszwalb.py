@@ -1,14 +1,13 @@
-"""Objects from shape alone: Felzenszwalb and Huttenlocher's graph segmentation on the faces of a mesh.
+"""Objects from shape alone: the graph segmentation of Felzenszwalb and Huttenlocher on the faces of a mesh.
 
-Faces that share an edge are joined by a graph edge whose weight says how much they look like different things (bend,
-concave more than convex; difference of colour). Edges are taken from the lightest on; the two regions at its ends
-merge when
+The nodes of the graph are faces, its edges are shared edges, and the weight w of an edge says how much the two faces look
+like different things (Eq. O.5). Edges are taken from the lightest on; the two regions at its ends merge if
 
-    w <= min(Int(A) + k / |A|, Int(B) + k / |B|)
+    w <= min(Int(A) + k / |A|, Int(B) + k / |B|)                                                        (Eq. O.6)
 
 with Int the heaviest edge merged so far inside a region and |.| its number of faces (IJCV 59(2), 2004, Eq. 4 and 5).
-Small regions then join the neighbour across their lightest edge. Over-segmentation is the safe side: a piece of an
-object can still be corrected by its own affine, two objects in one cannot.
+Small regions then join the neighbour across their lightest edge. In all functions `pairs` is (e, 2) int, the result of
+`face_adjacency`, and m is the number of faces.
 """
 
 from __future__ import annotations
@@ -18,32 +17,32 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
+from iif_core.numerics.arrays import numbered_by_first
 from iif_core.surface.segments import face_adjacency
+from iif_core.surface.triangles import face_geometry
 
 Array = np.ndarray
 
 FILTER_WIDTH = 0.35
-"""Bends (as |n_a - n_b|, about radians) above this count as creases when normals are filtered: 20 degrees."""
+"""Bend |n_a - n_b|, about radians, above which the filter of the normals keeps a crease: 20 degrees."""
 
 FILTER_ROUNDS = 5
 
 ISLAND_GAP = 3.0
-"""A small island joins the nearest large region when it is within this many mean edge lengths."""
-
-
-def face_normals(vertices: ArrayLike, faces: ArrayLike) -> Array:
-    """(m, 3) float64 unit right-hand normals; zero where a face has no area."""
-    corners = np.asarray(vertices, np.float64)[np.asarray(faces)]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.where(length > 0, normal / np.where(length > 0, length, 1), 0)
+"""Distance, in mean edge lengths, up to which a small island joins the nearest large region."""
 
 
 def filtered_normals(normal: ArrayLike, area: ArrayLike, pairs: ArrayLike, rounds: int = FILTER_ROUNDS) -> Array:
-    """Bilateral filter on face normals: calms the noise of a scan and keeps creases.
+    """Smooth face normals with a bilateral filter that keeps creases (Eq. O.4).
 
-    n_a <- sum over a and its neighbours b of area_b exp(-|n_a - n_b|^2 / (2 FILTER_WIDTH^2)) n_b, normalised; repeated.
-    normal (m, 3) unit or zero, area (m,) -> (m, 3) float64, zero where no normal is known.
+    Args:
+        normal: (m, 3) unit normals; 0 where a face has none.
+        area: (m,) areas, in any unit.
+        pairs: faces that share an edge.
+        rounds: number of passes.
+
+    Returns:
+        (m, 3) float64 unit normals; 0 where no normal is known.
     """
     normal, area, pairs = np.asarray(normal, np.float64), np.asarray(area, np.float64), np.asarray(pairs)
     a, b = pairs[:, 0], pairs[:, 1]
@@ -65,16 +64,19 @@ def edge_weights(
     colour: ArrayLike | None = None,
     colour_weight: float = 0.0,
 ) -> Array:
-    """How different the two faces of every pair are, (e,) float64 >= 0.
+    """Compute how different the two faces of every pair look (Eq. O.5).
 
-    w = 1 - n_a . n_b, squared where the surface is convex, n_b . (c_b - c_a) > 0 (a convex bend is rarely a
-    border), plus colour_weight times the largest channel difference. A face without area has no normal and
-    bends nowhere.
+    w = 1 - n_a . n_b, squared where the surface is convex, n_b . (c_b - c_a) > 0, plus `colour_weight` times the largest
+    difference of a colour channel. The bend of a face without normal is 0.
 
     Args:
-        normal, centre: (m, 3) unit normals (zero = none) and centres of the faces.
-        pairs: (e, 2) int, from `face_adjacency`.
-        colour: (m, 3) in [0, 1], NaN = not known, which costs nothing.
+        normal, centre: (m, 3) unit normals (0 = none) and centres of the faces.
+        pairs: faces that share an edge.
+        colour: (m, 3) in [0, 1]; NaN = not known, which adds nothing.
+        colour_weight: weight of the colour term.
+
+    Returns:
+        (e,) float64 >= 0.
     """
     normal, centre = np.asarray(normal, np.float64), np.asarray(centre, np.float64)
     a, b = np.asarray(pairs).T
@@ -89,9 +91,16 @@ def edge_weights(
 
 
 def smooth_over_faces(values: ArrayLike, weight: ArrayLike, pairs: ArrayLike, rounds: int) -> Array:
-    """Mean of each face and its neighbours, weighted and repeated: fills faces that nobody saw, calms noise.
+    """Average values over each face and its neighbours, repeatedly; this also fills faces that nobody saw.
 
-    values (m, c), weight (m,) >= 0 (0 = unknown) -> (m, c) float64, NaN where no weight came within `rounds` steps.
+    Args:
+        values: (m, c).
+        weight: (m,) >= 0; 0 = not known.
+        pairs: faces that share an edge.
+        rounds: number of passes.
+
+    Returns:
+        (m, c) float64; NaN for faces that no known value reached.
     """
     from scipy.sparse import coo_matrix, identity
 
@@ -106,12 +115,16 @@ def smooth_over_faces(values: ArrayLike, weight: ArrayLike, pairs: ArrayLike, ro
 
 
 def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float, min_size: int) -> Array:
-    """Regions of a graph of `count` nodes, (count,) int32, numbered by their lowest node.
+    """Merge the nodes of a graph to regions (Eq. O.6).
 
     Args:
-        pairs, weights: (e, 2) int and (e,) finite; the order of equal weights is that of `pairs`.
-        scale: k; larger gives larger regions.
+        count: number of nodes.
+        pairs, weights: (e, 2) int and (e,) finite; edges of equal weight are taken in the order of `pairs`.
+        scale: k; larger values give larger regions.
         min_size: a region with fewer nodes joins a neighbour, if it has one.
+
+    Returns:
+        (count,) int32 regions, numbered by their lowest node.
 
     Raises:
         InputError: a weight that is not finite, or a non-positive scale.
@@ -124,12 +137,12 @@ def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float
     order = np.argsort(weights, kind="stable")
     ends = pairs[order].astype(np.int64).reshape(-1, 2)
     parent = _merged(count, ends[:, 0].copy(), ends[:, 1].copy(), weights[order], float(scale), int(min_size))
-    return _numbered(parent)
+    return numbered_by_first(parent)
 
 
 @numba.njit(nogil=True, cache=True)
 def _merged(count, first, second, weight, scale, min_size):
-    """Root of every node: a union-find with halved paths over sorted edges, then once more for the small regions."""
+    """Find the root of every node: union-find with path halving over the sorted edges, and a second pass for small regions."""
     parent, size, limit = np.arange(count), np.ones(count, np.int64), np.full(count, scale)
     for last in (False, True):
         for edge in range(len(first)):
@@ -161,14 +174,6 @@ def _merged(count, first, second, weight, scale, min_size):
     return parent
 
 
-def _numbered(labels: Array) -> Array:
-    """Labels counted from 0 in order of their first face."""
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int32)
-    rank[np.argsort(first, kind="stable")] = np.arange(len(first), dtype=np.int32)
-    return rank[inverse.ravel()].astype(np.int32)
-
-
 def segment_mesh(
     vertices: ArrayLike,
     faces: ArrayLike,
@@ -178,26 +183,26 @@ def segment_mesh(
     colour_weight: float = 0.0,
     pairs: ArrayLike | None = None,
 ) -> Array:
-    """Region of every face, (m,) int32 from 0 without gaps, in order of their lowest face; deterministic.
+    """Segment a mesh into regions.
 
-    Corners at one position count as joined. Islands with fewer than `min_faces` faces that no edge ties to anything
-    (scans are full of them) join the region of the nearest face of a larger one if that is ISLAND_GAP mean edges away
-    or less, and stay on their own otherwise.
+    Vertices at one position count as one. Islands with fewer than `min_faces` faces and without neighbours join the region
+    of the nearest face of a larger region, up to ISLAND_GAP mean edge lengths away, and stay alone otherwise.
 
     Args:
-        vertices, faces: (n, 3) metres and (m, 3) int.
-        scale, min_faces: see `merge_regions`.
+        vertices, faces: (n, 3) in metres and (m, 3) int.
+        scale, min_faces: `scale` and `min_size` of `merge_regions`.
         colour, colour_weight: see `edge_weights`.
-        pairs: `face_adjacency(faces, vertices)` if it is known already.
+        pairs: `face_adjacency(faces, vertices)`, if it is known already.
+
+    Returns:
+        (m,) int32 regions from 0 without gaps, in the order of their lowest face; deterministic.
     """
     vertices, faces = np.asarray(vertices), np.asarray(faces)
     if len(faces) == 0:
         return np.zeros(0, np.int32)
     pairs = face_adjacency(faces, vertices) if pairs is None else np.asarray(pairs)
-    corners = vertices.astype(np.float64)[faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    normal = filtered_normals(face_normals(vertices, faces), area, pairs)
-    weights = edge_weights(normal, corners.mean(1), pairs, colour, colour_weight)
+    normal = filtered_normals(*face_geometry(vertices, faces), pairs)
+    weights = edge_weights(normal, vertices.astype(np.float64)[faces].mean(1), pairs, colour, colour_weight)
     labels = merge_regions(len(faces), pairs, weights, scale, min_faces)
     return _join_islands(vertices, faces, labels, min_faces)
 
@@ -214,11 +219,11 @@ def _join_islands(vertices: Array, faces: Array, labels: Array, min_faces: int) 
     large = np.flatnonzero(~small)
     island = np.flatnonzero(small)
     distance, nearest = cKDTree(centre[large]).query(centre[island])
-    # One answer for a whole island: its face that lies nearest, lowest face first.
+    # The face of an island that lies nearest decides for the island; of equal distances the lowest face.
     order = np.lexsort((island, distance, labels[island]))
     pieces, first = np.unique(labels[island][order], return_index=True)
     chosen = order[first]
     target = np.where(distance[chosen] <= ISLAND_GAP * edge, labels[large[nearest[chosen]]], pieces)
     out = labels.copy()
     out[island] = target[np.searchsorted(pieces, labels[island])]
-    return _numbered(out)
+    return numbered_by_first(out)

@@ -1,16 +1,16 @@
-"""2D masks of many views -> objects, by view consensus (METHOD 2.2; written from that description).
+"""Objects from 2D masks of many views by view consensus (docs/method/objects.md#masks, Eq. O.7 to O.12).
 
-A mask is a set of surface points that one view holds together. Views vote: view f *contains* mask m if most of what f sees
-of m lies in one mask of f, and *splits* m if it does not. A mask that too many views split holds several things and is
-dropped. Two masks belong together if nearly every view that contains both contains them in one mask:
+A mask is the set of surface points that lie in one region of one view. View f *contains* mask m if most of what f sees of m
+lies in one mask of f, and *splits* m otherwise. A mask that too many views split covers several things and is dropped. Two
+masks belong together if nearly every view that contains both contains them in one mask:
 
     consensus(i, j) = |C_i and C_j| / |V_i and V_j|                    (supporters over observers)
 
-with V_i the views that contain i, and C_i the masks that do. Pairs with many observers are joined first; what is joined is
-one node from then on (V and C by union), and the bar is lowered step by step.
+with V_i the views that contain i, and C_i the masks that contain it. Pairs with many observers are joined first. Joined masks
+are one node with the unions of V and C, and the required number of observers is lowered step by step.
 
-Points stand for equal pieces of surface; a mask's points are those that project into it. Rows of the sparse matrices are
-handled in blocks of `BLOCK`: no dense mask-by-mask matrix is ever made.
+Points represent equal pieces of surface. The rows of the sparse matrices are handled in blocks of `BLOCK_MASKS`, so no dense
+mask-by-mask matrix is made.
 """
 
 from __future__ import annotations
@@ -24,28 +24,38 @@ from numpy.typing import ArrayLike
 
 from iif_core.camera.pinhole import project
 from iif_core.errors import InputError
+from iif_core.numerics.arrays import numbered_by_first
+from iif_core.numerics.graph import component_labels
 
 Array = np.ndarray
 
-BLOCK = 2048
-"""Masks whose rows are held densely at once."""
+BLOCK_MASKS = 2048
+"""Number of masks whose rows are held densely at once."""
 
-ENOUGH_POINTS = 500
-"""So many visible points count as seeing a mask, however small their share."""
+SUFFICIENT_POINTS = 500
+"""Number of visible points that suffices to see a mask, whatever their share."""
 
 MASKED_SHARE = 0.5
-"""A view whose masks cover less than this of what it sees of a mask has no opinion about it."""
+"""Share of the visible points of a mask that must lie in masks of a view; otherwise the view has no opinion."""
 
 MIN_OBSERVERS = 2
-"""Views that must contain both masks of a pair before they can be joined."""
+"""Smallest number of views that must contain both masks of a pair before they can be joined."""
 
 PERCENTILES = tuple(range(95, -1, -5))
-"""Of the observers of all pairs with a supporter: the bars, from high to low."""
+"""Percentiles of the number of observers, over all pairs with a supporter, that are required step by step."""
 
 
 @dataclass(frozen=True)
 class ConsensusOptions:
-    """Shares in (0, 1]: see the module text. `min_points`: a mask of fewer points is ignored."""
+    """Thresholds of the clustering; shares in (0, 1].
+
+    Attributes:
+        visible: share of a mask that a view must see (Eq. O.8).
+        contained: share of the points that one mask must hold to contain them (Eq. O.9).
+        split: share of the views with an opinion above which a split mask is dropped (Eq. O.10).
+        consensus: smallest ratio of supporters to observers (Eq. O.11).
+        min_points: masks of fewer points are ignored.
+    """
 
     visible: float = 0.3
     contained: float = 0.8
@@ -55,8 +65,9 @@ class ConsensusOptions:
 
 
 def flatten_masks(masks: Sequence[Array]) -> Array:
-    """One label map (H, W) int32 of overlapping masks (H, W) bool: painted from the largest on, so that small ones lie
-    on top; label = position in the sequence + 1, 0 = none. Equal areas: the later one is on top.
+    """Paint overlapping masks (H, W) bool into one label map (H, W) int32, from the largest to the smallest.
+
+    The label of a mask is its position in the sequence + 1; 0 = none. Of equal areas the later mask is on top.
 
     Raises:
         InputError: shapes that differ.
@@ -79,15 +90,21 @@ def masks_at(
     pose: ArrayLike,
     slack: float,
 ) -> tuple[Array, Array]:
-    """Which points a view sees, and the label there: (rows (n,) int64 ascending, label (n,) int32).
+    """Find the points that a view sees, and the mask label at each.
 
-    A point is seen if the depth at the pixel that it projects to is its own within `slack` (metres) + 2 %.
+    A point is seen if it projects into the picture and the depth map there differs from its depth by at most
+    slack + 2 % (Eq. O.7).
 
     Args:
-        points: (m, 3) metres.
-        labels, depth: (H, W), z-depth in metres with 0 = miss.
+        points: (m, 3) in metres.
+        labels: (H, W) int.
+        depth: (H, W) z-depth in metres; 0 = miss.
         camera: fx, fy, cx, cy in pixels (`iif_core.camera.pinhole.project`).
         pose: (4, 4) world_from_camera.
+        slack: tolerance in metres.
+
+    Returns:
+        Rows of the seen points, (n,) int64 ascending, and their labels (n,) int32.
     """
     labels, depth = np.asarray(labels), np.asarray(depth)
     height, width = depth.shape
@@ -101,10 +118,11 @@ def masks_at(
 
 @dataclass(frozen=True)
 class MaskPoints:
-    """Masks of all views over E points: M masks sorted by view.
+    """The masks of all views as sets of points; M masks in the order of their views, E points, F views.
 
-    in_mask: (M, E) csr float32 of 0 and 1; visible: (F, E) likewise; view: (M,) int32 view of each mask; label: (M,)
-    int32 its label in that view's map.
+    Attributes:
+        in_mask: (M, E) csr float32 of 0 and 1; visible: (F, E) likewise.
+        view: (M,) int32 view of each mask; label: (M,) int32 its label in the map of that view.
     """
 
     in_mask: Any
@@ -114,9 +132,15 @@ class MaskPoints:
 
 
 def gather_masks(seen: Sequence[tuple[Array, Array]], count: int, min_points: int) -> MaskPoints:
-    """Masks from what `masks_at` found in every view; label 0 or less = no mask, as are masks of fewer points.
+    """Collect the results of `masks_at` of all views.
 
-    `count`: number of points, E.
+    Args:
+        seen: rows and labels of every view; a label of 0 or less = no mask.
+        count: number of points, E.
+        min_points: masks of fewer points are left out.
+
+    Returns:
+        Masks as sets of points.
     """
     from scipy.sparse import csr_matrix, vstack
 
@@ -137,14 +161,19 @@ def gather_masks(seen: Sequence[tuple[Array, Array]], count: int, min_points: in
 
 @dataclass(frozen=True)
 class Containment:
-    """What view f says of mask m. container: (M, F) int32, the mask of f that contains m, -1 = none; split: (M, F) bool."""
+    """Opinion of view f on mask m.
+
+    Attributes:
+        container: (M, F) int32, the mask of f that contains m; -1 = none.
+        split: (M, F) bool, whether f splits m. A view that neither contains nor splits a mask has no opinion.
+    """
 
     container: Array
     split: Array
 
 
 def containment(masks: MaskPoints, options: ConsensusOptions) -> Containment:
-    """Every view's vote on every mask: contained, split, or (neither) not seen well enough."""
+    """Compute the opinion of every view on every mask (Eq. O.8, O.9)."""
     count, views = len(masks.view), masks.visible.shape[0]
     container, split = np.full((count, views), -1, np.int32), np.zeros((count, views), bool)
     for rows in _blocks(count):
@@ -162,7 +191,7 @@ def containment(masks: MaskPoints, options: ConsensusOptions) -> Containment:
         last = np.flatnonzero(np.r_[np.diff(row[order] * views + view[order]) > 0, len(order) > 0])
         best = order[last]
         r, f = row[best], view[best]
-        visible = (seen[r, f] >= options.visible * size[r]) | (seen[r, f] >= ENOUGH_POINTS)
+        visible = (seen[r, f] >= options.visible * size[r]) | (seen[r, f] >= SUFFICIENT_POINTS)
         judged = visible & (masked[r, f] >= MASKED_SHARE * seen[r, f])
         inside = shared.data[best] > options.contained * masked[r, f]
         holds = judged & inside
@@ -173,13 +202,16 @@ def containment(masks: MaskPoints, options: ConsensusOptions) -> Containment:
 
 
 def undersegmented(votes: Containment, limit: float) -> Array:
-    """(M,) bool: more than `limit` of the views with an opinion split the mask."""
+    """Find masks that more than the share `limit` of the views with an opinion split (Eq. O.10); (M,) bool."""
     broken, whole = votes.split.sum(1), (votes.container >= 0).sum(1)
     return broken > limit * (broken + whole)
 
 
 def cluster_masks(masks: MaskPoints, options: ConsensusOptions | None = None) -> Array:
-    """Cluster of every mask, (M,) int32 from 0 in order of the first mask; -1 = dropped as under-segmented.
+    """Cluster the masks of all views.
+
+    Returns:
+        (M,) int32 clusters from 0 in the order of their first mask; -1 = dropped as under-segmented.
 
     Raises:
         InputError: an option outside (0, 1].
@@ -194,7 +226,7 @@ def cluster_masks(masks: MaskPoints, options: ConsensusOptions | None = None) ->
         return labels
     votes = containment(masks, options)
     dropped = undersegmented(votes, options.split)
-    # A dropped mask's opinion is void: the view neither contains nor splits what lay in it.
+    # A dropped mask contains nothing: its view has no opinion on the masks that it held.
     container = np.where((votes.container >= 0) & ~dropped[votes.container], votes.container, -1)
     kept = np.flatnonzero(~dropped)
     if len(kept):
@@ -203,7 +235,7 @@ def cluster_masks(masks: MaskPoints, options: ConsensusOptions | None = None) ->
 
 
 def _join(container: Array, count: int, consensus: float) -> Array:
-    """Clusters (n,) int32 of n masks from the masks that contain them, (n, F)."""
+    """Cluster n masks from the masks that contain them, (n, F); (n,) int32."""
     from scipy.sparse import csr_matrix
 
     n = len(container)
@@ -211,34 +243,34 @@ def _join(container: Array, count: int, consensus: float) -> Array:
     row, view = np.nonzero(container >= 0)
     holders = csr_matrix((np.ones(len(row), np.float32), (row, container[row, view])), (n, count))
     node = np.arange(n)
-    bars: list[int] | None = None
+    thresholds: list[int] | None = None
     while True:
         first, second, supporters, observers = agreeing_pairs(holders, views)
-        if bars is None:
+        if thresholds is None:
             if not len(first):
-                return _numbered(node)
+                return numbered_by_first(node)
             found = np.floor(np.percentile(observers, PERCENTILES)).astype(int)
-            bars = sorted({max(int(bar), MIN_OBSERVERS) for bar in found}, reverse=True)
+            thresholds = sorted({max(int(number), MIN_OBSERVERS) for number in found}, reverse=True)
         agree = supporters >= consensus * observers
-        while bars:
-            joined = agree & (observers >= bars[0])
-            if joined.any():
+        while thresholds:
+            linked = agree & (observers >= thresholds[0])
+            if linked.any():
                 break
-            bars.pop(0)
-        if not bars:
-            return _numbered(node)
-        group = components(len(views), first[joined], second[joined])
+            thresholds.pop(0)
+        if not thresholds:
+            return numbered_by_first(node)
+        group = component_labels(len(views), first[linked], second[linked])
         node = group[node]
         views, holders = _merged(views, holders, group)
-        bars.pop(0)
-        if not bars:
-            return _numbered(node)
+        thresholds.pop(0)
+        if not thresholds:
+            return numbered_by_first(node)
 
 
 def agreeing_pairs(holders: Any, views: Array) -> tuple[Array, Array, Array, Array]:
-    """Pairs of nodes i < j with a supporter: i, j, supporters, observers.
+    """Find pairs of nodes i < j with a supporter: i, j, supporters, observers.
 
-    holders: (n, M) csr of 0 and 1, the masks that hold a node; views: `packed_flags` of the (n, F) views that do.
+    holders: (n, M) csr of 0 and 1, the masks that contain a node; views: `packed_flags` of the (n, F) views that do.
     """
     parts: list[tuple[Array, Array, Array, Array]] = []
     for rows in _blocks(holders.shape[0]):
@@ -254,7 +286,7 @@ def agreeing_pairs(holders: Any, views: Array) -> tuple[Array, Array, Array, Arr
 
 
 def _merged(views: Array, holders: Any, group: Array) -> tuple[Array, Any]:
-    """Views and holders of the groups: unions over their nodes."""
+    """Views and holders of groups of nodes: the unions over their nodes."""
     from scipy.sparse import csr_matrix
 
     order = np.argsort(group, kind="stable")
@@ -265,17 +297,8 @@ def _merged(views: Array, holders: Any, group: Array) -> tuple[Array, Any]:
     return np.bitwise_or.reduceat(views[order], start, axis=0), union
 
 
-def components(count: int, first: Array, second: Array) -> Array:
-    """(count,) connected component of every node of a graph with the edges (first, second)."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_matrix((np.ones(len(first), np.int8), (first, second)), (count, count))
-    return connected_components(graph, directed=False)[1]
-
-
 def packed_flags(flags: Array) -> Array:
-    """(n, F) bool as (n, words) uint64."""
+    """Pack (n, F) bool into (n, words) uint64."""
     width = -(-flags.shape[1] // 64) * 64
     padded = np.zeros((len(flags), width), bool)
     padded[:, : flags.shape[1]] = flags
@@ -283,12 +306,4 @@ def packed_flags(flags: Array) -> Array:
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + BLOCK, count)) for start in range(0, count, BLOCK))
-
-
-def _numbered(labels: Array) -> Array:
-    """Labels counted from 0 in order of first occurrence, int32."""
-    _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), np.int32)
-    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    return rank[inverse.ravel()]
+    return (slice(start, min(start + BLOCK_MASKS, count)) for start in range(0, count, BLOCK_MASKS))

@@ -1,5 +1,8 @@
-"""From a promptable model's many answers to one label map: the choice that the automatic mask generator of Segment Anything makes
-(Kirillov et al. 2023, appendix B: confidence, stability under the threshold, non-maximum suppression)."""
+"""Choice among the masks that a promptable model proposes (docs/method/objects.md#proposals).
+
+The rules are those of the automatic mask generator of Segment Anything (Kirillov et al. 2023, appendix B): stability under
+the threshold, and suppression of masks that overlap one of higher confidence.
+"""
 
 from __future__ import annotations
 
@@ -10,25 +13,26 @@ Array = np.ndarray
 
 
 def point_grid(side: int) -> Array:
-    """(side^2, 2) float32 points (x, y) in (0, 1): the centres of side x side equal cells, row by row."""
+    """Compute the centres of side x side equal cells of the unit square, (side^2, 2) float32 as (x, y), row by row."""
     at = (np.arange(side, dtype=np.float32) + 0.5) / side
     return np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
 
 
 def threshold_stability(logits: ArrayLike, offset: float = 1.0) -> Array:
-    """|logit > offset| / |logit > -offset| of every mask, (n,) float64 in [0, 1] of (n, H, W); 0 where nothing is above -offset.
+    """Compute |logit > offset| / |logit > -offset| of every mask, (n,) float64 in [0, 1] of (n, H, W) (Eq. O.18).
 
-    The overlap over union of the two masks that the thresholds +-offset make (the one lies in the other): 1 = a sharp border.
+    This is the overlap over union of the masks at the thresholds +-offset; 1 = a sharp border, 0 also for an empty mask.
     """
     logits = np.asarray(logits)
     inner, outer = ((logits > level).sum((1, 2)) for level in (offset, -offset))
     return inner / np.maximum(outer, 1)
 
 
-def suppressed(masks: ArrayLike, score: ArrayLike, overlap: float) -> Array:
-    """Rows to keep, (k,) int64, surest first: of masks whose overlap over union is above `overlap` only the surest.
+def suppress_overlaps(masks: ArrayLike, score: ArrayLike, overlap: float) -> Array:
+    """Keep, of masks that overlap by more than `overlap` (Eq. O.19), only the one with the highest score.
 
-    Greedy, by falling score, of equal scores the first. masks (n, H, W) bool; score (n,).
+    masks (n, H, W) bool, score (n,). Returns rows (k,) int64 in the order of falling score; of equal scores the first comes
+    first.
     """
     masks = np.asarray(masks, bool)
     flat = masks.reshape(len(masks), masks[:1].size if len(masks) else 0)

@@ -1,5 +1,8 @@
-"""Clusters of masks -> objects on faces: parts that lie apart are told apart, the pixels of every face vote, and what the views
-do not hold together is parted again, what they do is joined."""
+"""From clusters of masks to objects on faces (docs/method/objects.md#from-clusters-to-faces, Eq. O.13 to O.17).
+
+Parts of a cluster that lie apart are separated, the pixels of every face vote, and objects are parted or joined according to
+the masks in which the views show them.
+"""
 
 from __future__ import annotations
 
@@ -8,28 +11,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.objects.mask_clustering import agreeing_pairs, components, packed_flags
+from iif_core.numerics.graph import component_labels
+from iif_core.objects.mask_clustering import agreeing_pairs, packed_flags
 from iif_core.surface.cells import neighbour_pairs, unpack_keys
 
 Array = np.ndarray
 
 PIECE_VIEWS = 3.0
-"""What a piece of the mesh is worth as a whole, in views of one of its faces."""
+"""Weight of the vote of a whole piece of the mesh, in views of one of its faces (Eq. O.14)."""
 
 JOIN_VIEWS = 3
 JOIN_SHARE = 0.8
-"""Objects are joined if at least so many views see both, and this share of them in one mask."""
+"""Objects are joined if at least JOIN_VIEWS views see both, and the share JOIN_SHARE of them in one mask (Eq. O.17)."""
 
-TIE = 1e-6
-"""Views by which majorities of shares must differ to be told apart from rounding."""
+TIE_VIEWS = 1e-6
+"""Tolerance, in views, within which two sums of shares count as equal."""
 
 
 @dataclass(frozen=True)
 class Votes:
-    """What photographs say about faces; n rows, one a (view, face, voxel of a cluster).
+    """Votes of the views for faces; n rows, one per (view, face, voxel of a cluster).
 
-    face: (n,) int64; key: (n,) uint64 voxel and cluster (`iif_core.surface.cells.pack_keys`); pixels: (n,) int64;
-    share: (n,) float64 of the view's pixels on that face. outside: (F,) float64 shares of pixels in no mask, over all views.
+    Attributes:
+        face: (n,) int64; key: (n,) uint64 voxel and cluster (`iif_core.surface.cells.pack_keys`).
+        pixels: (n,) int64; share: (n,) float64 share of the view's pixels on that face.
+        outside: (F,) float64, shares of pixels in no mask, summed over the views.
     """
 
     face: Array
@@ -40,9 +46,17 @@ class Votes:
 
 
 def view_votes(face: Array, key: Array, clustered: Array, masked: Array, count: int) -> Votes:
-    """Votes of one view. All arguments (n,), a row a pixel that hits the mesh; `count` faces.
+    """Collect the votes of one view from its pixels that hit the mesh.
 
-    key: voxel and cluster where `clustered`; masked: lies in a mask (whose cluster may be unknown: it does not vote).
+    Args:
+        face: (n,) face of every pixel.
+        key: (n,) uint64 voxel and cluster, where `clustered`.
+        clustered: (n,) bool, whether the cluster of the pixel is known.
+        masked: (n,) bool, whether the pixel lies in a mask; without a cluster it does not vote.
+        count: number of faces.
+
+    Returns:
+        Votes of the view.
     """
     seen = np.bincount(face, minlength=count)
     keys, which = np.unique(key[clustered], return_inverse=True)
@@ -53,40 +67,39 @@ def view_votes(face: Array, key: Array, clustered: Array, masked: Array, count: 
     return Votes(rows, keys[at] if len(keys) else np.zeros(0, np.uint64), pixels, pixels / seen[rows], outside)
 
 
-def joined(votes: list[Votes]) -> Votes:
-    """All views together."""
+def merge_votes(votes: list[Votes]) -> Votes:
+    """Merge the votes of all views."""
     columns = {name: np.concatenate([getattr(v, name) for v in votes]) for name in ("face", "key", "pixels", "share")}
     return Votes(**columns, outside=np.sum([v.outside for v in votes], axis=0))
 
 
 def split_apart(keys: Array) -> tuple[Array, Array]:
-    """Part of every voxel, (n,) int32: voxels of one cluster that touch; and the cluster of every part.
+    """Number the connected parts of clusters: part of every voxel (n,) int32, and the cluster of every part.
 
-    `keys`: (n,) uint64 sorted and distinct.
+    `keys` (n,) uint64 are sorted and distinct; voxels of one cluster are connected if they touch.
     """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    pairs = neighbour_pairs(keys)
-    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(keys), len(keys)))
-    count, part = connected_components(graph, directed=False)
-    cluster = np.zeros(count, np.int64)
+    part = component_labels(len(keys), *neighbour_pairs(keys).T)
+    cluster = np.zeros(part.max(initial=-1) + 1, np.int64)
     cluster[part] = unpack_keys(keys)[1]
     return part, cluster
 
 
-def elect(face: Array, label: Array, weight: Array, share: Array, piece: Array, piece_views: float = PIECE_VIEWS) -> Array:
-    """Label of every face, (F,) int64, -1 where nothing is known.
+def elect_labels(face: Array, label: Array, weight: Array, share: Array, piece: Array, piece_views: float = PIECE_VIEWS) -> Array:
+    """Choose the label of every face (Eq. O.14).
 
         score(face, l) = W(face, l) + piece_views W(piece, l) / N(piece)
 
-    W sums `weight` over the votes for l, N sums `share` over all votes in the face's piece of the mesh: faces that few
-    photographs show follow their piece, others their own votes. Candidates are the labels of the face's votes and the first
-    of its piece; ties go to the lowest label.
+    W sums `weight` over the votes for l, and N sums `share` over all votes in the piece of the mesh. Faces that few
+    photographs show therefore follow their piece. Candidates are the labels of the face's votes and the best label of its
+    piece; ties go to the lowest label.
 
     Args:
-        face, label, weight, share: (n,), a row a vote; labels from 0.
-        piece: (F,) int from 0.
+        face, label, weight, share: (n,) columns of the votes; labels from 0.
+        piece: (F,) int from 0, piece of the mesh of every face.
+        piece_views: weight of the vote of a piece.
+
+    Returns:
+        (F,) int64 labels; -1 where neither the face nor its piece has a vote.
     """
     out = np.full(len(piece), -1, np.int64)
     if not len(face):
@@ -115,15 +128,20 @@ def elect(face: Array, label: Array, weight: Array, share: Array, piece: Array, 
 
 
 def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: Array) -> tuple[Array, Array, Array]:
-    """Part of every face (F,) int64 (-1 = none), faces that lie mostly outside masks (F,) bool, and (P,) how far pixels agree.
+    """Choose the part of every face (Eq. O.13 to O.15).
 
-    A vote weighs 1 / sqrt(size of its cluster): a small thing in front of a large one is lost whenever the two share a mask,
-    the large one never. Clusters of one mask count only where no other does.
+    A vote weighs 1 / sqrt(size of its cluster), so that a small thing is not lost when it shares a mask with a large one in
+    some views. Clusters of one mask count only on faces without a vote for another cluster.
 
     Args:
         votes: of all views.
-        cluster_size: (C,) points of a mask of the cluster, mean; cluster_masks: (C,) number of its masks.
-        piece: (F,) pieces of the mesh.
+        cluster_size: (C,) mean number of points of the masks of a cluster.
+        cluster_masks: (C,) number of masks of a cluster.
+        piece: (F,) int, pieces of the mesh.
+
+    Returns:
+        Part of every face (F,) int64, -1 = none; faces that lie mostly outside masks, (F,) bool; and for every part the share
+        of the pixels on its faces that voted for it.
     """
     keys, which = np.unique(votes.key, return_inverse=True)
     part_of_key, cluster = split_apart(keys)
@@ -137,7 +155,7 @@ def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: 
     counted &= ~bare[votes.face]
     face, part, share = votes.face[counted], part[counted], votes.share[counted]
     weight = share / np.sqrt(np.maximum(cluster_size[cluster[part]], 1.0))
-    label = elect(face, part, weight, share, piece)
+    label = elect_labels(face, part, weight, share, piece)
     pixels = votes.pixels[counted]
     mine = label[face] == part
     agreeing = np.bincount(part[mine], pixels[mine], len(cluster))
@@ -147,9 +165,11 @@ def label_faces(votes: Votes, cluster_size: Array, cluster_masks: Array, piece: 
 
 @dataclass(frozen=True)
 class Sightings:
-    """Where fragments of objects lie in masks; n rows, one a (view, fragment, mask).
+    """Masks in which the views show fragments of objects; n rows, one per (view, fragment, mask).
 
-    view, fragment, mask: (n,) int64, masks numbered from 1 in every view; pixels: (n,) float64 > 0.
+    Attributes:
+        view, fragment, mask: (n,) int64; masks are numbered from 1 in every view.
+        pixels: (n,) float64 > 0.
     """
 
     view: Array
@@ -159,7 +179,7 @@ class Sightings:
 
 
 def sightings(views: Iterable[tuple[Array, Array]]) -> Sightings:
-    """Of every view the fragment and the mask of its pixels, both (p,) int, for pixels that lie in a mask."""
+    """Collect the fragment and the mask of the pixels of every view, both (p,) int; only pixels that lie in a mask."""
     columns = []
     for view, (fragment, mask) in enumerate(views):
         span = int(mask.max(initial=0)) + 1
@@ -168,17 +188,19 @@ def sightings(views: Iterable[tuple[Array, Array]]) -> Sightings:
     return Sightings(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
-def keep_together(home: Array, seen: Sightings) -> Array:
-    """Object of every fragment, (n,) int64: `home`, or a new one if the views do not hold it together with the rest of `home`.
+def part_objects(home: Array, seen: Sightings) -> Array:
+    """Separate fragments that the views do not show in one mask with the rest of their object (Eq. O.16).
 
-    A fragment is what an object has of one piece of the mesh. Every object grows from its fragment of the most pixels. Of the
-    n views that see a fragment and something of the object so far, t_f is the share of the fragment's pixels in that mask of
-    view f which holds most of the object. It joins if
+    A fragment is what an object has of one piece of the mesh. Every object grows from its fragment with the most pixels. Of
+    the n views that see a fragment and something of the object so far, t_f is the share of the fragment's pixels in the mask
+    of view f that holds most of the object. The fragment joins if
 
-        1 + sum t_f > (1 + n) / 2
+        1 + sum t_f > (1 + n) / 2,
 
-    a majority in which its election into the object counts as one view; a tie parts. When none joins, those that no view shows
-    with the object do. What then remains is one new object, which grows likewise.
+    a majority in which its election into the object counts as one view; a tie parts. When none joins, fragments that no view
+    shows with the object do. The remaining fragments become one new object, which grows in the same way.
+
+    `home` (n,) is the object of every fragment; returns (n,) int64.
     """
     home = np.array(home, np.int64)
     waits, size = np.ones(len(home), bool), np.bincount(seen.fragment, seen.pixels, len(home))
@@ -188,7 +210,7 @@ def keep_together(home: Array, seen: Sightings) -> Array:
     waits[_largest(home, size, waits)] = False
     while waits.any():
         together, views = _support(home, waits, seen, share)
-        joins = waits & (views > 0) & (1 + together > 0.5 * (1 + views) + TIE)
+        joins = waits & (views > 0) & (1 + together > 0.5 * (1 + views) + TIE_VIEWS)
         if not joins.any():
             joins = waits & (views == 0)
         waits &= ~joins
@@ -199,14 +221,14 @@ def keep_together(home: Array, seen: Sightings) -> Array:
 
 
 def _largest(home: Array, size: Array, waits: Array) -> Array:
-    """Of every object with waiting fragments the one of the most pixels; of equals the first."""
+    """Of every object with waiting fragments, the waiting fragment with the most pixels; of equals the first."""
     rows = np.flatnonzero(waits)
     rows = rows[np.lexsort((rows, -size[rows], home[rows]))]
     return rows[np.unique(home[rows], return_index=True)[1]]
 
 
 def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[Array, Array]:
-    """Of every waiting fragment: sum of t_f, and the number of views that see it with its object (both 0 for others)."""
+    """For every waiting fragment: sum of t_f, and the number of views that see it with its object; 0 for other fragments."""
     growing = np.zeros(int(home.max()) + 1, bool)
     growing[home[waits]] = True
     rows = np.flatnonzero(growing[home[seen.fragment]])
@@ -225,7 +247,7 @@ def _support(home: Array, waits: Array, seen: Sightings, share: Array) -> tuple[
 
 
 def _main_masks(place: Array, mask: Array, pixels: Array) -> tuple[Array, Array, Array]:
-    """Places (ascending), the mask that holds most pixels of each (of equals the lowest), and the share of them in it."""
+    """Places in ascending order, the mask that holds most pixels of each (of equals the lowest), and its share of the pixels."""
     masks = int(mask.max(initial=0)) + 1
     held, which = np.unique(place * masks + mask, return_inverse=True)
     count = np.bincount(which, pixels, len(held))
@@ -235,12 +257,13 @@ def _main_masks(place: Array, mask: Array, pixels: Array) -> tuple[Array, Array,
     return at, held[order][first] % masks, count[order][first] / total
 
 
-def join_together(home: Array, seen: Sightings) -> Array:
-    """Object of every fragment, (n,) int64: `home`, those joined that the views hold together; the lowest number stays.
+def join_objects(home: Array, seen: Sightings) -> Array:
+    """Join objects that the views show in one mask (Eq. O.17); the lowest number stays.
 
-    A view sees an object in the mask that holds most of it, if that is more than half. Two objects are one if at least
-    JOIN_VIEWS views see both, and JOIN_SHARE of them in the same mask; repeated with what was joined. The election tells
-    objects apart by the clusters of their masks; of small ones, and of those that were parted, the pixels know more.
+    A view sees an object in the mask that holds more than half of its pixels. Two objects become one if at least JOIN_VIEWS
+    views see both, and JOIN_SHARE of these views in the same mask. This is repeated until nothing changes.
+
+    `home` (n,) is the object of every fragment; returns (n,) int64.
     """
     from scipy.sparse import csr_matrix
 
@@ -254,10 +277,10 @@ def join_together(home: Array, seen: Sightings) -> Array:
         by = np.zeros((len(objects), views), bool)
         by[node, view] = True
         first, second, supporters, observers = agreeing_pairs(holders, packed_flags(by))
-        one = (observers >= JOIN_VIEWS) & (supporters >= JOIN_SHARE * observers - TIE)
+        one = (observers >= JOIN_VIEWS) & (supporters >= JOIN_SHARE * observers - TIE_VIEWS)
         if not one.any():
             return home
-        group = components(len(objects), first[one], second[one])
+        group = component_labels(len(objects), first[one], second[one])
         lowest = np.full(int(group.max()) + 1, int(home.max()))
         np.minimum.at(lowest, group, objects)
         home = lowest[group[at]]

@@ -1,20 +1,14 @@
-"""Prior `retinex`: albedo without any learned weights. A baseline, and called one.
+"""Prior `retinex`: albedo from the photographs and the mesh alone, without learned weights (docs/method/priors.md#retinex).
 
-Two steps. The light that arrives at every piece of surface is gathered from what all photographs show of everything that the
-surface sees (iif_core.light.irradiance), and divided out. What it leaves (fine shadows, gloss, errors of the mesh) is judged by
-colour retinex (Horn 1974; Grosse et al. 2009): in the log of the image strong steps are material and weak ones are light.
-Each hypothesis keeps the steps above its threshold, drops the others, and finds the image whose gradient is nearest to what
-is left, held weakly at the image it came from (a screened Poisson equation with free borders, solved exactly by cosine
-transform):
+The light at every piece of surface is estimated from all photographs (`iif_core.light.irradiance`) and divided out. What the
+division leaves, which is fine shadow, gloss and errors of the mesh, is separated by colour retinex (Horn 1974; Grosse et al.
+2009): in the logarithm of the image, strong steps are material and weak steps are light. Each of the K hypotheses keeps the
+steps above its threshold and finds the image whose gradient is nearest to them and which stays near the input y (Eq. P.14):
 
-    min_a  sum |grad a - kept steps|^2 + HOLD sum |a - log(L / light)|^2.
+    min_a  sum |grad a - kept steps|^2 + STAY_WEIGHT sum |a - y|^2.
 
-The K hypotheses are K thresholds, from "almost everything is material" to "only strong steps are", in turn with the light
-resolved finely and coarsely.
-
-What is known of the mesh helps: across a border of objects every step is material, and inside an object a step where the
-normal turns is light. Roughness and metallic are not estimated at all: they are draws, one an object and hypothesis, of a
-weak prior (most things in rooms are rough and none a metal).
+Across a border of objects every step is material; within an object, a grey step where the normal turns is light. Roughness
+and metallic are not estimated: they are drawn once per object and hypothesis from a weak prior.
 """
 
 from __future__ import annotations
@@ -25,21 +19,21 @@ from numpy.typing import NDArray
 from iif_core.errors import InputError
 
 THRESHOLDS = (0.05, 0.5)
-"""Smallest and largest step in log luminance that counts as material."""
+"""Smallest and largest threshold of a material step, in log luminance (Eq. P.13)."""
 CHROMATICITY_SHARE = 0.2
-"""A step in chromaticity counts as material from this share of the luminance threshold on: light is nearly grey."""
+"""Threshold of a step in chromaticity, as a share of that in luminance; light is nearly grey (Eq. P.11)."""
 NORMAL_TURN = 0.95
-"""Cosine below which neighbouring normals make an edge."""
+"""Cosine between neighbouring normals below which the surface turns."""
 DARKEST = 4e-3
-"""Linear sensor values below this are noise."""
-HOLD = 0.005
-"""Weight of the image beside its gradient: slow changes over more than some 1 / sqrt(HOLD) = 14 pixels are kept."""
+"""Linear sensor value below which a pixel is only noise."""
+STAY_WEIGHT = 0.005
+"""Weight of the image against its gradient; changes over more than 1 / sqrt(STAY_WEIGHT) = 14 pixels are kept."""
 ALBEDO = (0.01, 1.0)
-"""Range of albedo in rooms; what lies outside is gloss, noise or an emitter."""
+"""Range of albedo in rooms; values outside come from gloss, noise or emitters."""
 BRIGHT, BRIGHT_SHARE = 0.9, 0.03
-"""Few things in rooms are whiter than snow: albedo is scaled down until no more than this share of pixels is above."""
+"""Albedo is scaled so that at most the share BRIGHT_SHARE of the pixels exceeds BRIGHT (Eq. P.16)."""
 ROUGHNESS, METALLIC = (0.65, 0.15), (0.0, 0.1)
-"""Mean and standard deviation of the draws of roughness, cut at [0.2, 1]; range of those of metallic."""
+"""Mean and standard deviation of the drawn roughness, clamped to [0.2, 1]; range of the drawn metallic."""
 
 
 def retinex_predictions(
@@ -52,17 +46,20 @@ def retinex_predictions(
     light: NDArray | None = None,
     seed: int = 0,
 ) -> NDArray:
-    """K hypotheses of a view, (K, H, W, 5) float32: albedo R G B linear, perceptual roughness, metallic, in [0, 1].
+    """Predict K hypotheses of a view.
 
     Args:
-        linear: (H, W, 3) photograph proportional to radiance (sensor values through the inverse response).
+        linear: (H, W, 3) photograph proportional to radiance.
         samples: K >= 1.
-        mean_albedo: without `light`, mean over pixels and channels that each hypothesis is scaled to, in (0, 1).
-        object_id: (H, W) int, -1 = none; normals: (H, W, 3) unit; both optional.
-        valid: (H, W) bool; steps to other pixels (also saturated or not-finite ones) count as light.
-        light: (m, H, W, 3) finite log of what `linear` is divided by, used in turn: linear / e^light is albedo as it is.
-            Without it, light is constant and the level of the albedo is set to `mean_albedo`.
-        seed: of the draws of roughness and metallic.
+        mean_albedo: mean over pixels and channels of each hypothesis, in (0, 1); used without `light` only.
+        object_id: (H, W) int, -1 = none; normals: (H, W, 3) unit vectors.
+        valid: (H, W) bool; steps at other pixels count as light.
+        light: (m, H, W, 3) finite logarithms of the light, used in turn: linear / exp(light) is the albedo. If None, the
+            light is constant and the level of the albedo is `mean_albedo`.
+        seed: of the drawn roughness and metallic.
+
+    Returns:
+        (K, H, W, 5) float32: linear albedo, perceptual roughness, metallic, in [0, 1].
 
     Raises:
         InputError: shapes that do not match, samples < 1, mean_albedo outside (0, 1).
@@ -82,7 +79,7 @@ def retinex_predictions(
     log = np.log(np.maximum(np.where(known[..., None], linear, DARKEST), DARKEST))
     spread = np.linspace(0, 1, samples) if samples > 1 else np.array([0.5])
     out = np.empty((samples, *shape, 5), np.float32)
-    hold = 0.0 if light is None else HOLD  # of a photograph with its light in it, slow changes are to go
+    stay = 0.0 if light is None else STAY_WEIGHT  # without an estimate of the light, slow changes are light
     lights = np.zeros((1, *linear.shape)) if light is None else np.asarray(light, np.float64)
     for number, own in enumerate(lights[:samples]):
         image = log - own
@@ -91,16 +88,16 @@ def retinex_predictions(
         steps = [_Steps(image, axis, known, object_id, normals) for axis in (0, 1)]
         for k in range(number, samples, len(lights)):
             threshold = THRESHOLDS[0] * (THRESHOLDS[1] / THRESHOLDS[0]) ** spread[k]
-            albedo = np.exp(_integrated([step.material(threshold) for step in steps], image, hold))
+            albedo = np.exp(_integrated([step.material(threshold) for step in steps], image, stay))
             out[k, ..., :3] = _scaled(albedo, known, mean_albedo) if light is None else np.clip(albedo, *ALBEDO)
     out[..., 3:] = _draws(shape, samples, object_id, seed)
     return out
 
 
 def albedo_level(albedo: NDArray, weight: NDArray, mean_albedo: float) -> float:
-    """Gain that gives albedos (n, 3) of weight (n,) the wanted mean, less where more than BRIGHT_SHARE would be above BRIGHT.
+    """Compute the gain that gives albedos (n, 3) with weights (n,) the wanted mean (Eq. P.16).
 
-    White paper must not clip because the rest of a room is dark: what is cut at 1 has lost its texture for good.
+    The gain is smaller where more than BRIGHT_SHARE of the weight would exceed BRIGHT, since clipping at 1 removes texture.
     """
     total = float(np.sum(weight))
     if not total > 0:
@@ -112,7 +109,7 @@ def albedo_level(albedo: NDArray, weight: NDArray, mean_albedo: float) -> float:
 
 
 def _draws(shape: tuple[int, int], samples: int, object_id: NDArray | None, seed: int) -> NDArray:
-    """(K, H, W, 2) roughness and metallic: one draw an object and hypothesis, the same in every view."""
+    """Draw roughness and metallic (K, H, W, 2), once per object and hypothesis, equal in all views."""
     ids = np.full(shape, -1) if object_id is None else np.asarray(object_id)
     out = np.empty((samples, *shape, 2), np.float32)
     objects, row = np.unique(ids, return_inverse=True)
@@ -127,7 +124,7 @@ def _draws(shape: tuple[int, int], samples: int, object_id: NDArray | None, seed
 
 
 class _Steps:
-    """Differences between neighbours along one axis, and what is known about them."""
+    """Differences between neighbouring pixels along one axis, and which of them may be material."""
 
     def __init__(self, log: NDArray, axis: int, known: NDArray, object_id: NDArray | None, normals: NDArray | None):
         self.difference = np.diff(log, axis=axis)
@@ -150,36 +147,35 @@ class _Steps:
             self.turn = (a * b).sum(-1) < NORMAL_TURN
 
     def material(self, threshold: float) -> NDArray:
-        """(.., 3) steps of the log reflectance: all channels where it is material, none where it is light."""
+        """Steps (.., 3) of the log reflectance: the whole difference where it is material, 0 where it is light (Eq. P.12)."""
         strong = (np.abs(self.luminance) > threshold) | (self.chromaticity > CHROMATICITY_SHARE * threshold)
         grey_turn = self.turn & (self.chromaticity <= CHROMATICITY_SHARE * THRESHOLDS[1])
         kept = self.usable & (self.border | (strong & ~grey_turn))
         return np.where(kept[..., None], self.difference, 0.0)
 
 
-def _integrated(steps: list[NDArray], image: NDArray, hold: float) -> NDArray:
-    """(H, W, 3) image whose differences are nearest to `steps` = [vertical, horizontal] and which is near `image` (least
-    squares, the second with weight `hold` >= 0; with 0 the mean is that of `image`).
+def _integrated(steps: list[NDArray], image: NDArray, stay: float) -> NDArray:
+    """Solve Eq. P.14 by the cosine transform (Eq. P.15): (H, W, 3); with weight 0 the mean is that of `image`.
 
-    The normal equations are a screened Poisson equation with Neumann borders; the cosine transform makes them diagonal.
+    `steps` holds the vertical and the horizontal steps, `stay` is the weight of the image.
     """
     from scipy.fft import dctn, idctn
 
-    right = hold * image
+    right = stay * image
     right[:-1] -= steps[0]
     right[1:] += steps[0]
     right[:, :-1] -= steps[1]
     right[:, 1:] += steps[1]
     y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in image.shape[:2])
-    eigenvalue = y[:, None] + x[None, :] + hold
-    if hold == 0:
+    eigenvalue = y[:, None] + x[None, :] + stay
+    if stay == 0:
         eigenvalue[0, 0] = 1.0  # the mean is free; its right-hand side is 0
     out = idctn(dctn(right, axes=(0, 1)) / eigenvalue[..., None], axes=(0, 1))
-    return out if hold > 0 else out + image.mean((0, 1))
+    return out if stay > 0 else out + image.mean((0, 1))
 
 
 def _scaled(reflectance: NDArray, known: NDArray, mean_albedo: float) -> NDArray:
-    """Gain that gives the wanted mean after clipping at 1, by bisection (the mean grows with the gain)."""
+    """Scale to the wanted mean after clipping at 1, by bisection."""
     values = reflectance[known] if known.any() else reflectance.reshape(-1, 3)
     if not values.size:
         return reflectance

@@ -1,26 +1,15 @@
-"""Prior `simulated`: ground truth spoilt the way a single-view diffusion model spoils it (RGB-X; METHOD 2.1).
+"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (docs/method/priors.md#simulated).
 
-The model reproduces the kinds of error, not their cause:
+The model reproduces the kinds of error, not their cause (Eq. P.3 to P.9):
 
-* every object has a *bias* that all views and samples share: albedo too dark and slightly tinted, roughness and
-  metallic pulled to a wrong value. It is not zero-mean, so no average over predictions removes it;
-* every (view, object) and every (view, object, sample) has an affine error of its own on top;
-* a share of the samples of each (view, object) is *good*: nearly an affine map of the truth, which one affine map per
-  segment can repair. The others carry, over and above, a hallucinated pattern (partly common to all samples of the
-  view), leaked shading, and blur, which no affine map repairs.
+* every object has a *bias* that all views and samples share, so averaging over predictions does not remove it;
+* every (view, object) and every (view, object, sample) has affine errors of its own;
+* a share of the samples of each (view, object) is *good*, nearly an affine map of the truth. The other samples also have a
+  hallucinated pattern, leaked shading and blur, which no affine map repairs.
 
-Every random number is a hash of (seed, what, object, view, k): it does not depend on the order, on chunking, on image
-size, or on which other objects are in view. `strength` multiplies every error: 0 gives the truth, bit for bit.
-
-Calibration. `RGBX` gives, at strength 1, the raw errors the paper reports for RGB-X. Measured on truth of the Country
-Kitchen (10 views of 128 x 128, METHOD 2.11 masks, two samples of five views; mean and spread over seeds 0-5):
-
-|          | albedo PSNR dB | roughness L2  | metallic L2   |
-|----------|----------------|---------------|---------------|
-| paper    | 13.11          | 0.187         | 0.306         |
-| `RGBX`   | 13.08 +- 0.54  | 0.187 +- 0.007| 0.303 +- 0.024|
-
-Other scenes have other truth and hence other raw errors: where most surface is glossy, roughness errs less.
+Every random number is a hash of (seed, name, object, view, sample) (Eq. P.2), so it does not depend on the order of
+evaluation, on the size of the image, or on which other objects are in view. `strength` multiplies every error; 0 returns
+the truth exactly. The default sizes give, at strength 1, the raw errors that the paper reports for RGB-X.
 """
 
 from __future__ import annotations
@@ -39,75 +28,51 @@ class SimulatedErrors:
     """Sizes of the errors at strength 1. Logarithms are natural; colours linear.
 
     Attributes:
-        gain_mean: mean log gain of albedo. gain_object, gain_view, gain_sample: its spread from object to object, from
-            view to view of one object, from sample to sample.
+        gain_mean: mean log gain of the albedo. gain_object, gain_view, gain_sample: its standard deviation over objects, over
+            the views of an object, over samples.
         tint_object, tint_sample: the same for each colour channel.
-        offset_object, offset_sample: spread of an added value, per channel.
+        offset_object, offset_sample: standard deviation of an added value per channel.
         desaturation: largest share by which colours move to their grey (uniform from 0, per object).
         good_share: share of samples that are good.
-        good_residue: size of pattern, leak and blur in a good sample, relative to a bad one.
-        pattern: log amplitude of hallucinated patterns in albedo; pattern_shared: share common to a view's samples.
+        good_residue: size of pattern, leak and blur in a good sample, relative to the others.
+        pattern: log amplitude of hallucinated patterns in albedo; pattern_shared: share common to the samples of a view.
         leak: largest exponent of true shading in albedo (uniform from 0).
         blur: largest share of the blurred truth (uniform from 0); blur_sigma: width of the blur over the image width.
         noise: standard deviation of independent noise in every channel.
-        roughness_target, metallic_target: (low, high), the wrong value an object is pulled to.
-        roughness_pull, metallic_pull: how far, 1 = all the way.
-        material_view, material_sample: spread of roughness and metallic offsets.
-        material_pattern: amplitude of the pattern in roughness and metallic of bad samples.
+        roughness_target, metallic_target: range of the wrong value of an object; roughness_pull, metallic_pull: how far the
+            prediction moves towards it, 1 = all the way.
+        material_view, material_sample: standard deviation of offsets of roughness and metallic.
+        material_pattern: amplitude of the pattern in roughness and metallic.
     """
 
-    gain_mean: float
-    gain_object: float
-    gain_view: float
-    gain_sample: float
-    tint_object: float
-    tint_sample: float
-    offset_object: float
-    offset_sample: float
-    desaturation: float
-    good_share: float
-    good_residue: float
-    pattern: float
-    pattern_shared: float
-    leak: float
-    blur: float
-    blur_sigma: float
-    noise: float
-    roughness_target: tuple[float, float]
-    roughness_pull: float
-    metallic_target: tuple[float, float]
-    metallic_pull: float
-    material_view: float
-    material_sample: float
-    material_pattern: float
+    gain_mean: float = -0.27
+    gain_object: float = 0.06
+    gain_view: float = 0.10
+    gain_sample: float = 0.12
+    tint_object: float = 0.06
+    tint_sample: float = 0.03
+    offset_object: float = 0.02
+    offset_sample: float = 0.01
+    desaturation: float = 0.3
+    good_share: float = 0.4
+    good_residue: float = 0.12
+    pattern: float = 0.5
+    pattern_shared: float = 0.6
+    leak: float = 0.3
+    blur: float = 0.9
+    blur_sigma: float = 0.04
+    noise: float = 0.01
+    roughness_target: tuple[float, float] = (0.385, 0.485)
+    roughness_pull: float = 0.91
+    metallic_target: tuple[float, float] = (0.49, 0.61)
+    metallic_pull: float = 0.97
+    material_view: float = 0.06
+    material_sample: float = 0.08
+    material_pattern: float = 0.10
 
 
-RGBX = SimulatedErrors(
-    gain_mean=-0.27,
-    gain_object=0.06,
-    gain_view=0.10,
-    gain_sample=0.12,
-    tint_object=0.06,
-    tint_sample=0.03,
-    offset_object=0.02,
-    offset_sample=0.01,
-    desaturation=0.3,
-    good_share=0.4,
-    good_residue=0.12,
-    pattern=0.5,
-    pattern_shared=0.6,
-    leak=0.3,
-    blur=0.9,
-    blur_sigma=0.04,
-    noise=0.01,
-    roughness_target=(0.385, 0.485),
-    roughness_pull=0.91,
-    metallic_target=(0.49, 0.61),
-    metallic_pull=0.97,
-    material_view=0.06,
-    material_sample=0.08,
-    material_pattern=0.10,
-)
+RGBX = SimulatedErrors()
+"""Errors of the size that the paper reports for RGB-X."""
 
 
 def simulate_predictions(
@@ -122,17 +87,19 @@ def simulate_predictions(
     shading: NDArray | None = None,
     errors: SimulatedErrors = RGBX,
 ) -> NDArray:
-    """K predictions of a view, (K, H, W, 5) float32: albedo R G B linear, perceptual roughness, metallic, in [0, 1].
+    """Simulate K predictions of a view.
 
     Args:
         albedo: (H, W, 3) linear truth; roughness, metallic: (H, W).
         object_id: (H, W) int, the units that errors belong to; -1 = none is a unit of its own.
         samples: K >= 1.
-        view: id of the view; the same id gives the same errors.
-        seed: any integer.
-        strength: 0 = truth, 1 = RGB-X, at most 4.
+        view, seed: any integers; equal ones give equal errors.
+        strength: 0 = truth, 1 = the sizes in `errors`, at most 4.
         shading: (H, W) true shading > 0 up to scale (see `shading_proxy`); None = nothing leaks.
-        errors: the sizes at strength 1.
+        errors: sizes at strength 1.
+
+    Returns:
+        (K, H, W, 5) float32: linear albedo, perceptual roughness, metallic, in [0, 1].
 
     Raises:
         InputError: shapes that do not match, samples < 1, strength outside [0, 4], truth that is not finite.
@@ -192,7 +159,7 @@ def simulate_predictions(
 
 
 def _truth(albedo: NDArray, roughness: NDArray, metallic: NDArray, shading: NDArray | None, shape: tuple[int, ...]) -> NDArray:
-    """(H, W, 5) float32 of maps that share the height and width of the object ids and are finite."""
+    """Stack the truth to (H, W, 5) float32 after checking shapes and values."""
     found = [np.shape(a) for a in (albedo, roughness, metallic)] + ([] if shading is None else [np.shape(shading)])
     if len(shape) != 2 or found[0] != (*shape, 3) or any(f != shape for f in found[1:]):
         raise InputError(
@@ -206,10 +173,17 @@ def _truth(albedo: NDArray, roughness: NDArray, metallic: NDArray, shading: NDAr
 
 
 def shading_proxy(radiance: NDArray, albedo: NDArray, object_id: NDArray, sigma: float = 0.02) -> NDArray:
-    """Smooth shading (H, W) float32 > 0 up to scale: luminance of radiance / luminance of albedo, blurred in the log.
+    """Estimate smooth shading: luminance of radiance over that of albedo, blurred in the logarithm (Eq. P.8).
 
-    Colours linear; `sigma` over the image width. Pixels with albedo below 0.02 or without light take their
-    neighbourhood's value. A stand-in for diffuse shading: highlights are in it, as they are in what RGB-X leaks.
+    Highlights are part of it, as they are part of what RGB-X leaks.
+
+    Args:
+        radiance, albedo: (H, W, 3) linear.
+        object_id: (H, W) int, -1 = none.
+        sigma: standard deviation of the blur over the longer side of the image.
+
+    Returns:
+        (H, W) float32 > 0 up to scale; pixels with albedo below 0.02 or without light take the value of their neighbourhood.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -219,7 +193,7 @@ def shading_proxy(radiance: NDArray, albedo: NDArray, object_id: NDArray, sigma:
         return np.ones(known.shape, np.float32)
     value = np.zeros(known.shape)
     value[known] = np.log(light[known] / reflectance[known])
-    low, high = np.quantile(value[known], [0.02, 0.98])  # lamps and black corners would spread over their surroundings
+    low, high = np.quantile(value[known], [0.02, 0.98])  # limits the influence of lamps and black corners
     value = np.where(known, np.clip(value, low, high), 0)
     width = sigma * max(known.shape)
     cover = gaussian_filter(known.astype(np.float64), width)
@@ -228,7 +202,7 @@ def shading_proxy(radiance: NDArray, albedo: NDArray, object_id: NDArray, sigma:
 
 
 def _log_shading(shading: NDArray | None, shape: tuple[int, ...]) -> NDArray:
-    """Log shading about its median, limited to a factor of e^2 either way."""
+    """Log shading relative to its median, clamped to [-2, 2]."""
     if shading is None:
         return np.zeros(shape)
     log = np.log(np.maximum(np.asarray(shading, np.float64), 1e-6))
@@ -243,7 +217,7 @@ def _blurred(albedo: NDArray, e: SimulatedErrors) -> NDArray:
 
 
 def _patterns(shape: tuple[int, ...], draw: _Draws, e: SimulatedErrors, waves: int = 6) -> list[NDArray]:
-    """Smooth zero-mean colour fields of unit variance, one a sample, (H, W, 3), partly common to the view."""
+    """Smooth zero-mean colour fields of unit variance (H, W, 3), one per sample, partly common to the view (Eq. P.7)."""
     y, x = (np.arange(n) + 0.5 for n in shape)
     size = max(shape)
 
@@ -265,7 +239,7 @@ def _patterns(shape: tuple[int, ...], draw: _Draws, e: SimulatedErrors, waves: i
 
 
 class _Draws:
-    """Random numbers that are hashes of what they are for."""
+    """Random numbers that are hashes of what they are used for (Eq. P.2)."""
 
     def __init__(self, seed: int, objects: NDArray, view: int, samples: int):
         self.seed, self.view, self.samples = seed, view, samples
@@ -273,7 +247,7 @@ class _Draws:
         self.k = np.arange(samples)
 
     def uniform(self, what: str, level: str, channels: int = 1) -> NDArray:
-        """(channels, n, K), or (channels, n, 1) for levels above the sample; in (0, 1)."""
+        """Uniforms in (0, 1): (channels, n, K), or (channels, n, 1) for levels above the sample."""
         channel, unit, k = np.arange(channels)[:, None, None], self.objects[None, :, None], self.k[None, None, :]
         keys: dict[str, tuple] = {"object": (), "view": (self.view,), "sample": (self.view, k)}
         return _unit_interval(_hash(self.seed, _tag(what, level), channel, unit, *keys[level]))
@@ -298,7 +272,7 @@ def _tag(what: str, level: str) -> int:
 
 
 def _hash(*keys: int | NDArray) -> NDArray:
-    """64-bit hash of integers that broadcast (splitmix64 finaliser over the keys)."""
+    """Hash integers that broadcast to 64 bits, by the finaliser of splitmix64 applied to one key after another."""
     h = np.uint64(0)
     with np.errstate(over="ignore"):
         for key in keys:

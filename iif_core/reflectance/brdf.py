@@ -1,11 +1,13 @@
-"""The Cook-Torrance reflectance of the method, exactly, written once for NumPy, Dr.Jit and torch.
+"""The Cook-Torrance reflectance of the method, written once for NumPy, Dr.Jit and torch (Eq. R.1 to R.13).
 
-    f cos = k_d NoL / pi + (k_s + (1 - k_s) F_c) * spec          spec = D G NoL / (4 NoL NoV)
+    f cos = k_d NoL / pi + (k_s + (1 - k_s) F_c) spec          spec = D G NoL / (4 NoL NoV)
     k_d = (1 - m) a      k_s = 0.04 (1 - m) + m a      F_c = (1 - VoH)^5
 
-Every formula is in the form that stays exact in float32 down to r = 0.02 (METHOD sections 3.1, 3.2, 3.4).
-`xp` is a namespace of `iif_core.numerics.xp`; vectors are sequences (x, y, z) of arrays. All functions are elementwise
-and broadcast.
+The formulae have forms that keep their digits in float32 down to r = 0.02
+(docs/method/reflectance.md#forms-that-hold-in-single-precision). In all functions `xp` is a namespace of
+`iif_core.numerics.xp`; a vector is a sequence (x, y, z) of arrays; r is the perceptual roughness, alpha = r^2; colours and
+reflectances are linear. All functions are elementwise and broadcast. The cosines NoL, NoV, NoH, VoH and sin2_h are those of
+`half_angles`.
 """
 
 from __future__ import annotations
@@ -16,40 +18,52 @@ from typing import Any
 from iif_core.numerics.xp import Namespace
 
 R_MIN = 0.02
-"""Smallest perceptual roughness: below it D and its density leave the range of float32 (METHOD H16)."""
+"""Smallest perceptual roughness; D exceeds the range of float32 below it (docs/method/numerics.md#roughness-at-zero)."""
 
 F0_DIELECTRIC = 0.04
-_TINY = 1e-4
+_MIN_VOH = 1e-4
 _XYZ = Sequence[Any]
 
 
 def kd_ks(a: Any, m: Any) -> tuple[Any, Any]:
-    """Diffuse and specular reflectance (k_d, k_s) of base colour a and metallic m, linear, each in [0, 1].
+    """Compute the diffuse and specular reflectance of base colour a and metalness m (Eq. R.2), each in [0, 1].
 
-    k_d = (1 - m) a,  k_s = 0.04 (1 - m) + m a  (METHOD 3.1). m must broadcast against a.
+    k_d = (1 - m) a,  k_s = 0.04 (1 - m) + m a.  m must broadcast against a.
     """
     return (1 - m) * a, F0_DIELECTRIC * (1 - m) + m * a
 
 
 def compose(kd: Any, ks: Any, diffuse: Any, s0: Any, s1: Any) -> Any:
-    """k_d D + k_s S0 + S1: reflected radiance from cached shading, or f cos from the lobes of one direction.
+    """Compute k_d D + k_s S0 + S1: radiance from cached shading, or f cos from the lobes of one direction (Eq. R.7, S.2).
 
-    For f cos use D = diffuse, S0 = spec (1 - F_c), S1 = spec F_c; then it equals k_d/pi NoL + F spec with
-    F = k_s + (1 - k_s) F_c (METHOD 2.7, 3.1).
+    Args:
+        kd, ks: reflectances of `kd_ks`.
+        diffuse, s0, s1: cached shading, or for f cos the factors diffuse, spec (1 - F_c) and spec F_c of `lobes`.
+
+    Returns:
+        Reflected radiance, or f cos in 1/sr.
     """
     return kd * diffuse + ks * s0 + s1
 
 
 def dot(u: _XYZ, v: _XYZ) -> Any:
-    """Inner product of two vectors given as (x, y, z)."""
+    """Compute the inner product of two vectors (x, y, z)."""
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
 def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, Any, Any, Any, Any]:
-    """(NoL, NoV, NoH, VoH, sin2_h) of unit vectors: clamped cosines and sin2_h = |n x h|^2.
+    """Compute the cosines of a pair of directions and of their half vector.
 
-    h = (wi + wo) / max(|wi + wo|, 1e-8), so opposite directions give finite values (METHOD H19); sin2_h is
-    taken from the cross product because 1 - NoH^2 has no digits left near the peak (METHOD 3.4).
+    h = (wi + wo) / max(|wi + wo|, 1e-8), so opposite directions give finite values
+    (docs/method/numerics.md#opposite-directions). sin2_h = |n x h|^2 comes from the cross product, because 1 - NoH^2 loses
+    all digits near the peak of the lobe (docs/method/numerics.md#cancellation-at-the-ggx-peak).
+
+    Args:
+        xp: array namespace.
+        normal, wi, wo: unit vectors; wi points to the light, wo to the viewer.
+
+    Returns:
+        NoL, NoV, NoH, VoH (clamped to >= 0) and sin2_h.
     """
     hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
     scale = 1 / xp.maximum(xp.sqrt(hx * hx + hy * hy + hz * hz), 1e-8)
@@ -67,11 +81,17 @@ def half_angles(xp: Namespace, normal: _XYZ, wi: _XYZ, wo: _XYZ) -> tuple[Any, A
 
 
 def normal_distribution(xp: Namespace, NoH: Any, sin2_h: Any, r: Any) -> Any:
-    """GGX normal distribution D, 1/sr, in the stable form alpha^2 / (pi (alpha^2 NoH^2 + sin2_h)^2), alpha =
-    r^2.
+    """Compute the GGX normal distribution D = alpha^2 / (pi (alpha^2 NoH^2 + sin2_h)^2) (Eq. R.8).
 
-    r is clamped to [R_MIN, inf). The bracket is at least alpha^2 for any real angle; it is held there, so
-    that opposite directions (h = 0) stay finite. Source: METHOD 3.4.
+    The bracket is at least alpha^2 for unit vectors; it is clamped there, so that opposite directions (h = 0) stay finite.
+
+    Args:
+        xp: array namespace.
+        NoH, sin2_h: of `half_angles`.
+        r: roughness; raised to R_MIN.
+
+    Returns:
+        D in 1/sr.
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
@@ -80,11 +100,18 @@ def normal_distribution(xp: Namespace, NoH: Any, sin2_h: Any, r: Any) -> Any:
 
 
 def lobes(xp: Namespace, NoL: Any, NoV: Any, NoH: Any, VoH: Any, sin2_h: Any, r: Any) -> tuple[Any, Any, Any]:
-    """(diffuse, spec, fc): the material-free lobes times the cosine, for one pair of directions.
+    """Compute the factors of Eq. R.7 that depend on no material but the roughness, times the cosine (Eq. R.6).
 
-    diffuse = NoL / pi,  spec = D G/(NoL NoV) NoL / 4 with g(x) = 1/(x (1 - k) + k), k = (r + 1)^2 / 8,
-    fc = (1 - VoH)^5. All 1/sr; zero when NoL <= 0 or NoV <= 0. r in [0.02, 1] (smaller is clamped).
-    Source: METHOD 3.1, 3.4.
+    diffuse = NoL / pi,  spec = D g(NoL) g(NoV) NoL / 4 with g(x) = 1 / (x (1 - k) + k), k = (r + 1)^2 / 8,
+    fc = (1 - VoH)^5.
+
+    Args:
+        xp: array namespace.
+        NoL, NoV, NoH, VoH, sin2_h: of `half_angles`.
+        r: roughness in [0.02, 1]; smaller values are raised to R_MIN.
+
+    Returns:
+        diffuse and spec in 1/sr, both 0 where NoL or NoV is 0, and fc.
     """
     r = xp.maximum(r, R_MIN)
     k = (r + 1) * (r + 1) * 0.125
@@ -97,20 +124,32 @@ def lobes(xp: Namespace, NoL: Any, NoV: Any, NoH: Any, VoH: Any, sin2_h: Any, r:
 
 
 def specular_pdf(xp: Namespace, NoH: Any, VoH: Any, sin2_h: Any, r: Any) -> Any:
-    """Density (1/sr) of wi when h is drawn by `sample_ggx_half` and wi = reflect(wo, h): D NoH / (4 max(VoH,
-    1e-4)).
+    """Compute the density of wi when `sample_ggx_half` draws h and wi = reflect(wo, h) (Eq. R.11).
 
-    Source: METHOD 3.2.
+    Args:
+        xp: array namespace.
+        NoH, VoH, sin2_h: of `half_angles`.
+        r: roughness.
+
+    Returns:
+        D NoH / (4 max(VoH, 1e-4)) in 1/sr.
     """
-    return normal_distribution(xp, NoH, sin2_h, r) * NoH / (4 * xp.maximum(VoH, _TINY))
+    return normal_distribution(xp, NoH, sin2_h, r) * NoH / (4 * xp.maximum(VoH, _MIN_VOH))
 
 
 def specular_chance(xp: Namespace, kd: Any, ks: Any, NoV: Any) -> Any:
-    """Probability of drawing from the GGX lobe: its share F / (F + k_d) of what is reflected, F = k_s + (1 - k_s)(1 - NoV)^5,
-    kept in [0.05, 0.95].
+    """Compute the probability of drawing from the GGX lobe, its share of the reflectance (Eq. R.12).
 
-    kd, ks: of one channel or the largest of all. METHOD 3.2 draws either lobe half of the time; on a diffuse wall that
-    squanders half of the paths and lets weights of almost 2 multiply up from bounce to bounce.
+    F / (F + k_d) with F = k_s + (1 - k_s)(1 - NoV)^5, clamped to [0.05, 0.95]. An even choice would make path weights grow
+    (docs/method/numerics.md#path-weights-that-grow).
+
+    Args:
+        xp: array namespace.
+        kd, ks: reflectances of one channel, or the largest of all channels.
+        NoV: cosine between normal and viewer.
+
+    Returns:
+        Probability.
     """
     away = xp.maximum(1 - NoV, 0.0)
     fresnel = ks + (1 - ks) * away * away * away * away * away
@@ -119,22 +158,38 @@ def specular_chance(xp: Namespace, kd: Any, ks: Any, NoV: Any) -> Any:
 
 
 def mixture_pdf(xp: Namespace, NoL: Any, NoH: Any, VoH: Any, sin2_h: Any, r: Any, chance: Any = 0.5) -> Any:
-    """Density (1/sr) of choosing the GGX lobe with probability `chance`, else the cosine lobe."""
+    """Compute the density of a direction drawn from the GGX lobe with probability `chance`, else the cosine lobe (Eq. R.13).
+
+    Args:
+        xp: array namespace.
+        NoL, NoH, VoH, sin2_h: of `half_angles`.
+        r: roughness.
+        chance: probability of the GGX lobe.
+
+    Returns:
+        Density in 1/sr.
+    """
     return chance * specular_pdf(xp, NoH, VoH, sin2_h, r) + (1 - chance) * NoL * (1 / xp.pi)
 
 
 def sample_cosine(xp: Namespace, u1: Any, u2: Any) -> tuple[Any, Any, Any]:
-    """Local direction (z = normal) with density cos / pi from uniforms in [0, 1): theta = asin sqrt(u1), phi
-    = 2 pi u2."""
+    """Draw a direction with density cos / pi, in a frame with z = normal, from uniforms in [0, 1) (Eq. R.9)."""
     sine, phi = xp.sqrt(u1), 2 * xp.pi * u2
     return sine * xp.cos(phi), sine * xp.sin(phi), xp.sqrt(xp.maximum(1 - u1, 0))
 
 
 def sample_ggx_half(xp: Namespace, u1: Any, u2: Any, r: Any) -> tuple[Any, Any, Any]:
-    """Local half vector with density D NoH from uniforms in [0, 1).
+    """Draw a half vector with density D NoH, in a frame with z = normal (Eq. R.10).
 
-    tan^2 theta_h = alpha^2 u1 / (1 - u1), alpha = r^2; sine and cosine are formed separately so that neither
-    loses digits at small alpha (METHOD 3.2, 3.4). r below R_MIN is clamped.
+    tan^2 theta = alpha^2 u1 / (1 - u1). Sine and cosine are formed separately, so neither loses digits at small alpha.
+
+    Args:
+        xp: array namespace.
+        u1, u2: uniforms in [0, 1).
+        r: roughness; raised to R_MIN.
+
+    Returns:
+        Unit vector (x, y, z).
     """
     r = xp.maximum(r, R_MIN)
     alpha2 = (r * r) * (r * r)
@@ -145,7 +200,6 @@ def sample_ggx_half(xp: Namespace, u1: Any, u2: Any, r: Any) -> tuple[Any, Any, 
 
 
 def reflect(wo: _XYZ, h: _XYZ) -> tuple[Any, Any, Any]:
-    """wi = 2 (wo . h) h - wo, the mirror image of wo about h; it may lie below the surface (its weight is
-    then 0)."""
+    """Mirror wo about h: wi = 2 (wo . h) h - wo. The result may lie below the surface, where its weight is 0."""
     twice = 2 * dot(wo, h)
     return twice * h[0] - wo[0], twice * h[1] - wo[1], twice * h[2] - wo[2]

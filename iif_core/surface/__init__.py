@@ -1,1 +1,1 @@
-"""Surface: triangle meshes, surface cells, segments, and shading cells."""
+"""Surface: triangle meshes, surface cells, segments, shading cells."""

@@ -1,6 +1,6 @@
-"""Surface cells: voxel keys and a hash table from keys to rows that NumPy and Dr.Jit read alike.
+"""Surface cells: voxel keys, and a hash table from keys to rows that NumPy and Dr.Jit read alike.
 
-A key is 64 bits, kept as two 32-bit words because the kernels do 32-bit integer arithmetic:
+A key has 64 bits. It is kept as two 32-bit words, because the kernels use 32-bit integer arithmetic:
 
     bits  0-15  i     voxel index along x          0 ... 65535
     bits 16-31  j     along y                      0 ... 65535
@@ -32,10 +32,10 @@ _PROBE_STRIDE = 0x9E3779B9
 
 
 def grid_origin(points: ArrayLike, edge: float) -> Array:
-    """Lower corner (3,) float32 for a voxel grid around `points` (n, 3), so that every index is >= 1.
+    """Compute the lower corner (3,) float32 of a voxel grid around `points` (n, 3), so that every voxel index is >= 1.
 
-    Lies an irrational part of an edge below the minimum: walls at round coordinates then do not coincide with
-    voxel faces, where rounding would scatter one wall over two layers of voxels.
+    The corner lies an irrational part of an edge below the minimum, so that walls at round coordinates do not coincide with
+    borders of voxels (docs/method/numerics.md#walls-on-voxel-borders).
     """
     points = np.asarray(points, np.float64)
     if points.size == 0 or not np.isfinite(points).all():
@@ -44,10 +44,12 @@ def grid_origin(points: ArrayLike, edge: float) -> Array:
 
 
 def voxel_indices(points: ArrayLike, edge: float, origin: ArrayLike) -> Array:
-    """floor((x - origin) * (1 / edge)) in float32: the voxel (i, j, k) of each point, (n, 3) int32; any sign.
+    """Compute the voxel floor((x - origin) * (1 / edge)) of each point, (n, 3) int32, in float32; lengths in metres.
 
-    The kernels evaluate the same float32 expression, so both sides agree to the last bit. Lengths in metres.
-    Raises InputError for a non-positive edge or non-finite points.
+    The kernels evaluate the same float32 expression, so both results agree to the last bit.
+
+    Raises:
+        InputError: a non-positive edge, points that are not finite, or an edge too small for 32-bit indices.
     """
     if not edge > 0:
         raise InputError(f"voxel edge is {edge}; it must be a positive length in metres")
@@ -61,14 +63,15 @@ def voxel_indices(points: ArrayLike, edge: float, origin: ArrayLike) -> Array:
 
 
 def inverse_edge(edge: float) -> np.float32:
-    """1 / edge as float32: the factor that both NumPy and the kernels multiply with."""
+    """Compute 1 / edge as float32, the factor that NumPy and the kernels both use."""
     return np.float32(1.0 / edge)
 
 
 def pack_keys(ijk: ArrayLike, object_id: ArrayLike = -1) -> Array:
-    """64-bit keys (n,) uint64 of voxels (n, 3) and object ids (n,) or scalar, laid out as in the module text.
+    """Pack voxels (n, 3) and object ids, (n,) or scalar, into 64-bit keys (n,) uint64 (see the module docstring).
 
-    Raises InputError when an index is outside [0, 65535] or an object id outside [-1, 65534].
+    Raises:
+        InputError: an index outside [0, 65535] or an object id outside [-1, 65534].
     """
     ijk = np.asarray(ijk).reshape(-1, 3).astype(np.int64)
     objects = np.broadcast_to(np.asarray(object_id, np.int64), (len(ijk),)) + 1
@@ -84,17 +87,17 @@ def pack_keys(ijk: ArrayLike, object_id: ArrayLike = -1) -> Array:
 
 
 def unpack_keys(keys: ArrayLike) -> tuple[Array, Array]:
-    """((n, 3) int32 voxel indices, (n,) int32 object ids): the inverse of `pack_keys`."""
+    """Invert `pack_keys`: (n, 3) int32 voxel indices and (n,) int32 object ids."""
     keys = np.asarray(keys, np.uint64).reshape(-1)
     parts = [((keys >> np.uint64(shift)) & np.uint64(0xFFFF)).astype(np.int32) for shift in (0, 16, 32, 48)]
     return np.stack(parts[:3], axis=-1), parts[3] - 1
 
 
 def coarse_cells(ijk: ArrayLike, object_id: ArrayLike, values: ArrayLike) -> tuple[Array, Array, Array]:
-    """Cells of `COARSE` times the edge and the mean of the fine cells in them: ((m, 3), (m,), (m, C) float32).
+    """Average fine cells into cells of `COARSE` times the edge: voxels (m, 3), objects (m,), means (m, C) float32.
 
-    They answer for surface between fine cells, which a few views leave empty. The coarse index of a point is its fine
-    one shifted by two bits, so both grids share one origin.
+    Coarse cells give values to surface between fine cells, which few views leave empty. The coarse index of a point is its
+    fine index shifted by two bits, so both grids share one origin.
     """
     ijk, values = np.asarray(ijk).reshape(-1, 3), np.asarray(values, np.float64)
     keys, row = np.unique(pack_keys(ijk >> COARSE_SHIFT, object_id), return_inverse=True)
@@ -104,11 +107,14 @@ def coarse_cells(ijk: ArrayLike, object_id: ArrayLike, values: ArrayLike) -> tup
 
 
 def neighbour_pairs(keys: ArrayLike) -> Array:
-    """(m, 2) int32 rows of cells of one object whose voxels touch by face, edge or corner; `keys` sorted, distinct."""
+    """Find pairs of cells of one object whose voxels touch by face, edge or corner: (m, 2) int32 rows of `keys`.
+
+    `keys` must be sorted and distinct.
+    """
     keys = np.asarray(keys, np.uint64).reshape(-1)
     found = [np.zeros((0, 2), np.int32)]
     half = [(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1) if (k, j, i) > (0, 0, 0)]
-    for i, j, k in half:  # the other half are the same pairs again
+    for i, j, k in half:  # the other 13 directions give the same pairs again
         step = np.int64(i) + (np.int64(j) << np.int64(16)) + (np.int64(k) << np.int64(32))
         wanted = keys + step.astype(np.uint64)  # indices lie in 1 ... 65534, so no word overflows into the next
         row = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
@@ -118,8 +124,7 @@ def neighbour_pairs(keys: ArrayLike) -> Array:
 
 
 def hash_words(low, high):
-    """32-bit hash of a key's two words; only wrapping 32-bit multiplies, xors and shifts, for NumPy and
-    Dr.Jit uint32 alike."""
+    """Hash the two words of a key to 32 bits, with operations that NumPy and Dr.Jit uint32 arrays share."""
     h = (low * 0x85EBCA6B) ^ (high * 0xC2B2AE35)
     h = (h ^ (h >> 15)) * 0x2C1B3C6D
     h = (h ^ (h >> 12)) * 0x297A2D39
@@ -127,17 +132,20 @@ def hash_words(low, high):
 
 
 def probe_step(h):
-    """Odd step between probes, from other bits of the hash, so that keys that collide once part ways."""
+    """Compute the odd step between probes from other bits of the hash, so that colliding keys follow different sequences."""
     return ((h >> 16) ^ (h * _PROBE_STRIDE)) | 1
 
 
 @dataclass(frozen=True)
 class CellTable:
-    """Open-addressing hash table from 64-bit keys to row indices, read with at most `probes` <= 8 looks.
+    """Open-addressing hash table from 64-bit keys to row indices.
 
-    `slots` is (size, 4) uint32: low word, high word, row (0xFFFFFFFF = empty), 0; size is a power of two.
-    Probe p of a key looks at (hash + p * step) mod size; an empty slot ends the search, since no later slot
-    can hold the key.
+    Probe p of a key looks at the slot (hash + p * step) mod size. An empty slot ends the search, because no later slot can
+    hold the key.
+
+    Attributes:
+        slots: (size, 4) uint32: low word, high word, row (0xFFFFFFFF = empty), 0; size is a power of two.
+        probes: largest number of slots that a lookup reads, <= 8.
     """
 
     slots: Array
@@ -145,8 +153,7 @@ class CellTable:
 
     @classmethod
     def build(cls, keys: ArrayLike) -> CellTable:
-        """Table in which key number i maps to row i; deterministic, vectorised over keys. Keys must be
-        distinct."""
+        """Build the table that maps key number i to row i; keys must be distinct. The result is deterministic."""
         keys = np.ascontiguousarray(np.asarray(keys, np.uint64).reshape(-1))
         if len(keys) >= 1 << 28:
             raise InputError(f"{len(keys)} cells; the table holds fewer than 2^28: use a larger cell edge")
@@ -160,8 +167,10 @@ class CellTable:
 
     @classmethod
     def _place(cls, keys: Array, size: int) -> CellTable | None:
-        """Rounds: every unplaced key asks for its next slot; the lowest row that asks for a free slot gets
-        it."""
+        """Place all keys within MAX_PROBES rounds, or return None.
+
+        In each round every unplaced key requests its next slot, and the lowest row that requests a free slot gets it.
+        """
         low, high = _words(keys)
         h = hash_words(low, high)
         step = probe_step(h)
@@ -173,7 +182,7 @@ class CellTable:
                 return None
             slot = (h[waiting] + np.uint32(probes) * step[waiting]) & np.uint32(size - 1)
             free = np.flatnonzero(owner[slot] == EMPTY)[::-1]
-            owner[slot[free]] = waiting[free]  # of repeated indices the last value stays: that of the lowest row
+            owner[slot[free]] = waiting[free]  # the last assignment to a slot wins: the lowest row
             waiting = waiting[owner[slot] != waiting]
             probes += 1
         slots = np.zeros((size, 4), np.uint32)
@@ -183,7 +192,7 @@ class CellTable:
         return cls(slots, max(probes, 1))
 
     def lookup(self, keys: ArrayLike) -> Array:
-        """Row of every key, int32, -1 where the table does not hold it."""
+        """Return the row of every key, int32; -1 for keys that the table does not hold."""
         low, high = _words(np.asarray(keys, np.uint64).reshape(-1))
         h = hash_words(low, high)
         step = probe_step(h)

@@ -1,8 +1,7 @@
-"""Objects on faces and segments in views.
+"""Objects on faces, and segments in views (docs/method/objects.md).
 
-A *segment* is one object in one view: the unit that shares one affine correction (METHOD 1.1). Segments are numbered
-view by view, inside a view by ascending object id. Ids are int32, -1 = none. Faces get their object by the majority
-of the pixels that see them; a face nobody saw takes the label of the nearest labelled face across shared edges.
+A *segment* is one object in one view, the unit that shares one affine correction (Eq. O.1). Segments are numbered view by
+view, and within a view by ascending object id. Ids are int32, -1 = none.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from iif_core.errors import InputError
 
 @dataclass(frozen=True)
 class SegmentTable:
-    """Rows of the segment table, one a segment, in segment id order; all int32 of shape (S,)."""
+    """The segments of all views in the order of their ids; all columns int32 (S,)."""
 
     segment_id: NDArray
     view: NDArray
@@ -30,9 +29,18 @@ class SegmentTable:
 
 
 def view_segments(object_map: NDArray, first_segment: int = 0) -> tuple[NDArray, NDArray, NDArray]:
-    """Segments of one view: (segment ids (H, W) int32, object of each segment (s,), pixels of each segment (s,)).
+    """Number the segments of one view (Eq. O.1).
 
-    `object_map` (H, W) integer, -1 (any negative) = none and stays -1. Ids start at `first_segment`.
+    Args:
+        object_map: (H, W) integer; negative = none.
+        first_segment: id of the first segment.
+
+    Returns:
+        Segment ids (H, W) int32 with -1 = none, and object and number of pixels of each segment, (s,) int32.
+
+    Example:
+        >>> view_segments(np.array([[7, -1], [3, 7]]))[0].tolist()
+        [[1, -1], [0, 1]]
     """
     object_map = _integer_map(object_map, "object map")
     seen = object_map >= 0
@@ -43,11 +51,13 @@ def view_segments(object_map: NDArray, first_segment: int = 0) -> tuple[NDArray,
 
 
 def segment_table(object_maps: Iterable[NDArray]) -> tuple[list[NDArray], SegmentTable]:
-    """Segments of all views from their object maps.
+    """Number the segments of all views.
 
-    `object_maps`: (V, H, W) or a sequence of (H, W) maps (views may differ in size), integer, negative = none.
-    Returns the segment id maps (int32, -1 = none) and the table (segment_id, view, object, pixels), where `view` is
-    the position in the sequence.
+    Args:
+        object_maps: one (H, W) integer map per view, negative = none; views may differ in size.
+
+    Returns:
+        Segment id maps, and the table, in which `view` is the position in the sequence.
     """
     maps, views, objects, pixels, first = [], [], [], [], 0
     for view, object_map in enumerate(object_maps):
@@ -58,17 +68,15 @@ def segment_table(object_maps: Iterable[NDArray]) -> tuple[list[NDArray], Segmen
         pixels.append(counts)
         first += len(ids)
 
-    def joined(parts: list[NDArray]) -> NDArray:
-        return np.concatenate(parts) if parts else np.zeros(0, np.int32)
-
-    return maps, SegmentTable(np.arange(first, dtype=np.int32), joined(views), joined(objects), joined(pixels))
+    columns = (np.concatenate([np.zeros(0, np.int32), *parts]) for parts in (views, objects, pixels))
+    return maps, SegmentTable(np.arange(first, dtype=np.int32), *columns)
 
 
 def interior(object_map: NDArray, border: int) -> NDArray:
-    """Pixels not within `border` pixels of another id: bool (H, W); the picture's own edge is no border.
+    """Find pixels whose (2 border + 1)^2 neighbourhood has one object id (Eq. O.2): bool (H, W).
 
-    The neighbourhood is the (2 border + 1)^2 square. Pixels without an object (-1) are never interior; border = 0
-    keeps every pixel that has an object.
+    The edge of the picture is no border. Pixels without an object (-1) are never interior; border = 0 keeps every pixel that
+    has an object.
     """
     from scipy.ndimage import maximum_filter, minimum_filter
 
@@ -83,10 +91,15 @@ def interior(object_map: NDArray, border: int) -> NDArray:
 
 
 def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
-    """Pairs of faces that share an edge: (M, 2) int32, lower face first, sorted.
+    """Find pairs of faces that share an edge: (M, 2) int32, lower face first, sorted.
 
-    `faces` (F, 3) vertex indices. With `vertices` (N, 3) corners at identical positions count as one vertex, so that
-    faces split by texture or normal seams stay neighbours. An edge of n > 2 faces gives a chain of n - 1 pairs.
+    Args:
+        faces: (F, 3) vertex indices.
+        vertices: (N, 3); if given, vertices at identical positions count as one, so that seams of texture coordinates or
+            normals do not separate faces.
+
+    Returns:
+        Pairs; an edge of n > 2 faces gives a chain of n - 1 pairs.
     """
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3:
@@ -110,7 +123,7 @@ def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
 
 
 def _welded(vertices: NDArray) -> NDArray:
-    """Index of the first vertex at the same position, by vertex."""
+    """Index of the first vertex at the same position, for every vertex."""
     order = np.lexsort(vertices.T)
     ordered = vertices[order]
     new = np.r_[True, (ordered[1:] != ordered[:-1]).any(1)]
@@ -121,12 +134,14 @@ def _welded(vertices: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class FaceVotes:
-    """Object of every face and how well its pixels agree.
+    """Result of `vote_faces`.
 
-    `object_of_face` (F,) int32; `votes` (F,) int32 pixels that saw the face (0 = label came from a neighbour or the
-    background); `object_id` (O,) int32 ascending, every id that occurs on a face; `pixels`, `agreement` (O,): votes
-    cast on the object's faces, and the share of them that named it (0 where no pixel saw the object);
-    `background` the id given to faces no label reaches, or None if there are none.
+    Attributes:
+        object_of_face: (F,) int32.
+        votes: (F,) int32 pixels that saw the face; 0 = the label came from a neighbour or is the background.
+        object_id: (O,) int32 ascending, every id that occurs on a face.
+        pixels, agreement: (O,) votes cast on the faces of the object, and the share of them for it; 0 without votes.
+        background: id of the faces that no label reached; None if there are none.
     """
 
     object_of_face: NDArray
@@ -144,12 +159,22 @@ def vote_faces(
     faces_adjacency: NDArray | None = None,
     background: int | None = None,
 ) -> FaceVotes:
-    """Object of every face by the majority of the pixels that see it (METHOD 2.2, in place of a neural field).
+    """Label every face by the majority of the pixels that see it (Eq. O.3).
 
-    `face_id`, `instance_id`: integer arrays of one shape (pixels of all views), negative = miss / not labelled, which
-    casts no vote. Ties go to the lowest instance id. Faces without a vote take the label of the nearest labelled face,
-    counted in steps across shared edges (`faces_adjacency` (M, 2), see `face_adjacency`; equal distance: lowest id);
-    faces no label reaches become `background` (default: one more than the highest instance id).
+    Pixels with a negative id cast no vote, and ties go to the lowest instance id. A face without votes takes the label of the
+    nearest labelled face, counted in steps across shared edges; at equal distance the lowest label.
+
+    Args:
+        face_id, instance_id: integer arrays of one shape, the pixels of all views; negative = miss or not labelled.
+        n_faces: number of faces, F.
+        faces_adjacency: (M, 2) of `face_adjacency`.
+        background: label of faces that no other label reaches; one more than the highest instance id if None.
+
+    Returns:
+        Labels of the faces, and how far the votes agree.
+
+    Raises:
+        InputError: shapes that differ, or a face id that the mesh does not have.
     """
     face, instance = np.ravel(face_id), np.ravel(instance_id)
     if face.shape != instance.shape:
@@ -194,10 +219,19 @@ def vote_faces(
 
 
 def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDArray) -> NDArray:
-    """Labels for every face, (F,) int32: where photographs say nothing, the mesh decides.
+    """Label the remaining faces by the pieces of the mesh.
 
-    A face without a label (-1) takes that of the nearest labelled face across shared edges, without leaving its `piece` (F,)
-    and without entering a `closed` one (F,) bool. What remains becomes one new object a piece, numbered after the others.
+    A face without a label takes that of the nearest labelled face across shared edges, without leaving its piece and without
+    entering a closed face. The faces that remain become one new object per piece, numbered after the others.
+
+    Args:
+        label: (F,) int; -1 = no label.
+        piece: (F,) int, piece of the mesh of every face.
+        closed: (F,) bool, faces that neither receive nor pass on labels.
+        adjacency: (M, 2) of `face_adjacency`.
+
+    Returns:
+        (F,) int32 labels >= 0.
     """
     label, piece, closed = np.asarray(label, np.int64), np.asarray(piece, np.int64), np.asarray(closed, bool)
     pairs = np.asarray(adjacency).reshape(-1, 2)
@@ -210,17 +244,15 @@ def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDAr
 
 
 def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float, NDArray]:
-    """How alike two partitions of one set are: the adjusted Rand index, and of every label of `a` how well it is found again.
-
-    With n_ij the weight in label i of `a` and j of `b`, a_i and b_j its sums, N the total, p = sum a_i^2, q = sum b_j^2:
-
-        ARI = (sum n_ij^2 - p q / N^2) / ((p + q) / 2 - p q / N^2)
-
-    (Hubert and Arabie 1985 for weights instead of counts): 1 = the same, about 0 = no more alike than by chance. The second
-    result, (max(a) + 1,) float64, is max_j n_ij / (a_i + b_j - n_ij), the best overlap over union; NaN without weight.
+    """Compare two partitions of a set by the weighted adjusted Rand index (Eq. O.20).
 
     Args:
-        a, b: (n,) int labels from 0; weight: (n,) >= 0.
+        a, b: (n,) int labels from 0.
+        weight: (n,) >= 0.
+
+    Returns:
+        The index: 1 for equal partitions, about 0 for partitions that agree no more than by chance. And (max(a) + 1,) float64,
+        the best overlap over union of every label of `a` with a label of `b` (Eq. O.21); NaN for labels without weight.
 
     Raises:
         InputError: shapes that differ, or no weight at all.
@@ -233,7 +265,7 @@ def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float,
     total = weight.sum()
     if not total > 0:
         raise InputError("partitions without weight cannot be compared")
-    table = coo_matrix((weight, (a, b))).tocsr()  # sums what falls together
+    table = coo_matrix((weight, (a, b))).tocsr()  # sums entries at the same position
     table = table.tocoo()
     of_a, of_b = np.bincount(a, weight), np.bincount(b, weight)
     p, q = (of_a**2).sum(), (of_b**2).sum()
@@ -248,7 +280,7 @@ def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float,
 
 
 def _spread(label: NDArray, adjacency: NDArray) -> NDArray:
-    """Labels grown over the face graph ring by ring; a face reached by several in one ring takes the lowest."""
+    """Grow labels over the face graph ring by ring; a face that several labels reach in one ring takes the lowest."""
     n = len(label)
     ends = np.concatenate([adjacency, adjacency[:, ::-1]]).astype(np.int64)
     ends = ends[np.argsort(ends[:, 0], kind="stable")]

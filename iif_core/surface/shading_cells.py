@@ -1,7 +1,8 @@
-"""Diffuse shading once per piece of surface instead of once per pixel and view: it does not depend on the viewer (METHOD 7d).
+"""Diffuse shading per surface cell, computed once for all views because it does not depend on the viewer.
 
-A cell is object x voxel x normal direction (rounded to halves per axis). Paths start at a few of the pixels that see it, of all
-views, and go on until the measured noise is small enough; two halves stay independent of each other.
+A cell is a triple of object, voxel and direction of the normal (Eq. S.17). Paths start at a few of the pixels that see the
+cell, in any view, and are added until the measured noise is small enough. Two independent halves are kept
+(docs/method/shading.md#surface-cells).
 """
 
 from __future__ import annotations
@@ -18,23 +19,26 @@ from iif_core.surface.cells import pack_keys, voxel_indices
 Array = np.ndarray
 
 REPRESENTATIVES = 8
-"""Pixels of a cell from which its paths start."""
+"""Largest number of pixels of a cell at which its paths start."""
 
 _BINS = 125
 _MEDIAN_OF_NORMAL = 0.6745  # median |x| of a standard normal
 
 
 def normal_bin(normals: ArrayLike) -> Array:
-    """(n,) int64 in 0 ... 124 of unit normals (n, 3): each coordinate rounded to -1, -1/2, 0, 1/2 or 1."""
+    """Number the directions of unit normals (n, 3), each coordinate rounded to -1, -1/2, 0, 1/2 or 1: (n,) int64 in 0 ... 124."""
     return (np.rint(2 * np.asarray(normals, np.float64)).astype(np.int64) + 2) @ np.array([25, 5, 1])
 
 
 @dataclass(frozen=True)
 class ShadingCells:
-    """Cells with representative points; made by `ShadingCellBuilder`.
+    """Cells with representative points, made by `ShadingCellBuilder`.
 
-    object_id (c,) int32; points, normals (c, REPRESENTATIVES, 3) float32, repeated where a cell has fewer pixels;
-    pixels (c,) int64.
+    Attributes:
+        edge, origin: voxel grid, in metres.
+        object_id: (c,) int32.
+        points, normals: (c, REPRESENTATIVES, 3) float32; repeated where a cell has fewer pixels.
+        pixels: (c,) int64 pixels of all views that see the cell.
     """
 
     edge: float
@@ -50,7 +54,7 @@ class ShadingCells:
         return len(self.object_id)
 
     def find(self, points: ArrayLike, normals: ArrayLike, object_id: ArrayLike) -> Array:
-        """(n,) int64 cell of every surface point; raises InputError for one that was never added."""
+        """Return the cell (n,) int64 of every surface point; raise InputError for a point whose cell does not exist."""
         voxel = pack_keys(voxel_indices(points, self.edge, self.origin), object_id)
         row = np.minimum(np.searchsorted(self._voxels, voxel), len(self._voxels) - 1)
         cell = row * _BINS + normal_bin(normals)
@@ -61,9 +65,10 @@ class ShadingCells:
 
 
 class ShadingCellBuilder:
-    """Collects pixels view by view; memory grows with the surface, not with the number of views.
+    """Collects the pixels of all views; memory grows with the surface, not with the number of views.
 
-    Every pixel draws a random number; a cell keeps the pixels with the smallest ones, a uniform sample of all it ever had.
+    Every pixel draws a random number, and a cell keeps the pixels with the smallest numbers, which is a uniform sample of all
+    pixels added to it.
     """
 
     def __init__(self, edge: float, origin: ArrayLike):
@@ -71,7 +76,13 @@ class ShadingCellBuilder:
         self._kept: tuple[Array, ...] | None = None
 
     def add(self, points: ArrayLike, normals: ArrayLike, object_id: ArrayLike, seed: int) -> None:
-        """Surface points (n, 3) and unit normals (n, 3) of one view, object_id (n,)."""
+        """Add the pixels of one view.
+
+        Args:
+            points, normals: (n, 3) surface points in metres and unit normals.
+            object_id: (n,) int.
+            seed: seed of the random numbers of the view.
+        """
         points, normals = np.asarray(points, np.float32), np.asarray(normals, np.float32)
         new = (
             pack_keys(voxel_indices(points, self.edge, self.origin), object_id),
@@ -83,21 +94,21 @@ class ShadingCellBuilder:
             np.ones(len(points), np.int64),
         )
         old = self._kept
-        joined = new if old is None else tuple(np.concatenate(pair) for pair in zip(old, new, strict=True))
-        order = np.lexsort((joined[2], joined[1], joined[0]))
-        voxel, bins = joined[0][order], joined[1][order]
+        columns = new if old is None else tuple(np.concatenate(pair) for pair in zip(old, new, strict=True))
+        order = np.lexsort((columns[2], columns[1], columns[0]))
+        voxel, bins = columns[0][order], columns[1][order]
         first = np.r_[True, (voxel[1:] != voxel[:-1]) | (bins[1:] != bins[:-1])] if len(order) else np.zeros(0, bool)
         start = np.flatnonzero(first)
         cell = np.cumsum(first) - 1
         rank = np.arange(len(order)) - start[cell]
-        # The first pixel kept of a cell carries the cell's number of pixels.
-        pixels = np.bincount(cell, joined[6][order], len(start)).astype(np.int64)
+        # The first entry of a cell holds the cell's number of pixels.
+        pixels = np.bincount(cell, columns[6][order], len(start)).astype(np.int64)
         keep = rank < REPRESENTATIVES
         count = np.where(first, pixels[cell], 0)[keep]
-        self._kept = (*(column[order][keep] for column in joined[:6]), count)
+        self._kept = (*(column[order][keep] for column in columns[:6]), count)
 
     def finish(self) -> ShadingCells:
-        """The cells, sorted by voxel and normal."""
+        """Return the cells, sorted by voxel and normal."""
         if self._kept is None:
             raise InputError("no surface point was added: no view sees the mesh")
         voxel, bins, _, points, normals, object_id, count = self._kept
@@ -111,8 +122,14 @@ class ShadingCellBuilder:
 
 @dataclass(frozen=True)
 class DiffuseShading:
-    """diffuse (2, c, 3) float32: two independent estimates a cell; samples (c,) paths of both together; noise: median relative
-    standard error of their mean over cells, at first and at last; noisy_objects: objects that stopped at the most paths."""
+    """Result of `diffuse_of_cells`.
+
+    Attributes:
+        diffuse: (2, c, 3) float32, two independent estimates per cell.
+        samples: (c,) paths of both estimates together.
+        noise_first, noise_last: median over the cells of the relative standard error, after the first and after the last paths.
+        noisy_objects: number of objects that reached the largest number of paths and are still too noisy.
+    """
 
     diffuse: Array
     samples: Array
@@ -124,12 +141,24 @@ class DiffuseShading:
 Tracer = Callable[[Array, Array, int, int], Array]
 
 
-def diffuse_of_cells(cells: ShadingCells, trace: Tracer, samples: int, noise: float, most: int, seed: int) -> DiffuseShading:
-    """Diffuse shading of all cells: `samples` paths each, then twice as many for objects that are noisier than `noise`.
+def diffuse_of_cells(
+    cells: ShadingCells, trace: Tracer, samples: int, noise: float, max_samples: int, seed: int
+) -> DiffuseShading:
+    """Estimate the diffuse shading of all cells (Eq. S.18).
 
-    noise: relative standard error of the mean of the halves, the median over the cells of an object; the halves' difference
-    is twice that error, and the median of its size 0.67 of its standard deviation. most: paths a cell, both halves together.
-    trace(points, normals, paths, seed) -> (n, 3) mean over `paths` of the diffuse lobe.
+    Every cell gets `samples` paths. The cells of an object whose median relative error exceeds `noise` get as many paths
+    again, until the error is small enough or the number would exceed `max_samples`.
+
+    Args:
+        cells: of `ShadingCellBuilder`.
+        trace: function (points (n, 3), normals (n, 3), paths, seed) that returns (n, 3), the mean over `paths` paths.
+        samples: first number of paths per cell, both halves together.
+        noise: relative standard error of the mean of the halves that an object may have.
+        max_samples: largest number of paths per cell, both halves together.
+        seed: the streams of all calls of `trace` are derived from it.
+
+    Returns:
+        Two independent estimates per cell, and their noise.
     """
     count = len(cells)
     sums, paths = np.zeros((2, count, 3)), np.zeros(count, np.int64)  # paths of one half
@@ -149,7 +178,7 @@ def diffuse_of_cells(cells: ShadingCells, trace: Tracer, samples: int, noise: fl
         last = float(np.median(error)) if count else 0.0
         first = last if first is None else first
         noisy = _median_by(owner, error) > noise
-        room = (paths * 4 <= most) & noisy[owner]
+        room = (paths * 4 <= max_samples) & noisy[owner]
         if not room.any() or turn == 60:
             break
         work, turn = np.flatnonzero(room), turn + 1
@@ -158,9 +187,12 @@ def diffuse_of_cells(cells: ShadingCells, trace: Tracer, samples: int, noise: fl
     return DiffuseShading(diffuse.astype(np.float32), 2 * paths, first, last, left)
 
 
-def joined(cell: Array, cell_noise: float, own: Array) -> Array:
-    """(2, n, 3) float32 halves of pixels: their cells' estimate (2, n, 3) of relative error `cell_noise` and their own
-    (2, n, 3), each weighted with the other's variance. One weight for all pixels, so that it depends on no pixel's value."""
+def combine_estimates(cell: Array, cell_noise: float, own: Array) -> Array:
+    """Combine the estimates of the cells and of the pixels' own paths, weighted with each other's variance (Eq. S.19).
+
+    `cell` and `own` are (2, n, 3) halves, `cell_noise` is the relative error of the cells; result (2, n, 3) float32. One weight
+    serves all pixels, so it does not depend on the value of any single pixel.
+    """
     own_noise = float(np.median(relative_error(own))) if own.shape[1] else 0.0
     total = own_noise**2 + cell_noise**2
     weight = own_noise**2 / total if total > 0 else 1.0
@@ -168,8 +200,7 @@ def joined(cell: Array, cell_noise: float, own: Array) -> Array:
 
 
 def relative_error(halves: Array) -> Array:
-    """(c,) relative standard error of the mean of two estimates (2, c, 3), from how far they are apart; dark ones (below 1 % of
-    the median) relative to that 1 %."""
+    """Estimate the relative standard error of the mean of two estimates (2, c, 3) from their difference, (c,) (Eq. S.18)."""
     value = np.asarray(halves, np.float64).mean(-1)
     mean = value.mean(0)
     floor = max(1e-2 * float(np.median(mean)), 1e-12) if mean.size else 1.0
@@ -177,7 +208,7 @@ def relative_error(halves: Array) -> Array:
 
 
 def _median_by(owner: Array, values: Array) -> Array:
-    """Median of `values` for each owner 0 ... max, 0 for one without any."""
+    """Lower median of `values` for each owner 0 ... max; 0 for an owner without values."""
     out = np.zeros(int(owner.max(initial=0)) + 1)
     order = np.lexsort((values, owner))
     ids, start, count = np.unique(owner[order], return_index=True, return_counts=True)

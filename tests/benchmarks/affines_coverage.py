@@ -25,7 +25,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from iif_core.camera.response import response
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.problem import BIASES, CROSS, GAINS, IDENTITY, FitOptions, FitProblem, FitResult, apply_affines
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult
+from iif_core.reflectance.material import BIASES, CROSS_TERMS, GAINS, IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, radiance_of, shading_of
 
 
@@ -64,7 +65,7 @@ def planted(seed: int, objects: int, family: Family = FAMILIES["room"]) -> tuple
     truth = np.tile(IDENTITY, (objects, 1))
     truth[:, GAINS] = rng.normal(1.2, 0.12, (objects, 3))
     truth[:, BIASES] = rng.normal(0, 0.03, (objects, 3))
-    truth[:, CROSS] = rng.normal(0, 0.05, (objects, 6))
+    truth[:, CROSS_TERMS] = rng.normal(0, 0.05, (objects, 6))
     truth[:, 12] = family.texture
     truth[:, 13] = np.clip(rng.normal(0.5, 0.15, objects), 0.15, 0.9) - 0.5 * family.texture
     truth[:, 14], truth[:, 15] = 0.0, rng.random(objects) < 0.1
@@ -115,7 +116,7 @@ def main() -> None:
         spread = np.sqrt(np.diagonal(fit.covariance, axis1=1, axis2=2))
         right_kind = fit.affine[:, 15] == truth[:, 15]
         error = (fit.affine - truth)[right_kind]
-        for name, columns in (("gain", GAINS), ("bias", BIASES), ("cross", CROSS)):
+        for name, columns in (("gain", GAINS), ("bias", BIASES), ("cross", CROSS_TERMS)):
             z[name].append((error[:, columns] / np.maximum(spread[right_kind][:, columns], 1e-12)).ravel())
         mean = np.stack([problem.base[problem.object_id == o].mean(0) for o in range(arguments.objects)])[right_kind]
         covariance = fit.covariance[right_kind]

@@ -1,4 +1,4 @@
-"""How the direct base solver's cost grows with pixels and with predictions: is it linear over 8x?
+"""How the direct solver's cost grows with pixels and with predictions: is it linear over 8x?
 
     python tests/benchmarks/base_cost.py --output results/studies/base_cost.parquet
 
@@ -18,15 +18,15 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.fusion.direct import solve_base
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import BaseProblem
+from iif_core.fusion.direct import solve_direct
+from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.problem import FusionProblem
 
 VIEWS = 8
 OBJECTS = 64
 
 
-def wall(pixels: int, k: int, seed: int = 0) -> BaseProblem:
+def wall(pixels: int, k: int, seed: int = 0) -> FusionProblem:
     """`pixels` in all over `VIEWS` views, each a window over a wall with 1.5 cells a pixel; K predictions, half of them bad."""
     rng = np.random.default_rng(seed)
     side = int(np.sqrt(pixels / VIEWS))
@@ -44,13 +44,13 @@ def wall(pixels: int, k: int, seed: int = 0) -> BaseProblem:
         noise = np.where(np.arange(k) % 2, 0.1, 0.01)[:, None, None] * rng.standard_normal((k, side * side, 5))
         predictions.append(np.clip(gain * texture[window].reshape(-1, 5) + noise, 0.01, 0.99).astype(np.float16))
     of_segment = np.tile(np.arange(OBJECTS, dtype=np.int32), VIEWS)
-    return BaseProblem(predictions, cells, segments, size * size, objects.ravel(), of_segment)
+    return FusionProblem(predictions, cells, segments, size * size, objects.ravel(), of_segment)
 
 
 def measure(repeats: int = 3) -> list[dict[str, Any]]:
     """One row a size: what varies, pixels, k, cpu_seconds, and the exponent of its series."""
     series = {"pixels": [(1 << p, 8) for p in (17, 18, 19, 20)], "predictions": [(1 << 18, k) for k in (4, 8, 16, 32)]}
-    solve_base(wall(1 << 14, 4))  # compiles
+    solve_direct(wall(1 << 14, 4))  # compiles
     rows: list[dict[str, Any]] = []
     for varied, sizes in series.items():
         own = []
@@ -59,7 +59,7 @@ def measure(repeats: int = 3) -> list[dict[str, Any]]:
             seconds = []
             for _ in range(repeats):
                 start = time.process_time()
-                solve_base(problem, BaseOptions(), threads=1)
+                solve_direct(problem, FusionOptions(), threads=1)
                 seconds.append(time.process_time() - start)
             own.append({"varied": varied, "pixels": pixels, "predictions": k, "cpu_seconds": float(np.median(seconds))})
         size = np.log([row[varied] for row in own])

@@ -26,7 +26,7 @@ from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numb
 from iif_core.camera.response import Response, response
 from iif_core.camera.simulation import expose, response_curve
 from iif_core.surface.cells import grid_origin
-from iif_core.surface.mesh import face_geometry
+from iif_core.surface.triangles import face_geometry
 from workflow.artifacts import StageReader
 from workflow.scene.normal_form import CaptureReader
 

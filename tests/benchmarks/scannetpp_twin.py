@@ -47,6 +47,7 @@ def photographs(room, count: int, camera: Pinhole, lens: Distortion, samples: in
     from iif_core.camera.simulation import expose, response_curve
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
 
     geometry = mini.geometry(room)
     native.limit_threads(1)
@@ -55,7 +56,7 @@ def photographs(room, count: int, camera: Pinhole, lens: Distortion, samples: in
     out = []
     for i, pose in enumerate(room.cameras(count)):
         rays = directions(camera, lens, pose)
-        radiance = render(geometry, material, emitters, pose[:3, 3], rays, samples, 12, 1000 + i)
+        radiance = render(Scene(geometry, material, emitters), pose[:3, 3], rays, PathOptions(samples, 12, 1000 + i))
         picture = expose(radiance, 0.6, curve).reshape(camera.height, camera.width, 3)
         out.append((pose, picture))
     return out

@@ -1,16 +1,18 @@
 """Fixtures that several unit tests share."""
 
 import socket
+from types import SimpleNamespace
 
 import pytest
 
 
 @pytest.fixture(scope="session")
 def T(llvm):
-    """`iif_core.light.transport`, imported after Mitsuba's variant is set."""
-    from iif_core.light import transport
+    """Public names of the modules of `iif_core.light.transport`, imported after Mitsuba's variant is set."""
+    from iif_core.light.transport import cache, emitters, geometry, materials, matrix, render, scene, shading
 
-    return transport
+    modules = (cache, emitters, geometry, materials, matrix, render, scene, shading)
+    return SimpleNamespace(**{name: value for module in modules for name, value in vars(module).items() if name[0] != "_"})
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,8 @@
 import numpy as np
 
 from iif_core.fitting.levels import interpolate_levels
-from iif_core.fitting.problem import IDENTITY, FitProblem, apply_affines
+from iif_core.fitting.problem import FitProblem
+from iif_core.reflectance.material import IDENTITY, apply_affines
 
 LEVELS = np.linspace(0.02, 1.0, 10)
 

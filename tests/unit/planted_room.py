@@ -9,7 +9,8 @@ import numpy as np
 
 from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.camera.response import response
-from iif_core.light.emission.problem import EmissionProblem, PixelRows, assemble, initial_radiance
+from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.problem import EmissionProblem, assemble, initial_radiance
 from iif_core.light.emission.sensor import Sensor
 
 SIZE = np.array([5.0, 4.0, 2.7])
@@ -142,21 +143,22 @@ class PlantedScene:
     def photographs(self, seed: int, samples: int) -> np.ndarray:
         """(n, 3) radiance with the noise of `samples` paths."""
         from iif_core.light.transport.render import render
+        from iif_core.light.transport.scene import PathOptions, Scene
 
-        arguments = (self.geometry, self.material, self.emitters, self.origins, self.directions)
-        return render(*arguments, samples, BOUNCES, 7919 * seed + 1).astype(np.float64)
+        scene = Scene(self.geometry, self.material, self.emitters)
+        return render(scene, self.origins, self.directions, PathOptions(samples, BOUNCES, 7919 * seed + 1)).astype(np.float64)
 
     def halves(self, seed: int, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
         """Two independent traces of `samples` paths a pixel each; emitters do not reflect, so their rows are 0."""
         from iif_core.light.transport.matrix import transport_matrix
+        from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
 
         base = self.room.material[self.face]
-        surface = (self.points, self.normals, -self.directions, base[:, :3], base[:, 3], base[:, 4])
-        columns = (self.room.group, len(self.room.truth), self.side)
-        by_lobe = (
-            transport_matrix(self.geometry, self.material, *surface, *columns, samples, BOUNCES, 7919 * seed + 11 + half)
-            for half in range(2)
-        )
+        points = ShadingPoints(self.points, self.normals, -self.directions, base[:, :3], base[:, 3], base[:, 4])
+        columns = EmitterColumns(self.room.group, len(self.room.truth), self.side)
+        scene = Scene(self.geometry, self.material, None)
+        paths = [PathOptions(samples, BOUNCES, 7919 * seed + 11 + half) for half in range(2)]
+        by_lobe = (transport_matrix(scene, points, columns, half) for half in paths)
         return [(matrix.sum(1), cached.sum(1)) for matrix, cached in by_lobe]
 
     def problem(
@@ -181,7 +183,7 @@ class PlantedScene:
         group = np.where(self.room.truth[group].any(1) & (group >= 0), group, -1)
         if kind == "hdr_hidden":
             bound, radiance = bound | (group >= 0)[:, None], np.where((group >= 0)[:, None], 1.0, radiance)
-        rows = PixelRows(radiance, bound, self.room.object_id[self.face], self.view, self.tile, group)
+        rows = EmissionPixels(radiance, bound, self.room.object_id[self.face], self.view, self.tile, group)
         problem = assemble(rows, halves, len(self.room.truth))
         return problem, initial_radiance(rows, np.ones((len(self.room.truth), 3)), linear and kind == "hdr")
 

@@ -5,13 +5,14 @@ import pytest
 
 from iif_core.camera.response import response
 from iif_core.errors import InputError
-from iif_core.fitting.descent import Pull
+from iif_core.fitting.descent import GaussianPrior
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, pin
+from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
-from iif_core.fitting.pixels import evaluate, prepare
-from iif_core.fitting.problem import IDENTITY, FitOptions, FitProblem, albedo_uncertainty, apply_affines
+from iif_core.fitting.pixels import evaluate, prepare_pixels
+from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.reflectance.material import IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(
@@ -45,7 +46,7 @@ def test_planted_affines_and_gamma_from_clean_ldr(halves):
 
 @pytest.mark.parametrize("plain", [True, False])
 def test_matte_fits_no_gloss(plain):
-    """What shows gloss is fitted without: roughness 1 and no metal, and the albedo still moves."""
+    """Objects that show gloss are fitted without it: roughness 1 and no metal, and the albedo still moves."""
     problem, _ = problem_of(np.random.default_rng(2))
     options = replace(EXACT, matte=True) if plain else FitOptions(matte=True)
     out = fit_affines(problem, response("identity"), options)
@@ -56,7 +57,7 @@ def test_matte_fits_no_gloss(plain):
 
 
 def test_calibrated_response_is_a_prior():
-    """A sure prior holds the response, a vague one lets the photographs decide."""
+    """A precise prior holds the response; with a vague one the photographs decide."""
     problem, _ = problem_of(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x))
     for precision, expected in ((1e9, 2.1), (1e-9, 1.9)):
         opt = FitOptions(**{**EXACT.__dict__, "response_ridge": 1e-5, "response_prior": (np.array([2.1]), precision * np.eye(1))})
@@ -82,16 +83,16 @@ def test_gradient_and_normal_matrix_against_differences(family):
     problem = FitProblem(**{**problem.__dict__, "saturated": saturated})
     problem.base[:, 4] = rng.uniform(0.1, 0.9, 80)
     start = response(family)
-    px, tone = prepare(problem, start)
+    px, tone = prepare_pixels(problem, start)
     opt = FitOptions(roughness_weight=1e-3, metallic_weight=5e-3)
-    pull = Pull(np.tile(IDENTITY, (2, 1)), np.tile(0.3 * np.eye(16), (2, 1, 1)))
+    prior = GaussianPrior(np.tile(IDENTITY, (2, 1)), np.tile(0.3 * np.eye(16), (2, 1, 1)))
     t = np.tile(IDENTITY, (2, 1)) + rng.normal(0, 0.1, (2, 16))
     t[1, 0] += 2.0  # some albedos above 1
     t[1, 13] -= 0.4  # some roughness below the range
     params = start.params.ravel() * 1.07
     terms = evaluate(px, t, tone.at(params), opt, True)
     gradient = terms.g.copy()
-    gradient[:, :16] += pull.gradient(t)
+    gradient[:, :16] += prior.gradient(t)
     assert gradient.shape == (2, 16 + tone.size)
     for o in range(2):
         for k in range(16 + tone.size):
@@ -102,13 +103,13 @@ def test_gradient_and_normal_matrix_against_differences(family):
                     moved[o, k] += sign * 1e-7
                 else:
                     p[k - 16] += sign * 1e-7
-                values.append((evaluate(px, moved, tone.at(p), opt, False).cost + pull.cost(moved))[o])
+                values.append((evaluate(px, moved, tone.at(p), opt, False).cost + prior.cost(moved))[o])
             assert gradient[o, k] == pytest.approx((values[0] - values[1]) / 2e-7, rel=2e-4, abs=2e-4), (o, k)
     np.testing.assert_allclose(terms.h, terms.h.transpose(0, 2, 1))
 
 
 def test_noise_in_the_cache_raises_gamma_and_two_halves_cure_it():
-    """COMPUTE 6: a plain joint fit overestimates gamma (2.59 for 1.9 there); two independent halves do not."""
+    """A plain joint fit overestimates gamma; two independent halves do not (docs/method/numerics.md#noise-in-cached-shading)."""
     rng = np.random.default_rng(4)
     problem, truth = problem_of(
         rng, n_objects=8, per_object=3000, value_of=lambda x: response("gamma", [1.9])(x), noise=0.5, halves=2
@@ -159,12 +160,12 @@ def test_all_saturated_object_does_not_darken():
     saturated = np.repeat([[False], [True]], 200, 0).repeat(3, 1)
     low = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, 1e-3, problem.value)})
     out = fit_affines(low, response("gamma"), FitOptions(**PLAIN))
-    np.testing.assert_allclose(out.affine[1], IDENTITY, atol=1e-3)  # every bound is met: nothing pulls
+    np.testing.assert_allclose(out.affine[1], IDENTITY, atol=1e-3)  # every bound is met
     assert np.isfinite(out.covariance).all() and out.residual[1] == 0
     raised = response("gamma")(1.3 * response("gamma").inverse(problem.value))
     high = FitProblem(**{**problem.__dict__, "saturated": saturated, "value": np.where(saturated, raised, problem.value)})
     out = fit_affines(high, response("gamma"), FitOptions(**PLAIN))
-    assert out.affine[1, [0, 5, 10]].min() > 1.15  # bounds that are not met pull upwards
+    assert out.affine[1, [0, 5, 10]].min() > 1.15  # bounds that are not met raise the albedo
 
 
 def test_saturated_pixels_do_not_bias():
@@ -202,7 +203,7 @@ def _lambertian(rng, n, albedo, dim=1.0):
 
 @pytest.mark.parametrize("dim", [1.0, 0.9])
 def test_white_wall_in_light_that_is_too_dim_gets_no_gloss(dim):
-    """It shows more than an albedo of 1 explains: only a lobe could add it, were the albedo bounded there in the fit."""
+    """The wall shows more than an albedo of 1 explains, which only a lobe could add if the fit bounded the albedo there."""
     problem, base = _lambertian(np.random.default_rng(17), 800, 0.98, dim)
     out = fit_affines(problem, response("identity"), FitOptions())
     fitted = apply_affines(out.affine, problem.object_id, base)
@@ -221,7 +222,7 @@ def test_what_has_no_lobe_is_rough():
 
 
 def test_rough_metal_is_taken_for_a_dielectric():
-    """Degenerate (METHOD 7b); a smooth one is told."""
+    """The two look alike (docs/method/fitting.md#selection-of-kind-and-roughness); a smooth metal is recognised."""
     rng = np.random.default_rng(19)
     base = np.c_[rng.uniform(0.4, 0.6, (1000, 3)), np.full(1000, 0.5), np.full(1000, 0.5)]
     for roughness, metal in ((0.9, 0.0), (0.3, 1.0)):
@@ -232,7 +233,7 @@ def test_rough_metal_is_taken_for_a_dielectric():
         assert (apply_affines(out.affine, problem.object_id, base)[:, 4] == metal).all()
 
 
-def test_wrong_roughness_valley_is_left():
+def test_wrong_local_minimum_of_roughness_is_left():
     rng = np.random.default_rng(10)
     n = 600
     base = np.c_[rng.uniform(0.02, 0.1, (n, 3)), np.full(n, 0.95), np.zeros(n)]
@@ -290,30 +291,30 @@ def test_scale_pins():
         (Gauge("mean_albedo", 0.3), 0.3, slice(None)),
         (Gauge("white_patch", true_patch, patch), true_patch, patch),
     ):
-        pinned = pin(problem, free, gauge)
+        pinned = apply_gauge(problem, free, gauge)
         np.testing.assert_allclose(pinned.affine[:, :12] * pinned.light_scale, free.affine[:, :12], rtol=1e-9)
         np.testing.assert_array_equal(pinned.affine[:, 12:], free.affine[:, 12:])
         fitted = apply_affines(pinned.affine, problem.object_id, problem.base)[where, :3]
         np.testing.assert_allclose(fitted.mean(), level, rtol=1e-3)
         assert pinned.facts["scale"]["kind"] == gauge.kind and np.isfinite(pinned.facts["scale"]["relative_error"])
     for gauge in (Gauge("white_patch", true_patch, patch), Gauge("lamp", factor=1.25)):
-        found = pin(dimmer, dim, gauge)  # what is known of one thing gives the level of all
+        found = apply_gauge(dimmer, dim, gauge)  # one known albedo or lamp gives the level of all
         fitted, wanted = (apply_affines(t, problem.object_id, problem.base)[:, :3].mean() for t in (found.affine, truth))
         assert fitted == pytest.approx(wanted, rel=0.03) and found.light_scale == pytest.approx(1.25, rel=0.02)
-    assert pin(problem, free, Gauge("found")).affine is free.affine
+    assert apply_gauge(problem, free, Gauge("found")).affine is free.affine
 
 
-def test_a_level_that_is_not_sure_leans_on_the_prior():
+def test_an_uncertain_level_is_averaged_with_the_prior():
     problem, _ = problem_of(np.random.default_rng(14))
     free = fit_affines(problem, response("identity"), EXACT)
-    prior = pin(problem, free, Gauge("prior")).light_scale
+    prior = apply_gauge(problem, free, Gauge("prior")).light_scale
     assert abs(np.log(prior)) > 0.02
     for error, share, left in (
         (LEVEL_OF_PRIOR, 0.5, LEVEL_OF_PRIOR / np.sqrt(2)),
         (np.inf, 1.0, LEVEL_OF_PRIOR),
         (1e-6, 0.0, 1e-6),
     ):
-        pinned = pin(problem, free, Gauge("found", error=error))
+        pinned = apply_gauge(problem, free, Gauge("found", error=error))
         assert np.log(pinned.light_scale) == pytest.approx(share * np.log(prior), abs=1e-9)
         assert pinned.facts["scale"]["relative_error"] == pytest.approx(left, rel=1e-6)
 

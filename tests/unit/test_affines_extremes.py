@@ -7,9 +7,10 @@ import pytest
 
 from iif_core.camera.response import response
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, pin
-from iif_core.fitting.problem import IDENTITY, FitOptions, FitProblem, apply_affines
+from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.problem import FitOptions, FitProblem
 from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.reflectance.material import IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, planted, problem_of, radiance_of, shading_of
 
 
@@ -22,7 +23,7 @@ def _checked(problem, family="identity", **options):
     assert value.min() >= 0 and value.max() <= 1 and value[:, 3].min() >= 0.02
     assert (np.diagonal(fit.covariance, axis1=1, axis2=2) >= 0).all() and (np.diff(fit.history) <= 0).all()
     assert len(fit.model) == problem.n_objects and all(fit.model) and fit.reason
-    assert np.isfinite(pin(problem, fit, Gauge("prior")).light_scale)
+    assert np.isfinite(apply_gauge(problem, fit, Gauge("prior")).light_scale)
     return fit, value
 
 
@@ -51,7 +52,7 @@ def test_sharpest_and_roughest():
 
 
 def test_black_metal_is_black():
-    """m = 1 and a = 0: only S1 is left (METHOD H18), which no albedo explains."""
+    """With m = 1 and a = 0 only S1 is left, which no albedo explains (docs/method/numerics.md#black-metal)."""
     problem, truth = _uniform([[0.0, 0.0, 0.0, 0.3, 1], [0.5, 0.4, 0.3, 0.5, 0], [0.8, 0.7, 0.5, 0.3, 1]])
     fit, value = _checked(problem)
     assert value[:300, :3].max() < 0.05
@@ -78,7 +79,7 @@ def test_everything_saturated():
 
 
 def test_object_in_full_shadow_takes_what_the_others_have():
-    """No light, no information: pixels below a thousandth of the median light are left out (METHOD H59)."""
+    """Pixels below a thousandth of the median light are left out (docs/method/numerics.md#pixels-without-light)."""
     problem, truth = problem_of(np.random.default_rng(3), 5, 300)
     dark = problem.object_id == 4
     parts = {}

@@ -7,10 +7,11 @@ from iif_core.camera.response import response
 from iif_core.errors import InputError
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.pixels import prepare
-from iif_core.fitting.problem import IDENTITY, FitOptions, apply_affines
+from iif_core.fitting.pixels import prepare_pixels
+from iif_core.fitting.problem import FitOptions, SgdOptions
 from iif_core.fitting.reference_loss import reference_loss, reference_options, reference_problem
-from iif_core.fitting.sgd import SgdOptions, _gradient, fit_affines_sgd
+from iif_core.fitting.sgd import _gradient, fit_affines_sgd
+from iif_core.reflectance.material import IDENTITY, apply_affines
 from tests.unit.planted_fit import problem_of
 from workflow.settings.affines import Affines
 
@@ -22,7 +23,7 @@ def ldr():
 
 
 def test_reference_loss_by_hand(ldr):
-    """METHOD 2.8, written out once more with plain arrays."""
+    """Eq. M.39, written with plain arrays."""
     from iif_core.fitting.levels import interpolate_levels
 
     affine = np.tile(IDENTITY, (4, 1)) * 0.9
@@ -46,7 +47,7 @@ def test_reference_loss_by_hand(ldr):
 def test_gradient_of_the_reference_loss_against_differences(ldr, family):
     curve = response(family)
     problem = reference_problem(ldr, curve)
-    px, tone = prepare(problem, curve)
+    px, tone = prepare_pixels(problem, curve)
     rng = np.random.default_rng(1)
     affine = np.tile(IDENTITY, (4, 1)) + 0.05 * rng.normal(size=(4, 16))
     affine[:, 15] += 0.3
@@ -68,13 +69,13 @@ def test_gradient_of_the_reference_loss_against_differences(ldr, family):
 def test_twins_are_judged_by_one_loss(ldr):
     """The direct solver on the reference loss is not above the paper's optimiser; both are below the start."""
     start = response("gamma")
-    before = reference_loss(ldr, np.tile(IDENTITY, (4, 1)), start).total
+    initial_population = reference_loss(ldr, np.tile(IDENTITY, (4, 1)), start).total
     direct = fit_affines(reference_problem(ldr, start), start, reference_options())
     found = reference_loss(ldr, direct.affine, direct.response).total
     for options in (SgdOptions(batch=200, epochs=5), SgdOptions("adam", batch=200, epochs=10, decay=0.7)):
         fit = fit_affines_sgd(ldr, start, options)
         after = reference_loss(ldr, fit.affine, fit.response).total
-        assert after == pytest.approx(fit.history[-1]) and after < before
+        assert after == pytest.approx(fit.history[-1]) and after < initial_population
         assert found <= after
         assert fit.covariance.shape == (4, 16, 16) and np.isfinite(fit.covariance).all() and len(fit.model) == 4
     assert direct.converged

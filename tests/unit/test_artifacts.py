@@ -1,13 +1,15 @@
 """Artefacts: what is written is read back; what changed on disk is found and named."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from iif_core.errors import InputError
 from workflow.artifacts import DamagedArtefact, StageReader, StageWriter
 from workflow.artifacts.store import ids_from_disk, ids_to_disk, rgb, split_rgb
-from workflow.artifacts.verify import damaged
+from workflow.artifacts.verify import absent, damaged
 
 
 def provenance():
@@ -116,6 +118,47 @@ def test_stale_files_of_an_earlier_run_are_removed(stage):
     writer.json("base.json", {})
     writer.finish()
     assert sorted(p.name for p in folder.rglob("*") if p.is_file()) == ["base.json", "manifest.json"]
+
+
+@pytest.mark.parametrize("name", ["../evil", "maps/../../evil", "/tmp/evil", "", "link/evil"])
+def test_names_that_leave_the_folder_are_refused(tmp_path, name):
+    """Whatever the kind of file: relative parts, absolute paths, and links that lead out."""
+    folder, outside = tmp_path / "stage", tmp_path / "outside"
+    outside.mkdir()
+    writer = StageWriter(folder, provenance())
+    (folder / "link").symlink_to(outside)
+    before = sorted(path for path in tmp_path.rglob("*"))
+    for write in (
+        lambda: writer.exr(name, {"a": np.zeros((1, 1), np.float32)}),
+        lambda: writer.table(name, {"a": np.zeros(1)}),
+        lambda: writer.json(name, {}),
+        lambda: writer.bytes(name, b"x"),
+        lambda: writer.note(name, {}),
+        lambda: writer.noted(name),
+        lambda: writer.keep(name, {"sha256": ""}),
+    ):
+        with pytest.raises(InputError, match="would leave this folder"):
+            write()
+    assert sorted(path for path in tmp_path.rglob("*")) == before and not Path("/tmp/evil").exists()
+
+
+def test_a_folder_that_is_itself_a_link_can_be_written(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "stage").symlink_to(tmp_path / "disk")
+    StageWriter(tmp_path / "stage", provenance()).json("maps/a.json", {})
+    assert (tmp_path / "disk/maps/a.json").is_file()
+
+
+def test_files_that_are_gone_are_listed(stage, tmp_path):
+    folder = stage[0]
+    manifest = folder / "manifest.json"
+    assert absent(folder, manifest) == [] == absent(tmp_path / "nowhere", manifest)
+    (folder / "base.json").unlink()
+    (folder / "maps/v.exr").unlink()
+    assert absent(folder, manifest) == ["base.json", "maps/v.exr"]
+    manifest.unlink()
+    assert absent(folder, manifest) == ["manifest.json"]
+    assert absent(folder, tmp_path / "other/manifest.json") == []
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -1,4 +1,4 @@
-"""Every row of docs/bad-input.md, provoked: the message (or the recorded note) is the one that the page shows."""
+"""Every row of docs/reference/bad-input.md, provoked: the message (or the recorded note) is the one that the page shows."""
 
 import functools
 import json
@@ -16,8 +16,9 @@ from tests.unit import scannetpp_scene as mini
 from tests.unit import test_colmap, test_fipt
 from workflow import settings
 from workflow.runtime import fingerprint
+from workflow.sources.folder_scene import transforms
 
-PAGE = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs/reference/bad-input.md"
 PENDING = {"no emitter seen"}
 """Rows whose stage tests them elsewhere."""
 
@@ -738,8 +739,40 @@ def test_row(name, tmp_path):
     assert "Traceback" not in message and "\n" not in message.strip()
 
 
+def test_every_photograph_without_a_pose_is_named(tmp_path):
+    path = tmp_path / "data/own"
+    document = own.bare(path, 30)
+    for entry in document["frames"][2:]:
+        del entry["transform_matrix"]
+    own.write_transforms(path, document)
+    message = planned(tmp_path, capture={"views": 30})
+    for i in range(2, 22):
+        assert f"frames[{i}] (images/{i:03d}.png)" in message
+    assert "and 8 more: `transform_matrix` missing" in message and "frames[22]" not in message
+
+
+@pytest.mark.parametrize("key", ["_name", "_mask", "_seen", "_split", "_where", "_mask_full"])
+def test_keys_that_begin_with_an_underscore_are_not_taken_from_a_file(tmp_path, key):
+    """They carry what the readers themselves know; a name from outside would lead out of results/."""
+    path = tmp_path / "data/own"
+    document = own.bare(path)
+    dumped = own.settings_of(path)
+    expected = transforms.read(dumped["source"], dumped["capture"]).frames
+    document["frames"][1][key] = "../../evil"
+    own.write_transforms(path, document)
+    found = transforms.read(dumped["source"], dumped["capture"]).frames
+    assert [frame.name for frame in found] == ["000", "001", "002"]
+    assert [(f.mask, f.mask_full, f.split, f.seen) for f in found] == [(f.mask, f.mask_full, f.split, f.seen) for f in expected]
+
+
+def test_a_folder_with_a_similar_name_is_suggested(tmp_path):
+    own.bare(tmp_path / "data/office")
+    message = planned(tmp_path, source={"path": "data/ofice"})
+    assert message.endswith("Did you mean data/office?")
+
+
 def test_every_example_of_the_guide_is_valid():
-    guide = (PAGE.parent / "own-data.md").read_text()
+    guide = (PAGE.parents[1] / "guide/own-data.md").read_text()
     examples = re.findall(r"```yaml\n(.*?)```", guide, re.DOTALL)
     kinds = {settings.SceneSettings.model_validate(yaml.safe_load(text)).source.kind for text in examples}
     assert kinds == {"builtin", "mitsuba", "folder", "scannetpp", "fipt"}

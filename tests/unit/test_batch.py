@@ -15,7 +15,7 @@ from workflow.artifacts.files import write_exr, write_json, write_parquet
 from workflow.batch import plan as batch_plan
 from workflow.batch import summary
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import Outcome
+from workflow.runtime.job_state import JobState
 from workflow.settings import batch_table
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
@@ -168,7 +168,7 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
         ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides: `capture`: found 3"]),
         ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source: `source.kind`: found 'foldr', allowed: builtin"]),
         ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path: `source.path`: missing"]),
-        ("a\tfolder\tx\t\t", ["line 2: `prior`: missing"]),
+        ("a\tfolder\tx\t\t", ["line 2: `prior.kind`: missing", "allowed: simulated, files, retinex"]),
         ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path: `source.path`: unknown key"]),
         ("a\t\t\ttlp\t", ["line 2, column base: config/scenes/tlp.yaml not found", "Did you mean tpl?"]),
         ("a\t\t\ttpl\tviews", ["line 2, column overrides: found 'views', needed key=value"]),
@@ -250,13 +250,13 @@ def five(project, monkeypatch):
 
     write_json(Path("scenes/idle/manifest.json"), {"fingerprint": "publish of other settings"})
     write_json(Path("results/idle/capture/manifest.json"), {"fingerprint": "capture of idle"})
-    Outcome("idle", "prior", "prior of other settings").failed("long ago")
-    Outcome("killed", "capture", "capture of killed").started()
-    Outcome("failed", "capture", "capture of failed").started()
-    Outcome("failed", "capture", "capture of failed").done()
+    JobState("idle", "prior", "prior of other settings").failed("long ago")
+    JobState("killed", "capture", "capture of killed").started()
+    JobState("failed", "capture", "capture of failed").started()
+    JobState("failed", "capture", "capture of failed").done()
     write_json(Path("results/failed/capture/manifest.json"), {"fingerprint": "capture of failed"})
-    Outcome("failed", "prior", "prior of failed").started()  # both were running when one failed
-    Outcome("failed", "segmentation", "segmentation of failed").failed("mesh: no faces")
+    JobState("failed", "prior", "prior of failed").started()  # both were running when one failed
+    JobState("failed", "segmentation", "segmentation of failed").failed("mesh: no faces")
     return plan
 
 

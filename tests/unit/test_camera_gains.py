@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from iif_core.camera.calibration.choice import calibrate_response
-from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, follow, radius_squared
+from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate, falloff, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import response
 from iif_core.errors import InputError
@@ -85,7 +85,7 @@ def test_held_out_views_follow_and_move_nobody():
     rows, gain = planted(4)
     moving = np.arange(VIEWS) != 3
     ahead = choose_gains(rows.take(moving[rows.view]), VIEWS)
-    out = follow(rows, ahead, moving)
+    out = with_held_out_views(rows, ahead, moving)
     np.testing.assert_array_equal(out.gain[moving], ahead.gain[moving])
     common = np.exp(np.log(gain[moving]).mean(0))
     np.testing.assert_allclose(out.gain[3], gain[3] / common, rtol=0.015)

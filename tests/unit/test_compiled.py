@@ -17,8 +17,8 @@ import iif_core
 PROGRAM = """
 import hashlib
 import numpy as np
-from iif_core.base import kernels
-from iif_core.base.problem import LOWEST
+from iif_core.fusion import kernels
+from iif_core.fusion.problem import LOWEST
 
 rng = np.random.default_rng(0)
 n, n_segments, n_predictions = 20000, 40, 8
@@ -28,9 +28,8 @@ values = rng.random((n_predictions, 5, n)).astype(np.float16).view(np.uint16)
 affine = rng.normal(0, 0.1, (n_segments, n_predictions, kernels.CROSS)).astype(np.float32)
 mixed, target = rng.random((2, 5, n)).astype(np.float32)
 network = kernels.sorting_network(n_predictions)
-b, votes = kernels.disagreement(
-    values, affine, mixed, target, rng.random(n).astype(np.float32), start, np.ones(n_predictions, bool), network, LOWEST, 1e-3
-)
+pixels = kernels.Pixels(values, mixed, target, rng.random(n).astype(np.float32), start)
+b, votes = kernels.disagreement(pixels, affine, np.ones(n_predictions, bool), network, LOWEST, 1e-3)
 print(hashlib.sha256(b.tobytes() + votes.tobytes() + kernels.mixture(values, affine, start, LOWEST).tobytes()).hexdigest())
 """
 

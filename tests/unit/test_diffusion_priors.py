@@ -17,8 +17,9 @@ from tests.unit import tiny_diffusion
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.models import checkpoint
-from workflow.priors import diffusion, marigold, photograph, rgbx
+from workflow.priors import diffusion, marigold, rgbx
 from workflow.scene.normal_form import View
+from workflow.scene.photograph import picture_for_model
 from workflow.stages import prior as stage
 from workflow.stages.base import _read_predictions
 
@@ -96,13 +97,13 @@ def test_bytes_do_not_depend_on_threads(made):
     before, found = torch.get_num_threads(), []
     try:
         for threads in (1, 3):
-            diffusion.loaded.cache_clear()
+            diffusion.load_model.cache_clear()
             torch.set_num_threads(threads)
             found.append(sampled("rgbx", made["rgbx"], samples=3, steps=1).tobytes())
             assert torch.get_num_threads() == threads
     finally:
         torch.set_num_threads(before)
-        diffusion.loaded.cache_clear()
+        diffusion.load_model.cache_clear()
     assert len(set(found)) == 1
 
 
@@ -110,7 +111,7 @@ def test_bytes_do_not_depend_on_threads(made):
 def test_a_photograph_is_encoded_once(made, kind, monkeypatch):
     few = {"samples": 2, "steps": 1}
     keys = namespace(kind, made[kind], **few)
-    model = diffusion.loaded(MODULES[kind].RECIPE, json.dumps(vars(keys.prior), sort_keys=True))
+    model = diffusion.load_model(MODULES[kind].RECIPE, json.dumps(vars(keys.prior), sort_keys=True))
     shapes, encode = [], model.vae.encode
     monkeypatch.setattr(model.vae, "encode", lambda x: (shapes.append(tuple(x.shape)), encode(x))[1])
     for view in range(2):
@@ -131,8 +132,8 @@ def test_rgbx_is_ddim_by_hand(made):
     vae = AutoencoderKL.from_pretrained(folder / "vae").double()
     text = CLIPTextModel.from_pretrained(folder / "text_encoder").double()
     tokens = CLIPTokenizer.from_pretrained(folder / "tokenizer")
-    photo = photograph.seen(Capture().views[0], Capture(), linear=True)
-    wide = diffusion.resized(photo[None], 64, 46)[0]
+    photo = picture_for_model(Capture().views[0], Capture(), linear=True)
+    wide = diffusion.resize(photo[None], 64, 46)[0]
     image = np.concatenate([wide, wide[:-19:-1]])  # 64 x 64, continued by reflection
     with torch.no_grad():
         condition = vae.encode(torch.from_numpy(image.transpose(2, 0, 1).copy())[None].double() * 2 - 1).latent_dist.mode()
@@ -147,7 +148,7 @@ def test_rgbx_is_ddim_by_hand(made):
             v = unet(torch.cat([x, condition * 0.18215], 1), t, encoder_hidden_states=prompt).sample
             x = b * (a * x - s * v) + (1 - b**2).sqrt() * (a * v + s * x)
         decoded = (vae.decode(x / 0.18215).sample[0].numpy().transpose(1, 2, 0) / 2 + 0.5).clip(0, 1)[:46]
-    expected = diffusion.resized(decoded[None].astype(np.float32), WIDTH, HEIGHT)[0, ..., 0]
+    expected = diffusion.resize(decoded[None].astype(np.float32), WIDTH, HEIGHT)[0, ..., 0]
     found = sampled("rgbx", folder, seed=seed, steps=steps, samples=1)[0, ..., 3]
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -158,25 +159,25 @@ def test_marigold_is_the_pipeline_of_diffusers(made):
 
     pipeline = MarigoldIntrinsicsPipeline.from_pretrained(made["marigold"])
     pipeline.set_progress_bar_config(disable=True)
-    picture = photograph.seen(Capture().views[0], Capture(), linear=False)[:, :40]
+    picture = picture_for_model(Capture().views[0], Capture(), linear=False)[:, :40]
     noise = torch.cat([torch.randn(1, 8, 8, 8, generator=torch.Generator().manual_seed(5 + k)) for k in range(2)])
     image = torch.from_numpy(picture.transpose(2, 0, 1).copy())[None].expand(2, -1, -1, -1)
     expected = pipeline(image, latents=noise, batch_size=2, output_type="pt").prediction  # 40 -> 64 -> 40
     keys = namespace("marigold", made["marigold"], samples=2, steps=None, longest_side=None)
-    found = diffusion.predicted(marigold.RECIPE, keys.prior, picture, 64, 3, 5)
+    found = diffusion.predict_maps(marigold.RECIPE, keys.prior, picture, 64, 3, 5)
     size = (2, 2, 40, 40, 3)
-    small = diffusion.resized(diffusion.resized(picture[None], 64, 64), 40, 40)
+    small = diffusion.resize(diffusion.resize(picture[None], 64, 64), 40, 40)
     assert found.shape == size and abs(small - picture).max() > 0.01
     # The same noise, network and size; diffusers scales the answer back without a low-pass filter, so it is compared before.
     whole = pipeline(image, latents=noise, batch_size=2, output_type="pt", match_input_resolution=False).prediction
     whole = whole.numpy().transpose(0, 2, 3, 1)
-    np.testing.assert_allclose(found.reshape(4, 40, 40, 3), diffusion.resized(whole, 40, 40), atol=1e-5)
+    np.testing.assert_allclose(found.reshape(4, 40, 40, 3), diffusion.resize(whole, 40, 40), atol=1e-5)
     assert abs(expected.numpy().transpose(0, 2, 3, 1) - found.reshape(4, 40, 40, 3)).mean() < 0.05
 
 
 def test_marigold_says_what_its_channels_are(made):
     keys = namespace("marigold", made["marigold"], samples=2, steps=1)
-    raw = diffusion.predicted(marigold.RECIPE, keys.prior, photograph.seen(Capture().views[0], Capture(), False), 64, 1, 0)
+    raw = diffusion.predict_maps(marigold.RECIPE, keys.prior, picture_for_model(Capture().views[0], Capture(), False), 64, 1, 0)
     found = sampled("marigold", made["marigold"], samples=2, steps=1)
     np.testing.assert_allclose(found[..., :3], linear_from_srgb(raw[:, 0]), atol=1e-6)
     np.testing.assert_array_equal(found[..., 3:], raw[:, 1, ..., :2])
@@ -192,7 +193,7 @@ def test_every_size_and_tiles(made):
     rng = np.random.default_rng(0)
     for height, width, longest in ((3, 50, 100), (1, 1, 64), (130, 70, 70)):
         keys = namespace("marigold", made["marigold"], samples=1)
-        found = diffusion.predicted(marigold.RECIPE, keys.prior, rng.random((height, width, 3), np.float32), longest, 1, 0)
+        found = diffusion.predict_maps(marigold.RECIPE, keys.prior, rng.random((height, width, 3), np.float32), longest, 1, 0)
         assert found.shape == (1, 2, height, width, 3) and np.isfinite(found).all()
     whole = sampled("rgbx", made["rgbx"], samples=1, longest_side=192, steps=1, tile=192)
     tiled = sampled("rgbx", made["rgbx"], samples=1, longest_side=192, steps=1, tile=64)
@@ -209,19 +210,19 @@ def test_tiles_cover_and_weights_sum_to_one(length):
         covered[start : start + 16] += 1
     assert covered.min() >= 1 and all(b - a <= 12 for a, b in zip(starts, starts[1:], strict=False))
     picture = torch.rand(2, length, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = diffusion.blended(lambda rows, columns: picture[:, rows, columns] ** 2, length, 20, 16)
+    found = diffusion.blend_tiles(lambda rows, columns: picture[:, rows, columns] ** 2, length, 20, 16)
     np.testing.assert_allclose(found, picture**2, rtol=1e-6)  # what needs no neighbours does not see the tiles
 
 
 def test_resizing_and_padding():
     assert diffusion.working_size(640, 480, 1024) == (1024, 768) and diffusion.working_size(3, 3000, 100) == (1, 100)
     picture = np.arange(24, dtype=np.float32).reshape(4, 2, 3)
-    wide = diffusion.padded(picture, 8)
+    wide = diffusion.pad(picture, 8)
     assert wide.shape == (8, 8, 3)
     np.testing.assert_array_equal(wide[:4, :2], picture)
     np.testing.assert_array_equal(wide[4:, :2], picture[::-1])
     plane = np.mgrid[:20, :30][0][None, ..., None].astype(np.float32) + 0.5
-    np.testing.assert_allclose(diffusion.resized(plane, 15, 10)[0, 2:-2, 3, 0], 2 * np.arange(10)[2:-2] + 1, rtol=1e-5)
+    np.testing.assert_allclose(diffusion.resize(plane, 15, 10)[0, 2:-2, 3, 0], 2 * np.arange(10)[2:-2] + 1, rtol=1e-5)
 
 
 def test_bfloat16_is_float32_roughly_and_the_half_files_are_read(made, copied):
@@ -240,12 +241,12 @@ def test_bfloat16_is_float32_roughly_and_the_half_files_are_read(made, copied):
 def test_what_the_models_see():
     view = Capture().views[0]
     stored, valid = Capture().photo(view)
-    linear, shown = (photograph.seen(view, Capture(), linear) for linear in (True, False))
+    linear, shown = (picture_for_model(view, Capture(), linear) for linear in (True, False))
     np.testing.assert_allclose(shown[valid], stored[valid], atol=1e-7)
     np.testing.assert_allclose(linear[valid], stored[valid] ** 2.2, atol=1e-6)
     np.testing.assert_array_equal(shown[0], stored[2])  # two rows do not count and take the next
     bright = Capture(is_hdr=True)
-    linear, shown = (photograph.seen(view, bright, linear) for linear in (True, False))
+    linear, shown = (picture_for_model(view, bright, linear) for linear in (True, False))
     np.testing.assert_allclose(shown, srgb_from_linear(linear), atol=1e-6)
     scale = key_exposure(bright.photo(view)[0], valid)
     assert np.exp(np.log(luminance(bright.photo(view)[0] * scale))[valid].mean()) == pytest.approx(0.18, rel=1e-5)
@@ -344,9 +345,9 @@ def test_failed_samples_are_dropped_and_recorded(run, monkeypatch):
         return maps
 
     monkeypatch.setattr(diffusion.Model, "_decode", spoilt)
-    diffusion.loaded.cache_clear()
+    diffusion.load_model.cache_clear()
     reader, _ = run(views=2, batch=4, samples=4)
-    diffusion.loaded.cache_clear()
+    diffusion.load_model.cache_clear()
     table = reader.table("predictions.parquet")
     assert table["used"].tolist() == [True, False, True, False] * 2
     assert "not finite" in table["reason"][1] and "constant" in table["reason"][3] and "filled" in table["reason"][2]
@@ -484,7 +485,7 @@ def test_packages_and_devices(made, monkeypatch):
 
 
 def test_the_examples_of_the_page_are_scene_files():
-    page = (Path(__file__).resolve().parents[2] / "docs/priors.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs/guide/priors.md").read_text()
     examples = [yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)]
     kinds = [settings_module.SceneSettings.model_validate(example).prior.kind for example in examples]
     assert set(kinds) == set(settings_module.UNIONS["prior"])

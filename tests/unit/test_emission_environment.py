@@ -5,7 +5,8 @@ import pytest
 
 from iif_core.light.emission.direct import solve_emission
 from iif_core.light.emission.environment import HEIGHT, WIDTH, Sky, SkySums, cosine_directions, texels
-from iif_core.light.emission.problem import PixelRows, assemble
+from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.problem import assemble
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
 
@@ -64,7 +65,7 @@ def test_groups_of_texels_are_solved_with_the_rest():
     y = np.einsum("ngc,gc->nc", a, truth)
     noisy = [(a * (1 + 0.2 * rng.standard_normal(a.shape)), np.zeros((n, 3))) for _ in range(2)]
     none = np.full(n, -1)
-    pixels = PixelRows(y, np.zeros((n, 3), bool), np.arange(n) % 9, np.arange(n) % 4, np.arange(n), none)
+    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.arange(n) % 9, np.arange(n) % 4, np.arange(n), none)
     columns = np.repeat([0, 0, 1, 2], HEIGHT * WIDTH // 4).reshape(HEIGHT, WIDTH)
     sky = Sky(columns, np.array([500, 500, 0]), truth[1:] * [[1], [1], [0]], np.zeros(3, bool))
     problem = assemble(pixels, noisy, 4, None, sky)

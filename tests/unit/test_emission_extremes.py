@@ -7,7 +7,8 @@ from iif_core.light.emission.candidates import emitter_candidates, face_statisti
 from iif_core.light.emission.direct import solve_emission, solve_families
 from iif_core.light.emission.groups import group_emitters
 from iif_core.light.emission.loss import reference_loss
-from iif_core.light.emission.problem import PixelRows, assemble, initial_radiance, white_surface
+from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.problem import assemble, initial_radiance, white_surface
 from iif_core.light.emission.pruning import prune_groups
 from iif_core.light.emission.rows import EmissionRows
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
@@ -139,7 +140,7 @@ def test_one_object_and_five_thousand(objects):
     y = gain[owner][:, None] * np.einsum("ngc,gc->nc", a, truth)
     group = np.where(np.arange(n) < 200, np.arange(n) % 2, -1)
     y[:200] = truth[group[:200]]
-    pixels = PixelRows(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
+    pixels = EmissionPixels(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
     halves = [(a, np.zeros((n, 3)))] * 2
     initial = initial_radiance(pixels, np.ones((2, 3)), True)
     problem = assemble(pixels, halves, 2).with_gains(initial)
@@ -152,7 +153,7 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     y = np.einsum("ngc,gc->nc", a, truth)
     group = np.where(np.arange(1000) < 50, 0, -1)
     y[:50] = truth[0]
-    pixels = PixelRows(y, np.zeros((1000, 3), bool), np.zeros(1000, int), np.zeros(1000, int), np.arange(1000) // 4, group)
+    pixels = EmissionPixels(y, np.zeros((1000, 3), bool), np.zeros(1000, int), np.zeros(1000, int), np.arange(1000) // 4, group)
     halves = [(a.astype(np.float32), np.zeros((1000, 3), np.float32))] * 2
     white = [(np.zeros((50, 2, 3), np.float32), np.full((50, 3), 0.1, np.float32))] * 2
     seen = initial_radiance(pixels, np.full((2, 3), 2.0), True)

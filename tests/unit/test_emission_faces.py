@@ -6,9 +6,9 @@ import pytest
 from iif_core.errors import InputError
 from iif_core.light.emission.cache import RadianceSums
 from iif_core.light.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, radiance_threshold
-from iif_core.light.emission.groups import group_emitters
-from iif_core.surface.mesh import face_geometry
+from iif_core.light.emission.groups import GroupingOptions, group_emitters
 from iif_core.surface.segments import face_adjacency
+from iif_core.surface.triangles import face_geometry
 
 
 def _strip(n, start=(0.0, 0.0, 0.0)):
@@ -165,7 +165,7 @@ def test_groups_by_plane_colour_and_side():
     stats = _statistics([50] * 12, [1.0] * 12)
     out = group_emitters(everything, stats, adjacency, normals, areas)
     assert out.size == 2 and set(out.of_face[:6]) != set(out.of_face[6:])
-    assert group_emitters(everything, stats, adjacency, normals, areas, small_area=100).size == 1
+    assert group_emitters(everything, stats, adjacency, normals, areas, GroupingOptions(small_area=100)).size == 1
 
     colour = np.repeat([1.0, 1.0, 2.0], 4)
     stats = _statistics([50] * 12, colour)
@@ -199,7 +199,7 @@ def test_small_and_surplus_groups_are_dropped_with_a_reason():
     assert out.size == 0 and len(out.dropped) == 6 and out.dropped[0][2] == "too small or hardly seen"
     assert (out.of_face == -1).all() and (out.side == 0).all()
     normals, areas = face_geometry(vertices, faces)
-    out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas, max_groups=2)
+    out = group_emitters(np.ones(12, bool), stats, face_adjacency(faces), normals, areas, GroupingOptions(max_groups=2))
     assert out.size == 2 and len(out.dropped) == 4 and out.observed[0, 0] == 32
 
 

@@ -107,7 +107,9 @@ class Terrace:
 
     def seen(self, T, emitters, samples=64, seed=0, n=3000, bounces=3):
         point, _, wo = self.points(n)
-        return T.render(self.geometry, self.material, emitters, point + 0.5 * wo, -wo, samples, bounces, seed)
+        return T.render(
+            T.Scene(self.geometry, self.material, emitters), point + 0.5 * wo, -wo, T.PathOptions(samples, bounces, seed)
+        )
 
 
 def agree(a, b, sigmas=4.0, slack=1e-3):
@@ -177,7 +179,8 @@ def test_caches_and_matrix_see_the_same_sky(T):
     emitters, points = scene.emitters(T, light), scene.points(n)
     seen = scene.seen(T, emitters, seed=1, n=n, bounces=bounces)
     a, r, m = scene.values[0, :3], float(scene.values[0, 3]), float(scene.values[0, 4])
-    diffuse, s0, s1 = T.shading_caches(scene.geometry, scene.material, emitters, *points, [0.1, r], 64, bounces, 2)
+    world = T.Scene(scene.geometry, scene.material, emitters)
+    diffuse, s0, s1 = T.shading_caches(world, *points, [0.1, r], T.PathOptions(64, bounces, 2))
     agree(brdf.compose(*brdf.kd_ks(a, m), diffuse, s0[:, 1], s1[:, 1]), seen)
     # Columns: the roof, the two bright texels, everything else of the sky; one texel stays dark.
     columns = np.full((H, W), 3, np.int32)
@@ -186,27 +189,15 @@ def test_caches_and_matrix_see_the_same_sky(T):
     uniform[columns == 3], uniform[0, 0] = 0.3, 0
     seen = scene.seen(T, scene.emitters(T, uniform), seed=4, n=n, bounces=bounces)
     materials = np.tile(a, (n, 1)), np.full(n, r), np.full(n, m)
-    matrix, cached = T.transport_matrix(
-        scene.geometry,
-        scene.material,
-        *points,
-        *materials,
-        scene.group,
-        4,
-        None,
-        64,
-        bounces,
-        5,
-        environment_columns=columns,
-    )
+    points = T.ShadingPoints(*points, *materials)
+    found = T.EmitterColumns(scene.group, 4, of_texel=columns)
+    matrix, cached = T.transport_matrix(world, points, found, T.PathOptions(64, bounces, 5))
     matrix, cached = matrix.sum(1), cached.sum(1)
     assert not cached.any()
     radiance = np.array([[3, 2, 1], uniform[3, 5], uniform[5, 21], [0.3, 0.3, 0.3]])
     agree(np.einsum("ngc,gc->nc", matrix, radiance), seen)
     with pytest.raises(InputError, match="environment_columns"):
-        T.transport_matrix(
-            scene.geometry, scene.material, *points, *materials, scene.group, 3, None, 1, 1, 5, environment_columns=columns
-        )
+        T.transport_matrix(world, points, found._replace(count=3), T.PathOptions(1, 1, 5))
 
 
 def test_only_the_environment_and_any_chunk(T):
@@ -215,7 +206,7 @@ def test_only_the_environment_and_any_chunk(T):
     assert emitters.sky_is_sampled and np.sum(emitters.pdf_sky * environment.solid_angles(H, W)) == pytest.approx(1, abs=1e-6)
     point, _, wo = scene.points(300)
     first, second = (
-        T.render(scene.geometry, scene.material, emitters, point + 0.5 * wo, -wo, 16, 4, 0, chunk=chunk)
+        T.render(T.Scene(scene.geometry, scene.material, emitters), point + 0.5 * wo, -wo, T.PathOptions(16, 4, 0, chunk))
         for chunk in (1 << 18, 77)
     )
     assert np.isfinite(first).all() and first.mean() > 1e3 and first.tobytes() == second.tobytes()

@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 from iif_core.errors import InputError
 from iif_core.objects.felzenszwalb import (
     edge_weights,
-    face_normals,
     filtered_normals,
     merge_regions,
     segment_mesh,
     smooth_over_faces,
 )
 from iif_core.surface.segments import face_adjacency
+from iif_core.surface.triangles import face_geometry
 
 
 def sheet(n, place):
@@ -116,13 +116,13 @@ def test_three_planes_are_three_regions_also_with_noise():
 def test_filter_keeps_creases_and_calms_noise():
     vertices, faces, side = corner(24, 0.003)
     pairs = face_adjacency(faces, vertices)
-    noisy = face_normals(vertices, faces)
+    noisy = face_geometry(vertices, faces)[0]
     calm = filtered_normals(noisy, np.ones(len(faces)), pairs)
     true = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])[side]
     sign = np.sign((noisy * true).sum(1)).mean()
     assert np.abs(1 - sign * (calm * true).sum(1)).mean() < 0.3 * np.abs(1 - sign * (noisy * true).sum(1)).mean()
     clean, faces, side = corner(6)
-    exact = face_normals(clean, faces)
+    exact = face_geometry(clean, faces)[0]
     pairs = face_adjacency(faces, clean)
     assert np.abs((filtered_normals(exact, np.ones(len(faces)), pairs) * exact).sum(1) - 1).max() < 1e-3
 

@@ -18,7 +18,7 @@ SCENE = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n"
 def fingerprints(root, folder, quality="draft"):
     """Fingerprints of all stages, computed by the code in `root`, run in `folder`, in a fresh process."""
     code = (
-        "import json; from workflow import fingerprint as f; from workflow.registry import STAGES;"
+        "import json; from workflow.runtime import fingerprint as f; from workflow.registry import STAGES;"
         f"print(json.dumps({{s: f.fingerprint(s, 't', {quality!r}) for s in STAGES}}))"
     )
     environment = {"PYTHONPATH": str(root), "PATH": "/usr/bin:/bin"}
@@ -87,14 +87,14 @@ def test_closure_covers_what_a_stage_really_imports(repository):
     probe = textwrap.dedent(
         """
         import importlib, json, sys
-        from iif_core import native
+        from workflow.runtime import native
         native.prepare()
         import mitsuba as mi
         mi.set_variant("llvm_ad_rgb")
-        infrastructure = set(sys.modules)
-        names = sys.argv[1:]
-        for name in names: importlib.import_module(name)
-        print(json.dumps(sorted(m for m in sys.modules if m.split(".")[0] in ("iif_core", "workflow"))))
+        import workflow.settings  # takes its defaults from the options of the solvers; their values are in the fingerprint
+        before = set(sys.modules)
+        for name in sys.argv[1:]: importlib.import_module(name)
+        print(json.dumps(sorted(m for m in set(sys.modules) - before if m.split(".")[0] in ("iif_core", "workflow"))))
         """
     )
     plugins = {
@@ -158,7 +158,7 @@ def test_what_is_remembered_of_the_code_changes_nothing(checkout):
         assert fingerprints(code, run) == first
     memory.unlink()
     threads = (
-        "from concurrent.futures import ThreadPoolExecutor as P; from workflow import fingerprint as f;"
+        "from concurrent.futures import ThreadPoolExecutor as P; from workflow.runtime import fingerprint as f;"
         "stages = ['render', 'affines', 'emission', 'base'] * 4;"
         "list(P(8).map(lambda s: f.fingerprint(s, 't', 'draft'), stages))"
     )

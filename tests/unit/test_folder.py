@@ -72,7 +72,7 @@ def test_paths_without_extension_globs_and_spread(tmp_path):
     own.write_transforms(tmp_path, document)
     assert [f.name for f in read(tmp_path, capture={"views": 4}).frames] == ["001", "003", "005", "007"]
     assert [f.name for f in read(tmp_path, {"frames": "images/00[0-2]"}).frames] == ["000", "001", "002"]
-    assert transforms.spread(3, 5) == [0, 1, 2] and transforms.spread(100, 1) == [50]
+    assert transforms.evenly_spread(3, 5) == [0, 1, 2] and transforms.evenly_spread(100, 1) == [50]
     got = folder.raw_inputs(own.settings_of(tmp_path, capture={"views": 4}))
     assert [p.name for p in got] == [
         "transforms.json",

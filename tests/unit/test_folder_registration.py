@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter
 
 from iif_core.camera.distortion import Distortion, Pinhole
 from tests.unit.painted_room import FOCAL, HEIGHT, WIDTH, look, posed, room, twisted
-from workflow.sources.folder_scene.registration import registered
+from workflow.sources.folder_scene.registration import register_frames
 from workflow.sources.folder_scene.transforms import Frame, opencv_pose
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -38,7 +38,7 @@ def found():
     bad = twisted(photos[6].pose, np.array([0.25, 0.3, 0.1]), np.array([0.3, 0.2, 0.1]))
     photos = posed(photos, [bad if k == 6 else p.pose for k, p in enumerate(photos)])
     frames, poses = _frames([p.pose for p in photos], 0.001), [p.pose for p in photos]
-    return frames, poses, registered(frames, poses, [*photos[:-1], None], "opengl", 0.001)
+    return frames, poses, register_frames(frames, poses, [*photos[:-1], None], "opengl", 0.001)
 
 
 def test_blurred_and_badly_posed_views_are_named(found):
@@ -73,5 +73,5 @@ def test_a_view_that_sees_nothing_stays_as_it_is(found):
 def test_one_photograph_has_nothing_to_be_registered_with():
     photo = room(1)
     frames = _frames([photo[0].pose], 1.0)
-    out = registered(frames, [photo[0].pose], photo, "opengl", 1.0)
+    out = register_frames(frames, [photo[0].pose], photo, "opengl", 1.0)
     assert out.frames == frames and not out.left_out and not out.notes

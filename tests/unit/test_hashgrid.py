@@ -1,4 +1,4 @@
-"""Hash-grid texture: against a plain float64 reference, torch's Adam, itself on other threads and backends; edges."""
+"""Hash-grid texture: compared with a plain float64 reference, torch's Adam, other threads and engines; edge cases."""
 
 import subprocess
 import sys
@@ -35,7 +35,7 @@ def parameters(texture, dtype=torch.float64):
 
 
 def reference(options, named, u):
-    """METHOD 2.3.5 as one reads it, in float64; rows of the table by integers that do not wrap."""
+    """Eqs. F.57 to F.59 in float64, with integers that do not wrap."""
     u = u.to(torch.float32).clamp(0, 1 - 1e-6)
     features, start = [], 0
     for level in layout(options):
@@ -133,7 +133,7 @@ def test_step_equals_torch_adam(backend):
     named = parameters(texture, torch.float32)
     optimiser = torch.optim.Adam(named.values(), lr=1, betas=(0.8, 0.95), eps=1e-6)
     for i in range(6):
-        if i != 3:  # without any gradient: all goes on by its momentum
+        if i != 3:  # without a gradient, parameters move by their momentum
             u = points(40 + 300 * (i == 1), seed=i)
             (texture(u) ** 2).sum().backward()
         optimiser.zero_grad()
@@ -156,7 +156,7 @@ def test_step_equals_torch_adam(backend):
 
 
 def test_queued_update_needs_no_gradients_call():
-    """The shortcut that iterations take (scatter, update and encode in one go) gives what the long way gives."""
+    """Scatter, update and encode in one visit of a level equal the three one after another."""
     short, long = (HashGridTexture(SMALL, seed=2) for _ in range(2))
     for i in range(4):
         for texture in (short, long):
@@ -178,7 +178,7 @@ def assert_same_state(one, two):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_backward_passes_add_up(backend, monkeypatch):
     if backend == "numba":
-        monkeypatch.setattr(numba_engine, "PENDING", 700)  # the third pass is scattered early, the last waits
+        monkeypatch.setattr(numba_engine, "MAX_PENDING_SAMPLES", 700)  # the third pass is scattered early, the last waits
     parts, whole = (HashGridTexture(SMALL, seed=2, backend=backend) for _ in range(2))
     batches = [points(n, seed=n) for n in (300, 200, 250, 10)]
     graphs = [(parts(u) ** 3).sum() for u in batches]
@@ -202,7 +202,7 @@ def test_backends_agree_after_training():
     for texture in textures:
         for _ in range(3):
             ((texture(u) - 1) ** 2).mean().backward()
-            texture.step(0.01, eps=1e-3)  # large eps: where a gradient is 0 up to rounding, nothing shall move
+            texture.step(0.01, eps=1e-3)  # large eps: gradients that are 0 up to rounding move nothing
     y = [texture.evaluate(u) for texture in textures]
     torch.testing.assert_close(*y, atol=1e-5, rtol=1e-4)
 

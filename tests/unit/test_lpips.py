@@ -8,8 +8,16 @@ import pytest
 
 from iif_core.errors import InputError
 from iif_core.evaluation import metrics
-from iif_core.evaluation.lpips import lpips
+from iif_core.evaluation.catalogue import PROTOCOLS, PROTOCOLS_OF
+from iif_core.evaluation.lpips import Lpips
+from iif_core.reflectance.material import PROPERTIES
 from workflow.models import lpips as shipped
+
+
+def lpips(prediction, truth, weights, mask=None, network="alex"):
+    distance = Lpips(truth, weights, mask, network)
+    several = np.ndim(prediction) > np.ndim(truth)
+    return np.array([distance(one) for one in prediction]) if several else distance(prediction)
 
 
 @pytest.fixture(scope="module")
@@ -150,18 +158,18 @@ def test_vgg_layers_by_shape(vgg):
 
 def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
     """VGG: albedo of result, base and first prediction, raw and scaled; the result alone has AlexNet everywhere."""
-    from workflow.scoring.scores import MATERIALS, MaterialTruth
+    from workflow.scoring.scores import MaterialTruth
     from workflow.stages.metrics import _scores
 
     truth, mask, objects = image(1), np.ones(image(1).shape[:2], bool), np.zeros(image(1).shape[:2], int)
     maps = {"albedo": image(2), "roughness": image(2)[..., 0], "metallic": image(2)[..., 1]}
     images = {"albedo": truth, "roughness": truth[..., 0], "metallic": truth[..., 1]}
     networks = {"albedo": {"alex": alex, "vgg": vgg}, "roughness": {"alex": alex}, "metallic": {"alex": alex}}
-    targets = {q: metrics.Target(q, images[q], mask, objects, networks=networks[q]) for q in MATERIALS}
+    targets = {q: metrics.Target(q, images[q], mask, objects, networks=networks[q]) for q in PROPERTIES}
     materials = MaterialTruth(None, targets, {}, objects)
 
     def found(variant, metric):
-        scores = {q: _scores(materials, variant, maps, q) for q in MATERIALS}
+        scores = {q: _scores(materials, variant, maps, q) for q in PROPERTIES}
         return {(q, s.protocol): s.value for q, of in scores.items() for s in of if s.metric == metric}
 
     visual = {("albedo", "raw"), ("albedo", "scaled")}
@@ -170,9 +178,9 @@ def test_stage_scores_what_is_looked_at_with_the_learned_metrics(alex, vgg):
         assert set(values) == visual and values["albedo", "raw"] == lpips(maps["albedo"], truth, vgg, network="vgg")
     assert not found("texel_mean", "lpips_vgg") and not found("texel_mean", "lpips")
     assert set(found("base", "lpips")) == set(found("object_mean", "flip")) == visual
-    everything = {(q, p) for q in MATERIALS for p in metrics.PROTOCOLS_OF[q]}
+    everything = {(q, p) for q in PROPERTIES for p in PROTOCOLS_OF[q]}
     assert set(found("result", "lpips")) == everything == set(found("prior_k0", "l2"))
-    assert set(found("result", "flip")) == {("albedo", p) for p in metrics.PROTOCOLS}
+    assert set(found("result", "flip")) == {("albedo", p) for p in PROTOCOLS}
 
 
 def test_score_map_has_lpips_where_the_network_is_given(alex):

@@ -11,11 +11,11 @@ from iif_core.errors import InputError
 from iif_core.objects import mask_clustering as mc
 from iif_core.objects.mask_votes import (
     Sightings,
-    elect,
-    join_together,
-    joined,
-    keep_together,
+    elect_labels,
+    join_objects,
     label_faces,
+    merge_votes,
+    part_objects,
     sightings,
     split_apart,
     view_votes,
@@ -102,7 +102,7 @@ def test_votes_equal_loops_whatever_the_block(monkeypatch):
     np.testing.assert_array_equal(whole.container, container)
     np.testing.assert_array_equal(whole.split, split)
     clusters = mc.cluster_masks(masks, options)
-    monkeypatch.setattr(mc, "BLOCK", 7)
+    monkeypatch.setattr(mc, "BLOCK_MASKS", 7)
     np.testing.assert_array_equal(mc.containment(masks, options).container, container)
     np.testing.assert_array_equal(mc.cluster_masks(masks, options), clusters)
 
@@ -158,14 +158,14 @@ def test_election_by_hand():
     label = np.array([0, 1, 1, 0, 1])
     weight = np.array([2.0, 1.0, 1.0, 0.5, 0.5])
     alone = np.arange(5)
-    np.testing.assert_array_equal(elect(face, label, weight, weight, alone), [0, 1, 0, -1, -1])  # a tie: the lowest
+    np.testing.assert_array_equal(elect_labels(face, label, weight, weight, alone), [0, 1, 0, -1, -1])  # a tie: the lowest
     # One piece of 5 views, 2.5 each way: no help. Then label 1 gets one more face there: 2 views x 4.5 / 7 outweigh it.
     piece = np.zeros(5, int)
-    np.testing.assert_array_equal(elect(face, label, weight, weight, piece, 2.0), [0, 1, 0, -1, -1])
+    np.testing.assert_array_equal(elect_labels(face, label, weight, weight, piece, 2.0), [0, 1, 0, -1, -1])
     more = (np.r_[face, 3], np.r_[label, 1], np.r_[weight, 2.0])
-    np.testing.assert_array_equal(elect(*more, more[2], piece, 2.0), [0, 1, 1, 1, -1])
-    np.testing.assert_array_equal(elect(*more, more[2], piece, 100.0), [1, 1, 1, 1, -1])
-    assert (elect(face[:0], label[:0], weight[:0], weight[:0], piece) == -1).all()
+    np.testing.assert_array_equal(elect_labels(*more, more[2], piece, 2.0), [0, 1, 1, 1, -1])
+    np.testing.assert_array_equal(elect_labels(*more, more[2], piece, 100.0), [1, 1, 1, 1, -1])
+    assert (elect_labels(face[:0], label[:0], weight[:0], weight[:0], piece) == -1).all()
 
 
 def test_small_things_win_against_what_they_stand_on():
@@ -174,7 +174,7 @@ def test_small_things_win_against_what_they_stand_on():
     views = [
         view_votes(face, pack_keys(np.full((3, 3), 4), cluster), np.ones(3, bool), np.ones(3, bool), 2) for cluster in (0, 0, 1)
     ]
-    votes = joined(views)
+    votes = merge_votes(views)
     assert votes.pixels.tolist() == [3, 3, 3] and votes.share.tolist() == [1, 1, 1]
     label, bare, agreement = label_faces(votes, np.array([400.0, 4.0]), np.array([2, 2]), np.arange(2))
     assert label.tolist() == [1, -1] and not bare.any() and agreement[1] == pytest.approx(1 / 3)
@@ -210,26 +210,26 @@ def test_what_most_views_hold_apart_is_parted():
     """A thing of 4 pixels (fragment 1) on a table of 100 (fragment 0), of which fragment 2 is another piece."""
     joint, apart = [(0, 1, 100), (2, 1, 50), (1, 1, 4)], [(0, 1, 100), (2, 1, 50), (1, 2, 4)]
     one = np.zeros(3, int)
-    np.testing.assert_array_equal(keep_together(one, seen_as(joint, joint, apart, apart, apart)), [0, 1, 0])  # 1 + 2 to 3
-    np.testing.assert_array_equal(keep_together(one, seen_as(joint, joint, joint, apart, apart, apart)), [0, 0, 0])
-    np.testing.assert_array_equal(keep_together(one, seen_as(apart)), [0, 1, 0])
+    np.testing.assert_array_equal(part_objects(one, seen_as(joint, joint, apart, apart, apart)), [0, 1, 0])  # 1 + 2 to 3
+    np.testing.assert_array_equal(part_objects(one, seen_as(joint, joint, joint, apart, apart, apart)), [0, 0, 0])
+    np.testing.assert_array_equal(part_objects(one, seen_as(apart)), [0, 1, 0])
     # Three of its four pixels with the table, in each of two views: 1 + 1.5 of 3. One of four: 1 + 0.5 of 3.
-    np.testing.assert_array_equal(keep_together(one, seen_as(*[[(0, 1, 100), (1, 1, 3), (1, 2, 1)]] * 2)), [0, 0, 0])
-    np.testing.assert_array_equal(keep_together(one, seen_as(*[[(0, 1, 100), (1, 1, 1), (1, 2, 3)]] * 2)), [0, 1, 0])
+    np.testing.assert_array_equal(part_objects(one, seen_as(*[[(0, 1, 100), (1, 1, 3), (1, 2, 1)]] * 2)), [0, 0, 0])
+    np.testing.assert_array_equal(part_objects(one, seen_as(*[[(0, 1, 100), (1, 1, 1), (1, 2, 3)]] * 2)), [0, 1, 0])
 
 
 def test_what_is_parted_stays_together_itself():
     """Two things of two pieces each in one object, and a piece that no view shows with either."""
     views = [[(0, 1, 90), (1, 1, 40), (2, 2, 60), (3, 2, 30)]] * 3 + [[(4, 7, 5)]]
-    np.testing.assert_array_equal(keep_together(np.full(5, 8), seen_as(*views)), [8, 8, 9, 9, 8])
+    np.testing.assert_array_equal(part_objects(np.full(5, 8), seen_as(*views)), [8, 8, 9, 9, 8])
     # Piece 3 is never seen with 0 and 1, only with 2, which is parted: nobody said that 3 is.
     views = [[(0, 1, 190), (1, 1, 40), (2, 2, 60)]] * 3 + [[(2, 4, 60), (3, 4, 30)]] * 2
-    np.testing.assert_array_equal(keep_together(np.zeros(4, int), seen_as(*views)), [0, 0, 1, 0])
-    np.testing.assert_array_equal(keep_together(np.arange(4), seen_as(*views)), np.arange(4))  # never joins objects
+    np.testing.assert_array_equal(part_objects(np.zeros(4, int), seen_as(*views)), [0, 0, 1, 0])
+    np.testing.assert_array_equal(part_objects(np.arange(4), seen_as(*views)), np.arange(4))  # never joins objects
 
 
 def grown_by_loops(home, rows):
-    """`keep_together` as its docstring says, with dictionaries."""
+    """`part_objects` as its docstring says, with dictionaries."""
     home, waits = list(home), set(range(len(home)))
     pixels = {}
     for view, fragment, mask, n in rows:
@@ -272,28 +272,28 @@ def test_keeping_together_equals_loops():
         home = rng.integers(0, 4, count)
         rows = [(v, f, m, rng.integers(1, 9)) for v in range(6) for f in range(count) for m in (1, 2, 3) if rng.random() < 0.25]
         seen = Sightings(*np.array(rows, np.int64).T[:3], np.array([n for *_, n in rows], float))
-        found = keep_together(home, seen)
+        found = part_objects(home, seen)
         np.testing.assert_array_equal(found, grown_by_loops(home.tolist(), rows))
         assert len(np.unique(found)) > len(np.unique(home))
 
 
 def test_what_the_views_hold_together_is_joined():
     joint, apart = [(0, 1, 100), (1, 1, 4), (2, 2, 30)], [(0, 1, 100), (1, 3, 4), (2, 2, 30)]
-    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint)), [5, 5, 6])
-    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint)), [5, 7, 6])  # two views are too few
-    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, joint, apart)), [5, 5, 6])
-    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, apart)), [5, 7, 6])  # 0.75
+    np.testing.assert_array_equal(join_objects([5, 7, 6], seen_as(joint, joint, joint)), [5, 5, 6])
+    np.testing.assert_array_equal(join_objects([5, 7, 6], seen_as(joint, joint)), [5, 7, 6])  # two views are too few
+    np.testing.assert_array_equal(join_objects([5, 7, 6], seen_as(joint, joint, joint, joint, apart)), [5, 5, 6])
+    np.testing.assert_array_equal(join_objects([5, 7, 6], seen_as(joint, joint, joint, apart)), [5, 7, 6])  # 0.75
     # A view in which an object is cut in two halves, or not seen, has no opinion.
     cut, gone = [(0, 1, 100), (1, 1, 2), (1, 3, 2), (2, 2, 30)], [(0, 1, 100), (2, 2, 30)]
-    np.testing.assert_array_equal(join_together([5, 7, 6], seen_as(joint, joint, joint, cut, gone)), [5, 5, 6])
+    np.testing.assert_array_equal(join_objects([5, 7, 6], seen_as(joint, joint, joint, cut, gone)), [5, 5, 6])
 
 
 def test_joining_goes_on_with_what_was_joined():
     """0 and 1 share a mask in views 0-2; 2 shares it with both, but was seen with 0 twice and with 1 twice only."""
     views = [[(0, 1, 9), (1, 1, 3)]] * 3 + [[(0, 1, 9), (2, 1, 4)]] * 2 + [[(1, 1, 3), (2, 1, 4)]] * 2
-    np.testing.assert_array_equal(join_together(np.arange(3), seen_as(*views)), [0, 0, 0])
-    np.testing.assert_array_equal(join_together(np.arange(3), seen_as(*views[2:])), [0, 1, 2])
-    np.testing.assert_array_equal(join_together(np.arange(4), seen_as(*views)), [0, 0, 0, 3])  # never seen: stays
+    np.testing.assert_array_equal(join_objects(np.arange(3), seen_as(*views)), [0, 0, 0])
+    np.testing.assert_array_equal(join_objects(np.arange(3), seen_as(*views[2:])), [0, 1, 2])
+    np.testing.assert_array_equal(join_objects(np.arange(4), seen_as(*views)), [0, 0, 0, 3])  # never seen: stays
 
 
 def test_joining_equals_loops():
@@ -335,7 +335,7 @@ def test_joining_equals_loops():
     for group in groups:
         expected[list(group)] = min(group)
     assert 3 < len(groups) < 25
-    np.testing.assert_array_equal(join_together(np.arange(30), seen), expected)
+    np.testing.assert_array_equal(join_objects(np.arange(30), seen), expected)
 
 
 # ------------------------------------------------------------------------------------------------------------- stability
@@ -438,7 +438,8 @@ def test_spoilt_masks_make_pure_objects(photographed):
     pure, complete = purity(np.repeat(label[seen], 3), np.repeat(things[seen], 3))
     assert pure >= 0.95 and complete >= 0.9
     document = reader.json("segmentation.json")
-    assert document["masks_undersegmented"] > 0 and document["objects_from_masks"] >= 9 and document["objects_parted"] >= 0
+    assert document["masks_undersegmented"] > 0 and document["objects_from_masks"] >= 9
+    assert document["objects_parted"] == document["objects_joined"] == 0  # the clusters of this scene are complete
     assert 0.6 < document["stability"] <= 1 and len(document["stability_runs"]) == 3
     (item,) = document["plan"]
     assert item["component"] == "objects (masks)" and item["value"] == document["stability"]

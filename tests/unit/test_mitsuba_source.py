@@ -414,7 +414,7 @@ def plan(mesh, count: int, seed: int = 0, start=(1.0, 1.0, 1.5), unit: float = 1
     trace = trace_of(mesh)
     up = np.array([0.0, 0.0, 1.0])
     lens = path.Lens(0.77, 0.77)
-    return path.plan(trace, trace, mesh.vertices, mesh.faces, [(given, lens)], lens, up, count, seed), given, trace
+    return path.plan_views(trace, trace, mesh.vertices, mesh.faces, [(given, lens)], lens, up, count, seed), given, trace
 
 
 TABLE = """<shape type="cube" id="table"><transform name="to_world"><scale x="0.5" y="0.4" z="0.4"/>
@@ -722,5 +722,5 @@ def test_modern_hall_path(llvm, test_scene):
     given = look_at([6.91182, 1.65163, 2.55414], [6.0, 1.65163, 2.12], [0, 1, 0])
     trace, lens = trace_of(mesh), path.Lens(0.77, 0.77)
     up = np.array([0.0, 1.0, 0.0])
-    found = path.plan(trace, trace, mesh.vertices, mesh.faces, [(given, lens)], lens, up, 16, 0)
+    found = path.plan_views(trace, trace, mesh.vertices, mesh.faces, [(given, lens)], lens, up, 16, 0)
     assert len(found.poses) == 16 and found.facts["coverage_1"] > 0.95 and found.facts["clearance_m"] >= 0.35

@@ -145,14 +145,14 @@ def python(code, repository, **environment):
 
 
 def test_prepare_after_drjit_is_refused(repository):
-    child = python("import drjit\nfrom iif_core import native\nnative.prepare()", repository)
+    child = python("import drjit\nfrom workflow.runtime import native\nnative.prepare()", repository)
     assert child.returncode == 1 and "call prepare() first" in child.stderr
 
 
 def test_import_has_no_effect(repository):
     code = (
         "import os, sys; before = dict(os.environ)\n"
-        "from iif_core import native\n"
+        "from workflow.runtime import native\n"
         "assert dict(os.environ) == before\n"
         "third_party = {'numpy', 'torch', 'drjit', 'mitsuba', 'open3d'} & set(sys.modules)\n"
         "assert not third_party, third_party"
@@ -163,7 +163,7 @@ def test_import_has_no_effect(repository):
 def test_process_environment_of_an_empty_environment(repository):
     code = (
         "import os, subprocess, sys\n"
-        "from iif_core import native\n"
+        "from workflow.runtime import native\n"
         "native.process_environment(); once = dict(os.environ); native.process_environment()\n"
         "assert dict(os.environ) == once\n"
         "os.chdir('/')\n"
@@ -180,7 +180,7 @@ def test_process_environment_of_an_empty_environment(repository):
 def test_limit_threads_reaches_libraries_imported_before_and_after(repository):
     code = (
         "import os, torch\n"
-        "from iif_core import native\n"
+        "from workflow.runtime import native\n"
         "native.prepare(); native.limit_threads(1)\n"
         "import mitsuba, drjit, pyarrow\n"
         "mitsuba.set_variant('llvm_ad_rgb')\n"

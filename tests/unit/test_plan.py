@@ -44,8 +44,6 @@ KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
         (decisions.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.04, 0.03)), False),
         (decisions.affine_size(["full, roughness", "gain", "identity (3 pixels)"]), True),
         (decisions.affine_size([]), False),
-        (decisions.second_pass(np.array([1.5, 1.0]), np.array([10, 1])), False),
-        (decisions.second_pass(np.zeros(0), np.zeros(0)), False),
     ],
 )
 def test_decisions(decision, included):
@@ -56,7 +54,6 @@ def test_decisions(decision, included):
 def test_values_say_what_was_measured():
     assert decisions.camera_response("ldr", CHOSEN)["value"] == 3.0
     assert decisions.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
-    assert decisions.second_pass(np.array([1.5, 1.0, 0.7]), np.array([10, 1, 2]))["value"] == 0.5
     assert "1 because it pays" in decisions.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
     assert decisions.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
     assert decisions.environment("auto", np.nan, np.nan, None)["value"] == 0.0

@@ -1,4 +1,4 @@
-"""The reference loss: closed forms, an independent loop over pixels, invariances, what is left out."""
+"""The reference loss: closed forms, an independent loop over pixels, invariances, and pixels that are left out."""
 
 from dataclasses import replace
 
@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.fusion.problem import LOWEST, BaseProblem, usable_pixels
+from iif_core.fusion.problem import LOWEST, FusionProblem, usable_pixels
 from iif_core.fusion.reference_loss import identity_regulariser, reference_loss
 
 LOW = LOWEST.astype(np.float64)
 
 
 def random_state(seed=0, views=3, k=5, n=40, cells=20, spread=0.1):
-    """A problem of two segments a view, a texture, corrections near identity, soft weights."""
+    """A problem with two segments per view, a texture, maps near the identity and soft weights."""
     rng = np.random.default_rng(seed)
     segment = [np.repeat([2 * v, 2 * v + 1], n // 2).astype(np.int32) for v in range(views)]
-    problem = BaseProblem(
+    problem = FusionProblem(
         [rng.random((k, n, 5)) for _ in range(views)],
         [rng.integers(0, cells, n).astype(np.int32) for _ in range(views)],
         segment,
@@ -34,7 +34,7 @@ def random_state(seed=0, views=3, k=5, n=40, cells=20, spread=0.1):
 
 
 def by_pixel(problem, value, scale, corrections, weight, weighted=False, temperature=None):
-    """The same, straight from METHOD 2.3.2-2.3.8, pixel by pixel: data, label, regulariser of each property."""
+    """Data, label and regulariser of each property, pixel by pixel from Eqs. F.1 to F.15."""
     albedo, roughness, metallic = corrections
     data = label = total = 0.0
     penalty = np.zeros(3)
@@ -95,10 +95,10 @@ def test_a_planted_optimum_has_loss_zero():
 
 
 def test_known_divergence():
-    """KL(d = 0.3, b_r = 0.1, b_p = 0.2) = 1.2180407 (METHOD 2.3.4): three predictions 0.1 about 0.5, texture 0.8."""
+    """KL(d = 0.3, b_r = 0.1, b_p = 0.2) = 1.2180407 (Eq. F.7): three predictions 0.1 about 0.5, texture 0.8."""
     predictions = [np.repeat(np.array([0.4, 0.5, 0.6])[:, None, None], 5, 2)]
     zero = np.zeros(1, np.int32)
-    problem = BaseProblem(predictions, [zero], [zero], 1, zero, zero)
+    problem = FusionProblem(predictions, [zero], [zero], 1, zero, zero)
     identity = (np.eye(3, 4)[None, None].repeat(3, 1), np.tile([1.0, 0.0], (1, 3, 1)), np.tile([1.0, 0.0], (1, 3, 1)))
     # weights so that mu_ref = 0.5 and the distances are 0.1, 0, 0.1: the lower median is 0.1
     found = reference_loss(problem, np.full((1, 5), 0.8), np.full((1, 5), 0.2), identity, np.full((1, 3, 3), 1 / 3))
@@ -147,7 +147,7 @@ def test_one_hot_weights_have_infinite_label_loss_unless_the_votes_agree():
     texture = np.ones((20, 5))
     identity = (np.tile(np.eye(3, 4), (6, 5, 1, 1)), np.tile([1.0, 0.0], (6, 5, 1)), np.tile([1.0, 0.0], (6, 5, 1)))
     found = reference_loss(problem, texture, scale, identity, weight, log_weight=log_weight, temperature=1e-9)
-    assert found.label == 0  # q is 0 exactly where alpha is (METHOD H4)
+    assert found.label == 0  # q is 0 exactly where alpha is (docs/method/numerics.md#cold-temperatures)
 
 
 def test_regulariser_near_identity():
@@ -175,7 +175,7 @@ def test_pixels_that_do_not_count_are_left_out():
 def test_predictions_that_are_not_finite_are_left_out():
     problem, value, scale, corrections, weight = random_state()
     problem.predictions[0][2] = np.nan
-    problem.predictions[1][4, 9, 1] = np.inf  # 1 of 40 pixels: the prediction goes
+    problem.predictions[1][4, 9, 1] = np.inf  # 1 of 40 pixels: the prediction is dropped
     found = usable_pixels(problem, 0)
     assert found.usable.tolist() == [True, True, False, True, True] and len(found.pixel) == 40
     assert [(d.view, d.k) for d in found.dropped] == [(0, 2)]
@@ -184,7 +184,7 @@ def test_predictions_that_are_not_finite_are_left_out():
     full = reference_loss(problem, value, scale, corrections, weight)
     assert np.isfinite(full.total)
     keep = [[0, 1, 3, 4], [0, 1, 2, 3]]
-    parts = [  # views on their own, without the bad prediction
+    parts = [  # each view by itself, without the bad prediction
         by_pixel(
             replace(
                 problem,

@@ -33,7 +33,7 @@ def test_poses_are_found_again(photos: list[Photo]) -> None:
 def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> None:
     """Photographs whose true principal point lies (2, -1.5) pixels from the believed one."""
     taken = [replace(p, image=np.repeat(look(p.pose, (66.0, 46.5))[0][..., None], 3, -1)) for p in photos]
-    found = register(taken, points=4000, own=False)
+    found = register(taken, points=4000, poses=False)
     assert found.accepted
     np.testing.assert_allclose(found.principal * FOCAL, [2.0, -1.5], atol=0.3)
     assert abs(found.focal - 1) < 0.01

@@ -80,6 +80,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     from iif_core.light.transport.geometry import build_geometry, trace
     from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
 
     rng = np.random.default_rng(0)
     quad = np.array([[1.0, 0.7, 2.4], [2.0, 0.7, 2.4], [2.0, 1.3, 2.4], [1.0, 1.3, 2.4]])
@@ -105,7 +106,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
         face, depth = trace(geometry, eye, rays)
         material = FaceMaterials(TRUE[object_id])
         jitter = direction_derivatives(view.fx, view.fy, view.world_from_camera)
-        image = render(geometry, material, emitters, eye, rays, 256, 4, 1, jitter=jitter).reshape(HEIGHT, WIDTH, 3)
+        image = render(Scene(geometry, material, emitters), eye, rays, PathOptions(256, 4, 1), jitter).reshape(HEIGHT, WIDTH, 3)
         exposed = np.clip(view.exposure * image, 0, 1)
         photo = image if dynamic_range == "hdr" else exposed ** (1 / 2.2)
         writer.photo(view.name, photo, np.ones((HEIGHT, WIDTH), bool), dynamic_range == "ldr")

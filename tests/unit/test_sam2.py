@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from iif_core.errors import InputError
-from iif_core.objects.mask_proposals import point_grid, suppressed, threshold_stability
+from iif_core.objects.mask_proposals import point_grid, suppress_overlaps, threshold_stability
 from tests.unit import own_scene as own
 from tests.unit import tiny_sam2
 from workflow import settings as settings_module
@@ -67,10 +67,10 @@ def test_suppression_by_hand_and_by_loops():
     rows = np.zeros((4, 10, 13), bool)
     rows[0, :8], rows[1, :9], rows[2, 5:], rows[3, 6:] = True, True, True, True
     # 0 in 1: 8/9; 2 and 1: 4/10; 3 in 2: 4/5.
-    np.testing.assert_array_equal(suppressed(rows, [0.5, 0.9, 0.7, 0.7], 0.75), [1, 2])
-    np.testing.assert_array_equal(suppressed(rows, [0.5, 0.9, 0.7, 0.7], 0.85), [1, 2, 3])
-    np.testing.assert_array_equal(suppressed(rows, [0.5, 0.5, 0.5, 0.5], 0.75), [0, 2])
-    assert len(suppressed(rows[:0], [], 0.5)) == 0
+    np.testing.assert_array_equal(suppress_overlaps(rows, [0.5, 0.9, 0.7, 0.7], 0.75), [1, 2])
+    np.testing.assert_array_equal(suppress_overlaps(rows, [0.5, 0.9, 0.7, 0.7], 0.85), [1, 2, 3])
+    np.testing.assert_array_equal(suppress_overlaps(rows, [0.5, 0.5, 0.5, 0.5], 0.75), [0, 2])
+    assert len(suppress_overlaps(rows[:0], [], 0.5)) == 0
     rng = np.random.default_rng(1)
     many, score = rng.random((60, 9, 9)) < rng.uniform(0.3, 0.95, (60, 1, 1)), rng.integers(0, 20, 60)
     kept = []
@@ -78,7 +78,7 @@ def test_suppression_by_hand_and_by_loops():
         if all((many[i] & many[j]).sum() <= 0.5 * (many[i] | many[j]).sum() for j in kept):
             kept.append(i)
     assert 5 < len(kept) < 60
-    np.testing.assert_array_equal(suppressed(many, score, 0.5), kept)
+    np.testing.assert_array_equal(suppress_overlaps(many, score, 0.5), kept)
 
 
 # --------------------------------------------------------------------------------------------------------------- the model

@@ -243,7 +243,7 @@ def test_overlapping_groups_and_foreign_segments(tmp_path):
     found = scannetpp.vertex_ids(tmp_path / "s.json", tmp_path / "a.json")
     assert found.ids.tolist() == [3, 3, 3, 12, 12, -1, -1]
     assert found.names[12] == "cushion 12"
-    np.testing.assert_array_equal(mesh.majority(np.array([[3, 3, 12], [3, 12, 12], [12, 3, 12], [3, 12, 4]])), [3, 12, 12, -1])
+    np.testing.assert_array_equal(mesh.majority_id(np.array([[3, 3, 12], [3, 12, 12], [12, 3, 12], [3, 12, 4]])), [3, 12, 12, -1])
     (tmp_path / "a.json").write_text(json.dumps({"groups": []}))
     with pytest.raises(InputError, match="expected `segGroups`"):
         scannetpp.vertex_ids(tmp_path / "s.json", tmp_path / "a.json")

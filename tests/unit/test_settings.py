@@ -1,10 +1,16 @@
 """Settings: defaults, precedence, and errors that name file, key, what was found and what is allowed."""
 
+import itertools
+from dataclasses import fields
+
 import pytest
 
 from iif_core.errors import InputError
+from iif_core.fusion.options import FusionOptions
 from workflow import settings
 from workflow.registry import STAGES
+from workflow.settings import batch_table, study_files
+from workflow.settings.names import did_you_mean_path
 
 GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
 
@@ -50,6 +56,14 @@ def test_scene_over_preset_over_default(scene):
         ("source: builtin\nprior: {kind: simulated}\n", ["`source`", "'builtin'", "{kind: ...}"]),
         (GOOD + "base: {iterations: 100}\n", ["base", "`iterations`", "`solver: sgd` alone", "remove it"]),
         (GOOD + "base: {solver: sgd, sweeps: 3}\n", ["base", "`sweeps`", "`solver: direct` alone"]),
+        (GOOD + "emission: {iterations: 5}\n", ["`emission`: `iterations`: read by `solver: sgd` alone", "`solver: direct`"]),
+        (GOOD + "emission: {preset: paper}\n", ["`emission`: `preset`: read by `solver: sgd` alone"]),
+        (GOOD + "affines: {epochs: 5, rate: 1}\n", ["`affines`: `epochs`, `rate`: read by `solver: sgd` alone"]),
+        (GOOD + "affines: {solver: adam, robust_width: 1}\n", ["`robust_width`: read by `solver: direct` alone", "`solver: adam`"]),
+        (GOOD + "affines: {model: fipt, scale: prior}\n", ["`scale`: read by `model: objects` alone", "set the model"]),
+        (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`epochs`: read by `model: objects` alone"]),
+        (GOOD + "metrics: {views: all}\n", ["`metrics.views`: unknown key. It was removed", "delete it"]),
+        (GOOD + "affines: {ridge: 0.1}\n", ["`affines.ridge`: unknown key. It was removed", "no effect"]),
         (GOOD + "base: {predictions: 99}\n", ["`base: predictions` is 99", "`prior: samples` makes"]),
         (GOOD + "capture: {test_every: 1}\n", ["capture.test_every", "found 1", "2 and more"]),
     ],
@@ -79,21 +93,82 @@ def test_scene_file_that_is_not_utf8(scene):
         settings.load("x", "draft", root)
 
 
+def test_a_value_that_equals_the_default_is_never_idle(scene):
+    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nemission: {iterations: 10000}\nbase: {solver: sgd, sweeps: 9}\n")
+    assert settings.load("x", "draft", root).affines.iterations == 60
+
+
+def test_a_choice_drops_what_lower_layers_set_for_the_other_one(scene):
+    """A preset that sets a number for the direct solver must not forbid a scene to use another solver."""
+    root = scene(GOOD + "affines: {solver: sgd}\n", "affines: {iterations: 7, pixels: 500}\n")
+    got = settings.load("x", "draft", root).affines
+    assert (got.solver, got.iterations, got.pixels) == ("sgd", 60, 500)
+
+
+def test_defaults_are_those_of_the_solvers(repository):
+    from iif_core.fitting.problem import FitOptions
+    from iif_core.fitting.sgd import SgdOptions
+    from iif_core.light.emission import sgd
+
+    tree = settings.SceneSettings(source={"kind": "builtin"}, prior={"kind": "simulated"})
+    for section, options in (
+        (tree.affines, FitOptions()),
+        (tree.affines, SgdOptions()),
+        (tree.base, FusionOptions()),
+    ):
+        shared = set(type(section).model_fields) & {field.name for field in fields(options)}
+        assert {name: getattr(section, name) for name in shared} == {name: getattr(options, name) for name in shared}
+    assert (tree.emission.preset, tree.emission.iterations) == (sgd.SgdOptions().preset, sgd.SgdOptions().steps)
+
+
+def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
+    assert settings.load("kitchen", "standard", tmp_path) == settings.load("kitchen", "standard", repository)
+    assert study_files.study_names(tmp_path) == study_files.study_names(repository)
+    assert batch_table.read_table(tmp_path) == batch_table.read_table(repository)
+
+
+def test_a_folder_with_scenes_of_its_own_uses_these_alone_with_the_presets_of_the_repository(scene, repository):
+    root = scene(GOOD)
+    (root / "config/quality/draft.yaml").unlink()
+    draft = settings.read_yaml(repository / "config/quality/draft.yaml")
+    assert settings.load("x", "draft", root).capture.samples == draft["capture"]["samples"] != 128
+    assert [line.name for line in batch_table.read_table(root)] == ["x"]
+    with pytest.raises(InputError, match="config/scenes/kitchen.yaml: not found. Known scenes: x"):
+        settings.load("kitchen", "draft", root)
+
+
+def test_a_path_with_a_similar_name_beside_it_is_suggested(tmp_path):
+    (tmp_path / "data/office-3/images").mkdir(parents=True)
+    assert did_you_mean_path(tmp_path / "data/ofice-3/images") == f" Did you mean {tmp_path}/data/office-3/images?"
+    assert did_you_mean_path(tmp_path / "data/ofice-3/photos") == f" Did you mean {tmp_path}/data/office-3?"
+    assert did_you_mean_path(tmp_path / "dta/office-3") == f" Did you mean {tmp_path}/data/office-3?"
+    assert did_you_mean_path(tmp_path / "data/kitchen") == did_you_mean_path(tmp_path / "data/office-3/images/0.png") == ""
+
+
 def test_unknown_scene_suggests(scene):
     root = scene(GOOD)
     with pytest.raises(InputError, match="Did you mean scenes/x"):
         settings.load("xx", "draft", root)
 
 
-def test_shipped_scenes_load_at_every_quality(repository):
-    for name in settings.scene_names(repository):
-        for quality in settings.QUALITIES:
+def test_shipped_scenes_and_studies_load_at_every_quality(repository):
+    for quality in settings.QUALITIES:
+        for name in settings.scene_names(repository):
             settings.load(name, quality, repository)
+        for name in study_files.study_names(repository):
+            study = study_files.load_study(name, repository)
+            for scene, variant in itertools.product(study.scenes, study.variants):
+                settings.load(study_files.scene_of(name, scene, variant, 0), quality, repository)
+
+
+def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
+    document = settings.dump(settings.load("kitchen", "draft", repository))
+    assert [entry["name"] for entry in settings.require_relighting(document, "kitchen")] == ["dimmed", "lamp"]
 
 
 def test_generated_files_are_current(repository):
     assert (repository / "config/scene.schema.json").read_text() == settings.schema_json()
-    assert (repository / "docs/settings.md").read_text() == settings.reference_markdown()
+    assert (repository / "docs/reference/settings.md").read_text() == settings.reference_markdown()
 
 
 def test_bounds_are_words():

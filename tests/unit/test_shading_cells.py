@@ -7,8 +7,8 @@ from iif_core.errors import InputError
 from iif_core.surface.shading_cells import (
     REPRESENTATIVES,
     ShadingCellBuilder,
+    combine_estimates,
     diffuse_of_cells,
-    joined,
     normal_bin,
     relative_error,
 )
@@ -126,12 +126,12 @@ def test_two_estimates_are_better_than_one():
     truth = rng.uniform(1, 3, (1, 4000, 1)) * np.ones(3)
     cell = truth * (1 + rng.normal(0, 0.1 * np.sqrt(2), (2, 4000, 1)))
     own = truth * (1 + rng.normal(0, 0.2 * np.sqrt(2), (2, 4000, 1)))
-    both = joined(cell, 0.1, own)
+    both = combine_estimates(cell, 0.1, own)
     scatter = (both.mean(0) / truth[0] - 1).std()
     assert scatter == pytest.approx(1 / np.sqrt(1 / 0.1**2 + 1 / 0.2**2), rel=0.05)
     assert abs(np.corrcoef((both / truth - 1)[..., 0])[0, 1]) < 0.07
-    assert not joined(np.zeros((2, 5, 3)), 0.0, np.zeros((2, 5, 3))).any()
-    assert joined(np.zeros((2, 0, 3)), 0.1, np.zeros((2, 0, 3))).shape == (2, 0, 3)
+    assert not combine_estimates(np.zeros((2, 5, 3)), 0.0, np.zeros((2, 5, 3))).any()
+    assert combine_estimates(np.zeros((2, 0, 3)), 0.1, np.zeros((2, 0, 3))).shape == (2, 0, 3)
 
 
 def test_normals_of_every_direction_have_a_bin():
@@ -150,6 +150,7 @@ def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.materials import FaceMaterials
+    from iif_core.light.transport.scene import PathOptions, Scene
     from iif_core.light.transport.shading import shading_caches
 
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
@@ -164,7 +165,7 @@ def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
     cells = built([(points, normals, np.zeros(6000, np.int64))], edge=0.1)
 
     def trace(p, n, paths, seed):
-        return shading_caches(geometry, material, emitters, p, n, n, [], paths, 2, seed)[0]
+        return shading_caches(Scene(geometry, material, emitters), p, n, n, [], PathOptions(paths, 2, seed))[0]
 
     found = diffuse_of_cells(cells, trace, 64, 0.02, 1024, 1)
     assert found.noise_last < 0.03

@@ -100,12 +100,12 @@ seeds: [0, 1]
 scores: metrics
 costs: [base, affines]
 protocols: [raw, scaled]
-common: {base: {predictions: 2}, affines: {ridge: 0.1}}
+common: {base: {predictions: 2}, affines: {robust_width: 0.2}}
 variants:
   first: {}
   same: {row: prior_k0}
   other: {overrides: {affines: {model: fipt}}}
-  far: {overrides: {base: {ridge: 0.5}, affines: {ridge: 0.2}}}
+  far: {overrides: {base: {ridge: 0.5}, affines: {robust_width: 0.3}}}
 """
 
 
@@ -124,7 +124,7 @@ def test_variants_share_what_an_earlier_one_made(folder):
         for stage in ("affines", "render", "metrics"):
             assert home("other", seed, stage) == f"t--late-other-s{seed}"
         assert home("far", seed, "capture") == "t--s0" and home("far", seed, "base") == f"t--late-far-s{seed}"
-    assert settings.load("t--late-far-s0").base.predictions == 2 and settings.load("t--late-far-s0").affines.ridge == 0.2
+    assert settings.load("t--late-far-s0").base.predictions == 2 and settings.load("t--late-far-s0").affines.robust_width == 0.3
     # What depends on the variant but not on the seed is made once.
     folder("studies/late", LATE.replace("base: {ridge: 0.5}", "capture: {views: 3}"))
     assert home("far", 1, "capture") == "t--late-far-s0" and home("far", 1, "prior") == "t--late-far-s1"

@@ -22,8 +22,7 @@ def polygon_irradiance(point, normal, polygon):
 @pytest.mark.parametrize("half", [0.15, 1.5])
 @pytest.mark.parametrize("nee", [True, False])
 def test_direct_light_of_a_rectangle_is_the_form_factor(T, half, nee):
-    """A large near light is where a mixed-up measure in the MIS weights shows (METHOD 2.5: x1.64 for 3 x 3 m
-    at 2 m)."""
+    """A large light nearby shows densities in two measures (docs/method/numerics.md#densities-in-two-measures)."""
     light = quad((-half, -half + 0.2, 2), (0, 2 * half, 0), (2 * half, 0, 0))
     vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), light])
     geometry = T.build_geometry(vertices, faces, ids)
@@ -33,16 +32,12 @@ def test_direct_light_of_a_rectangle_is_the_form_factor(T, half, nee):
     n = 2000
     black = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (4, 1)))
     diffuse, s0, s1 = T.shading_caches(
-        geometry,
-        black,
-        emitters,
+        T.Scene(geometry, black, emitters),
         repeated((0.3, 0, 0), n),
         repeated((0, 0, 1), n),
         repeated((0.6, 0, 0.8), n),
         [],
-        64,
-        1,
-        seed=3,
+        T.PathOptions(64, 1, 3),
     )
     assert s0.shape == s1.shape == (n, 0, 3)
     expected = polygon_irradiance((0.3, 0, 1e-4), (0, 0, 1), light[0]) / np.pi
@@ -58,9 +53,13 @@ def test_emitters_radiate_from_their_side_only(T):
     nothing = T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (2, 1)))
     for side, below, above in ((1, 0, 1), (-1, 1, 0), (0, 1, 1)):
         emitters = T.Emitters(geometry, np.ones((2, 3)), np.full(2, side))
-        seen = T.render(geometry, nothing, emitters, [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], 2, 0, seed=0)
+        seen = T.render(
+            T.Scene(geometry, nothing, emitters), [[0.1, 0, 0], [0.1, 0, 4]], [[0, 0, 1], [0, 0, -1]], T.PathOptions(2, 0, 0)
+        )
         assert seen[:, 0].tolist() == [below, above]
-        diffuse, _, _ = T.shading_caches(geometry, nothing, emitters, [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], 64, 1, 0)
+        diffuse, _, _ = T.shading_caches(
+            T.Scene(geometry, nothing, emitters), [[0, 0, 0]], [[0, 0, 1]], [[0, 0, 1]], [], T.PathOptions(64, 1, 0)
+        )
         assert (diffuse[0, 0] > 0.1) == bool(below)
 
 
@@ -72,14 +71,10 @@ def test_closed_grey_box_sums_the_geometric_series(T):
         emitters = T.Emitters(geometry, np.full((12, 3), 0.7), np.ones(12), sampling_weight=weight)
         n = 4000
         seen = T.render(
-            geometry,
-            material,
-            emitters,
+            T.Scene(geometry, material, emitters),
             repeated((0.4, 0.9, 0.8), n),
             repeated((0.3, 0.5, -0.6), n),
-            16,
-            64,
-            1,
+            T.PathOptions(16, 64, 1),
         )
         # The last term is the grazing remainder, between 0 and 0.0035 of albedo on cosine average.
         low, high = 0.7 / (1 - rho), 0.7 / (1 - rho - 0.004)
@@ -117,7 +112,12 @@ def test_closed_sphere_solves_its_integral_equation(T):
         side /= np.linalg.norm(side)
         toward = cosine * start + np.sqrt(1 - cosine**2) * side  # arrives at the far wall under the same angle
         n = 4000
-        seen = T.render(geometry, material, emitters, repeated(start * 0.9 - 0 * side, n), repeated(toward, n), 32, 64, 5)
+        seen = T.render(
+            T.Scene(geometry, material, emitters),
+            repeated(start * 0.9 - 0 * side, n),
+            repeated(toward, n),
+            T.PathOptions(32, 64, 5),
+        )
         arrived = np.array([0.9 * start @ toward])
         distance = -arrived + np.sqrt(arrived**2 + 1 - 0.81)
         hit = 0.9 * start + distance * toward
@@ -146,35 +146,24 @@ def test_white_furnace(T, r, m):
     emitters = T.Emitters(geometry, np.zeros((2, 3)), environment=(1, 1, 1))
     assert not emitters.can_be_sampled
     material = T.FaceMaterials(np.tile([*a, r, m], (2, 1)))
-    seen = T.render(geometry, material, emitters, repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), 32, 8, 1)
+    seen = T.render(
+        T.Scene(geometry, material, emitters), repeated((0, 0, 1), n), repeated((-0.8, 0, -NoV), n), T.PathOptions(32, 8, 1)
+    )
     caches = T.shading_caches(
-        geometry,
-        material,
-        emitters,
+        T.Scene(geometry, material, emitters),
         repeated((0, 0, 0), n),
         repeated((0, 0, 1), n),
         repeated(wo, n),
         [r],
-        32,
-        8,
-        1,
+        T.PathOptions(32, 8, 1),
     )
     matrix, cached = T.transport_matrix(
-        geometry,
-        material,
-        repeated((0, 0, 0), n),
-        repeated((0, 0, 1), n),
-        repeated(wo, n),
-        repeated(a, n),
-        np.full(n, r),
-        np.full(n, m),
-        np.full(2, -1),
-        1,
-        None,
-        32,
-        8,
-        1,
-        environment_columns=[[0]],
+        T.Scene(geometry, material, None),
+        T.ShadingPoints(
+            repeated((0, 0, 0), n), repeated((0, 0, 1), n), repeated(wo, n), repeated(a, n), np.full(n, r), np.full(n, m)
+        ),
+        T.EmitterColumns(np.full(2, -1), 1, of_texel=[[0]]),
+        T.PathOptions(32, 8, 1),
     )
     assert not cached.any()
     lobes = brdf.compose(kd, 0, 1.0, 0, 0), brdf.compose(0, ks, 0, s0, s1)
@@ -195,26 +184,18 @@ def test_jitter_is_a_box_filter_over_the_pixel(T):
     n = 2000
     # At depth 2 the pixel of width 1 spans x in [-1, 1] (centre 0): 40 % lies beyond x = 0.2.
     seen = T.render(
-        geometry,
-        black,
-        emitters,
+        T.Scene(geometry, black, emitters),
         repeated((0, 0, 0), n),
         repeated((0, 0, 1), n),
-        16,
-        0,
-        0,
-        jitter=((1, 0, 0), (0, 1, 0)),
+        T.PathOptions(16, 0, 0),
+        ((1, 0, 0), (0, 1, 0)),
     )
     assert_mean(seen[:, 0], 0.4)
     wide = T.render(
-        geometry,
-        black,
-        emitters,
+        T.Scene(geometry, black, emitters),
         repeated((0, 0, 0), n),
         repeated((3, 0, 5), n),
-        16,
-        0,
-        0,
-        jitter=((3, 0, 0), (0, 1, 0)),
+        T.PathOptions(16, 0, 0),
+        ((3, 0, 0), (0, 1, 0)),
     )  # un-normalised direction: x/z in 2 * [0.3, 0.9] - all but nothing below 0.1
     assert (wide == 1).all()

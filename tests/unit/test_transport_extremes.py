@@ -1,4 +1,4 @@
-"""Light transport at its limits: finite, bounded, and equal to a closed form where there is one (METHOD 5)."""
+"""Light transport at its limits: finite, bounded, and equal to a closed form where there is one (docs/method/numerics.md)."""
 
 import numpy as np
 import pytest
@@ -45,33 +45,20 @@ def check(values, most=np.inf):
         assert np.isfinite(value).all() and (value >= 0).all() and value.max(initial=0) <= most
 
 
-def reflected(T, geometry, material, emitters, rough, metal, color, wo=(0.6, 0, 0.8), bounces=6, samples=32, n=400, **options):
+def reflected(T, geometry, material, emitters, rough, metal, color, wo=(0.6, 0, 0.8), bounces=6, samples=32, n=400):
     """Radiance of floor points by caches and by the matrix; both finite and not negative."""
     points, normals = floor_points(n)
     wo = np.tile(np.float32(wo), (n, 1))
-    diffuse, s0, s1 = T.shading_caches(geometry, material, emitters, points, normals, wo, [rough], samples, bounces, 1, **options)
+    scene = T.Scene(geometry, material, emitters)
+    diffuse, s0, s1 = T.shading_caches(scene, points, normals, wo, [rough], T.PathOptions(samples, bounces, 1))
     check((diffuse, s0, s1))
     kd, ks = brdf.kd_ks(np.broadcast_to(color, 3), metal)
     composed = brdf.compose(kd, ks, diffuse, s0[:, 0], s1[:, 0])
     group = np.where(emitters.radiance.any(1), 0, -1)
     columns = np.zeros((1, 1), int) if emitters.environment.any() else None
     own = np.tile(np.float32(color), (n, 3 // np.size(color))).reshape(n, 3), np.full(n, rough), np.full(n, metal)
-    matrix, h = T.transport_matrix(
-        geometry,
-        material,
-        points,
-        normals,
-        wo,
-        *own,
-        group,
-        1,
-        emitters.side,
-        samples,
-        bounces,
-        2,
-        environment_columns=columns,
-        **options,
-    )
+    found = T.EmitterColumns(group, 1, emitters.side, columns)
+    matrix, h = T.transport_matrix(scene, T.ShadingPoints(points, normals, wo, *own), found, T.PathOptions(samples, bounces, 2))
     check((matrix, h))
     matrix, h = matrix.sum(1), h.sum(1)
     return composed, matrix
@@ -97,10 +84,11 @@ def test_sharpest_roughest_black_and_grazing(T, rough, metal, color, wo):
         n=100,
         samples=16,
     )
-    # A lobe returns at most 1.04 of what arrives (METHOD 3.1), and inside nothing is brighter than the lamp's closed room.
+    # A lobe returns at most 1.04 of what arrives (docs/method/reflectance.md#energy), and nothing inside is brighter than the
+    # closed room of the lamp.
     assert composed.mean() <= 5 * 1.1 / (1 - 0.9) and matrix.mean() <= 1.1 / (1 - 0.9)
     if wo == (1, 0, 0):
-        assert not matrix.any()  # NoV = 0 counts as a miss (METHOD H50)
+        assert not matrix.any()  # NoV = 0 counts as a miss: docs/method/numerics.md#grazing-directions
 
 
 def test_white_closed_room_converges_to_its_series(T):
@@ -122,7 +110,7 @@ def test_white_closed_room_converges_to_its_series(T):
     origin, way = np.tile(np.float32([0.9, 0.4, 0.7]), (n, 1)), np.random.default_rng(0).normal(size=(n, 3))
     means = []
     for bounces in (1, 20, 60, 400):
-        seen = T.render(geometry, grey, emitters, origin, way, 16, bounces, 3)
+        seen = T.render(T.Scene(geometry, grey, emitters), origin, way, T.PathOptions(16, bounces, 3))
         check((seen,), 0.1 * 1.06 * (bounces + 1) * 20)
         partial = 0.1 * (1 - rho ** (bounces + 1)) / (1 - rho)
         # The grazing remainder of the lobe adds 0 ... 0.4 % of albedo.
@@ -141,7 +129,7 @@ def test_one_tiny_lamp_of_a_million(T):
     emitters = T.Emitters(geometry, lamp, np.where(np.arange(14) >= 12, 1, 0))
     dark = materials(T, 14, 0.0, 1.0, 1.0)
     points, normals = np.float32([[1, 1, 0]] * 200), np.float32([[0, 0, 1]] * 200)
-    diffuse, _, _ = T.shading_caches(geometry, dark, emitters, points, normals, normals, [], 16, 1, 0)
+    diffuse, _, _ = T.shading_caches(T.Scene(geometry, dark, emitters), points, normals, normals, [], T.PathOptions(16, 1, 0))
     # E = L A cos cos / d^2, D = E / pi: a point light straight above.
     np.testing.assert_allclose(diffuse.mean(), 1e6 * 1e-6 / 1.99**2 / np.pi, rtol=1e-2)
     assert diffuse.std() < 0.02 * diffuse.mean()  # drawn, not found by chance
@@ -162,7 +150,9 @@ def test_only_the_environment_through_a_hole(T):
     corner = (1 / (2 * np.pi)) * 2 * x / np.sqrt(1 + x * x) * np.arctan(x / np.sqrt(1 + x * x))
     for sky in (np.ones(3), np.ones((8, 16, 3))):
         emitters = T.Emitters(geometry, np.zeros((10, 3)), environment=sky)
-        diffuse, _, _ = T.shading_caches(geometry, dark, emitters, points, normals, normals, [], 256, 2, 0)
+        diffuse, _, _ = T.shading_caches(
+            T.Scene(geometry, dark, emitters), points, normals, normals, [], T.PathOptions(256, 2, 0)
+        )
         check((diffuse,), 2)
         error = 3 * diffuse[:, 0].std() / np.sqrt(n)
         assert diffuse[:, 0].mean() == pytest.approx(4 * corner, abs=error + 1e-3)
@@ -183,7 +173,9 @@ def test_coincident_and_flipped_faces(T, side):
         emitters = T.Emitters(geometry, radiance, np.where(np.arange(count) < 12, side, -side))
         assert np.sum(emitters.pdf_area * geometry.areas) == pytest.approx(count / 12)  # both copies know the density
         grey = materials(T, count, 0.5, 0.9, 0.0)
-        seen.append(T.render(geometry, grey, emitters, np.tile(np.float32([1, 1, 1]), (n, 1)), way, 32, 8, 1))
+        seen.append(
+            T.render(T.Scene(geometry, grey, emitters), np.tile(np.float32([1, 1, 1]), (n, 1)), way, T.PathOptions(32, 8, 1))
+        )
         check((seen[-1],), 20)
     assert seen[1].mean() == pytest.approx(seen[0].mean(), rel=0.04)
 
@@ -198,11 +190,11 @@ def test_lamp_that_is_never_seen_directly(T):
     emitters = T.Emitters(geometry, radiance, np.where(np.arange(16) >= 14, 1, 0))
     points, normals = np.float32([[0.3, 0.3, 0]] * 400), np.float32([[0, 0, 1]] * 400)
     white = materials(T, 16, 0.7, 1.0, 0.0)
-    direct, _, _ = T.shading_caches(geometry, white, emitters, points, normals, normals, [], 16, 1, 0)
+    direct, _, _ = T.shading_caches(T.Scene(geometry, white, emitters), points, normals, normals, [], T.PathOptions(16, 1, 0))
     assert not direct.any()
-    full, _, _ = T.shading_caches(geometry, white, emitters, points, normals, normals, [], 64, 12, 0)
+    full, _, _ = T.shading_caches(T.Scene(geometry, white, emitters), points, normals, normals, [], T.PathOptions(64, 12, 0))
     blind = T.Emitters(geometry, radiance, np.where(np.arange(16) >= 14, 1, 0), sampling_weight=np.zeros(16))
-    brute, _, _ = T.shading_caches(geometry, white, blind, points, normals, normals, [], 256, 12, 1)
+    brute, _, _ = T.shading_caches(T.Scene(geometry, white, blind), points, normals, normals, [], T.PathOptions(256, 12, 1))
     check((full, brute))
     error = np.hypot(full[:, 0].std(), brute[:, 0].std()) / np.sqrt(400)
     assert full.mean() > 0.05 and abs(full[:, 0].mean() - brute[:, 0].mean()) < 4 * error

@@ -16,42 +16,30 @@ def test_extremes_are_finite(T, room):
     for material in (mirror, room.material):
         for wo in (grazing, behind, room.wo):
             caches = T.shading_caches(
-                room.geometry,
-                material,
-                bright,
+                T.Scene(room.geometry, material, bright),
                 room.points[some],
                 room.normals[some],
                 wo[some],
                 [0.02, 1],
-                8,
-                6,
-                0,
+                T.PathOptions(8, 6, 0),
             )
             matrix = T.transport_matrix(
-                room.geometry,
-                material,
-                room.points[some],
-                room.normals[some],
-                wo[some],
-                np.zeros((300, 3)),
-                np.zeros(300),
-                np.ones(300),
-                room.group,
-                2,
-                room.side,
-                8,
-                6,
-                0,
+                T.Scene(room.geometry, material, None),
+                T.ShadingPoints(room.points[some], room.normals[some], wo[some], np.zeros((300, 3)), np.zeros(300), np.ones(300)),
+                T.EmitterColumns(room.group, 2, room.side),
+                T.PathOptions(8, 6, 0),
             )
             for value in (*caches, *matrix):
                 assert np.isfinite(value).all() and (value >= 0).all()
-        assert np.isfinite(T.render(room.geometry, material, bright, room.origin, room.directions, 4, 12, 0)).all()
+        assert np.isfinite(
+            T.render(T.Scene(room.geometry, material, bright), room.origin, room.directions, T.PathOptions(4, 12, 0))
+        ).all()
     dark = T.Emitters(room.geometry, np.zeros((len(room.faces), 3)))
-    assert not T.render(room.geometry, room.material, dark, room.origin, room.directions, 2, 4, 0).any()
+    assert not T.render(T.Scene(room.geometry, room.material, dark), room.origin, room.directions, T.PathOptions(2, 4, 0)).any()
 
 
 def test_far_from_the_origin_nothing_shadows_itself(T):
-    """At 5 km a float32 hit is off by 5e-4 m: the offset along the normal must grow with it (METHOD H24)."""
+    """At 5 km a float32 hit is off by 5e-4 m: the offset along the normal must grow with it (Eq. S.12)."""
     from scipy.spatial.transform import Rotation
 
     turn = Rotation.from_euler("xyz", (0.4, 0.7, 1.1)).as_matrix()
@@ -62,7 +50,7 @@ def test_far_from_the_origin_nothing_shadows_itself(T):
     for shift in (np.zeros(3), np.array([5000.0, -4000, 3000])):
         geometry = T.build_geometry(corners @ turn.T + shift, faces, np.zeros(12, np.int32))
         emitters = T.Emitters(geometry, np.ones((12, 3)), np.ones(12), sampling_weight=np.zeros(12))
-        seen.append(T.render(geometry, material, emitters, shift, directions, 32, 1, 0)[:, 0])
+        seen.append(T.render(T.Scene(geometry, material, emitters), shift, directions, T.PathOptions(32, 1, 0))[:, 0])
     assert 1 + rho < seen[0].mean() < 1 + rho + 0.01
     assert seen[1].mean() == pytest.approx(seen[0].mean(), rel=5e-3)
 
@@ -86,38 +74,26 @@ def test_bad_input_is_named(T, room):
         T.FaceMaterials(np.full((2, 5), np.nan))
     with pytest.raises(InputError, match="roughness levels"):
         T.shading_caches(
-            room.geometry,
-            room.material,
-            room.emitters,
+            T.Scene(room.geometry, room.material, room.emitters),
             room.points,
             room.normals,
             room.wo,
             [0.5, 0.1],
-            1,
-            1,
-            0,
+            T.PathOptions(1, 1, 0),
         )
     with pytest.raises(InputError, match="samples=0"):
         room.render(T, 0, seed=0)
     with pytest.raises(InputError, match="zero vector"):
-        T.render(room.geometry, room.material, room.emitters, [0, 0, 0], np.zeros((1, 3)), 1, 1, 0)
+        T.render(T.Scene(room.geometry, room.material, room.emitters), [0, 0, 0], np.zeros((1, 3)), T.PathOptions(1, 1, 0))
     with pytest.raises(InputError, match="emitter_of_face"):
         T.transport_matrix(
-            room.geometry,
-            room.material,
-            room.points,
-            room.normals,
-            room.wo,
-            room.base_color,
-            room.roughness,
-            room.metallic,
-            room.group,
-            1,
-            room.side,
-            1,
-            1,
-            0,
+            T.Scene(room.geometry, room.material, None),
+            T.ShadingPoints(room.points, room.normals, room.wo, room.base_color, room.roughness, room.metallic),
+            T.EmitterColumns(room.group, 1, room.side),
+            T.PathOptions(1, 1, 0),
         )
     none = np.zeros((0, 3), np.float32)
-    assert T.render(room.geometry, room.material, room.emitters, none, none, 1, 1, 0).shape == (0, 3)
-    assert T.shading_caches(room.geometry, room.material, room.emitters, none, none, none, [0.5], 1, 1, 0)[1].shape == (0, 1, 3)
+    assert T.render(T.Scene(room.geometry, room.material, room.emitters), none, none, T.PathOptions(1, 1, 0)).shape == (0, 3)
+    assert T.shading_caches(
+        T.Scene(room.geometry, room.material, room.emitters), none, none, none, [0.5], T.PathOptions(1, 1, 0)
+    )[1].shape == (0, 1, 3)

@@ -18,34 +18,16 @@ def test_reruns_chunks_and_threads_do_not_change_a_bit(T, room):
         parts = (room.points[pick], room.normals[pick], room.wo[pick])
         du = np.float32([1 / 26, 0, 0])
         rendered = T.render(
-            room.geometry,
-            room.material,
-            room.emitters,
+            T.Scene(room.geometry, room.material, room.emitters, constant_cache(T, (1, 2, 3), low=(-6, -6, -3), count=12)),
             room.origin,
             room.directions[pick],
-            8,
-            4,
-            9,
-            jitter=(du, du),
-            chunk=chunk,
-            cache=constant_cache(T, (1, 2, 3), low=(-6, -6, -3), count=12),
+            T.PathOptions(8, 4, 9, chunk),
+            (du, du),
         )
-        caches = T.shading_caches(room.geometry, room.material, room.emitters, *parts, levels, 8, 4, 9, chunk=chunk)
-        matrix = T.transport_matrix(
-            room.geometry,
-            room.material,
-            *parts,
-            room.base_color[pick],
-            room.roughness[pick],
-            room.metallic[pick],
-            room.group,
-            2,
-            room.side,
-            8,
-            4,
-            9,
-            chunk=chunk,
-        )
+        scene, paths = T.Scene(room.geometry, room.material, room.emitters), T.PathOptions(8, 4, 9, chunk)
+        caches = T.shading_caches(scene, *parts, levels, paths)
+        points = T.ShadingPoints(*parts, room.base_color[pick], room.roughness[pick], room.metallic[pick])
+        matrix = T.transport_matrix(scene, points, T.EmitterColumns(room.group, 2, room.side), paths)
         return b"".join(a.tobytes() for a in (rendered, *caches, *matrix))
 
     first = everything(1 << 18)
@@ -63,7 +45,8 @@ def test_lanes_and_seeds_are_independent(T, room):
     same = (repeated(room.origin, n), repeated(room.directions[len(room.directions) // 2], n))
 
     def run(seed):
-        return T.render(room.geometry, room.material, room.emitters, *same, 1, 5, seed)[:, 0].astype(np.float64)
+        scene = T.Scene(room.geometry, room.material, room.emitters)
+        return T.render(scene, *same, T.PathOptions(1, 5, seed))[:, 0].astype(np.float64)
 
     a, b, c = run(0), run(1), run(2**63 + 1)
     assert len(np.unique(a)) > 0.5 * n
@@ -100,7 +83,9 @@ def test_degenerate_faces_keep_their_ids(T):
     emitters = T.Emitters(geometry, np.ones((4, 3)))
     assert set(emitters.slots) == {1, 3} and emitters.pdf_area[[0, 2]].tolist() == [0, 0]
     colours = T.FaceMaterials(np.tile([0.5, 0.5, 0.5, 0.5, 0], (4, 1)))
-    assert np.isfinite(T.render(geometry, colours, emitters, [0, 0, 1], repeated((0.1, 0, -1), 5), 8, 3, 0)).all()
+    assert np.isfinite(
+        T.render(T.Scene(geometry, colours, emitters), [0, 0, 1], repeated((0.1, 0, -1), 5), T.PathOptions(8, 3, 0))
+    ).all()
 
 
 def test_light_slots_have_the_density_they_report(T):
@@ -121,7 +106,12 @@ def test_sampling_weights_do_not_change_the_mean(T, room):
     means = []
     for weight in (None, room.geometry.areas, np.where(room.group == 0, 1.0, 0.0), np.zeros(len(room.faces))):
         emitters = T.Emitters(room.geometry, room.radiance, room.side, sampling_weight=weight)
-        seen = T.render(room.geometry, room.material, emitters, repeated(room.origin, n), repeated(direction, n), 32, 3, 4)
+        seen = T.render(
+            T.Scene(room.geometry, room.material, emitters),
+            repeated(room.origin, n),
+            repeated(direction, n),
+            T.PathOptions(32, 3, 4),
+        )
         means.append((seen[:, 0].mean(), seen[:, 0].std() / np.sqrt(n)))
     for mean, error in means[1:]:
         assert abs(mean - means[0][0]) < 3.5 * np.hypot(error, means[0][1])
@@ -152,12 +142,12 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     coarse_ijk, coarse_object, coarse = cells.coarse_cells(*cells.unpack_keys(keys), values)
     around = cells.CellTable.build(cells.pack_keys(coarse_ijk, coarse_object))
     near = np.append(around.lookup(cells.pack_keys(ijk >> cells.COARSE_SHIFT, objects[: len(ijk)])), [-1, -1, -1])
-    assert 0 < np.mean((row < 0) & (near >= 0)) < np.mean(row < 0)  # all three roads are taken
+    assert 0 < np.mean((row < 0) & (near >= 0)) < np.mean(row < 0)  # all three cases occur
     fallback = np.where(near[:, None] >= 0, coarse[near], fallback)
     expected = np.where(row[:, None] >= 0, values[row], fallback)
     expected[:, 3] = np.maximum(expected[:, 3], brdf.R_MIN)
     assert 0.2 < np.mean(row >= 0) < 0.8
     np.testing.assert_array_equal(got, expected.astype(np.float32))
     assert np.isfinite(room.render(T, 2, seed=0)).all()
-    rendered = T.render(room.geometry, material, room.emitters, room.origin, room.directions, 2, 3, 0)
+    rendered = T.render(T.Scene(room.geometry, material, room.emitters), room.origin, room.directions, T.PathOptions(2, 3, 0))
     assert np.isfinite(rendered).all() and rendered.mean() > 0

@@ -85,18 +85,9 @@ class Room:
         self.base_color, self.roughness, self.metallic = values[:, :3], values[:, 3], values[:, 4]
         self.object = self.ids[self.face]
 
-    def render(self, T, samples, seed, **options):
-        options = {"max_bounces": 5} | options
-        return T.render(
-            self.geometry,
-            self.material,
-            self.emitters,
-            self.origin,
-            self.directions,
-            samples,
-            seed=seed,
-            **options,
-        )
+    def render(self, T, samples, seed, cache=None):
+        scene = T.Scene(self.geometry, self.material, self.emitters, cache)
+        return T.render(scene, self.origin, self.directions, T.PathOptions(samples, 5, seed))
 
 
 def repeated(vector, count):

@@ -1,11 +1,9 @@
 """A tiny scene through the real workflow, once a session; other tests work on copies of it."""
 
-import shutil
-import subprocess
-import sys
-from pathlib import Path
+import fcntl
 
 import pytest
+from support import Workflow
 
 TINY = """\
 source: {kind: builtin, scene: tiny}
@@ -19,37 +17,18 @@ report: {views: 2}
 """
 
 
-class Workflow:
-    """A folder with scenes, and Snakemake run in it as a user would."""
-
-    def __init__(self, repository: Path, folder: Path):
-        self.repository, self.folder = repository, folder
-
-    def write(self, scene: str, text: str) -> None:
-        path = self.folder / "config/scenes" / f"{scene}.yaml"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-
-    def command(self, *arguments: str) -> list[str]:
-        snakemake = Path(sys.executable).with_name("snakemake")
-        return [str(snakemake), "-s", str(self.repository / "Snakefile"), "-d", str(self.folder), "--cores", "2", *arguments]
-
-    def run(self, *arguments: str) -> subprocess.CompletedProcess:
-        return subprocess.run(self.command(*arguments), capture_output=True, text=True)
-
-    def copy(self, folder: Path) -> "Workflow":
-        """The same state elsewhere (time stamps and Snakemake's records kept)."""
-        shutil.copytree(self.folder, folder, symlinks=True)
-        return Workflow(self.repository, folder)
-
-
 @pytest.fixture(scope="session")
-def finished(repository, tmp_path_factory) -> Workflow:
-    """The tiny scene, run to the end. Do not change it: use `workflow`."""
-    workflow = Workflow(repository, tmp_path_factory.mktemp("tiny") / "run")
-    workflow.write("tiny", TINY)
-    result = workflow.run("scenes/tiny")
-    assert result.returncode == 0, result.stderr[-4000:]
+def finished(repository, tmp_path_factory, worker_id) -> Workflow:
+    """The tiny scene, run to the end, once for all processes of pytest-xdist. Do not change it: use `workflow`."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base if worker_id == "master" else base.parent
+    workflow = Workflow(repository, shared / "tiny")
+    with (shared / "tiny.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # the other processes wait here until the run is there
+        if not (workflow.folder / "scenes/tiny").is_dir():
+            workflow.write("tiny", TINY)
+            result = workflow.run("scenes/tiny")
+            assert result.returncode == 0, result.stderr[-4000:]
     return workflow
 
 

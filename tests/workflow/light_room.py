@@ -174,6 +174,7 @@ def build(
     from iif_core.light.transport.geometry import build_geometry, trace
     from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
 
     room = room or Room(seed)
     room.emission *= brightness
@@ -194,7 +195,9 @@ def build(
         directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(-1, 3)
         origin = view.world_from_camera[:3, 3]
         face, depth = trace(geometry, origin, directions)
-        radiance = render(geometry, material, emitters, origin, directions, samples, bounces, 1000 + view.view_id)
+        radiance = render(
+            Scene(geometry, material, emitters), origin, directions, PathOptions(samples, bounces, 1000 + view.view_id)
+        )
         depth = np.where(face >= 0, depth, 0)
         image = radiance.reshape(size, size, 3)
         if sensor is not None:

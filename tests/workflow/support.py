@@ -2,7 +2,9 @@
 
 import hashlib
 import re
+import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 
@@ -22,10 +24,39 @@ def manifests(folder: Path) -> dict[str, str]:
 
 
 def treatment(case: str) -> str:
-    """The text that docs/bad-input.md promises for a case."""
-    page = Path(__file__).resolve().parents[2] / "docs/bad-input.md"
+    """The text that docs/reference/bad-input.md promises for a case."""
+    page = Path(__file__).resolve().parents[2] / "docs/reference/bad-input.md"
     for line in page.read_text().splitlines():
         match = re.fullmatch(r"\| (.+?) \| `(.+)` \|", line)
         if match and match[1] == case:
             return match[2]
-    raise AssertionError(f"docs/bad-input.md has no row for {case!r}")
+    raise AssertionError(f"docs/reference/bad-input.md has no row for {case!r}")
+
+
+class Workflow:
+    """A folder with scenes, and Snakemake run in it as a user would."""
+
+    def __init__(self, repository: Path, folder: Path):
+        self.repository, self.folder = repository, folder
+
+    def write(self, scene: str, text: str) -> None:
+        path = self.folder / "config/scenes" / f"{scene}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def write_quality(self, quality: str, text: str) -> None:
+        path = self.folder / "config/quality" / f"{quality}.yaml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def command(self, *arguments: str) -> list[str]:
+        snakemake = Path(sys.executable).with_name("snakemake")
+        return [str(snakemake), "-s", str(self.repository / "Snakefile"), "-d", str(self.folder), "--cores", "2", *arguments]
+
+    def run(self, *arguments: str) -> subprocess.CompletedProcess:
+        return subprocess.run(self.command(*arguments), capture_output=True, text=True)
+
+    def copy(self, folder: Path) -> "Workflow":
+        """The same state elsewhere (time stamps and Snakemake's records kept)."""
+        shutil.copytree(self.folder, folder, symlinks=True)
+        return Workflow(self.repository, folder)

@@ -1,7 +1,4 @@
-"""The deliverable of the tiny scene: contract files, and a snapshot in three tiers (exact, tolerance, structure).
-
-`python tests/workflow/snapshot.py <folder>` rewrites the snapshot from a finished run; read the diff before you commit it.
-"""
+"""The deliverable of the tiny scene: the files and columns that users rely on."""
 
 import json
 
@@ -9,7 +6,6 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import yaml
-from snapshot import PATH, take
 
 FILES = """scene.glb mitsuba/scene.xml objects.parquet emitters.parquet plan.yaml metrics.parquet timings.parquet
 report.html manifest.json""".split()
@@ -62,12 +58,3 @@ def test_timings_name_every_job(scene):
     table = pq.read_table(scene / "timings.parquet").to_pandas()
     assert {"capture", "prior", "base", "emission", "shading", "affines", "render"} <= set(table["rule"])
     assert (table["seconds"] > 0).all() and (table["threads"] > 0).all()
-
-
-def test_snapshot(finished):
-    """Exact: counts, ids. Tolerance: means, within the Monte Carlo spread of another machine. Structure: files, channels."""
-    want, got = json.loads(PATH.read_text()), take(finished.folder)
-    assert got["exact"] == want["exact"]
-    assert got["structure"] == want["structure"]
-    for name, (value, tolerance) in want["tolerance"].items():
-        assert abs(got["tolerance"][name][0] - value) <= tolerance, (name, got["tolerance"][name][0], value)

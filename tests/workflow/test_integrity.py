@@ -8,6 +8,7 @@ import time
 
 from support import manifests, planned
 
+from tests.unit import own_scene as own
 from workflow.registry import STAGES
 
 NOTHING = "Nothing to be done"
@@ -77,6 +78,44 @@ def test_edited_deliverable_is_found(workflow):
     page.write_text(text)
     verify = workflow.run("verify")
     assert verify.returncode != 0 and "scenes/tiny/plan.yaml" in verify.stdout + verify.stderr
+
+
+def test_published_files_that_are_gone_are_named_and_published_again(workflow):
+    deliverable = workflow.folder / "scenes/tiny"
+    before = {path.name: path.read_bytes() for path in deliverable.glob("maps/*")}
+    (deliverable / "plan.yaml").unlink()
+    (deliverable / "maps/001.exr").unlink()
+    verify = workflow.run("verify")
+    assert verify.returncode != 0
+    assert verify.stderr.strip().splitlines()[-3:] == [
+        "scenes/tiny/maps/001.exr: missing; rebuild with: snakemake --cores 2 scenes/tiny --forcerun publish",
+        "scenes/tiny/plan.yaml: missing; rebuild with: snakemake --cores 2 scenes/tiny --forcerun publish",
+        "2 damaged",
+    ]
+    assert planned(workflow.run("scenes/tiny", "-n")) == {"publish"}
+    again = workflow.run("scenes/tiny")
+    assert again.returncode == 0 and "scenes/tiny: maps/001.exr, plan.yaml missing" in again.stderr
+    assert {path.name: path.read_bytes() for path in deliverable.glob("maps/*")} == before
+    assert (deliverable / "plan.yaml").is_file()
+    assert NOTHING in workflow.run("scenes/tiny").stderr
+
+
+def test_the_last_line_is_the_reason_of_the_failed_job(workflow):
+    """Also where several jobs fail, and after a run that failed for another reason."""
+    folder = workflow.folder
+    own.bare(folder / "data/mm")
+    vertices, faces, _ = own.room_mesh()
+    own.save_mesh(folder / "data/mm/mesh.ply", 1000 * vertices, faces)
+    text = "source: {kind: folder, path: data/mm}\ncapture: {width: 64, height: 48}\nprior: {kind: retinex}\n"
+    workflow.write("mm", text + "segmentation: {kind: geometry}\n")
+    old = folder / "results/tiny/logs/base.state.json"
+    old.write_text(json.dumps({"state": "failed", "reason": "long ago", "fingerprint": ""}))
+    os.utime(old, (0, 0))
+    failed = workflow.run("scenes/mm")
+    last = failed.stderr.strip().splitlines()[-1]
+    assert failed.returncode == 1
+    assert last.startswith("error: mm: capture failed (results/mm/logs/capture.log): data/mm/mesh.ply: the scene is 5590 m across")
+    assert "long ago" not in failed.stderr
 
 
 def test_killed_run_resumes_to_the_same_result(finished, tmp_path):

@@ -1,4 +1,4 @@
-"""The extremes of docs/extremes.md through the stages from emission to report: finite, within range, explained."""
+"""The extremes of docs/results/extremes.md through the stages from emission to report: finite, within range, explained."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -38,7 +38,7 @@ def _run(folder, dynamic_range, upto="metrics"):
 
 
 def _checked(folder):
-    """Everything that the stages wrote is finite (the reader refuses what is not) and within the ranges of docs/artefacts.md."""
+    """All that the stages wrote is finite (the reader refuses the rest) and in the ranges of docs/reference/artefacts.md."""
     found = SimpleNamespace(
         **{name: StubJob("reader", folder, {}).read(name) for name in ("capture", "base", *STAGES) if (folder / name).is_dir()}
     )

@@ -1,6 +1,7 @@
 """emission, shading and affines on a room whose light and materials are known."""
 
 import logging
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +9,8 @@ import pytest
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
 
 from iif_core.camera.simulation import response_curve
+from workflow.artifacts import files
+from workflow.scene import emission_pixels
 from workflow.scene.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
@@ -105,6 +108,31 @@ def test_same_bytes_twice(hdr):
     before = {s: _reader(folder, s).manifest["files"] for s in ("emission", "shading", "affines")}
     _run(folder, "hdr")
     assert before == {s: _reader(folder, s).manifest["files"] for s in before}
+
+
+def _emission_reading_files(folder, monkeypatch, budget):
+    """Hashes of what stage emission writes, and how often it reads files of each view, within `budget` megabytes."""
+    reads, real = Counter(), files.read_exr
+
+    def counted(path):
+        reads[path.stem] += 1
+        return real(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "read_exr", counted)
+        patch.setattr(emission_pixels, "VIEW_MEMORY_MB", budget)
+        _run(folder, "ldr", upto="emission")
+    return {name: facts["sha256"] for name, facts in _reader(folder, "emission").manifest["files"].items()}, reads
+
+
+def test_each_view_is_decoded_once_within_the_memory_budget(tmp_path, llvm, monkeypatch):
+    """Photograph, G-buffer, segmentation and base maps of a view are read once; without memory the result is the same."""
+    exposures = np.array([0.5, 1.0, 2.0, 1.0])
+    build(tmp_path, views=4, size=32, samples=32, dynamic_range="ldr", curve="filmic", exposures=exposures)
+    written, reads = _emission_reading_files(tmp_path, monkeypatch, emission_pixels.VIEW_MEMORY_MB)
+    assert len(reads) == 4 and max(reads.values()) <= 4
+    again, more = _emission_reading_files(tmp_path, monkeypatch, 0.0)
+    assert again == written and min(more.values()) > 4
 
 
 def test_ldr_with_unknown_response(tmp_path, llvm):

@@ -1,4 +1,4 @@
-"""Atomic writes, hashes, and the two formats (EXR, Parquet) as plain dictionaries of arrays."""
+"""Atomic writes, hashes, and the two data formats (EXR, Parquet) as plain dictionaries of arrays."""
 
 from __future__ import annotations
 
@@ -11,17 +11,32 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.errors import InputError
+
 _DTYPES = {"float16": np.float16, "float32": np.float32, "uint32": np.uint32}
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
+def inside(folder: Path, name: str) -> Path:
+    """Return `folder / name`, which must be a file below `folder`, also after symbolic links are followed.
+
+    Raises:
+        InputError: `name` is empty or absolute, has a part `..`, or leads through a link out of the folder.
+    """
+    path = folder / name
+    leaves = not Path(name).parts or Path(name).is_absolute() or ".." in Path(name).parts
+    if leaves or not path.parent.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{folder}: the file name {name!r} would leave this folder; nothing is written there")
+    return path
+
+
 def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Call `write(temporary)` beside `path`, flush it to disk, rename it to `path`: readers never see half a file."""
+    """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
@@ -34,7 +49,11 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def write_exr(path: Path, channels: dict[str, np.ndarray]) -> dict[str, str]:
-    """Write (H, W) arrays as one EXR, ZIP-compressed; float16, float32 and uint32 are kept. Returns channel -> dtype."""
+    """Write (H, W) arrays of float16, float32 or uint32 as one EXR, compressed without loss. Returns channel -> dtype.
+
+    Raises:
+        ValueError: shapes that differ, another dtype, or a value that is not finite.
+    """
     import OpenEXR
 
     shapes = {a.shape for a in channels.values()}
@@ -57,7 +76,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> dict[str, str]:
 
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
-    """All channels of a single-part EXR as (H, W) arrays, names as stored."""
+    """Return all channels of a single-part EXR as (H, W) arrays, with the names as stored."""
     import OpenEXR
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
@@ -65,7 +84,11 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
 
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str]) -> dict[str, str]:
-    """Write named columns; (n, k) arrays become fixed-size lists. Returns column -> type. Same input, same bytes."""
+    """Write named columns; (n, k) arrays become fixed-size lists. Equal input gives equal bytes. Returns column -> type.
+
+    Raises:
+        ValueError: columns of different length, or a value that is not finite.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -90,7 +113,7 @@ def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str])
 
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a table as numpy arrays; fixed-size lists become (n, k)."""
+    """Return the columns of a table as numpy arrays; fixed-size lists become (n, k)."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -1,4 +1,4 @@
-"""A stage's folder on disk: written by `StageWriter`, sealed by its manifest, read strictly by `StageReader`."""
+"""The folder of a stage: written by `StageWriter`, sealed by its manifest, read strictly by `StageReader`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ MANIFEST = "manifest.json"
 
 
 def command(scene: str, stage: str, quality: str | None) -> str:
-    """What makes a stage of a scene again as it was made; `draft` needs no word."""
+    """Return the command that makes a stage of a scene again at the same quality (`draft` need not be named)."""
     chosen = f" --config quality={quality}" if quality not in (None, "draft") else ""
     return f"snakemake --cores 2 scenes/{scene} --forcerun {stage}{chosen}"
 
 
 class DamagedArtefact(InputError):
-    """A file on disk is not what its stage wrote: missing, changed, of another schema, or not finite."""
+    """A file on disk is not what its stage wrote: it is missing, changed, of another schema, or not finite."""
 
     def __init__(self, path: Path, stage: str, scene: str, problem: str, quality: str | None = None, unfinished: bool = False):
         self.path, self.stage, self.scene = path, stage, scene
@@ -33,9 +33,11 @@ class DamagedArtefact(InputError):
 
 
 class StageWriter:
-    """Writes the files of one stage and, when it is finished, the manifest that makes them count.
+    """Writes the files of one stage and, at the end, the manifest that makes them count.
 
-    The old manifest goes first and the new one comes last, so a killed job leaves a stage that is plainly not done.
+    The old manifest is removed first and the new one is written last, so a killed job leaves a stage that is visibly not done.
+    Every method takes the name of a file relative to the folder of the stage, and raises `InputError` for a name that would
+    leave that folder.
     """
 
     def __init__(self, directory: Path, provenance: dict[str, Any]):
@@ -46,43 +48,54 @@ class StageWriter:
         (directory / MANIFEST).unlink(missing_ok=True)
 
     def exr(self, name: str, channels: dict[str, np.ndarray], units: str = "", colour_space: str = "linear") -> None:
-        """Write one raster: (H, W) float16/float32/uint32 channels; bool becomes half."""
+        """Write one raster.
+
+        Args:
+            name: file name, ending in `.exr`.
+            channels: channel name -> (H, W) float16, float32 or uint32; bool is stored as half.
+            units, colour_space: recorded in the manifest.
+
+        Raises:
+            InputError: the name would leave the folder.
+            ValueError: shapes that differ, another dtype, or a value that is not finite.
+        """
         channels = {k: a.astype(np.float16) if a.dtype == bool else a for k, a in channels.items()}
-        types = io.write_exr(self.directory / name, channels)
+        types = io.write_exr(io.inside(self.directory, name), channels)
         shape = list(next(iter(channels.values())).shape)
         self._record(name, kind="exr", shape=shape, channels=types, units=units, colour_space=colour_space)
 
     def table(self, name: str, columns: dict[str, Any], units: dict[str, str] | None = None) -> None:
         """Write one table; (n, k) arrays become fixed-size lists."""
         metadata = {"iif.schema": SCHEMA, "iif.stage": self.provenance["stage"]}
-        types = io.write_parquet(self.directory / name, columns, metadata)
+        types = io.write_parquet(io.inside(self.directory, name), columns, metadata)
         rows = len(np.asarray(next(iter(columns.values()))))
         self._record(name, kind="parquet", shape=[rows], channels=types, units=units or {}, colour_space="linear")
 
     def json(self, name: str, document: Any) -> None:
         """Write a small document."""
-        io.write_json(self.directory / name, document)
+        io.write_json(io.inside(self.directory, name), document)
         self._record(name, kind="json")
 
     def bytes(self, name: str, data: bytes) -> None:
         """Write a file of any other kind."""
-        io.write_atomically(self.directory / name, lambda temporary: _write_bytes(temporary, data))
+        io.write_atomically(io.inside(self.directory, name), lambda temporary: _write_bytes(temporary, data))
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
     def note(self, name: str, document: Any) -> None:
-        """Write a small document for this job alone, should it be killed and started again; `finish` removes it."""
-        io.write_json(self.directory / name, document)
+        """Write a small document that only this job reads, after it was killed and started again; `finish` removes it."""
+        io.write_json(io.inside(self.directory, name), document)
 
     def noted(self, name: str) -> Any | None:
-        """What an earlier run of this job noted; None if it did not, or not readably."""
+        """Return what an earlier run of this job noted; None if there is no readable note."""
+        path = io.inside(self.directory, name)
         try:
-            return json.loads((self.directory / name).read_text())
+            return json.loads(path.read_text())
         except (OSError, ValueError):
             return None
 
     def keep(self, name: str, facts: dict[str, Any]) -> bool:
-        """Take over a file of an earlier run that recorded `facts` of it, unless it is gone or has changed."""
-        path = self.directory / name
+        """Take over a file of an earlier run, which recorded `facts` of it. Returns False if it is gone or has changed."""
+        path = io.inside(self.directory, name)
         if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
             return False
         self.files[name] = facts
@@ -93,7 +106,7 @@ class StageWriter:
         self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}
 
     def finish(self) -> None:
-        """Remove what an earlier run left, then write the manifest."""
+        """Remove the files that an earlier run left, then write the manifest."""
         kept = set(self.files) | {MANIFEST}
         for path in sorted(self.directory.rglob("*"), reverse=True):
             if path.is_dir():
@@ -109,10 +122,11 @@ def _write_bytes(path: Path, data: bytes) -> None:
 
 
 class StageReader:
-    """Reads a finished stage; every file is checked against the manifest when it is opened.
+    """Reads a finished stage. Every file is checked against the manifest when it is opened.
 
     Raises:
-        DamagedArtefact: manifest missing or of another schema, file missing, hash differs, non-finite value.
+        DamagedArtefact: the manifest is missing or of another schema, a file is missing or has another hash, or a value is not
+            finite.
     """
 
     def __init__(self, directory: Path, stage: str, scene: str):
@@ -138,15 +152,15 @@ class StageReader:
         return DamagedArtefact(path, self.stage, self.scene, problem, self.manifest.get("quality"))
 
     def has(self, name: str) -> bool:
-        """Whether the stage wrote this file."""
+        """Return whether the stage wrote this file."""
         return name in self.manifest["files"]
 
     def names(self, prefix: str = "") -> list[str]:
-        """Files of the stage whose name starts with `prefix`."""
+        """Return the names of files that start with `prefix`, sorted."""
         return sorted(n for n in self.manifest["files"] if n.startswith(prefix))
 
     def path(self, name: str) -> Path:
-        """Verified path of a file, for readers of foreign formats."""
+        """Return the path of a file after checking it, for readers of other formats."""
         facts = self.manifest["files"].get(name)
         path = self.directory / name
         if facts is None:
@@ -162,7 +176,7 @@ class StageReader:
         return path
 
     def exr(self, name: str) -> dict[str, np.ndarray]:
-        """Channels of a raster as (H, W) arrays."""
+        """Return the channels of a raster as (H, W) arrays."""
         channels = io.read_exr(self.path(name))
         facts = self.manifest["files"][name]
         for channel, array in channels.items():
@@ -174,26 +188,26 @@ class StageReader:
         return channels
 
     def table(self, name: str) -> dict[str, np.ndarray]:
-        """Columns of a table as numpy arrays; fixed-size lists are (n, k)."""
+        """Return the columns of a table as numpy arrays; fixed-size lists are (n, k)."""
         return io.read_parquet(self.path(name))
 
     def rows(self, name: str) -> int:
-        """Number of rows of a table, from the manifest: the file is not opened."""
+        """Return the number of rows of a table from the manifest, without opening the file."""
         return int(self.manifest["files"][name]["shape"][0])
 
     def json(self, name: str) -> Any:
-        """A small document."""
+        """Return a small document."""
         return json.loads(self.path(name).read_text())
 
 
 def rgb(channels: dict[str, np.ndarray], layer: str = "") -> np.ndarray:
-    """(H, W, 3) float32 of `layer.R/G/B` (or `R G B`)."""
+    """Return channels `layer.R/G/B` (or `R G B`) as (H, W, 3) float32."""
     prefix = f"{layer}." if layer else ""
     return np.stack([channels[f"{prefix}{c}"].astype(np.float32) for c in "RGB"], -1)
 
 
 def split_rgb(array: np.ndarray, layer: str = "", dtype: type = np.float32) -> dict[str, np.ndarray]:
-    """Channels `layer.R/G/B` (or `R G B`) of an (H, W, 3) array."""
+    """Return an (H, W, 3) array as channels `layer.R/G/B` (or `R G B`)."""
     prefix = f"{layer}." if layer else ""
     return {f"{prefix}{c}": array[..., i].astype(dtype) for i, c in enumerate("RGB")}
 
@@ -202,10 +216,10 @@ NO_ID = np.uint32(0xFFFFFFFF)
 
 
 def ids_to_disk(ids: np.ndarray) -> np.ndarray:
-    """int32 with -1 = none -> uint32 with 4294967295 = none."""
+    """Convert int32 with -1 = none to uint32 with 4294967295 = none."""
     return np.where(ids < 0, NO_ID, ids.astype(np.int64)).astype(np.uint32)
 
 
 def ids_from_disk(ids: np.ndarray) -> np.ndarray:
-    """uint32 with 4294967295 = none -> int32 with -1 = none."""
+    """Convert uint32 with 4294967295 = none to int32 with -1 = none."""
     return np.where(ids == NO_ID, -1, ids.astype(np.int64)).astype(np.int32)

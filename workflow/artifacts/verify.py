@@ -1,4 +1,4 @@
-"""Re-hash every artefact under `results/` and `scenes/` against its manifest and name what is damaged."""
+"""Compare every artefact under `results/` and `scenes/` with its manifest."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from workflow.artifacts.store import MANIFEST, StageReader, command
 
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
-    """One line for each damaged, missing or unlisted file; nothing when all is well."""
-    upstream: set[str] = set()  # scenes whose results are damaged: those must be repaired before publishing
+    """Yield one line for each damaged, missing or unlisted file."""
+    upstream: set[str] = set()  # scenes with damaged results, which must be repaired before publishing
     for manifest in sorted(root.glob(f"results/*/*/{MANIFEST}")):
         stage, scene = manifest.parent.name, manifest.parent.parent.name
         if scenes and scene not in scenes:
@@ -42,6 +42,20 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
     for folder in sorted(root.glob("scenes/*")):
         if folder.is_dir() and (not scenes or folder.name in scenes) and not (folder / MANIFEST).is_file():
             yield f"{folder / MANIFEST}: missing; rebuild with: {command(folder.name, 'publish', None)}"
+
+
+def absent(folder: Path, manifest: Path) -> list[str]:
+    """Return the files of `folder` that are gone, sorted: those that `manifest` lists, or the manifest itself.
+
+    Nothing is missing from a folder that does not exist. Only presence is checked; `damaged` compares contents.
+    """
+    if not folder.is_dir():
+        return []
+    try:
+        listed = json.loads(manifest.read_text())["files"]
+        return sorted(name for name in listed if not (folder / name).is_file())
+    except (OSError, ValueError, KeyError, TypeError):
+        return [manifest.name] if manifest.is_relative_to(folder) else []
 
 
 def _deliverable(manifest: Path, scene: str, damaged_results: bool) -> Iterator[str]:

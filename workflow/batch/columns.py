@@ -1,8 +1,10 @@
-"""What the summary of a batch says of each scene: its states, and its scores."""
+"""Columns of the summary of a batch: states and scores of a scene."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+from iif_core.evaluation.catalogue import METRICS
 
 STATUSES = {
     "done": "published, as the settings, inputs and code of now would make it",
@@ -22,7 +24,11 @@ class Score(NamedTuple):
     metric: str
     protocol: str
     split: str = ""
-    digits: int = 2
+
+    @property
+    def digits(self) -> int:
+        """Decimals of a number of the column."""
+        return METRICS[self.metric].decimals
 
 
 SCORES = (
@@ -30,7 +36,7 @@ SCORES = (
     Score("rgb_psnr_held_out", "held-out PSNR", "rgb", "psnr", "raw", "test"),
     Score("albedo_psnr", "albedo PSNR", "albedo", "psnr", "raw"),
     Score("albedo_psnr_scaled", "albedo PSNR, scaled", "albedo", "psnr", "scaled"),
-    Score("roughness_l2", "roughness L2", "roughness", "l2", "raw", digits=4),
-    Score("metallic_l2", "metallic L2", "metallic", "l2", "raw", digits=4),
-    Score("emission_iou", "emission IoU", "emission", "iou", "raw", digits=3),
+    Score("roughness_l2", "roughness L2", "roughness", "l2", "raw"),
+    Score("metallic_l2", "metallic L2", "metallic", "l2", "raw"),
+    Score("emission_iou", "emission IoU", "emission", "iou", "raw"),
 )

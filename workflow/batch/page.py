@@ -1,4 +1,4 @@
-"""results/batch/report.html: the scenes of a batch on one page, without scripts; its links stay inside the project."""
+"""results/batch/report.html: the scenes of a batch on one page, without scripts. Its links stay inside the project."""
 
 from __future__ import annotations
 
@@ -19,7 +19,14 @@ WIDTH = 132
 
 
 def render(rows: Sequence[dict[str, Any]], quality: str, columns: Sequence[Score], statuses: dict[str, str]) -> str:
-    """The page as HTML text; every text is escaped. `columns`: scores to show where a scene has them; `statuses`: meanings."""
+    """Return the page as HTML text, with every text escaped.
+
+    Args:
+        rows: one per scene, with the columns of `workflow.batch.summary.COLUMNS`.
+        quality: preset of the batch.
+        columns: scores to show, where some scene has them.
+        statuses: status -> its meaning.
+    """
     done = [row for row in rows if row["status"] == "done"]
     scores = [score for score in columns if any(row[score.column] is not None for row in done)]
     return template(TEMPLATE).render(
@@ -44,7 +51,7 @@ def _median(values: Sequence[float | None]) -> float | None:
 
 
 def thumbnails(scene: str) -> list[tuple[str, str]]:
-    """(title, `data:` address): photograph, re-rendering and albedo of the middle view; nothing where a file is damaged."""
+    """Return (title, `data:` address) of photograph, re-rendering and albedo of the middle view; nothing if a file is damaged."""
     from workflow.artifacts.files import read_exr, read_parquet
     from workflow.artifacts.store import rgb
 
@@ -64,12 +71,12 @@ def thumbnails(scene: str) -> list[tuple[str, str]]:
             ("albedo", pic.linear(_small(rgb(channels, "albedo")))),
         ]
         return [(f"{title}, view {path.stem}", pic.data_uri(image)) for title, image in shown]
-    except Exception:  # a picture is not worth the page; `snakemake verify` names what is damaged
+    except Exception:  # the page matters more than a picture; `snakemake verify` names what is damaged
         return []
 
 
 def _small(image: Any) -> Any:
-    """(H, W, 3) averaged over blocks to at most `WIDTH` pixels across; what does not fill a block is cut off."""
+    """Return (H, W, 3) averaged over blocks to at most `WIDTH` pixels across; incomplete blocks are cut off."""
     step = max(1, -(-image.shape[1] // WIDTH))
     height, width = image.shape[0] // step * step, image.shape[1] // step * step
     blocks = image[:height, :width].reshape(height // step, step, width // step, step, 3)

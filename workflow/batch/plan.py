@@ -1,4 +1,4 @@
-"""What `snakemake scenes` will run: every scene of the batch table, checked on its own before any job starts."""
+"""Plan of `snakemake scenes`: every scene of the batch table, checked on its own before any job starts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workflow.settings.batch_table import Line, read_table
 
 @dataclass(frozen=True)
 class Plan:
-    """What `snakemake scenes` will run: fingerprint of every scene's deliverable, and the reason of every refused one."""
+    """The lines of the table; scene -> fingerprint of its deliverable; scene that cannot be run -> reason."""
 
     lines: tuple[Line, ...]
     ready: dict[str, str]
@@ -28,10 +28,10 @@ class Plan:
 
 @lru_cache(None)
 def plan(quality: str) -> Plan:
-    """Check every scene of the table on its own: settings, and all that its source can tell without pixels.
+    """Check every scene of the table on its own: its settings, and everything about its source except pixels.
 
     Raises:
-        InputError: only for the table as such (`read_table`).
+        InputError: the table itself cannot be read (`read_table`).
     """
     lines = read_table()
     ready, refused = {}, {}
@@ -45,13 +45,13 @@ def plan(quality: str) -> Plan:
                 ready[line.name] = fp.fingerprint("publish", line.name, quality)
             except InputError as error:
                 refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
-            except Exception as error:  # one scene must not stop hundreds of others, whatever is wrong with it
+            except Exception as error:  # whatever is wrong with one scene must not stop hundreds of others
                 refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
     return Plan(lines, ready, refused)
 
 
 def fingerprint(quality: str) -> str:
-    """Changes when the summary may: with the scenes, their results, what is refused, or the summary's code."""
+    """Return a digest that changes with the scenes, their results, the refused scenes and the code of the summary."""
     found = plan(quality)
     code = [fp.modules_digest(fp.import_closure("workflow.batch.summary")), sha256_of(TEMPLATE)]
     facts = [[line.number, line.name] for line in found.lines], found.ready, found.refused, quality, code

@@ -1,6 +1,6 @@
-"""What became of a batch: results/batch/summary.parquet, .tsv and report.html, one row a scene of config/batch.tsv.
+"""Summary of a batch: results/batch/summary.parquet, .tsv and report.html, with one row per scene of config/batch.tsv.
 
-Reads what the jobs left and nothing else, so it can be made at any time (`python -m workflow batch`), also while they run.
+It is made from the files that jobs have left, so it can be made at any time (`python -m workflow batch`), also while they run.
 """
 
 from __future__ import annotations
@@ -40,11 +40,12 @@ Row = dict[str, Any]
 
 
 def write_summary(quality: str, complete: str | None = None) -> None:
-    """Write table and page; say in the log what is not done, and why.
+    """Write table and page, and log which scenes are not done, and why.
 
     Args:
-        complete: fingerprint of the plan, when all its jobs are done. Without it `results/batch/complete` is taken away, lest
-            Snakemake take what a failed run left for the summary of a finished one.
+        quality: preset of the batch.
+        complete: fingerprint of the plan, when all its jobs are done. Without it, `results/batch/complete` is removed, so that
+            Snakemake does not take what a failed run left for the summary of a finished one.
     """
     (FOLDER / "complete").unlink(missing_ok=True)
     plan = batch_plan.plan(quality)
@@ -62,7 +63,7 @@ def refuse(quality: str) -> None:
     """Fail with the reasons of all scenes that cannot be run.
 
     Raises:
-        InputError: one line a scene.
+        InputError: always; one line per scene.
     """
     refused = batch_plan.plan(quality).refused
     if refused:
@@ -71,7 +72,7 @@ def refuse(quality: str) -> None:
 
 
 def closing(rows: Sequence[Row]) -> str:
-    """The last words of a run: how many are done, and what the others lack."""
+    """Return the last message of a run: how many scenes are done, and what the others lack."""
     done = sum(row["status"] == "done" for row in rows)
     lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
     for row in rows:
@@ -85,7 +86,7 @@ def closing(rows: Sequence[Row]) -> str:
 
 
 def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
-    """Everything about one scene; what is unknown is None. Nothing that one scene's files hold can raise."""
+    """Return the row of one scene; what is unknown is None. Never raises, whatever the files of the scene hold."""
     scene = line.name
     row: Row = dict.fromkeys(COLUMNS)
     row |= {"line": line.number, "scene": scene, "base": line.base or None, "quality": quality}
@@ -114,7 +115,7 @@ def _fingerprint_in(manifest: Path) -> str:
 
 
 def _why_not(scene: str, quality: str) -> Row:
-    """Status, stage, reason and log of the first job that did not end well; of the first that is missing if none ran."""
+    """Return status, stage, reason and log of the first job that did not end well, or of the first missing one if none ran."""
     missing = [
         stage.name
         for stage in STAGES.values()
@@ -138,7 +139,7 @@ def _manifest(scene: str, stage: str) -> Path:
 
 
 def _costs(scene: str) -> Row:
-    """Sums over the last run of each job on record, the largest memory, and the job that took longest."""
+    """Return sums over the last recorded run of each job, the largest memory, and the job that took longest."""
     jobs = read_timings(scene)
     if not jobs:
         return {}

@@ -1,8 +1,8 @@
-"""scene.glb: glTF 2.0, metallic-roughness, one mesh and material a part.
+"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part.
 
-Texture without a UV atlas: `baseColorFactor` is white and `COLOR_0` (linear, 16 bits) carries the albedo; roughness and
-metallic are the means of the part. The file is written here rather than by trimesh, which stores vertex colours in
-8 bits: linear albedo 0.04 would have steps of 10 %.
+There is no UV atlas: `baseColorFactor` is white and `COLOR_0` (linear, 16 bits) holds the albedo; roughness and metallic are the
+means of the part. trimesh is not used because it stores vertex colours in 8 bits, in which a linear albedo of 0.04 has steps of
+10 % (docs/method/numerics.md#albedo-in-eight-bits).
 """
 
 from __future__ import annotations
@@ -22,13 +22,11 @@ _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
 
 
 def glb_bytes(parts: Sequence[Part], up: np.ndarray, provenance: dict[str, Any]) -> bytes:
-    """The scene as one binary glTF file.
+    """Make one binary glTF file of the scene.
 
-    Vertices stay in the world of the photographs (metres); the root node turns `up` (3,) to +y, as glTF wants.
-    Roughness is perceptual, as in glTF. Radiance becomes `emissiveFactor` x `KHR_materials_emissive_strength`.
-
-    Args:
-        provenance: goes to `asset.extras`.
+    Vertices stay in the world of the photographs (metres); the root node turns `up` (3,) to +y, which glTF requires.
+    Roughness is perceptual, as in glTF. Radiance becomes `emissiveFactor` x `KHR_materials_emissive_strength`. `provenance` is
+    stored in `asset.extras`.
     """
     blob = _Blob()
     materials, meshes, nodes = [], [], []
@@ -64,7 +62,7 @@ def glb_bytes(parts: Sequence[Part], up: np.ndarray, provenance: dict[str, Any])
 
 
 def rotation_to_y(up: np.ndarray) -> list[float]:
-    """Unit quaternion [x, y, z, w] of the smallest rotation that takes the unit vector `up` to +y."""
+    """Return the unit quaternion [x, y, z, w] of the smallest rotation from the unit vector `up` to +y."""
     x, y, z = (float(v) for v in up)
     if y < -1 + 1e-9:
         return [1.0, 0.0, 0.0, 0.0]
@@ -91,7 +89,7 @@ def _mean(values: np.ndarray, default: float) -> float:
 
 
 class _Blob:
-    """The binary chunk: arrays one after the other, each at a multiple of four bytes."""
+    """The binary chunk: arrays one after the other, each aligned to four bytes."""
 
     def __init__(self) -> None:
         self.data = bytearray()

@@ -1,6 +1,7 @@
-"""mitsuba/scene.xml: the recovered scene for Mitsuba 3, relightable with `mitsuba -m scalar_rgb scene.xml` alone.
+"""Writes mitsuba/scene.xml, the recovered scene for Mitsuba 3; `mitsuba -m scalar_rgb scene.xml` renders it.
 
-Meshes are PLY with the material as vertex attributes, in world coordinates and metres; values linear, paths relative.
+Meshes are PLY files with the material as vertex attributes, in world coordinates and metres. All values are linear, all paths
+relative.
 """
 
 from __future__ import annotations
@@ -31,25 +32,29 @@ _NOTE = """
   Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)
 """
 
-# Mitsuba's map has +y up, its left edge towards -z, and runs the other way round: mirrored columns, then this turn.
+# Mitsuba's map has +y up, its left edge towards -z, and the opposite sense of rotation: columns are mirrored, then turned.
 _ENVIRONMENT = """\t<emitter type="envmap">
 \t\t<string name="filename" value="environment.exr"/>
 \t\t<transform name="to_world"><matrix value="0 0 -1 0 -1 0 0 0 0 1 0 0 0 0 0 1"/></transform>
 \t</emitter>"""
 
 ENVIRONMENT_ROWS = 256
-"""Texels are repeated up to about this many rows: Mitsuba interpolates, here radiance is constant in a texel."""
+"""Texels are repeated up to about this many rows, because Mitsuba interpolates and the workflow's texels are constant."""
 
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
 def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.ndarray, max_depth: int = 9) -> dict[str, bytes]:
-    """Files of the scene by relative name: `scene.xml` and `meshes/<part>.ply`.
+    """Make the files of the scene.
 
     Args:
-        views: at least one; each becomes a sensor. Mitsuba's cameras have square pixels: fy is taken to be fx.
+        parts: of the surface.
+        views: at least one; each becomes a sensor. Mitsuba's cameras have square pixels, so fy is replaced by fx.
         environment: (3,) constant radiance around the scene or (H, W, 3), a map as in `iif_core.light.environment`; 0 = none.
         max_depth: path length; 1 = emitters only.
+
+    Returns:
+        Content by relative name: `scene.xml` and `meshes/<part>.ply`.
     """
     files: dict[str, bytes] = {}
     body = []
@@ -90,9 +95,9 @@ def _environment_exr(environment: np.ndarray) -> bytes:
 
 
 def ply_bytes(part: Part, back: bool = False) -> bytes:
-    """Binary PLY: x y z, nx ny nz, albedo_0..2, roughness_0, metallic_0 (Mitsuba reads `vertex_albedo`, ...).
+    """Return a binary PLY of x y z, nx ny nz, albedo_0..2, roughness_0, metallic_0 (Mitsuba reads `vertex_albedo`, ...).
 
-    `back`: the other side of the same sheet, moved by `BACK_OFFSET` so that rays meet only one of them.
+    With `back` it is the other side of the same sheet, moved by `BACK_OFFSET` so that a ray meets only one of the two.
     """
     names = ["x", "y", "z", "nx", "ny", "nz", "albedo_0", "albedo_1", "albedo_2", "roughness_0", "metallic_0"]
     normals = -part.normals if back else part.normals
@@ -108,7 +113,7 @@ def ply_bytes(part: Part, back: bool = False) -> bytes:
 
 
 def _stems(parts: Sequence[Part]) -> list[str]:
-    """File names without the characters that some file system refuses; different even without upper case."""
+    """Return file names that every file system accepts and that differ even where case is ignored."""
     out: list[str] = []
     used: set[str] = set()
     for i, part in enumerate(parts):
@@ -138,7 +143,7 @@ def _shape(part: Part, file: str) -> str:
 
 
 def _sensor(view: View) -> str:
-    # Mitsuba looks along +z with x to the left and y up; OpenCV has x right and y down.
+    # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x to the right and y down.
     pose = np.asarray(view.world_from_camera, np.float64) @ np.diag([-1.0, -1.0, 1.0, 1.0])
     fov = 2 * math.degrees(math.atan(0.5 * view.width / view.fx))
     centre = (0.5 - view.cx / view.width, 0.5 - view.cy / view.height)  # Mitsuba's offset moves the image

@@ -24,13 +24,11 @@ from iif_core.fitting.baselines.direct import solve_direct
 from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown, object_means
 from iif_core.fitting.baselines.problem import DARK, CellSums, PixelRows
 from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
-from iif_core.fitting.problem import IDENTITY
+from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL
 from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
-    MATERIAL,
-    UNKNOWN_MATERIAL,
     BaseScene,
     ViewPixels,
     base_maps,
@@ -157,7 +155,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
     gain = across / square if square > 0 else 1.0
 
     def material(albedo: np.ndarray) -> np.ndarray:
-        rest = np.tile(np.float64(UNKNOWN_MATERIAL[3:]), (len(albedo), 1))
+        rest = np.tile(np.float64(NEUTRAL[3:]), (len(albedo), 1))
         return np.concatenate([np.clip(gain * albedo, 0, 1), rest], 1)
 
     return _Result(material(of_cell), material(of_object), np.zeros(len(of_cell)), curve, objects[:, 3], {"gain": gain})
@@ -192,7 +190,7 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
     with job.timed("solve"):
         solve = solve_direct if job.settings.affines.solver == "direct" else solve_adam
         fit = solve(problem, options, goal)
-    unseen = prior if prior is not None else np.tile(np.float64(UNKNOWN_MATERIAL), (scene.n_objects, 1))
+    unseen = prior if prior is not None else np.tile(np.float64(NEUTRAL), (scene.n_objects, 1))
     blocks = fill_unknown(fit, problem, unseen)
     job.log.info("%d of %d blocks seen, loss %s", fit.known.sum(), len(fit.known), fit.history[-1:])
     fine = AlbedoSums(len(block_of))
@@ -335,7 +333,7 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
 def _write_cells(job: Job, result: _Result) -> None:
     values = result.cells.astype(np.float32)
     columns = {"cell_id": job.read("base").table("cells.parquet")["cell_id"]}
-    columns |= {name: values[:, i] for i, name in enumerate(MATERIAL)}
+    columns |= {name: values[:, i] for i, name in enumerate(CHANNELS)}
     job.writer.table("cells.parquet", {**columns, "uncertainty": result.uncertainty.astype(np.float32)})
 
 

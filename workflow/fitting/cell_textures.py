@@ -8,7 +8,8 @@ import numpy as np
 
 from iif_core.fitting.baselines.texture import AlbedoSums
 from iif_core.fitting.cell_texture import smooth_light, textured_albedo
-from iif_core.fitting.problem import MATTE, FitResult, apply_affines
+from iif_core.fitting.problem import FitResult
+from iif_core.reflectance.material import MATTE_GLOSS, apply_affines
 from iif_core.surface.cells import neighbour_pairs, pack_keys
 from workflow.fitting.baselines import CellPixels
 from workflow.runtime.job import Job
@@ -45,7 +46,7 @@ class CellTextures:
         """How much the views of a cell differ with the fitted gloss, and with none (root mean square). Of these priors no gloss
         is known, and in real rooms it is where errors of light and normals go: it has to pay."""
         fitted = self._fitted(fit)
-        glossy, matte = (sums.scatter() for sums in self._sums(fit, (fitted[:, 3:], np.tile(MATTE[1:3], (len(fitted), 1)))))
+        glossy, matte = (sums.scatter() for sums in self._sums(fit, (fitted[:, 3:], np.tile(MATTE_GLOSS[1:3], (len(fitted), 1)))))
         return glossy, matte
 
     def albedo(self, fit: FitResult) -> np.ndarray:

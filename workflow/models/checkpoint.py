@@ -1,7 +1,7 @@
-"""A diffusion checkpoint on disk, checked before any job starts: packages, folder, revision, classes, channels, licence.
+"""Checks checkpoints on disk before any job starts: packages, folder, revision, classes, channels, licence.
 
-Snakemake reads this while it plans, so nothing heavy is imported, and nothing is ever downloaded: the licences of these models
-are for people to read.
+The checks run while Snakemake plans, so nothing heavy is imported. Nothing is downloaded, because users have to read and accept
+the licences of these models themselves.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COMPONENTS = {
     "scheduler": "DDIMScheduler",
 }
 LATENT = 4
-"""Channels of the latent space of Stable Diffusion 1 and 2, on which both models are built."""
+"""Channels of the latent space of Stable Diffusion 1 and 2, from which both models derive."""
 _STEM = {"text_encoder": "model", "unet": "diffusion_pytorch_model", "vae": "diffusion_pytorch_model"}
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
@@ -38,9 +38,12 @@ class Origin:
     """Where a model comes from.
 
     Attributes:
-        repository: where its authors publish it; licence: in words.
-        section: of the settings, that names the checkpoint; index: file that says what lies in its folder; layout: of that
-            folder, in words; page: of the documents.
+        repository: where its authors publish it.
+        licence: in words.
+        section: of the settings that names the checkpoint.
+        index: file that describes the content of its folder.
+        layout: of the folder, in words.
+        page: of the documentation.
     """
 
     repository: str
@@ -48,20 +51,21 @@ class Origin:
     section: str = "prior"
     index: str = "model_index.json"
     layout: str = "diffusers' layout"
-    page: str = "docs/priors.md"
+    page: str = "docs/guide/priors.md"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe(Origin):
-    """What the checkpoint of a prior must be, and how it is asked.
+    """What the checkpoint of a prior must be, and how it is used.
 
     Attributes:
         kind: of the prior.
         pipeline: class in model_index.json.
-        targets: of the document model_index.json, how many latent images the U-Net predicts at once (raises InputError).
-        prompts: one pass of the U-Net each; fill_prompts: padded to the length that the text encoder was trained with.
+        targets: number of latent images that the U-Net predicts at once, given model_index.json (raises InputError).
+        prompts: one pass of the U-Net each.
+        fill_prompts: whether prompts are padded to the length with which the text encoder was trained.
         condition_first: whether the U-Net reads the photograph's channels before the noisy ones.
-        scheduler: what replaces the checkpoint's own settings of the scheduler.
+        scheduler: replacements of the checkpoint's own settings of the scheduler.
     """
 
     kind: str
@@ -75,8 +79,15 @@ class Recipe(Origin):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checked folder. revision: 40 hexadecimal digits, None where nothing tells; index: the document that says what it is;
-    weights: file of each component."""
+    """A checked checkpoint.
+
+    Attributes:
+        folder: of its files.
+        revision: 40 hexadecimal digits, or None if unknown.
+        index: the document that describes it.
+        weights: file of each component.
+        files: all files that are read.
+    """
 
     folder: Path
     revision: str | None
@@ -85,23 +96,23 @@ class Checkpoint:
     files: tuple[Path, ...]
 
     def variant(self, component: str) -> str | None:
-        """Which of the published precisions the weights of a component are in; None = float32."""
+        """Return the published precision of the weights of a component; None = float32."""
         return "fp16" if self.weights[component].name.endswith(".fp16.safetensors") else None
 
 
 def check(prior: dict[str, Any], recipe: Recipe) -> Checkpoint:
-    """The checkpoint that `prior` (the settings' section, as plain values) names.
+    """Find and check the checkpoint that the settings section `prior`, as plain values, names.
 
     Raises:
-        InputError: a package, the folder or a file of it missing; another model or revision; licence not accepted.
+        InputError: a package, the folder or one of its files is missing; another model or revision; licence not accepted.
     """
     require_packages(f"`prior: {{kind: {recipe.kind}}}`", PACKAGES)
     require_device(prior["device"], recipe)
-    folder, revision = locate(prior["checkpoint"], prior["revision"], recipe)
+    folder, revision = find_checkpoint(prior["checkpoint"], prior["revision"], recipe)
     index = read_json(folder / "model_index.json", recipe)
     _check_classes(folder, index, recipe)
     weights = {component: weights_in(folder / component, stem) for component, stem in _STEM.items()}
-    headers = {component: header(path) for component, path in weights.items()}
+    headers = {component: tensor_header(path) for component, path in weights.items()}
     try:
         targets = recipe.targets(index)
     except InputError as error:
@@ -115,7 +126,7 @@ def check(prior: dict[str, Any], recipe: Recipe) -> Checkpoint:
 
 
 def require_packages(setting: str, names: tuple[str, ...]) -> None:
-    """Refuse while planning what would fail with an ImportError in the job."""
+    """Refuse settings whose job would fail with an ImportError."""
     missing = [name for name in names if find_spec(name) is None]
     if missing:
         raise InputError(f"{setting} needs {', '.join(missing)}, which this Python lacks; run `bash envs/setup.sh`")
@@ -126,12 +137,16 @@ def require_accepted(accepted: bool, folder: Path, origin: Origin) -> None:
     if not accepted:
         raise InputError(
             f"`{origin.section}.accept_license`: found false. {origin.repository} comes under {origin.licence}; {_terms(folder)}"
-            f" and, if you may use it, set {written(origin.section, 'accept_license: true')}"
+            f" and, if you may use it, set {setting_as_yaml(origin.section, 'accept_license: true')}"
         )
 
 
-def written(section: str, setting: str) -> str:
-    """`prior: {device: auto}` of "prior" and "device: auto"; sections may be nested: "segmentation.sam2"."""
+def setting_as_yaml(section: str, setting: str) -> str:
+    """Return a setting as YAML in backquotes; sections may be nested.
+
+    >>> setting_as_yaml("segmentation.sam2", "device: auto")
+    '`segmentation: {sam2: {device: auto}}`'
+    """
     text = setting
     for name in reversed(section.split(".")):
         text = f"{name}: {{{text}}}"
@@ -139,27 +154,33 @@ def written(section: str, setting: str) -> str:
 
 
 def require_device(device: str, origin: Origin) -> None:
-    """Refuse a GPU where torch was built without."""
+    """Refuse `cuda` where torch was built without it."""
     torch = importlib.metadata.version("torch")
     if device == "cuda" and "+cpu" in torch:
         raise InputError(
             f"`{origin.section}.device`: found cuda, but torch is the CPU build {torch}; envs/README.md says how to install a"
-            f" CUDA build, or set {written(origin.section, 'device: auto')}"
+            f" CUDA build, or set {setting_as_yaml(origin.section, 'device: auto')}"
         )
 
 
 # ----------------------------------------------------------------------------------------------------------------- where
 
 
-def locate(checkpoint: str, revision: str | None, origin: Origin) -> tuple[Path, str | None]:
-    """Folder of a checkpoint, given by its path or by the name of a repository in the local cache, and its revision, if known."""
+def find_checkpoint(checkpoint: str, revision: str | None, origin: Origin) -> tuple[Path, str | None]:
+    """Find a checkpoint, given by its path or by the name of a repository in the local cache.
+
+    Returns its folder and its revision, if known.
+
+    Raises:
+        InputError: not found, or another revision.
+    """
     folder = Path(checkpoint).expanduser()
     if folder.is_dir():
         found = _revision_of(folder, origin.index)
         if revision and found and not found.startswith(revision):
             raise InputError(
                 f"{folder}: revision {found}, needed {revision} (`{origin.section}.revision`); download that one, or set"
-                f" {written(origin.section, f'revision: {found}')} if this one is meant"
+                f" {setting_as_yaml(origin.section, f'revision: {found}')} if this one is meant"
             )
         return folder, found
     if _REPOSITORY.fullmatch(checkpoint) is None:
@@ -168,7 +189,7 @@ def locate(checkpoint: str, revision: str | None, origin: Origin) -> tuple[Path,
 
 
 def _in_cache(repository: str, revision: str | None, origin: Origin) -> tuple[Path, str]:
-    """Snapshot of a repository in the local cache of huggingface_hub, as `hf download` leaves it."""
+    """Return the snapshot of a repository in the local cache of huggingface_hub, as `hf download` writes it, and its revision."""
     from huggingface_hub.constants import HF_HUB_CACHE
 
     snapshots = Path(HF_HUB_CACHE) / f"models--{repository.replace('/', '--')}" / "snapshots"
@@ -188,7 +209,7 @@ def _in_cache(repository: str, revision: str | None, origin: Origin) -> tuple[Pa
 
 
 def _revision_of(folder: Path, index: str) -> str | None:
-    """What the downloader left beside a folder (`hf download --local-dir`), or the name of a snapshot in the cache."""
+    """Return the revision that `hf download --local-dir` noted in a folder, or the name of a snapshot in the cache."""
     note = folder / f".cache/huggingface/download/{index}.metadata"
     first = note.read_text().split("\n", 1)[0].strip() if note.is_file() else folder.resolve().name
     return first if re.fullmatch(r"[0-9a-f]{40}", first) else None
@@ -215,7 +236,7 @@ def _check_classes(folder: Path, index: dict[str, Any], recipe: Recipe) -> None:
     for component, needed in COMPONENTS.items():
         entry = index.get(component)
         name = entry[1] if isinstance(entry, list) and len(entry) == 2 else entry
-        made_anew = component == "scheduler" and recipe.scheduler  # DDIM, from whichever one's settings
+        made_anew = component == "scheduler" and recipe.scheduler  # DDIM is built from the settings of any scheduler
         if name not in (needed, f"{needed}Fast") and not made_anew:
             raise InputError(f"{path}: `{component}` is {name}, needed {needed}; only this kind of it is read here")
         if not (folder / component).is_dir():
@@ -241,7 +262,7 @@ def _check_channels(folder: Path, targets: int, unet: dict[str, Any], recipe: Re
 
 
 def weights_in(folder: Path, stem: str) -> Path:
-    """The safetensors file of a folder."""
+    """Return the safetensors file of a folder."""
     names = (f"{stem}.safetensors", f"{stem}.fp16.safetensors")
     for name in names:
         if (folder / name).is_file():
@@ -251,19 +272,16 @@ def weights_in(folder: Path, stem: str) -> Path:
     raise InputError(f"{folder}: no {' or '.join(names)}{why}; download the checkpoint with its safetensors files")
 
 
-def header(path: Path) -> dict[str, Any]:
-    """Names, types and shapes of the tensors in a safetensors file, of which the size must be what they say."""
+def tensor_header(path: Path) -> dict[str, Any]:
+    """Return names, types and shapes of the tensors in a safetensors file, after checking its size against them."""
     size = path.stat().st_size
     with path.open("rb") as file:
         start = file.read(8)
         length = struct.unpack("<Q", start)[0] if len(start) == 8 else math.inf
         if length > size - 8:
             pointer = start.startswith(b"version ")
-            why = (
-                "a pointer of git-lfs: run `git lfs pull` there"
-                if pointer
-                else "cut short, or not safetensors: download it again"
-            )
+            lfs, damaged = "a pointer of git-lfs: run `git lfs pull` there", "cut short, or not safetensors: download it again"
+            why = lfs if pointer else damaged
             raise InputError(f"{path}: {size} bytes, {why}")
         try:
             tensors = json.loads(file.read(length))
@@ -277,7 +295,7 @@ def header(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path, origin: Origin) -> dict[str, Any]:
-    """A document of a checkpoint."""
+    """Read a document of a checkpoint."""
     try:
         document = json.loads(path.read_text())
     except FileNotFoundError:
@@ -292,7 +310,7 @@ def read_json(path: Path, origin: Origin) -> dict[str, Any]:
 
 
 def _terms(folder: Path) -> str:
-    """Where in a checkpoint its terms stand."""
+    """Return where the terms of a checkpoint can be read."""
     named = sorted(path.name for path in folder.iterdir() if path.name.lower().startswith(("license", "licence")))
     if named:
         return f"read {folder / named[0]}"

@@ -1,4 +1,4 @@
-"""Denoising of rendered pictures: photographs, re-renderings, the light of the baselines. Never of what our fit reads."""
+"""Denoising of rendered pictures: photographs, re-renderings and the light of the baselines, but never data of the solvers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ NOTE = "photographs denoised (Intel Open Image Denoise): biased, and so is the r
 
 
 def require_denoiser() -> None:
-    """Raises InputError where the denoiser does not load."""
+    """Raise InputError if the denoiser cannot be loaded."""
     try:
         import pyoidn  # noqa: F401
     except (ImportError, OSError) as error:
@@ -21,7 +21,7 @@ def require_denoiser() -> None:
 
 
 def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """An HDR picture (H, W, 3) without its noise, guided by noise-free albedo and world normals."""
+    """Denoise a linear HDR picture (H, W, 3), guided by noise-free albedo and world normals."""
     import pyoidn
 
     images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]

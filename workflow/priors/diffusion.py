@@ -1,8 +1,8 @@
-"""Sampling from a latent diffusion model that is conditioned on a photograph: what the priors rgbx and marigold share.
+"""Sampling from a latent diffusion model that is conditioned on a photograph, for the priors rgbx and marigold.
 
-The photograph is encoded once; K latents, each from noise of its own seed, are denoised beside it by DDIM (METHOD 2.1) and
-decoded. Every size is possible: pictures are padded by reflection to what the networks can halve, and beyond one tile the U-Net
-sees overlapping tiles whose answers are blended at every step, so that tiles agree while the picture forms.
+The photograph is encoded once. K latents, each from noise of its own seed, are denoised by DDIM (Eq. P.20, P.21) and decoded.
+Pictures of any size are padded by reflection to sizes that the networks can halve. Beyond one tile, the U-Net processes
+overlapping tiles, and its outputs are blended at every step, so that the tiles stay consistent.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from torch.nn.functional import interpolate
 
 from iif_core.errors import InputError
 from workflow.models.checkpoint import PACKAGES, Checkpoint, Recipe, check
-from workflow.models.loading import device_named, exact, network, quiet
+from workflow.models.loading import deterministic, load_network, named_device, quiet
 
 PRECISIONS = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
-OVERLAP = 0.25
-"""Of a tile, shared with the next one; the share that AutoencoderKL takes for its own tiles."""
+OVERLAP = 0.25  # share of a tile that the next one repeats, as AutoencoderKL has it for its own tiles
 
 
 # --------------------------------------------------------------------------------------------------------------- pictures
 
 
 def working_size(width: int, height: int, longest: int) -> tuple[int, int]:
-    """(width, height) of a picture whose longer side becomes `longest`, aspect kept to half a pixel."""
+    """Return (width, height) of a picture whose longer side becomes `longest`, with its aspect kept to half a pixel."""
     factor = longest / max(width, height)
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(n, height, width, c) of (n, H, W, c): bilinear, low-pass filtered where it shrinks; NaN spreads to its neighbours."""
+def resize(maps: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize (n, H, W, c) bilinearly to (n, height, width, c), low-pass filtered where it shrinks; NaN spreads to neighbours."""
     if maps.shape[1:3] == (height, width):
         return maps
     planes = torch.from_numpy(np.ascontiguousarray(maps.transpose(0, 3, 1, 2)))
@@ -47,14 +46,14 @@ def resized(maps: np.ndarray, width: int, height: int) -> np.ndarray:
     return out.numpy().transpose(0, 2, 3, 1)
 
 
-def padded(image: np.ndarray, multiple: int) -> np.ndarray:
-    """(H', W', 3) with sides that are multiples of `multiple`: (H, W, 3) continued at bottom and right by reflection."""
+def pad(image: np.ndarray, multiple: int) -> np.ndarray:
+    """Pad (H, W, 3) at bottom and right by reflection to sides that are multiples of `multiple`."""
     extra = [(0, -size % multiple) for size in image.shape[:2]]
     return np.pad(image, (*extra, (0, 0)), mode="symmetric")
 
 
 def tile_starts(length: int, tile: int) -> list[int]:
-    """First elements of the fewest equally spread tiles that cover `length` and share at least OVERLAP of a tile."""
+    """Return the first elements of the fewest equally spread tiles that cover `length` and overlap by at least OVERLAP."""
     if length <= tile:
         return [0]
     count = 1 + math.ceil((length - tile) / (tile - int(tile * OVERLAP)))
@@ -62,7 +61,7 @@ def tile_starts(length: int, tile: int) -> list[int]:
 
 
 def tile_weight(height: int, width: int, tile: int) -> torch.Tensor:
-    """(height, width) weight of a tile's answer: 1 inside, falling to its borders over OVERLAP of a tile; positive."""
+    """Return the positive weight (height, width) of a tile's output: 1 inside, falling to its borders over OVERLAP of a tile."""
 
     def ramp(size: int) -> torch.Tensor:
         i = torch.arange(size, dtype=torch.float32)
@@ -71,8 +70,17 @@ def tile_weight(height: int, width: int, tile: int) -> torch.Tensor:
     return ramp(height)[:, None] * ramp(width)
 
 
-def blended(apply: Callable[[slice, slice], torch.Tensor], height: int, width: int, tile: int) -> torch.Tensor:
-    """(..., height, width) from `apply(rows, columns)` on overlapping tiles: the weighted mean where they overlap."""
+def blend_tiles(apply: Callable[[slice, slice], torch.Tensor], height: int, width: int, tile: int) -> torch.Tensor:
+    """Apply a function to overlapping tiles and blend its outputs.
+
+    Args:
+        apply: (rows, columns) -> (..., h, w) output of a tile.
+        height, width: of the whole.
+        tile: largest side of a tile.
+
+    Returns:
+        (..., height, width), the weighted mean where tiles overlap.
+    """
     rows, columns = tile_starts(height, tile), tile_starts(width, tile)
     if len(rows) == len(columns) == 1:
         return apply(slice(0, height), slice(0, width))
@@ -96,25 +104,25 @@ def blended(apply: Callable[[slice, slice], torch.Tensor], height: int, width: i
 class Model:
     """A loaded checkpoint.
 
-    The U-Net works in the chosen precision; the VAE always in float32, whose range a decoder in half precision exceeds
-    (METHOD H51), and so does the scheduler.
+    The U-Net computes in the chosen precision; the VAE and the scheduler always in float32, because a decoder exceeds the range
+    of half precision (docs/method/numerics.md#half-precision-overflow).
 
     Attributes:
-        multiple: pixels that both sides of a picture must be a multiple of.
+        multiple: pixels of which both sides of a picture must be a multiple.
     """
 
     def __init__(self, recipe: Recipe, prior: SimpleNamespace):
-        """`prior`: the settings' section; its checkpoint is checked again."""
+        """Load the model of the settings section `prior`, whose checkpoint is checked again."""
         self.recipe, self.checkpoint = recipe, check(vars(prior), recipe)
-        self.device = device_named(prior.device, recipe)
+        self.device = named_device(prior.device, recipe)
         self.dtype = _precision(prior.precision, self.device)
         self.workers = 1 if self.device.type == "cuda" else torch.get_num_threads()
         self.batch = prior.batch or (1 if self.device.type == "cpu" else 4)
         with quiet("diffusers", "transformers"):
             import diffusers
 
-            self.unet = network(self.checkpoint, "unet", diffusers.UNet2DConditionModel).to(self.device, self.dtype)
-            self.vae = network(self.checkpoint, "vae", diffusers.AutoencoderKL).to(self.device)
+            self.unet = load_network(self.checkpoint, "unet", diffusers.UNet2DConditionModel).to(self.device, self.dtype)
+            self.vae = load_network(self.checkpoint, "vae", diffusers.AutoencoderKL).to(self.device)
             stored = diffusers.DDIMScheduler.load_config(self.checkpoint.folder / "scheduler")
             self.scheduler = diffusers.DDIMScheduler.from_config(stored, **dict(recipe.scheduler))
             self.text = [text.to(self.device, self.dtype) for text in _embeddings(self.checkpoint, recipe)]
@@ -126,15 +134,19 @@ class Model:
         self.vae.tile_sample_min_size, self.vae.tile_latent_min_size = self.tile, self.tile // self.reduction
 
     def encode(self, image: np.ndarray) -> torch.Tensor:
-        """(1, 4, h, w) latent of a picture (H, W, 3) in [0, 1] with sides that are multiples of `multiple`: the mode of the
-        VAE's posterior times its scaling factor."""
-        with exact(self.device):
+        """Encode a picture (H, W, 3) in [0, 1] with sides that are multiples of `multiple`.
+
+        Returns the latent (1, 4, h, w), the mode of the VAE's posterior times its scaling factor.
+        """
+        with deterministic(self.device):
             planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(self.device, torch.float32)
             return self.vae.encode(planes * 2 - 1).latent_dist.mode() * self.vae.config.scaling_factor
 
     def sample(self, condition: torch.Tensor, seeds: list[int], steps: int) -> np.ndarray:
-        """(K, prompts * targets, H, W, 3) float32 in [0, 1]: decoded samples, one a seed, whatever else is in their batch;
-        NaN where numbers overflowed."""
+        """Draw one sample per seed, whose value does not depend on the other samples in its batch.
+
+        Returns decoded samples (K, prompts * targets, H, W, 3), float32 in [0, 1]; NaN where the model overflowed.
+        """
         self.scheduler.set_timesteps(steps, device=self.device)
         batches = [seeds[i : i + self.batch] for i in range(0, len(seeds), self.batch)]
 
@@ -142,7 +154,7 @@ class Model:
             with torch.inference_mode():
                 return np.concatenate([self._decode(self._denoise(condition, text, batch)) for text in self.text], 1)
 
-        with exact(self.device), ThreadPoolExecutor(self.workers) as pool:
+        with deterministic(self.device), ThreadPoolExecutor(self.workers) as pool:
             return np.concatenate(list(pool.map(one, batches)))
 
     def _denoise(self, condition: torch.Tensor, text: torch.Tensor, seeds: list[int]) -> torch.Tensor:
@@ -157,7 +169,7 @@ class Model:
             def velocity(rows: slice, columns: slice, both: torch.Tensor = both, step: torch.Tensor = step) -> torch.Tensor:
                 return self.unet(both[..., rows, columns], step, encoder_hidden_states=text).sample.float()
 
-            answer = blended(velocity, height, width, self.tile // self.reduction)
+            answer = blend_tiles(velocity, height, width, self.tile // self.reduction)
             latent = self.scheduler.step(answer, step, latent, eta=0.0).prev_sample
         return latent
 
@@ -171,37 +183,47 @@ class Model:
 
 
 def _noise(seeds: list[int], channels: int, height: int, width: int) -> torch.Tensor:
-    """(K, channels, height, width) float32, each from a generator of its own on the CPU: the same on every device."""
+    """Draw (K, channels, height, width) float32, each from its own generator on the CPU, so that devices do not differ."""
     draws = [torch.randn(1, channels, height, width, generator=torch.Generator("cpu").manual_seed(seed)) for seed in seeds]
     return torch.cat(draws)
 
 
-def predicted(recipe: Recipe, prior: SimpleNamespace, photo: np.ndarray, longest: int, steps: int, seed: int) -> np.ndarray:
-    """(K, prompts * targets, H, W, 3) in [0, 1] of a photograph (H, W, 3) in [0, 1] that the model sees `longest` pixels large.
+def predict_maps(recipe: Recipe, prior: SimpleNamespace, photo: np.ndarray, longest: int, steps: int, seed: int) -> np.ndarray:
+    """Predict maps of a photograph; sample k has the noise of seed + k, the same for all photographs of a size and all maps.
 
-    Sample k is drawn with seed + k, the same noise for all photographs of a size and all maps.
+    Args:
+        recipe: of the model.
+        prior: settings section.
+        photo: (H, W, 3) in [0, 1].
+        longest: longer side of the picture that the model receives, pixels.
+        steps: of DDIM.
+        seed: of the first sample.
+
+    Returns:
+        (K, prompts * targets, H, W, 3) in [0, 1].
 
     Raises:
         InputError: the checkpoint cannot be used, or the GPU's memory is not enough.
     """
-    model = loaded(recipe, json.dumps(vars(prior), sort_keys=True))
+    model = load_model(recipe, json.dumps(vars(prior), sort_keys=True))
     height, width = photo.shape[:2]
     wide, high = working_size(width, height, longest)
     try:
-        condition = model.encode(padded(resized(photo[None], wide, high)[0], model.multiple))
+        condition = model.encode(pad(resize(photo[None], wide, high)[0], model.multiple))
         maps = model.sample(condition, [seed + k for k in range(prior.samples)], steps)[:, :, :high, :wide]
     except torch.OutOfMemoryError:
         raise InputError(
             f"the GPU's memory does not hold {model.batch} samples of {wide}x{high} at once: lower `prior.batch`,"
             " then `prior.tile`, then `prior.longest_side`"
         ) from None
-    flat = np.clip(resized(maps.reshape(-1, high, wide, 3), width, height), 0, 1)  # its weights round to 1 + 1e-7; NaN stays
+    # The weights of the filter sum to up to 1 + 1e-7; NaN stays.
+    flat = np.clip(resize(maps.reshape(-1, high, wide, 3), width, height), 0, 1)
     return flat.reshape(*maps.shape[:2], height, width, 3)
 
 
-def described(recipe: Recipe, prior: SimpleNamespace) -> dict[str, Any]:
-    """What made the predictions: model, revision, licence, device and precision."""
-    model = loaded(recipe, json.dumps(vars(prior), sort_keys=True))
+def describe_model(recipe: Recipe, prior: SimpleNamespace) -> dict[str, Any]:
+    """Return facts about the model: source, revision, licence, device, precision and versions."""
+    model = load_model(recipe, json.dumps(vars(prior), sort_keys=True))
     gpu = model.device.type == "cuda"
     return {
         "checkpoint": prior.checkpoint,
@@ -216,8 +238,8 @@ def described(recipe: Recipe, prior: SimpleNamespace) -> dict[str, Any]:
 
 
 @lru_cache(1)
-def loaded(recipe: Recipe, prior: str) -> Model:
-    """The model of a prior's settings (as JSON), kept from view to view."""
+def load_model(recipe: Recipe, prior: str) -> Model:
+    """Load the model of a settings section (as JSON) and keep it for the next view."""
     return Model(recipe, SimpleNamespace(**json.loads(prior)))
 
 
@@ -225,13 +247,13 @@ def loaded(recipe: Recipe, prior: str) -> Model:
 
 
 def _embeddings(checkpoint: Checkpoint, recipe: Recipe) -> list[torch.Tensor]:
-    """(1, tokens, channels) of each prompt; the text encoder is not kept."""
+    """Return the embedding (1, tokens, channels) of each prompt; the text encoder is not kept."""
     from transformers import CLIPTextModel, CLIPTokenizer
 
-    encoder = network(checkpoint, "text_encoder", CLIPTextModel, dtype=torch.float32)
+    encoder = load_network(checkpoint, "text_encoder", CLIPTextModel, dtype=torch.float32)
     try:
         tokenizer = CLIPTokenizer.from_pretrained(checkpoint.folder / "tokenizer", local_files_only=True)
-    except Exception as error:  # as in _network
+    except Exception as error:  # as in load_network
         raise InputError(f"{checkpoint.folder / 'tokenizer'}: not loaded as CLIPTokenizer ({error})") from error
     padding, longest = "max_length" if recipe.fill_prompts else "do_not_pad", encoder.config.max_position_embeddings
     out = []

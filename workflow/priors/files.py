@@ -1,8 +1,7 @@
-"""Prior `files`: predictions that some model left in `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`.
+"""Prior `files`: predictions of any model in `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`.
 
-`<view>` is the view's name, `<kkk>` = 000, 001, ... . PNG (8 or 16 bit) holds [0, 1]; EXR holds the values. How albedo
-and roughness are encoded is declared in the settings, never guessed. A map of another size is resized when it has the
-photograph's shape.
+`<view>` is the name of the view and `<kkk>` = 000, 001, ... . PNG files (8 or 16 bit) hold [0, 1], EXR files the values. The
+settings state how albedo and roughness are encoded. A map of another size is resized if it has the photograph's aspect ratio.
 """
 
 from __future__ import annotations
@@ -17,21 +16,21 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import images
 
 PROPERTIES = ("albedo", "roughness", "metallic")
-SHAPE_TOLERANCE = 0.02
-"""Largest relative difference of aspect ratio that still counts as the same picture (models round to 8 or 64)."""
-TOO_LARGE = 1.5
-"""Values above this are no albedo, roughness or metallic in [0, 1] (half floats overshoot a little)."""
+ASPECT_TOLERANCE = 0.02
+"""Largest relative difference of aspect ratio between maps of the same picture (models round sizes to multiples of 8 or 64)."""
+MAX_VALUE = 1.5  # the 99th percentile of a map in [0, 1] stays below, although half floats overshoot a little
 _NAME = re.compile(r"(?P<view>.+)_(?P<k>\d{3,})\.(?:png|exr)", re.IGNORECASE)
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Every prediction file that this scene reads: k = 000 ... samples - 1 of all three properties.
+    """List every prediction file that a scene reads: k = 000 ... samples - 1 of all three properties.
 
     Raises:
-        InputError: no folder, no predictions, or some of the set missing, by name.
+        InputError: no folder, no predictions, or an incomplete set; the message names the missing files.
     """
     folder, samples = _folder(document["prior"]["path"], document["source"].get("path")), document["prior"]["samples"]
     found = {name: _listing(folder / name) for name in PROPERTIES}
@@ -46,10 +45,18 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """The K predictions of a view, (K, H, W, 5) float32 linear / perceptual; NaN where a file has no finite value.
+    """Read the K predictions of a view.
+
+    Args:
+        view: of the capture.
+        settings: sections `prior` and `source`.
+        capture, seed: not used.
+
+    Returns:
+        (K, H, W, 5) float32, linear albedo, perceptual roughness, metallic; NaN where a file has no finite value.
 
     Raises:
-        InputError: files missing, of another shape, unreadable, or with values that are not in [0, 1].
+        InputError: files missing, of another aspect ratio, unreadable, or with values outside [0, 1].
     """
     prior = settings.prior
     folder = _folder(prior.path, getattr(settings.source, "path", None))
@@ -72,16 +79,28 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
 
 
 def load(path: Path, width: int, height: int, srgb: bool) -> np.ndarray:
-    """One map as (height, width, 3) float32 linear in [0, 1], NaN where it has no value; decoded, then resized."""
+    """Read one map, decode it, then resize it.
+
+    Args:
+        path: png or EXR.
+        width, height: of the photograph, pixels.
+        srgb: whether the values are sRGB-encoded.
+
+    Returns:
+        (height, width, 3) float32 linear in [0, 1], NaN where the map has no value.
+
+    Raises:
+        InputError: another aspect ratio, or values outside [0, 1].
+    """
     photo = images.load_photo(path)
     stored_height, stored_width = photo.valid.shape
-    if abs(stored_width * height / (stored_height * width) - 1) > SHAPE_TOLERANCE:
+    if abs(stored_width * height / (stored_height * width) - 1) > ASPECT_TOLERANCE:
         raise InputError(
             f"{path}: {stored_width}x{stored_height}, but the photograph is {width}x{height}: another aspect"
             " ratio, so not the same picture. Predict on the photographs of this capture"
         )
     counted = photo.pixels[photo.valid]
-    if counted.size and np.quantile(counted, 0.99) > TOO_LARGE:
+    if counted.size and np.quantile(counted, 0.99) > MAX_VALUE:
         raise InputError(
             f"{path}: values up to {counted.max():.4g}; albedo, roughness and metallic lie in [0, 1]."
             " Divide by the largest value of the encoding (255, 65535) when writing the file"
@@ -100,7 +119,7 @@ def load(path: Path, width: int, height: int, srgb: bool) -> np.ndarray:
 
 
 def bilinear(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """(height, width, C) bilinear interpolation of (H, W, C); pixel centres at half-integers, borders repeated."""
+    """Interpolate (H, W, C) bilinearly to (height, width, C); pixel centres at half-integers, borders repeated."""
     for axis, wanted in ((0, height), (1, width)):
         size = image.shape[axis]
         position = np.clip((np.arange(wanted) + 0.5) * size / wanted - 0.5, 0, size - 1)
@@ -120,13 +139,13 @@ def _folder(path: str | None, source: str | None) -> Path:
     if not folder.is_dir():
         raise InputError(
             f"{folder}: not found; `prior: {{kind: files}}` reads albedo/, roughness/ and metallic/ below it"
-            " (set `prior.path` to the folder that holds predictions/)"
+            f" (set `prior.path` to the folder that holds predictions/).{did_you_mean_path(folder)}"
         )
     return folder
 
 
 def _listing(folder: Path, view: str | None = None) -> dict[tuple[str, int], Path]:
-    """(view, k) -> file; of one view, or of all."""
+    """Return (view, k) -> file, of one view or of all."""
     if not folder.is_dir():
         raise InputError(f"{folder}: not found; predictions/ needs the folders {', '.join(PROPERTIES)}")
     out: dict[tuple[str, int], Path] = {}

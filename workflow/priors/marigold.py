@@ -1,7 +1,7 @@
 """Prior `marigold`: Marigold-IID appearance (Ke et al. 2025), a diffusion model that predicts all maps in one pass.
 
-The checkpoint is the user's (docs/priors.md). It sees pictures as they are displayed; what its outputs mean and how they are
-encoded stands in the checkpoint's `target_properties` and is read from there.
+Users provide the checkpoint (docs/guide/priors.md, docs/method/priors.md#diffusion). The model reads display-encoded pictures;
+meaning and encoding of its outputs are read from the checkpoint's `target_properties`.
 """
 
 from __future__ import annotations
@@ -18,20 +18,18 @@ from workflow.models.checkpoint import Recipe, check
 from workflow.scene.normal_form import CaptureReader, View
 
 REPOSITORY = "prs-eth/marigold-iid-appearance-v1-1"
-MAPS = {"albedo": 3, "roughness": 1, "metallicity": 1}
-"""The checkpoint's name of each map, and its channels."""
+MAPS = {"albedo": 3, "roughness": 1, "metallicity": 1}  # the checkpoint's name of each map, and its channels
 SPACES = ("linear", "srgb")
-STEPS, LONGEST_SIDE = 4, 768
-"""Where the checkpoint names none: what its authors recommend."""
+STEPS, LONGEST_SIDE = 4, 768  # as its authors recommend, where the checkpoint states none
 
 
 def layout(index: dict[str, Any]) -> dict[str, tuple[int, list[int], str]]:
-    """map -> (latent image, its channels, encoding), from `target_properties` of model_index.json.
+    """Read map -> (latent image, its channels, encoding) from `target_properties` of model_index.json.
 
-    A target is one map, or a stack of up to three of one channel each (`sub_target_names`).
+    A target is one map, or a stack of up to three maps of one channel each (`sub_target_names`).
 
     Raises:
-        InputError: a map missing, of an unknown encoding, or known up to a factor only.
+        InputError: a map is missing, of an unknown encoding, or known only up to a factor.
     """
     properties = index.get("target_properties") or {}
     out = {}
@@ -72,27 +70,37 @@ RECIPE = Recipe(
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """The files of the checkpoint, checked; raises InputError."""
+    """Check the checkpoint and list its files; raises InputError."""
     return list(check(document["prior"], RECIPE).files)
 
 
 def describe(settings: SimpleNamespace) -> dict[str, Any]:
-    """What made the predictions, for model.json."""
-    from workflow.priors.diffusion import described
+    """Return the facts about the model for model.json."""
+    from workflow.priors.diffusion import describe_model
 
-    return described(RECIPE, settings.prior)
+    return describe_model(RECIPE, settings.prior)
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """K samples of a view, (K, H, W, 5) float32 in [0, 1]; NaN where the model's numbers overflowed."""
-    from workflow.priors.diffusion import predicted
-    from workflow.scene.photograph import seen
+    """Draw K predictions of a view.
+
+    Args:
+        view: of the capture.
+        settings: section `prior`.
+        capture: the normal form.
+        seed: of the first sample.
+
+    Returns:
+        (K, H, W, 5) float32 in [0, 1], linear albedo, perceptual roughness, metallic; NaN where the model overflowed.
+    """
+    from workflow.priors.diffusion import predict_maps
+    from workflow.scene.photograph import picture_for_model
 
     prior = settings.prior
     index = check(vars(prior), RECIPE).index
     steps = prior.steps or index.get("default_denoising_steps") or STEPS
     longest = prior.longest_side or index.get("default_processing_resolution") or LONGEST_SIDE
-    found = predicted(RECIPE, prior, seen(view, capture, linear=False), longest, steps, seed)
+    found = predict_maps(RECIPE, prior, picture_for_model(view, capture, linear=False), longest, steps, seed)
     maps = []
     for position, channels, space in layout(index).values():
         values = found[:, position][..., channels]

@@ -1,6 +1,6 @@
-"""Prior `retinex`: photograph / gathered light, then colour retinex, without learned weights (docs/real-scenes.md).
+"""Prior `retinex`: a baseline without learned weights (docs/method/priors.md#retinex).
 
-A baseline, and called one.
+It divides the photograph by the irradiance that the other photographs imply, then applies colour retinex.
 """
 
 from __future__ import annotations
@@ -11,25 +11,34 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from iif_core.light.irradiance import LightField, SurfaceCellsBuilder, Trace, with_light
+from iif_core.light.irradiance import LightField, SurfaceCellsBuilder, Trace, estimate_log_light
 from iif_core.priors.retinex import albedo_level, retinex_predictions
-from iif_core.surface.mesh import face_geometry
+from iif_core.surface.triangles import face_geometry
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
 from workflow.segmentations.surface import Surface
 
-SATURATED = 0.99
-CELL_FOOTPRINTS = 6.0
-"""Edge of a surface cell in median pixel footprints."""
+SATURATED = 0.99  # sensor value
+CELL_FOOTPRINTS = 6.0  # edge of a surface cell in median pixel footprints
 REACHES = (3.0, 8.0)
-"""How far, in edges of a cell, light that the gathering does not explain reaches: two versions of the light."""
+"""Reach of the residual light in edges of a cell (Eq. L.52); each makes one version of the light."""
 PIECES = SimpleNamespace(scale=0.05, min_faces=100, colour=0.1)
-"""Where the capture names no objects, pieces of the mesh stand for them (as `segmentation: {kind: geometry}` by default)."""
+"""Pieces of the mesh take the place of objects where the capture names none (the defaults of segmentation `geometry`)."""
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """K hypotheses of a view, (K, H, W, 5) float32. The light is found once, from all views that are not held out."""
+    """Make K predictions of a view; the light is estimated once, from all views that are not held out.
+
+    Args:
+        view: of the capture.
+        settings: section `prior`.
+        capture: the normal form.
+        seed: of the random numbers.
+
+    Returns:
+        (K, H, W, 5) float32, linear albedo, perceptual roughness, metallic.
+    """
     scene = _scene(capture, settings.prior.mean_albedo, seed)
     pixels = _pixels(view, capture, scene.normals, scene.group)
     log_light = np.zeros((len(REACHES), view.height * view.width, 3))
@@ -54,7 +63,14 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
 
 @dataclass(frozen=True)
 class _Scene:
-    """Faces: normals (m, 3), group (m,). Light: versions (len(REACHES), cells, 3) scaled to the mean albedo; None = no cells."""
+    """Faces and light.
+
+    Attributes:
+        normals: (m, 3) of the faces.
+        group: (m,) object of each face.
+        field: interpolates between the cells; None without cells.
+        log_light: (len(REACHES), cells, 3) versions of the log-irradiance, scaled to the mean albedo.
+    """
 
     normals: np.ndarray
     group: np.ndarray
@@ -64,7 +80,7 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Pixels:
-    """One view: photograph as radiance x exposure, and what the mesh says, (H, W) each."""
+    """One view, (H, W) each: the photograph as radiance x exposure, and points, normals and objects of the mesh."""
 
     linear: np.ndarray
     valid: np.ndarray
@@ -85,8 +101,8 @@ def _pixels(view: View, capture: CaptureReader, face_normals: np.ndarray, face_g
     depth, face = capture.gbuffer(view)
     hit = (face >= 0) & (depth > 0)
     normals = np.where(hit[..., None], face_normals[face], 0)
-    directions = capture.directions(view)
-    # A face without area has no normal; any unit vector towards the camera will do.
+    directions = view.directions()
+    # A face without area has no normal; the unit vector towards the camera takes its place.
     towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
     normals = np.where(((normals**2).sum(-1, keepdims=True) < 0.5) & hit[..., None], towards, normals)
     normals = np.where((normals * towards).sum(-1, keepdims=True) < 0, -normals, normals)
@@ -99,7 +115,7 @@ def _pixels(view: View, capture: CaptureReader, face_normals: np.ndarray, face_g
 
 @lru_cache(1)
 def _scene(capture: CaptureReader, mean_albedo: float, seed: int) -> _Scene:
-    """Light on the surface cells, from every view that is not held out."""
+    """Estimate the light on the surface cells from every view that is not held out."""
     vertices, faces = capture.mesh()
     normals, _ = face_geometry(vertices, faces)
     group = _groups(capture)
@@ -121,13 +137,13 @@ def _scene(capture: CaptureReader, mean_albedo: float, seed: int) -> _Scene:
     cells = builder.finish()
     if not len(cells):
         return _Scene(normals, group, None, np.zeros((len(REACHES), 0, 3)))
-    light = with_light(cells, _tracer(vertices, faces), mean_albedo, REACHES, seed)
+    light = estimate_log_light(cells, _tracer(vertices, faces), mean_albedo, REACHES, seed)
     levels = [albedo_level(np.exp(cells.log_radiance - own), cells.pixels, mean_albedo) for own in light]
     return _Scene(normals, group, LightField(cells), light - np.log(levels)[:, None, None])
 
 
 def _groups(capture: CaptureReader) -> np.ndarray:
-    """(m,) object of each face: as the capture names them, else pieces of the mesh."""
+    """Return the object (m,) of each face as the capture gives it, else pieces of the mesh."""
     given = capture.faces()["instance_id"].astype(np.int64)
     if (given >= 0).any():
         return given

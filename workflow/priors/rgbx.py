@@ -1,8 +1,8 @@
-"""Prior `rgbx`: RGB-X (Zeng et al., SIGGRAPH 2024), a diffusion model that is asked for one map at a time (METHOD 2.1).
+"""Prior `rgbx`: RGB-X (Zeng et al., SIGGRAPH 2024), a diffusion model that predicts one map per prompt.
 
-The checkpoint is the user's (docs/priors.md); this module is written from the published facts about it. It sees linear pictures
-and answers with linear albedo, perceptual roughness and metallic (the first channel of a picture each). Its authors say that
-the published weights differ from the paper's in metallic.
+Users provide the checkpoint (docs/guide/priors.md, docs/method/priors.md#diffusion); this module follows the published facts
+about it. The model reads linear pictures and predicts linear albedo, perceptual roughness and metallic (the first channel of a
+picture each). According to its authors the published weights differ from the paper's in metallic.
 """
 
 from __future__ import annotations
@@ -25,28 +25,38 @@ RECIPE = Recipe(
     prompts=("Albedo (diffuse basecolor)", "Roughness", "Metallicness"),
     fill_prompts=True,
     condition_first=False,
-    # How the model was trained and is used; what the checkpoint itself says is older.
+    # As the model was trained and is used; the checkpoint's own settings are older.
     scheduler=(("rescale_betas_zero_snr", True), ("timestep_spacing", "trailing")),
 )
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """The files of the checkpoint, checked; raises InputError."""
+    """Check the checkpoint and list its files; raises InputError."""
     return list(check(document["prior"], RECIPE).files)
 
 
 def describe(settings: SimpleNamespace) -> dict[str, Any]:
-    """What made the predictions, for model.json."""
-    from workflow.priors.diffusion import described
+    """Return the facts about the model for model.json."""
+    from workflow.priors.diffusion import describe_model
 
-    return described(RECIPE, settings.prior)
+    return describe_model(RECIPE, settings.prior)
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """K samples of a view, (K, H, W, 5) float32 in [0, 1]; NaN where the model's numbers overflowed."""
-    from workflow.priors.diffusion import predicted
-    from workflow.scene.photograph import seen
+    """Draw K predictions of a view.
+
+    Args:
+        view: of the capture.
+        settings: section `prior`.
+        capture: the normal form.
+        seed: of the first sample.
+
+    Returns:
+        (K, H, W, 5) float32 in [0, 1], linear albedo, perceptual roughness, metallic; NaN where the model overflowed.
+    """
+    from workflow.priors.diffusion import predict_maps
+    from workflow.scene.photograph import picture_for_model
 
     prior = settings.prior
-    maps = predicted(RECIPE, prior, seen(view, capture, linear=True), prior.longest_side, prior.steps, seed)
+    maps = predict_maps(RECIPE, prior, picture_for_model(view, capture, linear=True), prior.longest_side, prior.steps, seed)
     return np.concatenate([maps[:, 0], maps[:, 1, ..., :1], maps[:, 2, ..., :1]], -1)

@@ -1,4 +1,4 @@
-"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (iif_core.priors.simulate)."""
+"""Prior `simulated`: ground truth with simulated errors of a single-view diffusion model (docs/method/priors.md#simulated)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NO_TRUTH = (
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """No files of its own; refuses a folder without `truth/` before any work starts."""
+    """Return no files, but refuse a folder without `truth/` before any job starts."""
     source = document["source"]
     if source["kind"] == "folder" and not (Path(source["path"]) / "truth").is_dir():
         raise InputError(_NO_TRUTH)
@@ -28,7 +28,16 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 
 def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed: int) -> np.ndarray:
-    """K spoilt copies of the truth of a view, (K, H, W, 5) float32; errors belong to the instances of the capture.
+    """Simulate K predictions of a view from its ground truth; the errors are tied to the instances of the capture.
+
+    Args:
+        view: of the capture.
+        settings: sections `prior` and `source`.
+        capture: with ground truth.
+        seed: of the errors.
+
+    Returns:
+        (K, H, W, 5) float32, linear albedo, perceptual roughness, metallic.
 
     Raises:
         InputError: the capture has no ground truth.

@@ -1,4 +1,4 @@
-"""report.html: one page without scripts and without any address outside of itself."""
+"""report.html: one page without scripts and without addresses outside of itself."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from iif_core.evaluation.catalogue import METRICS
 
 if TYPE_CHECKING:
     import jinja2
@@ -20,10 +22,6 @@ VARIANT_NAMES = {
     "base": "base texture (fused)",
     "result": "result",
 }
-_DECIMALS = {"psnr": 2, "ssim": 3, "iou": 3, "flip": 3, "shading_left": 3, "shading_slope": 3, "view_spread": 3}
-_BETTER_HIGH = {"psnr", "ssim", "iou"}
-_LABELS = {"l2": "L2", "psnr": "PSNR", "ssim": "SSIM", "log_l2": "log L2", "iou": "IoU", "flip": "FLIP"}
-_LABELS |= {"shading_left": "shading left", "shading_slope": "its slope", "view_spread": "spread over views"}
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Strip:
-    """A row of tiles of one view; None leaves a gap so that columns line up."""
+    """A row of tiles of one view; None leaves a gap, so that columns line up."""
 
     title: str
     pictures: Sequence[Picture | None]
@@ -45,7 +43,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class ViewRows:
-    """What is shown of one view."""
+    """The tiles of one view."""
 
     name: str
     caption: str
@@ -66,7 +64,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Page:
-    """Everything on the page."""
+    """Content of the page."""
 
     scene: str
     credit: str
@@ -85,12 +83,12 @@ class Page:
 
 
 def render_page(page: Page) -> str:
-    """The page as HTML text; every text is escaped."""
+    """Render the page as HTML; all text is escaped."""
     return template(TEMPLATE).render(page=page)
 
 
 def template(path: Path) -> jinja2.Template:
-    """The template in a file; it escapes every text, and a name that it lacks is an error."""
+    """Load a template that escapes all text and refuses unknown names."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -105,7 +103,7 @@ def template(path: Path) -> jinja2.Template:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """Short text of a value: three significant digits, yes or no, a dash for nothing."""
+    """Format a value: three significant digits, yes or no, a dash for nothing."""
     if value is None or value == "":
         return "–"
     if isinstance(value, bool):
@@ -118,9 +116,16 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def score_table(title: str, means: dict[str, Any], columns: Sequence[tuple[str, str, str]], note: str = "") -> Table | None:
-    """Variants x (quantity, protocol, metric) from summary.json's `means`; None when no variant has any of them.
+    """Tabulate variants x (quantity, protocol, metric); the best number of each column is marked where two variants have one.
 
-    The best number of each column is marked where two variants have one.
+    Args:
+        title: title of the table.
+        means: `means` of summary.json.
+        columns: (quantity, protocol, metric) of every column; columns without any number are left out.
+        note: text below the table.
+
+    Returns:
+        The table; None if no variant has any of the numbers.
     """
     variants = [v for v in VARIANT_NAMES if any(_mean(means, v, *column) is not None for column in columns)]
     columns = [c for c in columns if any(_mean(means, v, *c) is not None for v in variants)]
@@ -138,10 +143,10 @@ def score_table(title: str, means: dict[str, Any], columns: Sequence[tuple[str, 
         numbers = [(_mean(means, v, *column), i) for i, v in enumerate(variants)]
         present = [pair for pair in numbers if pair[0] is not None]
         if len(present) > 1:
-            target = max(present)[0] if column[2] in _BETTER_HIGH else min(present)[0]
+            target = max(present)[0] if METRICS[column[2]].higher_is_better else min(present)[0]
             best |= {(i, j) for value, i in present if value == target}
     rows = [[VARIANT_NAMES[v], *(_text(_mean(means, v, *c), c[2]) for c in columns)] for v in variants]
-    heads = [f"{_LABELS[metric]} {'↑' if metric in _BETTER_HIGH else '↓'}" for _, _, metric in columns]
+    heads = [f"{METRICS[metric].short} {'↑' if METRICS[metric].higher_is_better else '↓'}" for _, _, metric in columns]
     return Table(title, groups, heads, rows, frozenset(best), note)
 
 
@@ -153,4 +158,4 @@ def _mean(means: dict[str, Any], variant: str, quantity: str, protocol: str, met
 def _text(value: float | None, metric: str) -> str:
     if value is None:
         return "–"
-    return f"{value:.{_DECIMALS[metric]}f}" if metric in _DECIMALS else f"{value:.4f}" if value < 1000 else f"{value:.3g}"
+    return f"{value:.{METRICS[metric].decimals}f}" if value < 1000 else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""Pictures of maps for people: 8-bit arrays from linear data, and their encoding into a page."""
+"""Pictures of maps for the report: 8-bit arrays from linear data, and their encoding for the page."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from iif_core.errors import InputError
 from iif_core.numerics import color
 
 Array = np.ndarray
@@ -15,50 +16,94 @@ Array = np.ndarray
 SEGMENT_EDGE = (1.0, 0.55, 0.0)
 OBJECT_BORDER = (0.05, 0.05, 0.05)
 DEPTH_EDGE = (0.0, 0.85, 1.0)
-DEPTH_STEP = 0.05  # see `depth_edges`
+DEPTH_STEP = 0.05  # relative, see `depth_edges`
+_COLOUR_MAPS = {"error": "inferno", "value": "viridis"}
 
 
 def encoded(image: Array) -> Array:
-    """Sensor or sRGB values in [0, 1] as they are."""
+    """Show sensor or sRGB values in [0, 1] unchanged."""
     return color.to_uint8(image)
 
 
 def linear(image: Array, exposure: float = 1.0) -> Array:
-    """Linear colour (H, W, 3), sRGB-encoded."""
+    """Show linear colour (H, W, 3), encoded with the sRGB curve."""
     return color.to_uint8(color.tone_map(image, exposure))
 
 
+def false_colour(values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "error") -> Array:
+    """Map scalars to sRGB colours (..., 3) in [0, 1] by a perceptually uniform colour map: `low` is dark, `high` is light.
+
+    Args:
+        values: (...) scalars; values outside the range take the colour of its end, NaN becomes mid-grey.
+        low, high: range of the colour map.
+        scheme: `error` (inferno) or `value` (viridis).
+
+    Returns:
+        (..., 3) float64.
+
+    Raises:
+        InputError: unknown scheme, or high <= low.
+    """
+    from matplotlib import colormaps
+
+    if scheme not in _COLOUR_MAPS:
+        raise InputError(f"colour map {scheme!r}: unknown; allowed: {', '.join(_COLOUR_MAPS)}")
+    if not high > low:
+        raise InputError(f"colour map range {low} ... {high}: the upper end must be larger")
+    values = np.asarray(values, np.float64)
+    position = np.clip((np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (high - low), 0, 1)
+    return np.where(np.isnan(values)[..., None], 0.5, np.asarray(colormaps[_COLOUR_MAPS[scheme]](position))[..., :3])
+
+
 def scalar(values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "value", mask: Array | None = None) -> Array:
-    """(H, W) in false colours; grey where `mask` is False."""
-    picture = color.false_colour(values, low, high, scheme)
+    """Draw a scalar map in false colours.
+
+    Args:
+        values: (H, W).
+        low, high, scheme: as for `false_colour`.
+        mask: (H, W) bool; pixels outside are grey.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
+    picture = false_colour(values, low, high, scheme)
     return color.to_uint8(picture if mask is None else np.where(mask[..., None], picture, 0.35))
 
 
 def grey(values: Array) -> Array:
-    """(H, W) in [0, 1] as grey without encoding: 0.5 looks like the middle."""
+    """Show (H, W) values in [0, 1] as grey levels without encoding."""
     return color.to_uint8(np.repeat(values[..., None], 3, -1))
 
 
 def ids(values: Array) -> Array:
-    """(H, W) ids in distinct colours."""
+    """Show (H, W) ids in distinct colours."""
     return color.to_uint8(color.id_colours(values))
 
 
 def overlay(photo: Array, values: Array) -> Array:
-    """(H, W) ids in distinct colours over the photograph (H, W, 3), borders dark."""
+    """Blend the colours of (H, W) ids with the photograph (H, W, 3); borders between ids are dark."""
     picture = 0.5 * np.clip(photo, 0, 1) + 0.5 * color.id_colours(values)
     picture[edges(values)] = OBJECT_BORDER
     return color.to_uint8(picture)
 
 
 def difference(a: Array, b: Array, mask: Array, high: float = 0.25) -> Array:
-    """Mean absolute difference of two (H, W, 3) or (H, W) images, 0 ... `high`; grey outside `mask`."""
+    """Show the mean absolute difference of two images in false colours.
+
+    Args:
+        a, b: (H, W, 3) or (H, W).
+        mask: (H, W) bool; pixels outside are grey.
+        high: difference that is shown lightest.
+
+    Returns:
+        (H, W, 3) uint8.
+    """
     error = np.abs(np.asarray(a, np.float64) - b)
     return scalar(error.mean(-1) if error.ndim == 3 else error, 0.0, high, "error", mask)
 
 
 def edges(ids: Array) -> Array:
-    """(H, W) bool: the id differs from that of the pixel to the right or below."""
+    """Find pixels whose id differs from that of the pixel to the right or below; (H, W) bool."""
     out = np.zeros(ids.shape, bool)
     out[:-1] |= ids[:-1] != ids[1:]
     out[:, :-1] |= ids[:, :-1] != ids[:, 1:]
@@ -66,10 +111,10 @@ def edges(ids: Array) -> Array:
 
 
 def depth_edges(depth: Array, step: float = DEPTH_STEP) -> Array:
-    """(H, W) bool: inverse depth bends by more than the share `step` of itself between three neighbours.
+    """Find depth discontinuities: the second difference of inverse depth exceeds the share `step` of it; (H, W) bool.
 
-    Inverse depth is linear over the image of a plane, so slanted walls have no edges, only steps and sharp folds do.
-    0 = miss counts as infinitely far.
+    Inverse depth is linear over the image of a plane, so slanted walls have no edges; steps and sharp folds have.
+    Depth 0 (miss) counts as infinitely far.
     """
     w = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0)
     out = np.zeros(depth.shape, bool)
@@ -82,7 +127,7 @@ def depth_edges(depth: Array, step: float = DEPTH_STEP) -> Array:
 
 
 def alignment(photo: Array, object_id: Array, depth: Array) -> Array:
-    """Edges of the mesh over the pale photograph, where they should lie on what they outline: objects, depth steps."""
+    """Draw the mesh's object borders and depth edges over a pale photograph, to check that the mesh fits the photograph."""
     picture = 0.55 * np.repeat(np.clip(photo, 0, 1).mean(-1, keepdims=True), 3, -1) + 0.2
     picture[depth_edges(depth)] = DEPTH_EDGE
     picture[edges(object_id)] = SEGMENT_EDGE
@@ -90,10 +135,18 @@ def alignment(photo: Array, object_id: Array, depth: Array) -> Array:
 
 
 def selected_prediction(segment_id: Array, row_segment: Array, row_k: Array, row_weight: Array) -> Array:
-    """(H, W) int: number of the prediction with the largest weight in each pixel's segment, -1 without one."""
+    """Find the prediction with the largest weight in the segment of every pixel.
+
+    Args:
+        segment_id: (H, W) int.
+        row_segment, row_k, row_weight: (n,) segment, prediction number and weight of every row of the weight table.
+
+    Returns:
+        (H, W) int, the smallest such number; -1 for pixels without a segment or without weights.
+    """
     if not len(row_segment):
         return np.full(segment_id.shape, -1, np.int64)
-    order = np.lexsort((-row_k, row_weight, row_segment))  # last row of a segment: heaviest, ties to the smaller k
+    order = np.lexsort((-row_k, row_weight, row_segment))  # heaviest row last; ties: smaller k
     segments, first = np.unique(row_segment[order][::-1], return_index=True)
     best = np.full(max(int(segments.max()), int(segment_id.max(initial=-1))) + 2, -1, np.int64)
     best[segments] = row_k[order][::-1][first]
@@ -101,7 +154,7 @@ def selected_prediction(segment_id: Array, row_segment: Array, row_k: Array, row
 
 
 def data_uri(image: Array, lossless: bool = False) -> str:
-    """(H, W, 3) uint8 as a `data:` address, JPEG without colour subsampling, or PNG. Same image, same bytes."""
+    """Encode (H, W, 3) uint8 as a `data:` address: JPEG without colour subsampling, or PNG; deterministic."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -115,7 +168,7 @@ def data_uri(image: Array, lossless: bool = False) -> str:
 
 
 def curves_svg(curves: Sequence[tuple[Array, Array, str, bool]], width: int = 300, height: int = 220) -> str:
-    """Curves over [0, 1] x [0, 1] as SVG text: (x, y, colour, dashed)."""
+    """Draw curves, given as (x, y, colour, dashed), over [0, 1] x [0, 1] as SVG text."""
     left, bottom, top, right = 34, 28, 8, 8
     w, h = width - left - right, height - top - bottom
     out = [f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img">']

@@ -1,13 +1,26 @@
-# Shared by all rules: the import path, the fingerprint of a stage, and the command of a job. Nothing is computed here.
+# Functions that choose names, inputs and parameters for the rules. Nothing is computed here.
+import atexit
+import json
 import os
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 sys.path.insert(0, workflow.basedir)
 
 from iif_core.errors import InputError
+from workflow.artifacts.verify import absent
+from workflow.batch import plan as batch_table
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import native
-from workflow.settings import QUALITIES, SCENE_NAME, scene_file
+from workflow.runtime.job_state import reasons
+from workflow.settings import QUALITIES, SCENE_NAME, require_relighting, scene_file
+from workflow.settings import study_files
+from workflow.studies import table as study_table
+
+STARTED = time.time()
+KERNEL_BENCHMARKS = "hashgrid|base_cost"
 
 native.process_environment()
 
@@ -16,6 +29,14 @@ def stop(message):
     """End with one message for the user instead of a traceback through Snakemake."""
     print(f"\nerror: {message}\n", file=sys.stderr)
     sys.exit(1)
+
+
+def or_stop(compute, *arguments):
+    """What `compute` returns; what is wrong with the user's files ends the run here, before any job."""
+    try:
+        return compute(*arguments)
+    except InputError as error:
+        stop(error)
 
 
 for place in (".", "results", "scenes", ".snakemake"):
@@ -34,48 +55,188 @@ if QUALITY not in QUALITIES:
 if set(config) - {"quality"}:
     stop(
         f"--config {', '.join(sorted(set(config) - {'quality'}))}: unknown key; allowed: quality."
-        " Everything else belongs into config/scenes/<scene>.yaml (docs/settings.md)."
+        " Everything else belongs into config/scenes/<scene>.yaml (docs/reference/settings.md)."
     )
 
 
 wildcard_constraints:
     scene=SCENE_NAME,
+    study=rf"(?!(?:{KERNEL_BENCHMARKS})\.){study_files.STUDY}",
+    benchmark=KERNEL_BENCHMARKS,
+
+
+# ---------------------------------------------------------------------------------------------------------- stages
+
+
+def reads(stage, *names):
+    """Named inputs of a stage: the manifests of the stages `names`, which must be those of workflow/registry.py.
+
+    The scene is checked first, so that bad input stops before any job. Variants of a study share what they have in common.
+    """
+    assert names == fingerprints.STAGES[stage].upstream, (stage, names)
+
+    def inputs(wildcards):
+        or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
+        return {name: manifest(name, wildcards.scene) for name in names}
+
+    return inputs
 
 
 def manifest(stage, scene):
-    """Manifest of a stage; variants of a study share what they have in common."""
+    """Manifest of a stage, in the folder of the scene that computes it."""
     return f"results/{fingerprints.home(stage, scene, QUALITY)}/{stage}/manifest.json"
 
 
-def upstream(stage):
-    """Manifests of the stages that `stage` reads. Checks the scene first, so that bad input stops before any job."""
+def job(wildcards, output):
+    """Arguments of `python3 -m workflow`; the fingerprint makes Snakemake run again what changed, and only that."""
+    return job_of(Path(output.manifest).parent.name)(wildcards)
+
+
+def job_of(stage):
+    """As `job`, for a stage whose output does not tell its name."""
+
+    def arguments(wildcards):
+        mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
+        return f"{stage} {wildcards.scene} --quality {QUALITY} --fingerprint {mark}"
+
+    return arguments
+
+
+def per_attempt(amount, diffusion=None):
+    """A resource that grows with every retry; `diffusion`: for a prior that is a network of gigabytes, not a formula."""
+
+    def value(wildcards, attempt):
+        if diffusion is None:
+            return amount * attempt
+        kind = resolved(wildcards.scene)["prior"]["kind"]
+        return (diffusion if kind in ("rgbx", "marigold") else amount) * attempt
+
+    return value
+
+
+def resolved(scene):
+    """All settings of a scene, as plain values."""
+    return json.loads(or_stop(fingerprints.resolved, scene, QUALITY))
+
+
+def no_stage(wildcards):
+    """Input of the template, which nobody shall run."""
+    stop(f"results/{wildcards.scene}/stage: no stage has this name")
+
+
+# ----------------------------------------------------------------------------------------------------- deliverables
+
+
+def publish_inputs(*names):
+    """What is published. A deliverable of which a file is gone is published again."""
+    inputs_of = reads("publish", *names)
 
     def inputs(wildcards):
-        try:
-            fingerprints.fingerprint(stage, wildcards.scene, QUALITY)
-        except InputError as error:
-            stop(error)
-        return [
-            manifest(name, wildcards.scene)
-            for name in fingerprints.STAGES[stage].upstream
-        ]
+        folder = f"scenes/{wildcards.scene}"
+        again_without(folder, f"{folder}/manifest.json")
+        return inputs_of(wildcards)
+
+    return inputs
+
+
+def relit_inputs(wildcards):
+    """The relightings of a scene; those of which a picture is gone are copied again."""
+    source = f"results/{wildcards.scene}/relight/manifest.json"
+    again_without(f"relight/{wildcards.scene}", source)
+    return {"manifest": source}
+
+
+def again_without(folder, manifest):
+    """Have the job run that makes `folder`, if files that `manifest` lists are gone: Snakemake looks at folders, not into them."""
+    gone = absent(Path(folder), Path(manifest))
+    if gone:
+        more = f" and {len(gone) - 3} more" if len(gone) > 3 else ""
+        print(f"{folder}: {', '.join(gone[:3])}{more} missing", file=sys.stderr)
+        workflow.dag.forcefiles.add(folder)
+
+
+def relight_inputs(*names):
+    """What is relit; a scene without relightings stops here, before any job."""
+    inputs_of = reads("relight", *names)
+
+    def inputs(wildcards):
+        found = inputs_of(wildcards)
+        or_stop(require_relighting, resolved(wildcards.scene), wildcards.scene)
+        return found
 
     return inputs
 
 
 def unknown(wildcards):
     """Ends with what is wrong about a scene that can have no file."""
-    try:
-        return str(scene_file(wildcards.name))
-    except InputError as error:
-        stop(error)
+    return str(or_stop(scene_file, wildcards.name))
 
 
-def job(stage):
-    """Arguments of `python -m workflow` for a stage; the fingerprint makes Snakemake rerun what changed, and only that."""
+# ---------------------------------------------------------------------------------------------------------- studies
 
-    def arguments(wildcards):
-        mark = fingerprints.fingerprint(stage, wildcards.scene, QUALITY)
-        return f"{stage} {wildcards.scene} --quality {QUALITY} --fingerprint {mark}"
 
-    return arguments
+def of_study(compute):
+    """`compute(study, QUALITY)` for the study of a target; what is wrong in its file stops here, before any job."""
+    return lambda wildcards: or_stop(compute, wildcards.study, QUALITY)
+
+
+def study_inputs(study, quality):
+    """Manifests of a study; what it will leave out is said before hours of work, not after."""
+    for note in study_table.left_out(study, quality):
+        print(f"study {study}: {note}", file=sys.stderr)
+    return study_table.inputs(study, quality)
+
+
+# ------------------------------------------------------------------------------------------------------------ batch
+# An input function that raises ends Snakemake's plan for all scenes, so each scene is checked first and a bad one is kept
+# out of the plan. A scene whose job fails does not stop the others. Snakemake ends with an error when the others are done.
+
+batch_asked = []
+
+
+def batch_plan():
+    """What can be run; a table that cannot be read stops here, before any job."""
+    plan = or_stop(batch_table.plan, QUALITY)
+    if not batch_asked:
+        batch_asked.append(True)
+        for reason in plan.refused.values():
+            print(f"batch: left out: {reason}", file=sys.stderr)
+        if (
+            workflow.execution_settings is not None
+        ):  # None where nothing is run, as for --summary
+            # A batch is independent scenes: as --keep-going, for this target without being told.
+            workflow.execution_settings.keep_going = True
+    return plan
+
+
+def batch_targets(wildcards):
+    """The summary, and every scene by itself, so that an old summary never stands for a scene that is gone. Parts
+    (`--batch batch=1/10`) divide what the summary reads, so there it stands alone."""
+    plan = batch_plan()
+    scenes = (
+        [] if workflow.dag_settings.batch else [f"scenes/{name}" for name in plan.ready]
+    )
+    refused = ["results/batch/refused"] if plan.refused else []
+    return [*scenes, "results/batch/complete", *refused]
+
+
+# ------------------------------------------------------------------------------------------------------------ errors
+
+
+def tell_reasons():
+    """Say why jobs failed, after the last line of Snakemake: the last line that a user reads is the reason."""
+    if not workflow.is_main_process:
+        return  # a job on a node of a cluster
+    if batch_asked:
+        # Jobs failed, so the summary was not made: it tells of what there is. It is not `complete`, so the next run makes it.
+        command = [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY]
+        atexit.register(subprocess.run, command, check=False)
+    elif found := reasons(STARTED) or damages():
+        atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
+
+
+def damages():
+    """What `snakemake verify` found in this run."""
+    found = Path("results/verify.log")
+    new = found.is_file() and found.stat().st_mtime >= STARTED
+    return found.read_text().splitlines() if new else []

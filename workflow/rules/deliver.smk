@@ -1,110 +1,68 @@
-rule render:
-    input:
-        upstream("render"),
-    output:
-        manifest="results/{scene}/render/manifest.json",
-    log:
-        "results/{scene}/logs/render.log",
-    benchmark:
-        "results/{scene}/benchmarks/render.jsonl"
-    threads: 2
-    resources:
-        mem_mb=lambda wildcards, attempt: 5000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
-    params:
-        job=job("render"),
-        python=sys.executable,
-    message:
-        "{wildcards.scene}: re-rendering every view"
-    shell:
-        "{params.python:q} -m workflow {params.job} --threads {threads} --log {log:q}"
-
-
-rule metrics:
-    input:
-        upstream("metrics"),
-    output:
-        manifest="results/{scene}/metrics/manifest.json",
-    log:
-        "results/{scene}/logs/metrics.log",
-    benchmark:
-        "results/{scene}/benchmarks/metrics.jsonl"
-    threads: 2
-    resources:
-        mem_mb=lambda wildcards, attempt: 3000 * attempt,
-        runtime=lambda wildcards, attempt: 60 * attempt,
-    params:
-        job=job("metrics"),
-        python=sys.executable,
-    message:
-        "{wildcards.scene}: scores"
-    shell:
-        "{params.python:q} -m workflow {params.job} --threads {threads} --log {log:q}"
-
-
-rule export:
-    input:
-        upstream("export"),
-    output:
-        manifest="results/{scene}/export/manifest.json",
-    log:
-        "results/{scene}/logs/export.log",
-    benchmark:
-        "results/{scene}/benchmarks/export.jsonl"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 5000 * attempt,
-        runtime=lambda wildcards, attempt: 60 * attempt,
-    params:
-        job=job("export"),
-        python=sys.executable,
-    message:
-        "{wildcards.scene}: glTF, Mitsuba scene and maps"
-    shell:
-        "{params.python:q} -m workflow {params.job} --threads {threads} --log {log:q}"
-
-
-rule report:
-    input:
-        upstream("report"),
-    output:
-        manifest="results/{scene}/report/manifest.json",
-    log:
-        "results/{scene}/logs/report.log",
-    benchmark:
-        "results/{scene}/benchmarks/report.jsonl"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
-    params:
-        job=job("report"),
-        python=sys.executable,
-    message:
-        "{wildcards.scene}: the page"
-    shell:
-        "{params.python:q} -m workflow {params.job} --threads {threads} --log {log:q}"
+# What people open: scenes/<scene>/ and relight/<scene>/, copies of what the stages wrote.
 
 
 rule publish:
+    """Copy the deliverable to scenes/<scene>/."""
     input:
-        upstream("publish"),
+        unpack(
+            publish_inputs(
+                "capture",
+                "prior",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+                "affines",
+                "render",
+                "metrics",
+                "export",
+                "report",
+            )
+        ),
     output:
-        scene=directory("scenes/{scene}"),
+        scene=report(
+            directory("scenes/{scene}"),
+            patterns=["{page}.html"],
+            caption="../report/captions/scene.rst",
+            category="Scenes",
+            subcategory="{scene}",
+        ),
     log:
         "results/{scene}/logs/publish.log",
     localrule: True
     params:
-        job=job("publish"),
-        python=sys.executable,
+        job=job_of("publish"),
     message:
         "{wildcards.scene}: publishing scenes/{wildcards.scene}"
     shell:
-        "{params.python:q} -m workflow {params.job} --log {log:q}"
+        "python3 -m workflow {params.job} --log {log:q}"
 
 
-# `scenes/My room`, `scenes/kitchen.yaml`: without this, Snakemake says no more than that no rule makes it.
+rule relit:
+    """Copy the relit pictures to relight/<scene>/, without the workflow's own files."""
+    input:
+        unpack(relit_inputs),
+    output:
+        pictures=report(
+            directory("relight/{scene}"),
+            patterns=["{lighting}/{frame}.png"],
+            caption="../report/captions/relighting.rst",
+            category="Relighting",
+            subcategory="{scene}",
+        ),
+    log:
+        "results/{scene}/logs/relit.log",
+    localrule: True
+    message:
+        "{wildcards.scene}: pictures in relight/{wildcards.scene}"
+    shell:
+        "mkdir -p {output.pictures:q} && cp -r results/{wildcards.scene}/relight/. {output.pictures:q}"
+        " && rm {output.pictures:q}/manifest.json > {log:q} 2>&1"
+
+
+# `scenes/My room`, `scenes/kitchen.yaml`: without this rule, Snakemake says only that no rule makes it.
 rule unknown_scene:
+    """Explain why a name cannot be that of a scene."""
     input:
         unknown,
     output:

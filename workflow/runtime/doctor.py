@@ -1,10 +1,9 @@
-"""What this machine offers, one line a check: `python -m workflow.runtime.doctor` or `make doctor`.
+"""Report what this machine offers, one line per check: `python -m workflow.runtime.doctor` or `make doctor`.
 
     ok|warn|FAIL  what: found - what to do
 
-Exit code 1 if any check FAILs. Only the standard library is imported here: libraries that can abort the
-process (Dr.Jit on a wrong LLVM) or lack a system library (Open3D) are tried in child processes, so that an
-abort gets a name.
+The exit code is 1 if any check FAILs. Only the standard library is imported here. Libraries that can abort the process (Dr.Jit
+with a wrong LLVM) or lack a system library (Open3D) are tried in child processes, so that an abort can be reported.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ NEWEST_PYTHON = (3, 14)  # the newest one with wheels for every pin
 GIB = 1 << 30
 CHILD_TIMEOUT_S = 300
 
-# `minimum` is what LLVM < 16 cannot select; the other two answers are a gradient and a ray-traced image.
+# LLVM < 16 cannot compile `minimum`; the other two numbers are a gradient and the mean of a ray-traced image.
 DRJIT_PROBE = """
 import drjit as dr, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
@@ -48,7 +47,7 @@ print(round(y[0], 4), round(dr.grad(x)[1], 4), round(float(mi.render(scene, spp=
 """
 DRJIT_ANSWER = "6.0 0.25 1.0"
 OPEN3D_PROBE = """
-from iif_core import native
+from workflow.runtime import native
 native.load_libusb()
 import open3d
 print(len(open3d.geometry.TriangleMesh.create_box().triangles))
@@ -58,7 +57,7 @@ OPEN3D_ANSWER = "12"
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report; level is `ok`, `warn` (works, but) or `FAIL` (does not work)."""
+    """One line of the report; `level` is `ok`, `warn` (works with a restriction) or `FAIL` (does not work)."""
 
     level: str
     what: str
@@ -80,7 +79,7 @@ def check_python() -> Iterator[Finding]:
 
 
 def check_packages(pins: Path = PINS) -> Iterator[Finding]:
-    """Every requirement of the pin file is installed, as pinned (a local suffix such as +cpu is free)."""
+    """Check that every requirement of the pin file is installed as pinned; a local suffix such as +cpu is ignored."""
     missing, differing, count = [], [], 0
     for line in pins.read_text().splitlines():
         match = re.match(r"([A-Za-z0-9._-]+)(?:==([^\s;#]+))?", line)
@@ -104,7 +103,7 @@ def check_packages(pins: Path = PINS) -> Iterator[Finding]:
 
 
 def check_llvm() -> Iterator[Finding]:
-    """The LLVM that will be used and, only where there is one, Dr.Jit and Mitsuba on it."""
+    """Check the LLVM that will be used and, if there is one, Dr.Jit and Mitsuba with it."""
     report = native.find_llvm()
     if report.path is None:
         yield Finding("FAIL", "llvm", report.problem)
@@ -118,7 +117,7 @@ def check_open3d() -> Iterator[Finding]:
 
 
 def check_gpu() -> Iterator[Finding]:
-    """Never a failure: everything runs on CPUs."""
+    """Report GPUs; none is needed, so this check never fails."""
     names, advice = _nvidia_gpus(), ""
     if not names:
         yield Finding("ok", "gpu", "none found; none is needed")
@@ -133,7 +132,7 @@ def check_gpu() -> Iterator[Finding]:
 
 
 def check_disk(repository: Path = REPOSITORY) -> Iterator[Finding]:
-    """Space and write permission where results and temporary files go."""
+    """Check space and write permission where results and temporary files go."""
     for what, folder, plenty_gib in (
         ("disk", repository, 5.0),
         ("scratch", Path(tempfile.gettempdir()), 2.0),
@@ -150,7 +149,7 @@ def check_disk(repository: Path = REPOSITORY) -> Iterator[Finding]:
 
 
 def check_compute() -> Iterator[Finding]:
-    """Processors and memory that this process may use: affinity and control group included."""
+    """Report processors and memory that this process may use, within its affinity and control group."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     quota = _control_group("cpu.max")
     if quota and quota[0] != "max":
@@ -168,7 +167,7 @@ def check_compute() -> Iterator[Finding]:
 
 
 def check_kernel_cache() -> Iterator[Finding]:
-    """Compiled kernels lie in `$DRJIT_CACHE_DIR`, else `~/.drjit`; without it every process compiles anew."""
+    """Check the cache of compiled kernels, `$DRJIT_CACHE_DIR` or `~/.drjit`; without it every process compiles them again."""
     named = os.environ.get("DRJIT_CACHE_DIR", "")
     folder = Path(named or os.path.expanduser("~/.drjit"))
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
@@ -180,13 +179,10 @@ def check_kernel_cache() -> Iterator[Finding]:
 
 
 def check_optional() -> Iterator[Finding]:
-    """Tools that a few extras use when they are there."""
-    node, validator = shutil.which("node"), shutil.which("gltf_validator")
-    if validator is None and node is not None:
-        child = _run([node, "-p", "require.resolve('gltf-validator')"])
-        validator = child.stdout.strip() if child.returncode == 0 else None
-    advice = "optional, checks scene.glb: `npm install gltf-validator`"
-    yield Finding("ok", "gltf-validator", validator or "not found", "" if validator else advice)
+    """Report optional tools."""
+    validator = REPOSITORY / ".node/node_modules/gltf-validator"
+    advice = "optional, lets the tests check scene.glb: `make validator` (needs npm)"
+    yield Finding("ok", "gltf-validator", *((str(validator), "") if validator.is_dir() else ("not found", advice)))
     oidn = find_spec("pyoidn") is not None
     advice = "rendered scenes and re-renderings are denoised with it: `bash envs/setup.sh`, or set denoise: false"
     yield Finding("ok" if oidn else "warn", "oidn", "pyoidn" if oidn else "not found", "" if oidn else advice)
@@ -254,7 +250,7 @@ def _control_group(name: str) -> list[str]:
 
 
 def main() -> int:
-    """Print every finding as it is made; 1 if any FAILs, else 0."""
+    """Print every finding as it is made; return 1 if any FAILs, else 0."""
     failed = False
     for check in CHECKS:
         try:

@@ -1,8 +1,8 @@
-"""Chained fingerprints: what a stage's result depends on, in sixteen characters.
+"""Chained fingerprints: everything that the result of a stage depends on, in sixteen characters.
 
-fingerprint(stage) = sha256(settings that the stage reads, digest of the code that it imports, digest of the raw input files,
-fingerprints of all upstream stages). Every rule carries it as a parameter, so Snakemake reruns exactly what changed and
-everything below it, also after a run that failed half-way; touching a file or editing a comment changes nothing.
+fingerprint(stage) = sha256(settings that the stage reads, digest of the code that it imports, digest of its raw input files,
+fingerprints of all upstream stages). Every rule carries its fingerprint as a parameter, so Snakemake runs again exactly what
+changed and everything below it, also after a run that failed half-way. Touching a file or editing a comment changes nothing.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from workflow.runtime import input_digests
 from workflow.settings import study_files
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PACKAGES = ("iif_core", "workflow")  # their __init__ hold a docstring and nothing else
-# Runners, not results: their effect on artefacts is versioned by the schema number in the manifest.
+PACKAGES = ("iif_core", "workflow")  # their __init__ hold nothing but a docstring
+# Modules that run stages without computing results: the schema number in the manifest stands for their effect on artefacts.
 INFRASTRUCTURE = (
     "workflow.runtime",
     "workflow.registry",
@@ -37,19 +37,19 @@ INFRASTRUCTURE = (
     "workflow.artifacts",
     "iif_core.errors",
 )
-# A setting that chooses a module at run time -> the module's name.
+# Stage -> settings that choose a module at run time, with the pattern of its name.
 PLUGINS = {
     "capture": (("source", "kind", "workflow.sources.{}"),),
     "prior": (("prior", "kind", "workflow.priors.{}"),),
     "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
 }
-# Modules that know (and check) further input files of a stage.
+# Stage -> modules that know (and check) further input files.
 FILE_MODULES = {"emission": ("workflow.scene.response_file",)}
 VGG = Path("results/weights/lpips_vgg.npz")
 
 
 def module_file(module: str) -> Path | None:
-    """Source file of one of our modules, or None if there is no such module."""
+    """Return the source file of one of our modules; None if there is no such module."""
     path = REPOSITORY.joinpath(*module.split("."))
     if path.with_suffix(".py").is_file():
         return path.with_suffix(".py")
@@ -70,7 +70,7 @@ _lock = threading.Lock()  # stages read their upstream from several threads
 
 @lru_cache(None)
 def _recall() -> None:
-    """Take over what an earlier process found with the same Python and the same text of this module."""
+    """Read what an earlier process found with the same version of Python and of this module."""
     try:
         document = json.loads(_CODE.read_text())
         if document["by"] == _reader_of_code():
@@ -93,9 +93,9 @@ def _save() -> None:
 
 @lru_cache(None)
 def _facts(module: str) -> tuple[str, tuple[str, ...]]:
-    """Digest of a module's code, and the names within our packages that it imports anywhere in its source.
+    """Return the digest of a module's code, and the names within our packages that it imports anywhere in its source.
 
-    Reading all modules takes longer than some stages, so it is remembered by the sha256 of the source.
+    Parsing all modules takes longer than some stages, so the result is kept in a file, keyed by the sha256 of the source.
     """
     global _unsaved
     path = module_file(module)
@@ -126,7 +126,7 @@ def _imported(tree: ast.Module, package: str) -> set[str]:
 
 @lru_cache(None)
 def direct_imports(module: str) -> frozenset[str]:
-    """Our modules that `module` imports anywhere in its source (also inside functions)."""
+    """Return those of our modules that `module` imports anywhere in its source, also inside functions."""
     found: set[str] = set()
     for name in _facts(module)[1]:
         if module_file(name):
@@ -136,7 +136,7 @@ def direct_imports(module: str) -> frozenset[str]:
 
 
 def import_closure(*modules: str) -> list[str]:
-    """Every module of ours that importing `modules` can reach, without the infrastructure; sorted."""
+    """Return every module of ours that importing `modules` can reach, without the infrastructure; sorted."""
     todo, seen = list(modules), set()
     while todo:
         module = todo.pop()
@@ -149,7 +149,7 @@ def import_closure(*modules: str) -> list[str]:
 
 
 def _digest_of(tree: ast.Module) -> str:
-    for node in ast.walk(tree):  # docstrings and comments do not change results
+    for node in ast.walk(tree):  # docstrings do not change results, and the tree holds no comments
         body = getattr(node, "body", None)
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and body:
             first = body[0]
@@ -164,7 +164,7 @@ def _roots_digest(roots: tuple[str, ...]) -> str:
 
 
 def stage_modules(stage: str, settings: dict[str, Any]) -> list[str]:
-    """Modules whose code a stage's result depends on, with these settings."""
+    """Return the modules on whose code the result of a stage depends, with these settings."""
     return import_closure(*_roots(stage, settings))
 
 
@@ -174,24 +174,28 @@ def _roots(stage: str, settings: dict[str, Any]) -> tuple[str, ...]:
 
 
 def code_digest(stage: str, settings: dict[str, Any]) -> str:
-    """Digest of the code behind a stage, blind to comments, docstrings and layout."""
+    """Return the digest of the code behind a stage, without comments, docstrings and layout."""
     return _roots_digest(_roots(stage, settings))
 
 
 def modules_digest(modules: list[str]) -> str:
-    """Digest of the code of some modules."""
+    """Return the digest of the code of some modules."""
     parts = [f"{module}:{_facts(module)[0]}" for module in modules]
     _save()
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
 
 
 def raw_digest(paths: list[Path]) -> str:
-    """Digest of the contents of input files (workflow/runtime/input_digests.py says how large ones are told apart)."""
+    """Return the digest of the contents of input files; large ones are treated as in workflow/runtime/input_digests.py."""
     return hashlib.sha256("\n".join(input_digests.digests(paths)).encode()).hexdigest()[:16]
 
 
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
-    """Input files from outside that a stage reads; the source (or prior) module knows them and checks them first."""
+    """Return the files from outside that a stage reads.
+
+    Raises:
+        InputError: the module of the source, prior or segmentation, which lists the files, found something wrong with them.
+    """
     wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
     out = [VGG] if wants_vgg and VGG.is_file() else []
     if stage == "relight":
@@ -207,13 +211,17 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
 
 @lru_cache(None)
 def resolved(scene: str, quality: str) -> str:
-    """Settings of a scene as JSON text (so that it can be cached)."""
+    """Return the settings of a scene as JSON text, which can be cached."""
     return json.dumps(settings_module.dump(settings_module.load(scene, quality)), sort_keys=True)
 
 
 @lru_cache(None)
 def fingerprint(stage: str, scene: str, quality: str) -> str:
-    """Sixteen hexadecimal characters that change when, and only when, the stage's result may."""
+    """Return sixteen hexadecimal characters that change when, and only when, the result of the stage may change.
+
+    Raises:
+        InputError: the settings or the raw files of the scene cannot be used.
+    """
     document = json.loads(resolved(scene, quality))
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
@@ -231,7 +239,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
 
 @lru_cache(None)
 def home(stage: str, scene: str, quality: str) -> str:
-    """Scene in whose folder the result of a stage lies: a study's variant shares what others would make alike."""
+    """Return the scene in whose folder the result of a stage lies: variants of a study share equal results."""
     for shared in study_files.bases(scene):
         if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
             return shared

@@ -1,9 +1,10 @@
 """Digests of input files for fingerprints, without reading gigabytes while Snakemake plans.
 
-A file of at most `WHOLE` bytes is known by its content. A larger one (photographs of a camera, meshes: hundreds of gigabytes in a
-batch) by its size and three samples of it; the job that reads it anyway notes the digest of its whole content (`remember`). When
-the time stamp of such a file changes, its whole content decides: touched or copied it is the same, edited it is another, even if
-size and samples are as before. What is known is kept in `results/.input-digests.json` by path, size and time stamp.
+A file of at most `WHOLE` bytes is identified by its content. A larger one (the photographs and meshes of a batch can be hundreds
+of gigabytes) is identified by its size and three samples; the job that reads it anyway records the digest of its whole content
+(`remember`). When the time stamp of such a file changes, its whole content decides: a file that was touched or copied is the
+same, an edited one is different, even if size and samples agree. The digests are kept in `results/.input-digests.json` by path,
+size and time stamp.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ CACHE = Path("results/.input-digests.json")
 
 
 class Known(NamedTuple):
-    """What is known of a file: stamp, the digest that fingerprints use, the digest of the whole content ("" = not known)."""
+    """A file as it was last seen: size, time stamp, digest for fingerprints, digest of the whole content ("" = not computed)."""
 
     size: int
     mtime_ns: int
@@ -38,7 +39,7 @@ _held = False
 
 
 def digests(paths: Iterable[Path]) -> list[str]:
-    """`path:digest` of every file, sorted by path."""
+    """Return `path:digest` of every file, sorted by path."""
     _recall()
     out = [f"{path}:{_digest(path)}" for path in sorted(paths)]
     _save()
@@ -46,7 +47,7 @@ def digests(paths: Iterable[Path]) -> list[str]:
 
 
 def remember(paths: Iterable[Path]) -> None:
-    """Note the whole content of large files that a job has just read; of none that changed since it was fingerprinted."""
+    """Record the whole content of large files that a job has just read, except those that changed since their fingerprint."""
     _recall()
     for path in paths:
         entry, status = _known.get(str(path)), path.stat()
@@ -57,7 +58,7 @@ def remember(paths: Iterable[Path]) -> None:
 
 @contextmanager
 def saved_once() -> Iterator[None]:
-    """Within it nothing is saved; at its end all is, once: the file has an entry for every photograph of a batch."""
+    """Save the digests only once, at the end of the block: the file has an entry for every photograph of a batch."""
     global _held
     _held = True
     try:
@@ -87,7 +88,7 @@ def _look(path: Path, stamp: tuple[int, int], before: Known | None) -> Known:
 
 
 def _samples(path: Path, size: int) -> str:
-    """Digest of size, beginning, middle and end."""
+    """Return the digest of size, beginning, middle and end."""
     out = hashlib.sha256(f"{size}\n".encode())
     with open(path, "rb", buffering=0) as handle:
         for start in (0, (size - SAMPLE) // 2, size - SAMPLE):
@@ -101,7 +102,7 @@ def _note(path: Path, entry: Known) -> None:
 
 
 def _recall() -> None:
-    """Take over what the file says, if another process has written it or the working directory is another."""
+    """Read the file again if another process has written it or the working folder has changed."""
     global _read_at
     path = CACHE.absolute()
     try:
@@ -125,7 +126,7 @@ def _stored() -> dict[str, Known]:
 
 
 def _save() -> None:
-    """Add what is new to the file; what other processes wrote meanwhile is kept."""
+    """Add new digests to the file, and keep those that other processes have written meanwhile."""
     global _read_at
     if _held or not _new:
         return

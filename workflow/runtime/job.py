@@ -1,4 +1,4 @@
-"""One job: a stage of a scene. Gives the stage its settings, its inputs and its writer, and nothing else."""
+"""One job runs one stage of one scene: it gives the stage its settings, its inputs and its writer, and nothing else."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarro
 
 
 def stage_directory(scene: str, stage: str) -> Path:
-    """Where a stage of a scene lies."""
+    """Return the folder of a stage of a scene."""
     return Path("results") / scene / stage
 
 
@@ -40,13 +40,13 @@ def _namespace(value: Any) -> Any:
 
 
 class Job:
-    """What a stage's `run(job)` gets.
+    """What the `run(job)` of a stage receives.
 
     Attributes:
-        settings: the parts of the settings tree that the registry lets this stage see, by attribute
-            (`job.settings.base.ridge`); anything else raises AttributeError.
-        seed: seed of the scene (only when the registry lists it).
-        threads: cores that this job may use.
+        settings: the parts of the settings tree that the registry lists for this stage, by attribute (`job.settings.base.ridge`);
+            any other raises AttributeError.
+        seed: seed of the scene, if the registry lists it.
+        threads: number of cores that this job may use.
         log: logger of the job; `progress(done, total, what)` writes at most one line every five seconds.
     """
 
@@ -83,7 +83,11 @@ class Job:
         return fp.fingerprint(self.stage.name, self.scene, self.quality)
 
     def read(self, stage: str) -> StageReader:
-        """Reader of an upstream stage; one that was built under other settings or code is refused."""
+        """Return the reader of an upstream stage.
+
+        Raises:
+            InputError: the stage is not there, or was built under other settings or code.
+        """
         if stage not in self.stage.upstream:
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as upstream")
         if stage not in self._readers:
@@ -101,7 +105,7 @@ class Job:
 
     @cached_property
     def writer(self) -> StageWriter:
-        """Writer of this stage's folder; `run` need not finish it."""
+        """The writer of this stage's folder; it is finished after `run`."""
         return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
@@ -126,9 +130,10 @@ class Job:
 
     @contextmanager
     def timed(self, name: str) -> Iterator[None]:
-        """Record the wall and CPU seconds of a part of the job (all threads of this process); parts of one name add up.
+        """Record the wall and CPU seconds of a part of the job, over all threads; parts of the same name are added.
 
-        They go to `results/<scene>/benchmarks/<stage>.parts.json`, not into the manifest: no two runs take the same time.
+        They go to `results/<scene>/benchmarks/<stage>.parts.json` and not into the manifest, because no two runs take the same
+        time.
         """
         wall, cpu = time.perf_counter(), time.process_time()
         try:
@@ -139,7 +144,7 @@ class Job:
             part["cpu_seconds"] += time.process_time() - cpu
 
     def write_timings(self) -> None:
-        """Write what `timed` recorded, and seconds, CPU seconds peak memory (MB) and threads of the job so far as `job`."""
+        """Write what `timed` recorded, and as `job` the seconds, CPU seconds, peak memory (MB) and threads of the whole job."""
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
         whole = {
             "seconds": time.monotonic() - self._started,
@@ -152,9 +157,9 @@ class Job:
         write_json(Path("results") / self.scene / "benchmarks" / f"{self.stage.name}.parts.json", document)
 
     def progress(self, done: int, total: int, what: str) -> None:
-        """Say how far the job is, at most every five seconds and at the end."""
+        """Log how far the job is, at most every five seconds and at the end."""
         now = time.monotonic()
-        if self._progress_of != what or done <= 1:  # the first item pays for compiling and loading; the estimate starts after it
+        if self._progress_of != what or done <= 1:  # the first item includes compilation, so the estimate starts after it
             self._progress_of, self._first_item = what, (done, now)
         if done < total and now - self._last_progress < 5:
             return
@@ -167,7 +172,7 @@ class Job:
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of Python and of the libraries that make numbers."""
+    """Return the versions of Python and of the libraries that compute numbers."""
     out = {"python": platform.python_version()}
     for name in _LIBRARIES:
         try:
@@ -181,11 +186,14 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
     """Run one stage of one scene in this process.
 
     Args:
-        expected: fingerprint that the caller planned with; a difference means that settings, code or inputs changed
-            between planning and running, and is refused.
+        stage: name of the stage.
+        scene: name of the scene.
+        quality: preset of the settings.
+        threads: number of cores that the job may use.
+        expected: fingerprint under which the job was planned; None = any.
 
     Raises:
-        InputError: with a message for the user.
+        InputError: the input cannot be used, or settings, code or input files changed since the job was planned.
     """
     job = Job(stage, scene, quality, threads)
     if expected and expected != job.fingerprint:
@@ -202,7 +210,7 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
 
 
 def configure_logging(path: Path | None) -> None:
-    """Log to stderr and, when given, to a file of the job's own; warnings included."""
+    """Log to stderr and, if `path` is given, to that file, warnings included."""
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)

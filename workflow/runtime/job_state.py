@@ -1,7 +1,7 @@
-"""How the last run of a job ended, kept beside its log, so that a batch can say why a scene is not there.
+"""How the last run of a job ended, kept beside its log, so that the end of a run and the summary of a batch can give the reason.
 
-`results/<scene>/logs/<stage>.state.json` is there from the start of a job to its good end: what is left of one that was killed
-says `started`, of one that failed `failed` and the reason.
+`results/<scene>/logs/<stage>.state.json` exists from the start of a job until it ends well. The file of a job that was killed
+says `started`; that of a job that failed says `failed` and why.
 """
 
 from __future__ import annotations
@@ -13,11 +13,17 @@ from typing import Any
 from workflow.artifacts.files import write_json
 
 
-class Outcome:
-    """Keeps the state of one job. `fingerprint`: what the job was planned as ("" when run by hand)."""
+class JobState:
+    """Records the state of one job.
 
-    def __init__(self, scene: str, stage: str, fingerprint: str | None):
-        self.path, self.fingerprint = state_file(scene, stage), fingerprint or ""
+    Args:
+        owner: folder of results/ that the job belongs to: a scene, or `studies` or `weights`.
+        name: stage of the scene, or name of the study.
+        fingerprint: what the job was planned as; None when it is run by hand.
+    """
+
+    def __init__(self, owner: str, name: str, fingerprint: str | None = None):
+        self.path, self.fingerprint = state_file(owner, name), fingerprint or ""
 
     def started(self) -> None:
         self._write("started", "")
@@ -32,16 +38,47 @@ class Outcome:
         write_json(self.path, {"state": state, "reason": reason, "fingerprint": self.fingerprint})
 
 
-def state_file(scene: str, stage: str, root: Path = Path(".")) -> Path:
-    """Where the state of a job is kept."""
-    return root / "results" / scene / "logs" / f"{stage}.state.json"
+def state_file(owner: str, name: str, root: Path = Path(".")) -> Path:
+    """Return where the state of a job is kept."""
+    return root / "results" / owner / "logs" / f"{name}.state.json"
 
 
 def read_state(scene: str, stage: str, fingerprint: str, root: Path = Path(".")) -> dict[str, Any]:
-    """`state` and `reason` of a job that did not end well; empty if it did, or if it ran as something else than `fingerprint`."""
+    """Return how a job ended.
+
+    Args:
+        scene, stage: which job.
+        fingerprint: what the job would be planned as now.
+        root: the working folder.
+
+    Returns:
+        `state` and `reason` of a job that did not end well; empty if it did, or if it ran under another fingerprint.
+    """
+    document = _read(state_file(scene, stage, root))
+    return document if document.get("fingerprint") == fingerprint else {}
+
+
+def reasons(since: float, root: Path = Path(".")) -> list[str]:
+    """Return one message for every job that failed or was killed after `since` (seconds, as `time.time`), oldest first."""
+    found = []
+    for path in (root / "results").glob("*/logs/*.state.json"):
+        try:
+            changed = path.stat().st_mtime
+        except OSError:  # its job has just ended well
+            continue
+        document = _read(path)
+        if changed < since or not document:
+            continue
+        owner, name = path.parents[1].name, path.name.removesuffix(".state.json")
+        log = path.with_name(f"{name}.log")
+        reason = document.get("reason") or "it was killed (out of memory, or over its time limit?)"
+        found.append((changed, f"error: {owner}: {name} failed ({log}): {reason}"))
+    return [message for _, message in sorted(found)]
+
+
+def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(state_file(scene, stage, root).read_text())
+        document = json.loads(path.read_text())
     except (OSError, ValueError):
         return {}
-    same = isinstance(document, dict) and document.get("fingerprint") == fingerprint
-    return document if same else {}
+    return document if isinstance(document, dict) else {}

@@ -1,12 +1,11 @@
-"""Native libraries and the process environment: what must be right before `mitsuba` or `open3d` is imported.
+"""Native libraries and the process environment, which must be right before `mitsuba` or `open3d` is imported.
 
-Dr.Jit compiles through a shared libLLVM. With LLVM 15 it does not raise: it aborts the whole process in the
-first kernel ("Cannot select fminimum"), and with none it fails only when a variant is chosen. So the
-library is looked for and asked for its version here, in a child process, before Dr.Jit is imported. Open3D
-needs libusb although no camera is ever opened; where the system has none, the one of the `libusb-package`
-wheel is loaded under its soname.
+Dr.Jit compiles through a shared libLLVM. With LLVM 15 it aborts the whole process in the first kernel ("Cannot select
+fminimum") instead of raising an error, and without LLVM it fails only when a variant is chosen. Therefore the library is
+found and its version is asked here, in a child process, before Dr.Jit is imported. Open3D needs libusb although no camera is ever
+opened; where the system has none, that of the `libusb-package` wheel is loaded under its soname.
 
-Standard library only; importing this module changes nothing.
+Only the standard library is used, and importing this module changes nothing.
 """
 
 from __future__ import annotations
@@ -65,10 +64,11 @@ else: print(major.value)
 class LlvmReport:
     """The LLVM library that Dr.Jit shall load, or the reason why there is none.
 
-    path: absolute path of the usable library, None if there is none.
-    version: its major version, 0 if path is None.
-    candidates: every library found as (path, major version by its file name or 0), best first.
-    problem: one line (what was found, what is needed, what to do), None if path is usable.
+    Attributes:
+        path: absolute path of the usable library, None if there is none.
+        version: its major version, 0 if `path` is None.
+        candidates: every library found as (path, major version by its file name or 0), best first.
+        problem: one line that says what was found, what is needed and what to do; None if `path` is usable.
     """
 
     path: str | None
@@ -80,12 +80,13 @@ class LlvmReport:
 def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[str] | None = None) -> LlvmReport:
     """Find an LLVM >= 16: `DRJIT_LIBLLVM_PATH` if set, else this environment's lib folder, else the system's.
 
-    A variable that names an unusable library is a problem even where another library would do: it was set
-    on purpose and every child process inherits it.  Never raises.
+    A variable that names an unusable library is a problem even where another library would do, because it was set on purpose and
+    every child process inherits it. Never raises.
 
-    environment: default `os.environ`.
-    folders: glob patterns of library folders, best first; default `<sys.prefix>/lib`,
-    `<sys.base_prefix>/lib`, SYSTEM_FOLDERS.
+    Args:
+        environment: by default `os.environ`.
+        folders: glob patterns of library folders, best first; by default `<sys.prefix>/lib`, `<sys.base_prefix>/lib` and
+            SYSTEM_FOLDERS.
     """
     environment = os.environ if environment is None else environment
     if folders is None:
@@ -120,7 +121,7 @@ def find_llvm(environment: Mapping[str, str] | None = None, folders: Sequence[st
 
 
 def load_libusb() -> bool:
-    """Make libusb-1.0 resolvable for a later `import open3d`; False where neither system nor wheel has it."""
+    """Make libusb-1.0 available to a later `import open3d`; return False where neither system nor wheel has it."""
     try:
         ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
         return True
@@ -137,11 +138,11 @@ def load_libusb() -> bool:
 
 
 def prepare() -> LlvmReport:
-    """Set `DRJIT_LIBLLVM_PATH` to a usable LLVM and make libusb loadable; call before importing Mitsuba.
+    """Set `DRJIT_LIBLLVM_PATH` to a usable LLVM and make libusb loadable; call it before importing Mitsuba. Idempotent.
 
-    Idempotent (about 20 ms the first time).  Raises InputError with one line when there is no usable LLVM,
-    and RuntimeError if Dr.Jit was imported without it: it reads the variable at its import, so it may hold
-    a wrong LLVM.
+    Raises:
+        InputError: there is no usable LLVM.
+        RuntimeError: Dr.Jit is imported already; it reads the variable at its import, so it may hold a wrong LLVM.
     """
     if "drjit" in sys.modules and not os.environ.get(LLVM_VARIABLE):
         raise RuntimeError("drjit was imported before native.prepare(); call prepare() first")
@@ -156,8 +157,8 @@ def prepare() -> LlvmReport:
 def process_environment() -> None:
     """Put this interpreter first on PATH and the repository first on PYTHONPATH, for this process's children.
 
-    So `.venv/bin/snakemake` works from an environment that was never activated, or is empty.  HOME is
-    filled in from the user database where it is unset: Dr.Jit and Snakemake keep their caches there.
+    Thus `.venv/bin/snakemake` works in an environment that was never activated, or is empty, and jobs find the code from any
+    working folder. HOME, where Dr.Jit and Snakemake keep their caches, is taken from the user database if it is unset.
     Idempotent.
     """
     repository = Path(__file__).resolve().parents[2]
@@ -170,12 +171,14 @@ def process_environment() -> None:
 
 
 def limit_threads(count: int) -> None:
-    """Let numerical libraries use `count` >= 1 threads, the calling one included.
+    """Let numerical libraries use `count` threads, the calling one included.
 
-    Libraries not yet imported read it from environment variables, as do child processes; torch and pyarrow
-    are told if they are imported already.  Dr.Jit reads no variable, so after prepare() it is imported here
-    and told.  An OpenBLAS that NumPy has already started keeps its threads.  Raises InputError if
-    count < 1.
+    Libraries that are not yet imported read it from environment variables, as do child processes; torch and pyarrow are set
+    directly if they are imported already. Dr.Jit reads no variable, so after prepare() it is imported here and set. An OpenBLAS
+    that NumPy has already started keeps its threads.
+
+    Raises:
+        InputError: `count` is below 1.
     """
     if count < 1:
         raise InputError(f"threads: found {count}, allowed is 1 or more")
@@ -191,7 +194,7 @@ def limit_threads(count: int) -> None:
 
 
 def _libraries(folders: Sequence[str]) -> tuple[tuple[str, int], ...]:
-    """(path, version by name) of every libLLVM: folder by folder, newest first, links resolved."""
+    """Return (path, version by name) of every libLLVM: folder by folder, newest first, links resolved."""
     found: dict[str, int] = {}
     for folder in folders:
         here: dict[str, int] = {}
@@ -209,7 +212,7 @@ def _named_version(path: str) -> int:
 
 
 def _version(path: str) -> tuple[int, str | None]:
-    """Major version that the library itself reports, and why it cannot be used (None if it can)."""
+    """Return the major version that the library itself reports, and why it cannot be used (None if it can)."""
     if not os.path.exists(path):
         return 0, "which does not exist"
     if not os.path.isfile(path):

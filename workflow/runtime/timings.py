@@ -10,11 +10,11 @@ from workflow.registry import STAGES
 
 
 def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
-    """One row a job: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads (0 = not recorded), in workflow order.
+    """Return one row per job, in the order of the workflow: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads.
 
-    Of a job that ran several times the last line of `results/<scene>/benchmarks/<rule>.jsonl` counts; a rule without a
-    readable file (run without Snakemake, or not yet finished) has no row. Jobs of less than half a second have no CPU
-    time or memory ("NA"): 0.
+    Of a job that ran several times, the last line of `results/<scene>/benchmarks/<rule>.jsonl` is used. A rule without a
+    readable file (run without Snakemake, or not yet finished) has no row. Numbers that were not recorded are 0: threads of
+    some jobs, and CPU time and memory ("NA") of jobs of less than half a second.
     """
     rows = []
     for stage in STAGES:
@@ -39,9 +39,9 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
 
 
 def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]:
-    """What a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job`, the whole, also has max_rss_mb and threads.
+    """Return what a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job` is the whole, with max_rss_mb, threads.
 
-    Empty where nothing readable was left. Snakemake samples too seldom to tell the CPU time of a short job.
+    Empty if there is no readable file. Snakemake samples too rarely to measure the CPU time of a short job.
     """
     try:
         document = json.loads((root / "results" / scene / "benchmarks" / f"{stage}.parts.json").read_text())
@@ -51,7 +51,7 @@ def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]
 
 
 def _threads(benchmark: Path) -> str:
-    """What `python -m workflow` noted beside the benchmark: Snakemake's short format leaves it out."""
+    """Return what `python -m workflow` wrote beside the benchmark, because Snakemake's short format has no threads."""
     try:
         return benchmark.with_suffix(".threads").read_text()
     except OSError:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from iif_core.camera.gains import CameraGains, radius_squared
+from iif_core.reflectance.material import BLACK, CHANNELS, NEUTRAL
 from iif_core.surface.cells import grid_origin
-from iif_core.surface.mesh import face_geometry
+from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
@@ -20,21 +21,18 @@ if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
     from iif_core.light.transport.materials import CellMaterials
 
-MATERIAL = ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")
-UNKNOWN_MATERIAL = (0.5, 0.5, 0.5, 0.9, 0.0)  # METHOD H40: surface of an object that nobody saw
-BLACK = (0.0, 0.0, 0.0, 1.0, 0.0)  # kept emitters do not reflect: what is seen of them is their emission
 
 
 @dataclass(frozen=True)
 class BaseScene:
-    """The mesh with the base texture; ids int32 with -1 = none.
+    """The mesh with the base texture; ids are int32 with -1 = none, lengths metres, colours linear.
 
     Attributes:
         vertices (n, 3), faces (m, 3), object_id (m,) of the faces, normals (m, 3), areas (m,).
         n_objects: objects are 0 ... n_objects - 1.
         cell_edge, cell_origin, cell_ijk (c, 3), cell_object (c,), cell_values (c, 5): surface cells of the base
             texture.
-        object_values: (n_objects, 5) means, for surface that nobody saw.
+        object_values: (n_objects, 5) means, for surface that no photograph shows.
     """
 
     vertices: np.ndarray
@@ -51,7 +49,7 @@ class BaseScene:
     object_values: np.ndarray
 
     def with_gains(self, gain: np.ndarray) -> BaseScene:
-        """The scene with the albedos of its objects multiplied by gain (n_objects, 3), at most 1."""
+        """Return the scene with the albedos of its objects multiplied by `gain` (n_objects, 3) and limited to 1."""
         cells, objects = self.cell_values.copy(), self.object_values.copy()
         objects[:, :3] = np.minimum(objects[:, :3] * gain, 1.0)
         cells[:, :3] = np.minimum(cells[:, :3] * gain[self.cell_object], 1.0)
@@ -60,9 +58,14 @@ class BaseScene:
     def traceable(
         self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
     ) -> tuple[Geometry, CellMaterials]:
-        """Geometry and materials on the device; faces in `black` (m,) bool reflect nothing.
+        """Build geometry and materials on the device.
 
-        extra: vertices (v, 3) and faces (f, 3) of a black thing to add; its faces come last.
+        Args:
+            black: (m,) bool, faces that reflect nothing.
+            extra: vertices (v, 3) and faces (f, 3) of a black object to add; its faces come last.
+
+        Returns:
+            What the light transport needs: geometry and materials.
         """
         material = self.materials()
         from iif_core.light.transport.geometry import build_geometry
@@ -76,7 +79,7 @@ class BaseScene:
         return build_geometry(vertices, faces, object_id), material
 
     def materials(self) -> CellMaterials:
-        """On the device; object n_objects is black."""
+        """Build the materials on the device; an object of id `n_objects` is black."""
         import mitsuba
 
         mitsuba.set_variant("llvm_ad_rgb")
@@ -87,7 +90,7 @@ class BaseScene:
 
 
 def read_base_scene(job: Job) -> BaseScene:
-    """The scene as stage base left it. Needs capture, segmentation and base upstream."""
+    """Read the scene that stage base wrote; the job needs capture, segmentation and base upstream."""
     capture, segmentation, base = CaptureReader(job.read("capture")), job.read("segmentation"), job.read("base")
     vertices, faces = capture.mesh()
     object_id = segmentation.table("faces.parquet")["object_id"].astype(np.int32)
@@ -95,7 +98,7 @@ def read_base_scene(job: Job) -> BaseScene:
     n_objects = int(max(object_id.max(initial=-1), known.max(initial=-1))) + 1
     cells, facts = base.table("cells.parquet"), base.json("base.json")
     means = base.table("objects.parquet")
-    object_values = np.tile(np.float32(UNKNOWN_MATERIAL), (n_objects, 1))
+    object_values = np.tile(np.float32(NEUTRAL), (n_objects, 1))
     seen = means["cells"] > 0
     object_values[means["object_id"][seen]] = _rows(means)[seen]
     normals, areas = face_geometry(vertices, faces)
@@ -116,7 +119,7 @@ def read_base_scene(job: Job) -> BaseScene:
 
 
 def _rows(table: dict[str, np.ndarray]) -> np.ndarray:
-    return np.stack([table[name] for name in MATERIAL], 1).astype(np.float32)
+    return np.stack([table[name] for name in CHANNELS], 1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -142,33 +145,64 @@ class ViewPixels:
     interior: np.ndarray
 
     def take(self, choice: np.ndarray) -> ViewPixels:
-        """Some of the pixels."""
+        """Return the chosen pixels."""
         return ViewPixels(**{name: array[choice] for name, array in self.__dict__.items()})
 
 
 def sensor_bounds(value: np.ndarray, is_hdr: bool, saturation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Sensor values, and which of them are bounds: at the top of the range, whatever is stored above it. Radiance has no top."""
+    """Return sensor values limited to `saturation`, and a mask of those that are at it and thus only lower bounds.
+
+    Radiance (`is_hdr`) has no upper limit and no bounds.
+    """
     if is_hdr:
         return value, np.zeros(value.shape, bool)
     return np.minimum(value, saturation), value >= saturation
 
 
-def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) -> ViewPixels:
-    """Photograph, G-buffer and segmentation of a view, a row a pixel that hits the mesh; no pixel of a held-out view is valid."""
-    if view.split == "test":  # geometry alone: no stage that finds anything sees what it shows
+class DecodedView(NamedTuple):
+    """Photograph, G-buffer and segmentation of a view as they are stored, (H, W) and (H, W, 3) arrays."""
+
+    photo: np.ndarray
+    valid: np.ndarray
+    depth: np.ndarray
+    face: np.ndarray
+    object_id: np.ndarray
+    interior: np.ndarray
+
+
+def decode_view(job: Job, capture: CaptureReader, view: View) -> DecodedView:
+    """Read the three files of a view; the photograph of a held-out view is not read, and none of its pixels is valid."""
+    if view.split == "test":
         photo, valid = np.zeros((view.height, view.width, 3), np.float32), np.zeros((view.height, view.width), bool)
     else:
         photo, valid = capture.photo(view)
     depth, face = capture.gbuffer(view)
     maps = job.read("segmentation").exr(f"maps/{view.name}.exr")
+    return DecodedView(photo, valid, depth, face, ids_from_disk(maps["object.id"]), maps["interior"] > 0.5)
+
+
+def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View, decoded: DecodedView | None = None) -> ViewPixels:
+    """Collect the pixels of a view that hit the mesh; no pixel of a held-out view is valid.
+
+    Args:
+        job: with capture and segmentation upstream.
+        capture: of the job.
+        scene: mesh.
+        view: of the capture.
+        decoded: what the files of the view hold; None = read them.
+
+    Returns:
+        One row for each pixel that hits the mesh.
+    """
+    photo, valid, depth, face, object_id, interior = decoded or decode_view(job, capture, view)
     hit = np.flatnonzero((face.ravel() >= 0) & (depth.ravel() > 0))
-    directions = capture.directions(view).reshape(-1, 3)[hit]
+    directions = view.directions().reshape(-1, 3)[hit]
     points = (view.world_from_camera[:3, 3] + depth.reshape(-1, 1)[hit] * directions).astype(np.float32)
     wo = -directions / np.linalg.norm(directions, axis=1, keepdims=True)
     face = face.ravel()[hit]
     normals = scene.normals[face].astype(np.float32)
     front = np.einsum("ij,ij->i", normals, wo) >= 0
-    # Degenerate faces have no normal; any unit vector towards the camera will do.
+    # Degenerate faces have no normal; the unit vector towards the camera takes its place.
     flat = np.einsum("ij,ij->i", normals, normals) < 0.5
     normals = np.where(flat[:, None], wo, np.where(front[:, None], normals, -normals)).astype(np.float32)
     value = photo.reshape(-1, 3)[hit]
@@ -178,32 +212,35 @@ def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View) 
         normals,
         wo.astype(np.float32),
         face,
-        ids_from_disk(maps["object.id"]).ravel()[hit],
+        object_id.ravel()[hit],
         front,
         value,
         valid.ravel()[hit] & np.isfinite(value).all(1),
-        maps["interior"].ravel()[hit] > 0.5,
+        interior.ravel()[hit],
     )
 
 
 def base_maps(job: Job, view: View) -> np.ndarray:
-    """(H * W, 5) float32 base albedo, roughness and metallic of a view."""
+    """Read the base albedo, roughness and metallic of a view, (H * W, 5) float32."""
     maps = job.read("base").exr(f"maps/{view.name}.exr")
     parts = [rgb(maps, "albedo"), maps["roughness"][..., None], maps["metallic"][..., None]]
     return np.concatenate(parts, -1).reshape(-1, 5).astype(np.float32)
 
 
 def cache_origin(scene: BaseScene, edge: float) -> np.ndarray:
-    """Corner (3,) of the radiance-cache grid, the same wherever it is needed."""
+    """Return the corner (3,) of the radiance-cache grid, in metres."""
     return grid_origin(scene.vertices[scene.faces.ravel()], edge)
 
 
 @dataclass(frozen=True)
 class Light:
-    """What stage emission found, per face.
+    """The light that stage emission estimated, per face.
 
     Attributes:
-        radiance: (m, 3); side: (m,) int8; emits: (m,) bool; environment: (3,), or (H, W, 3) as in `iif_core.light.environment`.
+        radiance: (m, 3) linear.
+        side: (m,) int8, side of the face that emits: +1 front, -1 back, 0 both.
+        emits: (m,) bool.
+        environment: (3,), or (H, W, 3) as in `iif_core.light.environment`.
     """
 
     radiance: np.ndarray
@@ -212,14 +249,14 @@ class Light:
     environment: np.ndarray
 
     def emitters(self, geometry: Geometry) -> Emitters:
-        """On the device."""
+        """Build the emitters on the device."""
         from iif_core.light.transport.emitters import Emitters
 
         return Emitters(geometry, self.radiance, self.side, self.environment)
 
 
 def read_light(job: Job, n_faces: int) -> Light:
-    """Kept emitters and environment. Needs emission upstream."""
+    """Read the emitters that were kept and the environment; the job needs emission upstream."""
     reader = job.read("emission")
     table, faces = reader.table("emitters.parquet"), reader.table("emitter_faces.parquet")
     rows = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float32).reshape(-1, 3)
@@ -235,7 +272,7 @@ def read_light(job: Job, n_faces: int) -> Light:
 
 
 def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.ndarray, shines: np.ndarray) -> np.ndarray:
-    """(H, W, 3) where the stage wrote the texels of its environment emitters, else (3,), one radiance everywhere."""
+    """Return (H, W, 3) where the stage wrote texels of environment emitters, else (3,), one radiance for all directions."""
     name = "environment_texels.parquet"
     if not reader.has(name):
         return rows[shines].sum(0, dtype=np.float32)
@@ -250,7 +287,7 @@ def _environment(reader: StageReader, emitters: dict[str, np.ndarray], rows: np.
 
 
 def read_object_gains(job: Job, n_objects: int) -> np.ndarray:
-    """(n_objects, 3) factors on the base albedo that go with the light. Needs emission upstream."""
+    """Read the factors (n_objects, 3) on the base albedo that belong to the estimated light; the job needs emission upstream."""
     table = job.read("emission").table("object_gains.parquet")
     gain = np.ones((n_objects, 3), np.float32)
     gain[table["object_id"]] = np.stack([table[f"gain_{c}"] for c in "rgb"], 1)
@@ -258,20 +295,29 @@ def read_object_gains(job: Job, n_objects: int) -> np.ndarray:
 
 
 def read_gains(job: Job) -> CameraGains:
-    """Exposure, white balance and vignetting of every view of the capture, in order, as stage emission used them. Needs
-    emission upstream."""
+    """Read exposure, white balance and vignetting of every view as stage emission used them; the job needs emission upstream."""
     facts = job.read("emission").json("emission.json")
     gain = np.asarray(facts["gain"], np.float64)
     return CameraGains(gain, np.asarray(facts["vignetting"], np.float64), np.ones(len(gain), bool))
 
 
 def pixel_gains(gains: CameraGains, number: int, view: View, index: np.ndarray) -> np.ndarray:
-    """(n, 3) what the radiance of pixels (flattened indices) of the view at `number` in the capture is multiplied by."""
+    """Compute the factors on the radiance of some pixels.
+
+    Args:
+        gains: of all views of the capture.
+        number: position of the view in the capture.
+        view: its camera.
+        index: (n,) flattened indices of the pixels.
+
+    Returns:
+        (n, 3) factors: exposure, white balance and vignetting.
+    """
     return gains.factor(number, radius_squared(index, view.width, view.height))
 
 
 def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:
-    """The radiance cache on the device; `with_bounds`: also voxels that were only ever seen saturated."""
+    """Read the radiance cache onto the device; `with_bounds` includes voxels that only saturated pixels show."""
     from iif_core.light.transport.cache import RadianceCache
 
     reader = job.read("emission")

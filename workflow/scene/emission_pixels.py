@@ -1,4 +1,5 @@
-"""The photographs as stage emission reads them: exposure, response, and pixels as statistics, cache and rows."""
+"""The photographs as stage emission reads them: views decoded once, exposure and response, and pixels as statistics of faces,
+radiance cache and rows of the linear system."""
 
 from __future__ import annotations
 
@@ -18,18 +19,18 @@ from iif_core.camera.calibration.choice import (
     given_response,
     needs_rows,
 )
-from iif_core.camera.gains import CameraGains, choose_gains, follow, radius_squared
+from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
 from iif_core.light.emission.candidates import FaceStatistics, face_statistics, radiance_threshold, with_thin_objects
 from iif_core.light.emission.environment import SkySums, cosine_directions
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.problem import PixelRows
+from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose_pixels, tile_of
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.cells import grid_origin
 from workflow import decisions
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, pixel_gains, view_pixels
+from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, decode_view, pixel_gains, view_pixels
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.response_file import read_response_file
 
@@ -37,13 +38,71 @@ if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
     from iif_core.light.transport.materials import CellMaterials
 
-TILE = 8
-"""Pixels of one object in one tile of this edge are averaged into one row (COMPUTE 4)."""
+VIEW_MEMORY_MB = 1024.0
+"""Megabytes of decoded views that are kept in memory; every pass over the photographs decodes the others again."""
 STATISTICS_PIXELS = 20_000_000
 """Photographs are thinned to about this many pixels for the statistics of faces."""
-ANCHOR_PIXELS = 64
-"""At least this many directly seen pixels a group enter the solve."""
 SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
+
+
+@dataclass(frozen=True)
+class ViewRecord:
+    """Everything that the stage reads of one view, decoded.
+
+    Attributes:
+        pixels: the pixels that hit the mesh, n of them.
+        base: (n, 5) float32 base albedo, roughness and metallic of these pixels; empty for a held-out view.
+        median_depth: metres, of the pixels with depth; None without any.
+        counted: number of valid pixels of the whole photograph.
+        escaping: (k,) flattened indices of the valid pixels that meet no surface; escaping_value, escaping_direction: (k, 3) what they
+            show, and their directions in the world.
+    """
+
+    pixels: ViewPixels
+    base: np.ndarray
+    median_depth: float | None
+    counted: int
+    escaping: np.ndarray
+    escaping_value: np.ndarray
+    escaping_direction: np.ndarray
+
+    @property
+    def megabytes(self) -> float:
+        arrays = (*self.pixels.__dict__.values(), self.base, self.escaping, self.escaping_value, self.escaping_direction)
+        return sum(array.nbytes for array in arrays) / 1e6
+
+
+class ViewRecords:
+    """Records of views, read from disk once as far as they fit into VIEW_MEMORY_MB.
+
+    Passes visit the views in the same order, so the first views are kept and the later ones are decoded again.
+    """
+
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene):
+        self.job, self.capture, self.scene = job, capture, scene
+        self._kept: dict[int, ViewRecord] = {}
+        self._megabytes = 0.0
+
+    def __getitem__(self, view: View) -> ViewRecord:
+        record = self._kept.get(view.view_id)
+        if record is None:
+            record = self._decoded(view)
+            if self._megabytes + record.megabytes <= VIEW_MEMORY_MB:
+                self._kept[view.view_id] = record
+                self._megabytes += record.megabytes
+        return record
+
+    def _decoded(self, view: View) -> ViewRecord:
+        decoded = decode_view(self.job, self.capture, view)
+        pixels = view_pixels(self.job, self.capture, self.scene, view, decoded)
+        base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
+        values = decoded.photo.reshape(-1, 3)
+        out = decoded.valid.ravel() & np.isfinite(values).all(1)
+        out[pixels.index] = False
+        direction = view.directions().reshape(-1, 3)[out]
+        deep = decoded.depth[decoded.depth > 0]
+        median = np.median(deep) if deep.size else None
+        return ViewRecord(pixels, base, median, int(decoded.valid.sum()), np.flatnonzero(out), values[out], direction)
 
 
 @dataclass(frozen=True)
@@ -56,9 +115,7 @@ class Photographs:
     views: list[View]
     sensor: Sensor
     gains: CameraGains  # of the views of the capture, in order
-
-    def pixels(self, view: View) -> ViewPixels:
-        return view_pixels(self.job, self.capture, self.scene, view)
+    records: ViewRecords
 
     @cached_property
     def world(self) -> tuple[Geometry, CellMaterials]:
@@ -66,11 +123,11 @@ class Photographs:
         return self.scene.traceable()
 
     def number(self, view: View) -> int:
-        """Place of a view in the capture."""
+        """Return the place of a view in the capture."""
         return next(i for i, other in enumerate(self.capture.views) if other.view_id == view.view_id)
 
     def radiance(self, view: View, value: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of sensor values (n, 3) of pixels `index` (n,): radiance, and where it is a bound."""
+        """Turn sensor values (n, 3) of pixels `index` (n,) into radiance, and say where it is a bound."""
         number = self.number(view)
         if self.gains.is_plain:
             return self.sensor.radiance(value, float(self.gains.gain[number, 0]))
@@ -78,17 +135,17 @@ class Photographs:
 
 
 def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:
-    """Exposures of the views as the source knows them."""
+    """Return the exposures of the views as the source knows them."""
     exposures = capture.exposures()
     bad = [view.name for view in capture.views if not view.exposure > 1e-6]
-    if bad:  # METHOD H31
+    if bad:  # docs/method/numerics.md#exposure-at-zero
         notes.append(f"exposure not positive, taken as 1: {', '.join(bad)}")
         exposures = np.where(exposures > 1e-6, exposures, 1.0)
     return CameraGains.plain(exposures)
 
 
 def gain_plan(capture: CaptureReader, gains: CameraGains) -> list[decisions.Decision]:
-    """What was found about exposure, white balance and vignetting."""
+    """Return the decisions about exposure, white balance and vignetting."""
     if not capture.facts.get("exposure_estimated"):
         return [decisions.exposure("given", np.zeros(0), 0)]
     found = [decisions.exposure("estimate", np.log(gains.exposure), int(gains.estimated.sum()))]
@@ -98,8 +155,9 @@ def gain_plan(capture: CaptureReader, gains: CameraGains) -> list[decisions.Deci
 
 
 def calibrated(photos: Photographs) -> tuple[Photographs, CalibratedResponse]:
-    """The photographs with their camera response (the measured curve, the family that is set, or the one that surface under
-    different exposures speaks for) and the gains that go with it; and how it was found. Views kept for testing follow."""
+    """Find the camera response (the measured curve, the family that is set, or the one that fits surface seen under different
+    exposures best) and the gains that go with it; return the photographs with both, and how they were found. Held-out views
+    take part only with gains that follow from the others."""
     settings, facts = photos.job.settings, photos.capture.facts
     setting, given = settings.affines.response, not photos.capture.facts.get("exposure_estimated", False)
     number = np.array([photos.number(view) for view in photos.views])
@@ -120,7 +178,7 @@ def calibrated(photos: Photographs) -> tuple[Photographs, CalibratedResponse]:
 
 
 def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse, rows: PatchRows) -> CameraGains:
-    """Gains of all views of the capture: of those `number` that were used, and of those that follow them."""
+    """Gains of all views of the capture: of the views `number` that were used, and of the others, which follow from them."""
     moving = np.isin(np.arange(len(start.gain)), number)
     linear = gain_rows(rows, found.response)
     if found.gains is None:  # the curve is given, the gains are not
@@ -130,13 +188,14 @@ def _all_gains(start: CameraGains, number: np.ndarray, found: CalibratedResponse
         gain, seen = start.gain.copy(), np.zeros(len(moving), bool)
         gain[number], seen[number] = found.gains.gain, found.gains.estimated
         ahead = replace(found.gains, gain=gain, estimated=seen)
-    return follow(linear, ahead, moving)
+    return with_held_out_views(linear, ahead, moving)
 
 
 def _shared_surface(photos: Photographs) -> PatchRows:
-    """Patches of interior surface as the views show them."""
-    capture, scene, views = photos.capture, photos.scene, photos.capture.views
-    footprints = [np.median(depth[depth > 0]) / view.fx for view in views if (depth := capture.gbuffer(view)[0]).any()]
+    """Patches of interior surface as all views show them."""
+    scene, views = photos.scene, photos.capture.views
+    medians = [(photos.records[view].median_depth, view.fx) for view in views]
+    footprints = [depth / focal for depth, focal in medians if depth is not None]
     extent = float(np.ptp(scene.vertices, axis=0).max())
     edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
     origin = grid_origin(scene.vertices[scene.faces.ravel()], edge)
@@ -144,7 +203,7 @@ def _shared_surface(photos: Photographs) -> PatchRows:
     saturation = photos.job.settings.emission.saturation
     parts = [no_rows()]
     for number, view in enumerate(views):
-        pixels = photos.pixels(view)
+        pixels = photos.records[view].pixels
         pixels = pixels.take(np.flatnonzero(pixels.valid & pixels.interior))
         patch = patch_numbers(pixels.points, pixels.object_id, edge, origin)
         radius2 = radius_squared(pixels.index, view.width, view.height)
@@ -155,13 +214,13 @@ def _shared_surface(photos: Photographs) -> PatchRows:
 
 
 def statistics_of_faces(photos: Photographs) -> tuple[FaceStatistics, float]:
-    """Statistics of the faces, and the radiance from which one may shine."""
+    """Return the statistics of all faces, and the radiance from which a face may shine."""
     scene, views, least = photos.scene, photos.views, photos.job.settings.emission.min_observations
     total = sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
     parts = []
     for done, view in enumerate(views):
-        pixels = photos.pixels(view)
+        pixels = photos.records[view].pixels
         pixels = pixels.take(np.flatnonzero(pixels.valid)[::stride])
         radiance, bound = photos.radiance(view, pixels.value, pixels.index)
         parts.append((pixels.face, radiance.astype(np.float32), bound, pixels.from_front, pixels.interior))
@@ -175,38 +234,35 @@ def statistics_of_faces(photos: Photographs) -> tuple[FaceStatistics, float]:
 
 
 def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[RadianceVoxels, SkySums, float, float | None]:
-    """The cache of interior pixels that are not on an emitter; what the camera rays see that miss the mesh, their share,
-    and their brightness relative to the others'."""
+    """Build the cache of interior pixels that are on no emitter; also return the sums of what camera rays see that miss the
+    mesh, the share of such rays, and their mean brightness relative to the other rays."""
     edge = photos.job.settings.emission.cache_edge
     sums, sky = RadianceSums(edge, cache_origin(photos.scene, edge)), SkySums()
     total, mean_hit, hits = 0, 0.0, 0
     for done, view in enumerate(photos.views):
-        pixels = photos.pixels(view)
+        record = photos.records[view]
+        pixels = record.pixels
         radiance, bound = photos.radiance(view, pixels.value, pixels.index)
         use = pixels.valid & pixels.interior & (groups.of_face[pixels.face] < 0)
         sums.add(pixels.points[use], radiance[use], bound[use].any(1))
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
         hits += int(pixels.valid.sum())
-        photo, valid = photos.capture.photo(view)
-        values = photo.reshape(-1, 3)
-        out = valid.ravel() & np.isfinite(values).all(1)
-        out[pixels.index] = False
-        sky.add(photos.capture.directions(view).reshape(-1, 3)[out], *photos.radiance(view, values[out], np.flatnonzero(out)))
-        total += int(valid.sum())
+        sky.add(record.escaping_direction, *photos.radiance(view, record.escaping_value, record.escaping))
+        total += record.counted
         photos.job.progress(done + 1, len(photos.views), "views cached")
     brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None
     return sums.finish(), sky, sky.pixels / max(total, 1), brightness
 
 
 def escaping_share(photos: Photographs) -> float:
-    """Share of cosine-distributed directions from visible surface that leave the mesh (METHOD 8, epsilon_2)."""
+    """Return the share of cosine-distributed rays from visible surface that leave the mesh."""
     geometry, _ = photos.world
     from iif_core.light.transport.geometry import trace
 
     rng = np.random.default_rng([photos.job.seed, SEEDS])
     origins, directions = [], []
     for view in photos.views:
-        pixels = photos.pixels(view)
+        pixels = photos.records[view].pixels
         if not len(pixels.index):
             continue
         pixels = pixels.take(rng.integers(0, len(pixels.index), max(1, 65536 // len(photos.views))))
@@ -219,41 +275,36 @@ def escaping_share(photos: Photographs) -> float:
     return float((face < 0).mean())
 
 
-def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tuple[ViewPixels, np.ndarray, PixelRows]:
-    """A fixed number of pixels, evenly over views (one in `thin`), plus enough on every emitter; their materials (n, 5)."""
+def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
+    """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
+
+    Returns them three times: as surface points, as base materials (n, 5), and as what they show.
+    """
     rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
-    per_view = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
-    quota = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
-    parts: list[tuple[ViewPixels, np.ndarray, PixelRows]] = []
+    elsewhere = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
+    per_group = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
+    parts: list[tuple[ViewPixels, np.ndarray, EmissionPixels]] = []
     for view in photos.views:
-        pixels = photos.pixels(view)
+        record = photos.records[view]
+        pixels = record.pixels
         group = groups.of_face[pixels.face]
         side = groups.side[pixels.face]
-        away = (group >= 0) & (side != 0) & ((side > 0) != pixels.from_front)
-        usable = pixels.valid & ~away & (pixels.interior | (group >= 0))
-        on_emitter = np.flatnonzero(usable & (group >= 0))
-        elsewhere = np.flatnonzero(usable & (group < 0))
-        chosen = [rng.permutation(elsewhere)[:per_view]]
-        for g in np.unique(group[on_emitter]):
-            own = on_emitter[group[on_emitter] == g]
-            inner = own[pixels.interior[own]]
-            chosen.append(rng.permutation(inner if len(inner) else own)[:quota])
-        choice = np.sort(np.concatenate(chosen))
+        dark_side = (group >= 0) & (side != 0) & ((side > 0) != pixels.from_front)
+        usable = pixels.valid & ~dark_side & (pixels.interior | (group >= 0))
+        choice = choose_pixels(group, usable, pixels.interior, elsewhere, per_group, rng)
         part = pixels.take(choice)
-        row, column = part.index // view.width, part.index % view.width
-        tile = (row // TILE) * (-(-view.width // TILE)) + column // TILE
-        number = np.full(len(choice), view.view_id)
-        rows = PixelRows(*photos.radiance(view, part.value, part.index), part.object_id, number, tile, group[choice])
-        parts.append((part, base_maps(photos.job, view)[part.index], rows))
+        shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
+        rows = EmissionPixels(*shown, part.object_id, number, tile_of(part.index, view.width), group[choice])
+        parts.append((part, record.base[choice], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
-    joined, group = _joined(pixels), np.concatenate([part.group for part in rows])
-    # Border pixels mix with what is beside the emitter: only for emitters that have no others.
+    joined, everything = _joined(pixels), _joined(rows)
+    # Border pixels mix with what is beside the emitter; they are used only for emitters that have no others.
+    group = everything.group
     inner = np.bincount(group[joined.interior & (group >= 0)], minlength=groups.size) > 0
     use = (group < 0) | joined.interior | ~np.append(inner, False)[group]
-    everything = _joined(rows)
-    return joined.take(use), np.concatenate(base)[use], PixelRows(**{k: v[use] for k, v in everything.__dict__.items()})
+    return joined.take(use), np.concatenate(base)[use], EmissionPixels(**{k: v[use] for k, v in everything.__dict__.items()})
 
 
 def _joined(parts: Sequence[Any]) -> Any:
-    """Records of arrays, one after another."""
+    """Join records of arrays, one after another."""
     return type(parts[0])(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in parts[0].__dict__})

@@ -1,4 +1,4 @@
-"""The waist of the workflow: every source ends in this form, every later stage begins with it (docs/artefacts.md, capture)."""
+"""The normal form of a capture: every source writes it, and every later stage reads it (docs/reference/artefacts.md, capture)."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.camera.pinhole import pixel_directions
 from workflow.artifacts.store import StageReader, StageWriter, ids_from_disk, ids_to_disk, rgb, split_rgb
 
 
 @dataclass(frozen=True)
 class View:
-    """One photograph's camera. OpenCV axes, pixel centres at (u + 0.5, v + 0.5), lengths in metres."""
+    """The camera of one photograph: OpenCV axes, pixel centres at (u + 0.5, v + 0.5), lengths in metres."""
 
     view_id: int
     name: str
@@ -25,29 +26,33 @@ class View:
     cy: float
     world_from_camera: np.ndarray  # (4, 4) float64
     exposure: float = 1.0  # multiplies radiance before the response
-    split: str = "train"
+    split: str = "train"  # or "test": held out
+
+    def directions(self) -> np.ndarray:
+        """Return (H, W, 3) float32 world directions through pixel centres; point = origin + z-depth * direction (Eq. C.1)."""
+        return pixel_directions(self.fx, self.fy, self.cx, self.cy, self.width, self.height, self.world_from_camera)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth of one view; `valid` is where material truth means something (not glass, not background)."""
+    """Ground truth of one view; `valid` excludes pixels without a material truth, such as glass and background."""
 
     albedo: np.ndarray  # (H, W, 3) linear
     roughness: np.ndarray  # (H, W) perceptual
     metallic: np.ndarray  # (H, W)
     emission: np.ndarray  # (H, W, 3) radiance
-    radiance: np.ndarray  # (H, W, 3) noise of the render included
+    radiance: np.ndarray  # (H, W, 3) with the noise of the rendering
     valid: np.ndarray  # (H, W) bool
 
 
 class CaptureWriter:
-    """Writes the normal form; the order of calls does not matter, `finish` comes last."""
+    """Writes the normal form. The order of the calls does not matter, except that `finish` comes last."""
 
     def __init__(self, writer: StageWriter):
         self.writer = writer
 
     def cameras(self, views: list[View]) -> None:
-        """All cameras; names must be unique."""
+        """Write all cameras; their names must be unique."""
         columns = {
             name: [getattr(v, name) for v in views]
             for name in ("name", "width", "height", "fx", "fy", "cx", "cy", "exposure", "split")
@@ -67,7 +72,15 @@ class CaptureWriter:
         instance_names: list[str] | None = None,
         emission: np.ndarray | None = None,
     ) -> None:
-        """Vertices (n, 3) in metres, faces (m, 3), ids (m,) with -1 = none, emission (m, 3) of the front side if known."""
+        """Write the mesh.
+
+        Args:
+            vertices: (n, 3) metres.
+            faces: (m, 3).
+            instance_id: (m,) object of each face, -1 = none.
+            instance_names: one per id.
+            emission: (m, 3) radiance of the front side, where it is known.
+        """
         v, f = np.asarray(vertices, np.float32), np.asarray(faces, np.int32)
         n = np.arange(len(v), dtype=np.int32)
         self.writer.table(
@@ -84,22 +97,29 @@ class CaptureWriter:
             self.writer.table("instances.parquet", rows)
 
     def photo(self, name: str, image: np.ndarray, valid: np.ndarray | None = None, encoded: bool = True) -> None:
-        """(H, W, 3): sensor values in [0, 1] when `encoded`, else radiance; `valid` (H, W) bool, default all."""
+        """Write a photograph.
+
+        Args:
+            name: of the view.
+            image: (H, W, 3) sensor values in [0, 1], or radiance.
+            valid: (H, W) bool, the pixels that may be used; None = all.
+            encoded: whether the values are sensor values.
+        """
         mask = np.ones(image.shape[:2], bool) if valid is None else np.asarray(valid, bool)
         space = "sensor" if encoded else "linear"
         self.writer.exr(f"photos/{name}.exr", {**split_rgb(image), "valid": mask}, "relative", space)
 
     def gbuffer(self, name: str, depth: np.ndarray, face_id: np.ndarray) -> None:
-        """z-depth (H, W) in metres, 0 = miss; face ids (H, W), -1 = miss."""
+        """Write z-depth (H, W) in metres, 0 = miss, and face ids (H, W), -1 = miss."""
         channels = {"depth.Z": depth.astype(np.float32), "face.id": ids_to_disk(face_id)}
         self.writer.exr(f"gbuffer/{name}.exr", channels, "m")
 
     def given_instances(self, name: str, instance_id: np.ndarray) -> None:
-        """Per-view ids (H, W) that the source came with, -1 = none."""
+        """Write the object ids (H, W) that the source gives for a view, -1 = none."""
         self.writer.exr(f"given/{name}.exr", {"instance.id": ids_to_disk(instance_id)})
 
     def truth(self, name: str, truth: Truth) -> None:
-        """Ground truth of one view."""
+        """Write the ground truth of one view."""
         channels = {
             **split_rgb(truth.albedo, "albedo"),
             "roughness": truth.roughness.astype(np.float32),
@@ -119,7 +139,16 @@ class CaptureWriter:
         response_truth: np.ndarray | None = None,
         facts: dict[str, Any] | None = None,
     ) -> None:
-        """What the capture is, and in words what was approximated or treated. `response_truth`: (3, 101) samples of f."""
+        """Write capture.json.
+
+        Args:
+            source: kind of the source.
+            dynamic_range: `ldr` or `hdr`.
+            has_truth: whether ground truth was written for all views.
+            notes: what was approximated or corrected, in words.
+            response_truth: (3, 101) samples of the true camera response on [0, 1], where it is known.
+            facts: further entries of the document.
+        """
         document = {"source": source, "dynamic_range": dynamic_range, "has_truth": has_truth, "notes": notes, **(facts or {})}
         if response_truth is not None:
             document["response_truth"] = np.asarray(response_truth, float).round(8).tolist()
@@ -159,32 +188,33 @@ class CaptureReader:
         return iter(self.views)
 
     def exposures(self) -> np.ndarray:
-        """(views,) exposure of every view, in order."""
+        """Return the exposures (views,) in the order of the views."""
         return np.array([view.exposure for view in self.views], np.float64)
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (n, 3) float32 in metres and faces (m, 3) int32."""
+        """Return vertices (n, 3) float32 in metres and faces (m, 3) int32."""
         v, f = self.reader.table("vertices.parquet"), self.reader.table("faces.parquet")
         return np.stack([v["x"], v["y"], v["z"]], 1), np.stack([f["v0"], f["v1"], f["v2"]], 1)
 
     def faces(self) -> dict[str, np.ndarray]:
-        """Columns of faces.parquet (instance ids, true emission)."""
+        """Return the columns of faces.parquet, among them instance ids and true emission."""
         return self.reader.table("faces.parquet")
 
     def true_emission(self) -> np.ndarray | None:
-        """(m, 3) radiance of the front side of every face, if known."""
+        """Return the radiance (m, 3) of the front side of every face, or None where it is not known."""
         f = self.faces()
         return np.stack([f[f"emission_{c}"] for c in "rgb"], 1) if "emission_r" in f else None
 
     @property
     def used(self) -> list[View]:
-        """The views that may be read to find anything: all but those held out."""
+        """The views that are not held out: no estimate may read any other photograph."""
         return [view for view in self.views if view.split != "test"]
 
     def photo(self, view: View, held_out: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """(H, W, 3) float32 sensor values or radiance, and (H, W) bool: which pixels count.
+        """Return (H, W, 3) float32 sensor values or radiance, and (H, W) bool, the pixels that may be used.
 
-        A held-out photograph is refused unless `held_out` says that it is read to score or to show, never to fit.
+        Raises:
+            AssertionError: the view is held out and `held_out` is not set; only scoring and display may set it.
         """
         if view.split == "test" and not held_out:
             raise AssertionError(f"view {view.name} is held out: its photograph is for scores alone")
@@ -192,28 +222,22 @@ class CaptureReader:
         return rgb(channels), channels["valid"] > 0.5
 
     def gbuffer(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth (H, W) float32 metres (0 = miss) and face ids (H, W) int32 (-1 = miss)."""
+        """Return z-depth (H, W) float32 in metres (0 = miss) and face ids (H, W) int32 (-1 = miss)."""
         channels = self.reader.exr(f"gbuffer/{view.name}.exr")
         return channels["depth.Z"], ids_from_disk(channels["face.id"])
 
     def given_instances(self, view: View) -> np.ndarray | None:
-        """Per-view ids (H, W) int32, or None when the source has none."""
+        """Return the object ids (H, W) int32 that the source gives for a view, or None."""
         name = f"given/{view.name}.exr"
         return ids_from_disk(self.reader.exr(name)["instance.id"]) if self.reader.has(name) else None
 
     def truth(self, view: View) -> Truth:
-        """Ground truth of a view (only when `has_truth`)."""
+        """Return the ground truth of a view; only for captures with `has_truth`."""
         c = self.reader.exr(f"truth/{view.name}.exr")
         valid = c["valid"] > 0.5
         return Truth(rgb(c, "albedo"), c["roughness"], c["metallic"], rgb(c, "emission"), rgb(c, "radiance"), valid)
 
-    def directions(self, view: View) -> np.ndarray:
-        """(H, W, 3) world directions through pixel centres, scaled so that point = origin + z-depth * direction."""
-        from iif_core.camera.pinhole import pixel_directions
-
-        return pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
-
     def points(self, view: View, depth: np.ndarray) -> np.ndarray:
-        """(H, W, 3) float32 surface points; meaningless where depth is 0."""
+        """Return (H, W, 3) float32 surface points in metres; they mean nothing where the depth is 0."""
         origin = view.world_from_camera[:3, 3]
-        return (origin + depth[..., None] * self.directions(view)).astype(np.float32)
+        return (origin + depth[..., None] * view.directions()).astype(np.float32)

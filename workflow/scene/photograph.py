@@ -1,4 +1,4 @@
-"""What a model trained on photographs gets to see of a view: a picture in [0, 1], without holes."""
+"""The picture of a view that a model trained on photographs receives: values in [0, 1], without holes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from iif_core.numerics.filters import fill_from_neighbours
 from workflow.scene.normal_form import CaptureReader, View
 
 GAMMA = 2.2
-"""Stands for the unknown inverse response of an LDR photograph, as in the reference's prior (METHOD 1.3)."""
+"""Power that stands for the unknown inverse response of an LDR photograph (Eq. P.17)."""
 
 
-def seen(view: View, capture: CaptureReader, linear: bool) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1], linear or encoded for display; pixels that do not count take their neighbours' colour.
+def picture_for_model(view: View, capture: CaptureReader, linear: bool) -> np.ndarray:
+    """Return (H, W, 3) float32 in [0, 1], linear or encoded for display (Eq. P.17).
 
-    LDR photographs are display-encoded already and are made linear by the power 2.2; radiance is exposed to a log-average of
-    0.18 first and cut at 1.
+    LDR photographs are display-encoded already and become linear by the power 2.2. Radiance is exposed to a log-average of 0.18
+    and clipped at 1. Pixels that are not valid take the colour of their neighbours.
     """
     photo, valid = capture.photo(view)
     if capture.is_hdr:

@@ -1,4 +1,4 @@
-"""The recovered scene put together from what the stages found; render, export and report start from it."""
+"""The recovered scene, assembled from the artefacts of several stages; render, export and report start from it."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from iif_core.camera.response import Response, response, sampled_response
 from iif_core.errors import InputError
-from iif_core.fitting.problem import apply_affines
+from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import MATERIAL, BaseScene, Light, read_base_scene, read_light
+from workflow.scene.base_scene import BaseScene, Light, read_base_scene, read_light
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """Geometry, fitted materials and light; ids int32 with -1 = none, lengths in metres, colours linear.
+    """Geometry, fitted materials and light; ids are int32 with -1 = none, lengths metres, colours linear.
 
     Attributes:
         surface: mesh and cells with the *fitted* materials.
@@ -25,7 +25,7 @@ class Recovered:
         light: per face, with the light scale.
         emitter_id: (m,) kept emitter of each face.
         emitter_radiance: (emitters, 3) per emitter id, with the light scale; 0 for dropped ones and environments.
-        light_scale: what the radiance of stage emission is multiplied by to go with the fitted albedo.
+        light_scale: factor on the radiance of stage emission that makes it consistent with the fitted albedo.
     """
 
     surface: BaseScene
@@ -37,7 +37,7 @@ class Recovered:
     light_scale: float
 
     def emission_map(self, face_id: np.ndarray, eye: np.ndarray) -> np.ndarray:
-        """(H, W, 3) float32 radiance that the seen faces emit towards `eye` (3,); `face_id` (H, W), -1 = miss."""
+        """Return the radiance (H, W, 3) float32 that the faces `face_id` (H, W), -1 = miss, emit towards `eye` (3,)."""
         first = self.surface.vertices[self.surface.faces[:, 0]].astype(np.float64)
         facing = np.sign(np.einsum("ij,ij->i", self.surface.normals, np.asarray(eye, np.float64) - first))
         emits = (self.light.side == 0) | (self.light.side == facing)
@@ -46,7 +46,11 @@ class Recovered:
 
 
 def read_recovered(job: Job) -> Recovered:
-    """The scene as stage affines left it. Needs capture, segmentation, base, emission and affines upstream."""
+    """Read the scene that stage affines wrote; the job needs capture, segmentation, base, emission and affines upstream.
+
+    Raises:
+        InputError: the cells of affines are not those of base.
+    """
     base = read_base_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
     objects = job.read("segmentation").table("objects.parquet")
@@ -63,7 +67,7 @@ def read_recovered(job: Job) -> Recovered:
     if base.n_objects:
         each = np.arange(base.n_objects)
         object_values = apply_affines(read_affines(affines, base.n_objects), each, object_values).astype(np.float32)
-    cell_values = np.stack([fitted[name] for name in MATERIAL], 1).astype(np.float32)
+    cell_values = np.stack([fitted[name] for name in CHANNELS], 1).astype(np.float32)
     scale = float(affines.json("affines.json").get("light_scale", 1.0)) if affines.has("affines.json") else 1.0
     light = read_light(job, len(base.faces))
     light = replace(light, radiance=light.radiance * np.float32(scale), environment=light.environment * np.float32(scale))
@@ -85,9 +89,9 @@ def read_recovered(job: Job) -> Recovered:
 
 
 def read_affines(reader: StageReader, n_objects: int) -> np.ndarray:
-    """(objects, 16) float64 [T_albedo row by row, T_roughness, T_metallic]; identity where the table has no row."""
+    """Read (objects, 16) float64 [T_albedo row by row, T_roughness, T_metallic]; identity where the table has no row."""
     table = reader.table("objects.parquet")
-    out = np.tile(np.r_[np.eye(3, 4).ravel(), 1.0, 0.0, 1.0, 0.0], (n_objects, 1))
+    out = np.tile(IDENTITY, (n_objects, 1))
     out[table["object_id"]] = np.concatenate([table[name] for name in ("T_albedo", "T_roughness", "T_metallic")], 1)
     return out
 
@@ -96,7 +100,7 @@ RESPONSE_SAMPLES = 101
 
 
 def write_response(job: Job, curve: Response) -> None:
-    """camera_response.parquet: parameters (x = 0) and samples of f on [0, 1] for each channel."""
+    """Write camera_response.parquet: parameters (x = 0) and samples of f on [0, 1] for each channel."""
     x = np.linspace(0.0, 1.0, RESPONSE_SAMPLES)
     rows: list[tuple[str, str, str, float, float]] = []
     for number, channel in enumerate("RGB"):
@@ -108,7 +112,7 @@ def write_response(job: Job, curve: Response) -> None:
 
 
 def read_response(reader: StageReader) -> Response:
-    """The camera response that stage affines found, from its samples; identity when it wrote none (HDR)."""
+    """Read the camera response that stage affines estimated, from its samples; identity when it wrote none (HDR)."""
     name = "camera_response.parquet"
     if not reader.has(name):
         return response("identity")
@@ -117,7 +121,11 @@ def read_response(reader: StageReader) -> Response:
 
 
 def response_samples(table: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """x (S,) and f(x) (3, S), channels R G B, of a camera_response table; empty when it holds parameters only."""
+    """Return x (S,) and f(x) (3, S), channels R G B, of a camera_response table; empty when it holds parameters only.
+
+    Raises:
+        InputError: the channels are sampled at different x.
+    """
     rows = np.flatnonzero((table["kind"] == "sample") & (table["x"] >= 0) & (table["x"] <= 1))
     if not len(rows):
         return np.zeros(0), np.zeros((3, 0))

@@ -1,4 +1,4 @@
-"""`affines.response: {file: ...}`: a measured camera response, checked before any job starts."""
+"""`affines.response: {file: ...}`: a measured camera response, which is checked before any job starts."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 
 from iif_core.camera.response import Response, sampled_response
 from iif_core.errors import InputError
+from workflow.settings.names import did_you_mean_path
 
 COLUMNS = ("x", "R", "G", "B")
 FALL = 1e-3
-"""Of the range: measured curves may fall by this much (noise, rounding); it is flattened. More is refused."""
+"""Share of the range by which a measured curve may fall because of noise or rounding; such falls are flattened."""
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """The file that a scene's settings name, if any; read once, so that a bad one stops before any job."""
+    """Return the file that the settings of a scene name, if any, after reading it once to refuse an unusable one."""
     setting = document["affines"]["response"]
     if not isinstance(setting, dict):
         return []
@@ -25,14 +26,15 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 
 def read_response_file(path: Path) -> Response:
-    """The curve (3 channels), scaled to f(0) = 0 and f(1) = 1.
+    """Read a curve of three channels and scale it to f(0) = 0 and f(1) = 1.
 
     Raises:
         InputError: no such file, unknown kind, missing columns, values that are not finite, outside [0, 1] or falling,
             x that does not rise from 0 to 1.
     """
     if not path.is_file():
-        raise InputError(f"affines.response.file: {path}: not found; a path counts from the folder of the Snakefile")
+        hint = did_you_mean_path(path)
+        raise InputError(f"affines.response.file: {path}: not found; a path counts from the folder that Snakemake runs in.{hint}")
     readers = {".csv": _csv, ".parquet": _parquet, ".npy": _npy}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a response is .csv, .parquet (columns x, R, G, B) or .npy (3, samples)")

@@ -1,4 +1,4 @@
-"""Scores that need no truth (docs/real-scenes.md): shading left in albedo, distance between the views of one surface."""
+"""Scores without truth: shading left in albedo, and agreement of views (docs/method/evaluation.md#scores-without-truth)."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.scores import prediction_numbers
 
 EVERY_VIEW = "all"
-"""What stands in column `view` of scores over all views together."""
+"""Value of the column `view` for scores over all views together."""
 DARK = 0.02
-"""Pixels with less than this share of the median light are left out: light and albedo are noise there."""
+"""Share of the median light below which pixels are left out, because light and albedo are noise there."""
 
 
 def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, str, str, list[Score]]]:
-    """(variant, view, quantity, scores) of `result`, `base`, `prior_k0` and the mean of the scores of every prediction.
+    """Score the albedo of `result`, `base` and `prior_k0`, and the mean of the scores of all predictions (`prior_mean_k`).
 
-    Light: the diffuse light of stage shading (mean of its halves) at interior pixels of surface that does not shine, in the
-    views that were used; surface cells: of its edge.
+    The light is the diffuse light of stage shading (mean of its halves) at interior pixels of surface that does not emit, in the
+    views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
     """
     vertices, faces = capture.mesh()
     emits = read_light(job, len(faces)).emits
@@ -67,7 +67,7 @@ def _scores(left: ShadingLeft, spread: ViewSpread) -> list[Score]:
 
 
 def _light(job: Job, capture: CaptureReader, view: View, emits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(H, W, 3) diffuse light; (H, W) which pixels count; (H, W) object."""
+    """Diffuse light (H, W, 3), which pixels count (H, W), and object (H, W)."""
     file = f"maps/{view.name}.exr"
     channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
     light = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))

@@ -1,4 +1,4 @@
-"""Scores of the material maps of views against ground truth: what the stages metrics and base_scores share."""
+"""Scores of the material maps of views against ground truth, for the stages metrics and base_scores."""
 
 from __future__ import annotations
 
@@ -10,25 +10,32 @@ from typing import Any
 import numpy as np
 
 from iif_core.evaluation import metrics
+from iif_core.evaluation.catalogue import PROTOCOLS
 from iif_core.evaluation.lpips import Weights
-from iif_core.fusion.problem import CHANNELS
-from iif_core.fusion.uncertainty import CALIBRATION, LEVELS, SMALLEST, coverage, gauge_free_error
+from iif_core.evaluation.metrics import Score
+from iif_core.fusion.uncertainty import CALIBRATION, MIN_OBJECT_CELLS, NOMINAL_COVERAGES, coverage, gauge_free_error
+from iif_core.reflectance.material import CHANNELS
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.models.lpips import lpips_weights
 from workflow.scene.normal_form import CaptureReader, Truth, View
 
-MATERIALS = ("albedo", "roughness", "metallic")
 UNITS = {"value": "l2: squared; psnr: dB; coverage: share of cells"}
 
 
 @dataclass
 class ScoreRows:
-    """Columns of a table of scores, in order of arrival, and the scores that could not be computed."""
+    """Columns of a table of scores in order of arrival, and the scores that could not be computed."""
 
     columns: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
     missing: list[dict[str, str]] = field(default_factory=list)
 
-    def add(self, variant: str, view: str, quantity: str, scores: list[metrics.Score]) -> None:
+    def add(self, variant: str, view: str, quantity: str, scores: list[Score]) -> None:
+        """Add the scores of one quantity.
+
+        Args:
+            variant, view, quantity: values of the columns.
+            scores: scores without a value go to `missing`.
+        """
         for score in scores:
             facts = {"variant": variant, "view": view, "quantity": quantity, "metric": score.metric}
             facts["protocol"] = score.protocol
@@ -40,7 +47,7 @@ class ScoreRows:
             self.columns["value"].append(score.value)
 
     def table(self, scene: str, variants: set[str] | None = None) -> dict[str, Any]:
-        """Columns scene, view, quantity, metric, protocol, variant (unless some are chosen), value."""
+        """Return the columns scene, view, quantity, metric, protocol, variant (unless some are chosen), value."""
         chosen = [i for i, v in enumerate(self.columns["variant"]) if variants is None or v in variants]
         names = ["view", "quantity", "metric", "protocol"] + ([] if variants else ["variant"])
         out: dict[str, Any] = {"scene": np.array([scene] * len(chosen), object)}
@@ -49,7 +56,7 @@ class ScoreRows:
         return out
 
     def means(self) -> dict[str, Any]:
-        """variant -> quantity -> protocol -> metric -> {mean over views, number of views}."""
+        """Return variant -> quantity -> protocol -> metric -> {mean over views, number of views}."""
         sums: dict[tuple[str, ...], list[float]] = defaultdict(list)
         for i, value in enumerate(self.columns["value"]):
             sums[tuple(self.columns[c][i] for c in ("variant", "quantity", "protocol", "metric"))].append(value)
@@ -62,7 +69,7 @@ class ScoreRows:
 
 @dataclass(frozen=True)
 class MaterialTruth:
-    """What the material maps of a view are compared with."""
+    """True material maps of a view, prepared for scoring."""
 
     truth: Truth
     targets: dict[str, metrics.Target]  # by quantity
@@ -74,9 +81,19 @@ class MaterialTruth:
         maps: dict[str, np.ndarray],
         quantity: str,
         only: Iterable[str] | None = None,
-        perceptual: Container[str] = metrics.PROTOCOLS,
-    ) -> list[metrics.Score]:
-        """Every score of one quantity (or the `only` ones) under every protocol; FLIP and LPIPS under `perceptual`."""
+        perceptual: Container[str] = PROTOCOLS,
+    ) -> list[Score]:
+        """Score one quantity under every protocol.
+
+        Args:
+            maps: quantity -> predicted map.
+            quantity: `albedo`, `roughness` or `metallic`.
+            only: metrics; all of the quantity if None.
+            perceptual: protocols under which FLIP and LPIPS are computed.
+
+        Returns:
+            Scores in the order of the protocols.
+        """
         return self.targets[quantity].scores(maps[quantity], only, perceptual)
 
 
@@ -86,7 +103,16 @@ def material_truth(
     view: View,
     networks: Mapping[str, Mapping[str, Weights]] | None = None,
 ) -> MaterialTruth:
-    """Targets, masks and objects of a view of a capture that has truth; `networks`: quantity -> what LPIPS is scored with."""
+    """Read targets, masks and objects of a view of a capture that has truth.
+
+    Args:
+        capture, segmentation: results of these stages.
+        view: the view.
+        networks: quantity -> networks of LPIPS that it is scored with.
+
+    Returns:
+        Truth of the view.
+    """
     truth = capture.truth(view)
     _, face_id = capture.gbuffer(view)
     masks = metrics.material_masks(truth.valid, face_id >= 0, truth.emission, truth.roughness)
@@ -100,12 +126,12 @@ def material_truth(
 
 
 def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
-    """Numbers k of the predictions in the channels of one view."""
+    """Return the numbers k of the predictions in the channels of one view."""
     return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
 
 
 def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
-    """albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
+    """Return albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
     return {
         "albedo": rgb(channels, f"{prefix}albedo"),
         "roughness": channels[f"{prefix}roughness"].astype(np.float32),
@@ -114,10 +140,10 @@ def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str
 
 
 def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:
-    """Weights of LPIPS for a stage that scores its views in threads of its own: torch gets one thread in each."""
+    """Read the weights of LPIPS, and limit torch to one thread, because stages score several views in threads of their own."""
     import torch
 
-    torch.set_num_threads(1)  # a convolution's last bits depend on how many threads share it
+    torch.set_num_threads(1)  # the last bits of a convolution depend on the number of threads
     weights = lpips_weights(with_vgg)
     return {name: {part: np.asarray(array, np.float32) for part, array in parts.items()} for name, parts in weights.items()}
 
@@ -126,7 +152,7 @@ _CHANNELS_OF = {"albedo": CHANNELS[:3], "roughness": CHANNELS[3:4], "metallic": 
 
 
 def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageReader) -> dict[str, np.ndarray]:
-    """Mean truth of every cell: quantity -> (cells, channels) float64, NaN where no pixel of the cell counts."""
+    """Compute the mean truth of every cell: quantity -> (cells, channels) float64, NaN where no pixel of the cell counts."""
     n = len(base.table("cells.parquet")["cell_id"])
     sums = {quantity: np.zeros((n, 1 + len(names))) for quantity, names in _CHANNELS_OF.items()}
     for view in capture.views:
@@ -146,26 +172,25 @@ def cell_truth(capture: CaptureReader, segmentation: StageReader, base: StageRea
 
 def interval_scores(
     cells: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray], predictions: int
-) -> Iterator[tuple[str, list[metrics.Score]]]:
-    """Share of the surface cells whose error lies within the interval that the base claims, at 50, 80 and 95 %.
+) -> Iterator[tuple[str, list[Score]]]:
+    """Compute the share of the cells whose error lies within the interval that the base claims (Eq. E.11 to E.13).
 
-    The columns `uncertainty_*` are standard deviations of the error that is left when each object's truth is mapped to the base
-    by its nearest affine, over all views together (iif_core.fusion.uncertainty): protocol `oracle_affine`. `raw` is the same
-    without the affine, which no such scale can know. Objects of few cells are left out (their affine follows the errors).
-
-    `psnr_3d` is over cells, with one affine per object for all views together: unlike the score of each
-    view it sees levels that differ from view to view.
+    The columns `uncertainty_*` are standard deviations of the error that remains when each object's truth is mapped to the base
+    by its nearest affine, over all views together: protocol `oracle_affine`. Protocol `raw` does without the affine, whose error
+    these columns cannot contain. Objects of few cells are left out, because their affine follows the errors. `psnr_3d` is
+    computed over cells with one affine per object for all views; unlike the scores of single views it includes levels that differ
+    between views.
 
     Args:
         cells: table base/cells.parquet; truth: of `cell_truth`; predictions: K.
     """
     for quantity, names in _CHANNELS_OF.items():
-        labels = [f"coverage_{round(100 * level)}" for level in LEVELS]
+        labels = [f"coverage_{round(100 * level)}" for level in NOMINAL_COVERAGES]
         known = np.isfinite(truth[quantity]).all(1) & (cells["coverage"] > 0)
         of_object = np.bincount(cells["object_id"][known], minlength=int(cells["object_id"].max(initial=0)) + 1)
-        known &= of_object[cells["object_id"]] >= SMALLEST
+        known &= of_object[cells["object_id"]] >= MIN_OBJECT_CELLS
         if not known.any():
-            yield quantity, [metrics.Score(name, "raw", None, "no cell counts") for name in labels]
+            yield quantity, [Score(name, "raw", None, "no cell counts") for name in labels]
             continue
         target = truth[quantity][known]
         value, claimed = (
@@ -173,17 +198,8 @@ def interval_scores(
         )
         errors = {"raw": value - target, "oracle_affine": gauge_free_error(value, target, cells["object_id"][known])}
         fitted = gauge_free_error(target, value, cells["object_id"][known])
-        whole = metrics.Score("psnr_3d", "oracle_affine", float(-10 * np.log10(max(np.mean(fitted**2), 1e-10))))
-        yield (
-            quantity,
-            [
-                whole,
-                *(
-                    metrics.Score(name, protocol, share)
-                    for protocol, error in errors.items()
-                    for name, share in zip(
-                        labels, coverage(error, claimed, float(CALIBRATION[quantity].beta(predictions))), strict=True
-                    )
-                ),
-            ],
-        )
+        whole = Score("psnr_3d", "oracle_affine", float(-10 * np.log10(max(np.mean(fitted**2), 1e-10))))
+        beta = float(CALIBRATION[quantity].beta(predictions))
+        within = {protocol: coverage(error, claimed, beta) for protocol, error in errors.items()}
+        shares = [Score(m, protocol, share) for protocol, found in within.items() for m, share in zip(labels, found, strict=True)]
+        yield quantity, [whole, *shares]

@@ -1,13 +1,15 @@
-"""Which face belongs to which object: one module a kind, chosen by `segmentation: {kind: ...}`.
+"""Assigns faces to objects: one plug-in module per kind, chosen by `segmentation: {kind: ...}`.
 
-Each has
+A plug-in is a module `workflow/segmentations/<kind>.py` with
 
     segment(surface, settings, fold) -> Objects
+    PERTURBED                            what the perturbed runs change, in words
+    perturbs(surface) -> bool            whether they change anything
 
-`surface` is what all kinds read (workflow/segmentations/surface.py), `settings` what stage segmentation sees. `fold` is None
-for the result, and 0 ... FOLDS - 1 for the perturbed runs that its stability is measured by: the photographs of that fold
-are left out (`Surface.views`). A kind that reads files from outside also has `raw_inputs(document) -> list[Path]`, called
-while Snakemake plans; it names what is missing. One that has something to make once, before all runs, has `prepare(job,
-surface)`. `PERTURBED` says in words what the runs change, `perturbs(surface)` whether
-they change anything.
+`surface` holds mesh and photographs (workflow/segmentations/surface.py), and `settings` are the sections that stage segmentation
+reads. `fold` is None for the result, and 0 ... FOLDS - 1 for the perturbed runs that measure its stability; they leave out the
+photographs of that fold (`Surface.views`). Two functions are optional:
+
+    raw_inputs(document) -> list[Path]   files from outside that it reads; called while Snakemake plans, refuses missing files
+    prepare(job, surface)                called once before all runs
 """

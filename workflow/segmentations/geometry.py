@@ -1,4 +1,4 @@
-"""Segmentation `geometry`: pieces of the mesh, by Felzenszwalb's method on bend and, weakly, colour."""
+"""Segmentation `geometry`: pieces of the mesh by Felzenszwalb and Huttenlocher's method (docs/method/objects.md#geometry)."""
 
 from __future__ import annotations
 
@@ -11,24 +11,23 @@ from workflow.segmentations.surface import FOLDS, Objects, Surface
 
 PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"
 
-COLOUR_ROUNDS = 3
-"""Steps over the mesh by which a face that no pixel saw borrows colour."""
+COLOUR_ROUNDS = 3  # steps across the mesh over which a face that no pixel sees takes its colour
 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
-    """Every piece is an object."""
+    """Make every piece an object."""
     labels = pieces(surface, settings.segmentation, fold)
     names = [f"piece {i}" for i in range(int(labels.max()) + 1)]
     return Objects(labels, names, np.ones(len(names)), {})
 
 
 def perturbs(surface: Surface) -> bool:
-    """Always."""
+    """Return True: every run changes scale and colours."""
     return True
 
 
 def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> np.ndarray:
-    """(m,) int32 piece of every face, from 0; fold 0 ... FOLDS - 1: as `PERTURBED` says."""
+    """Return the piece of every face, (m,) int32 from 0; with `fold` as `PERTURBED` says."""
     scale = own.scale if fold is None else own.scale * 2 ** (0.5 * (fold - FOLDS // 2))
     colour = None
     if own.colour > 0:
@@ -38,10 +37,10 @@ def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> n
 
 
 def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(m, 3) mean colour of the pixels that see a face, roughly in [0, 1], and (m,) how many do.
+    """Return the mean colour (m, 3) of the pixels that see each face, roughly in [0, 1], and their number (m,).
 
-    Sensor values are divided by exposure^0.45 (what a usual response makes of it), radiance L is shown as
-    L / (L + mean of its view): a weak hint is all that is asked of colour.
+    Sensor values are divided by exposure^0.45, as a usual response suggests; radiance L becomes L / (L + mean of its view).
+    Both are rough, because colour has little weight in the segmentation.
     """
     capture, count = surface.capture, len(surface.faces)
     total, pixels = np.zeros((count, 3)), np.zeros(count)

@@ -1,4 +1,4 @@
-"""Segmentation `given`: ids of the mesh's faces, else ids in the views by the majority of the pixels that see a face."""
+"""Segmentation `given`: ids of the mesh's faces, else a majority vote of the ids in the views (Eq. O.3)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ PERTURBED = "every third photograph's ids left out"
 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
-    """Faces without an id form one object `unlabelled`; so do faces that no vote reaches. Objects that no view sees stay.
+    """Return the given objects, also those that no view sees; faces without an id and without votes form one, `unlabelled`.
 
     Raises:
-        InputError: no ids.
+        InputError: the capture has no ids.
     """
     instance = surface.capture.faces()["instance_id"]
     return _by_face(surface, instance) if (instance >= 0).any() else _by_view(surface, fold)
 
 
 def perturbs(surface: Surface) -> bool:
-    """Ids of faces are taken as they are; those of views vote."""
+    """Return whether the ids come from the views, whose votes the runs change."""
     return not (surface.capture.faces()["instance_id"] >= 0).any()
 
 
@@ -34,7 +34,7 @@ def _by_face(surface: Surface, instance: np.ndarray) -> Objects:
         table = surface.capture.reader.table("instances.parquet")
         names = dict(zip(table["instance_id"].tolist(), table["name"].tolist(), strict=True))
     ids, labels = np.unique(instance, return_inverse=True)
-    # np.unique puts -1 first: roll it to the end so that given objects keep their order.
+    # np.unique puts -1 first; it moves to the end so that the given objects keep their order.
     unlabelled = int(ids[0] < 0)
     labels = (labels.ravel() - unlabelled) % len(ids)
     texts = [str(names.get(i, f"instance {i}")) for i in ids[unlabelled:].tolist()] + ["unlabelled"] * unlabelled
@@ -51,7 +51,7 @@ def _by_view(surface: Surface, fold: int | None) -> Objects:
     if not face_ids:
         raise InputError(
             "`segmentation: {kind: given}`, but the capture has no instance ids, neither of faces nor of views;"
-            " give `instances/<view>.png` or an `instance` property of the mesh's faces (docs/own-data.md),"
+            " give `instances/<view>.png` or an `instance` property of the mesh's faces (docs/guide/own-data.md),"
             " or set `segmentation: {kind: geometry}`"
         )
     face, instance = np.concatenate(face_ids), np.concatenate(instance_ids)

@@ -1,7 +1,8 @@
-"""Mask files: `masks/<view>.png|exr` label maps, or `masks/<view>/*.png` binary masks that may overlap (docs/segmentation.md).
+"""Reads mask files (docs/guide/segmentation.md).
 
-Masks belong to the photographs as they lie in the folder, at their size or any other of that shape; lens distortion is
-undone here as it is for the photographs. 0 is no mask.
+A view has a label map `masks/<view>.png|exr`, or binary masks `masks/<view>/*.png` that may overlap. Masks belong to the
+photographs as they are stored, at any size of the same aspect ratio; lens distortion is removed as it is from the photographs.
+0 is no mask.
 """
 
 from __future__ import annotations
@@ -18,19 +19,20 @@ from iif_core.camera.distortion import Distortion, Pinhole, distort
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import images
 
-SHAPE_TOLERANCE = 0.02
-"""Largest relative difference of aspect ratio that still counts as the same picture (models round to 8 or 64)."""
+ASPECT_TOLERANCE = 0.02
+"""Largest relative difference of aspect ratio between masks of the same picture (models round sizes to multiples of 8 or 64)."""
 
 MAPS = (".png", ".exr")
 PHOTOGRAPHED = ("folder", "scannetpp", "fipt")
-"""Sources of photographs that lie in a folder, perhaps distorted or turned."""
+"""Sources whose photographs are files, which may be distorted or turned."""
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """Geometry of a stored photograph: masks are pictures of its shape. turn: EXIF orientation that makes it upright."""
+    """Camera, lens and EXIF orientation of a stored photograph, which its masks share."""
 
     camera: Pinhole
     lens: Distortion | None = None
@@ -39,7 +41,14 @@ class Photograph:
 
 @dataclass(frozen=True)
 class MaskFiles:
-    """folder; of every view with masks its label map (one file) or its binary masks (several); its photograph, if known."""
+    """The mask files of a scene.
+
+    Attributes:
+        folder: that holds them.
+        maps: name of a view -> its label map.
+        binary: name of a view -> its binary masks.
+        photographs: name of a view -> its photograph; empty for sources that have no photographs in files.
+    """
 
     folder: Path
     maps: dict[str, Path]
@@ -47,14 +56,15 @@ class MaskFiles:
     photographs: dict[str, Photograph]
 
     def files(self) -> list[Path]:
+        """List all files."""
         return [*self.maps.values(), *(path for paths in self.binary.values() for path in paths)]
 
     @staticmethod
     def of_capture(settings: SimpleNamespace, capture: CaptureReader) -> MaskFiles:
-        """The same, checked against the views that there are.
+        """Find the mask files and check them against the views of the capture.
 
         Raises:
-            InputError: names of no view (sources whose views are known only now), no masks for the views taken.
+            InputError: names that no view has, or no masks for the views of the capture.
         """
         found = mask_files(vars(settings.segmentation), vars(settings.source), vars(settings.capture))
         views = {view.name for view in capture}
@@ -65,14 +75,14 @@ class MaskFiles:
         return found
 
     def labels(self, view: View) -> np.ndarray:
-        """(H, W) int32 label of every pixel of the view, 0 = no mask; all 0 for a view without masks.
+        """Return the labels (H, W) int32 of the pixels of a view, 0 = no mask; all 0 for a view without masks.
 
         Raises:
-            InputError: a picture of another shape, in colour, or with ids between integers.
+            InputError: a picture of another aspect ratio, in colour, or with ids between integers.
         """
         camera = Pinhole(view.fx, view.fy, view.cx, view.cy, view.width, view.height)
         photograph = self.photographs.get(view.name, Photograph(camera))
-        # Without a lens the view is the photograph, pixel for pixel, also where its intrinsics were corrected.
+        # Without distortion, pixels of the view are pixels of the photograph, even where its intrinsics were corrected.
         straight = photograph.lens is None or photograph.lens.is_identity
         sampled = replace(photograph, camera=camera) if straight else photograph
         if view.name in self.maps:
@@ -93,7 +103,13 @@ class MaskFiles:
 
 
 def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, Any]) -> MaskFiles:
-    """The mask files of a scene, checked by names and headers.
+    """Find the mask files of a scene and check their names and headers.
+
+    Args:
+        own, source, capture: the dumped settings sections `segmentation`, `source` and `capture`.
+
+    Returns:
+        The files of the views that the capture uses.
 
     Raises:
         InputError: see `raw_inputs` of segmentation `masks`.
@@ -126,7 +142,7 @@ def _folder(path: str | Path | None, source: str | Path | None) -> Path:
         raise InputError(
             f"{folder}: not found; `segmentation: {{kind: masks}}` reads masks/<view>.png or masks/<view>/<n>.png there"
             " (set `segmentation.path` to the folder that holds masks/). Masks come from any tool, such as SAM 2; without"
-            " any: `segmentation: {kind: geometry}`"
+            f" any: `segmentation: {{kind: geometry}}`.{did_you_mean_path(folder)}"
         )
     return folder
 
@@ -166,7 +182,7 @@ def _refuse_unknown(folder: Path, found: set[str], views: set[str]) -> None:
 
 
 def _turn(path: Path, size: tuple[int, int], photograph: Photograph) -> int:
-    """EXIF turn that the mask needs, by its shape; another picture is refused."""
+    """Return the EXIF turn that a mask needs, judged by its shape, and refuse masks of another picture."""
     camera, turn = photograph.camera, photograph.turn
     upright = _same_shape(size, (camera.width, camera.height))
     stored = (camera.height, camera.width) if turn >= 5 else (camera.width, camera.height)
@@ -185,11 +201,11 @@ def _turn(path: Path, size: tuple[int, int], photograph: Photograph) -> int:
 
 
 def _same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= SHAPE_TOLERANCE
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= ASPECT_TOLERANCE
 
 
 def _sampled(picture: np.ndarray, photograph: Photograph, target: Pinhole) -> np.ndarray:
-    """(H, W) value of the nearest pixel of a picture of the photograph's shape, as the `target` camera sees it; 0 outside."""
+    """Sample a picture of the photograph's shape at the nearest pixels, as the `target` camera sees it, (H, W); 0 outside."""
     x = (np.arange(target.width) + 0.5 - target.cx) / target.fx
     y = (np.arange(target.height) + 0.5 - target.cy) / target.fy
     at, unique = np.stack(np.broadcast_arrays(x[None, :], y[:, None]), -1), True

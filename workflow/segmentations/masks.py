@@ -1,4 +1,4 @@
-"""Segmentation `masks`: 2D masks of any tool, clustered across the views by view consensus (docs/segmentation.md)."""
+"""Segmentation `masks`: 2D masks of any tool, clustered across the views by view consensus (docs/method/objects.md#masks)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import ConsensusOptions, MaskPoints, cluster_masks, gather_masks, masks_at
-from iif_core.objects.mask_votes import join_together, joined, keep_together, label_faces, sightings, view_votes
+from iif_core.objects.mask_votes import join_objects, label_faces, merge_votes, part_objects, sightings, view_votes
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from iif_core.surface.segments import fill_within
 from workflow.runtime.job import Job
@@ -23,22 +23,18 @@ from workflow.segmentations.surface import Objects, Surface
 
 PERTURBED = "every third photograph and its masks left out"
 
-POINT_FOOTPRINTS = 2.0
-"""Edge of the voxels that stand for the surface, in median pixel footprints."""
-
-GAP = 0.1
-"""Parts of a cluster further apart than about this (metres; at least GAP_POINTS voxels) are different objects."""
-
-GAP_POINTS = 3.0
+POINT_FOOTPRINTS = 2.0  # edge of the voxels that sample the surface, in median pixel footprints
+GAP, GAP_VOXELS = 0.1, 3.0
+"""Parts of a cluster further apart than about this distance (metres, but at least that many voxels) are different objects."""
 
 Load = Callable[[View], np.ndarray]
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Every mask file that this scene reads, or the files of the model that makes them.
+    """List every mask file that a scene reads, or the files of the model that makes the masks.
 
     Raises:
-        InputError: no folder, nothing in it, names that are no view's, sizes that are not the photographs'; no such model.
+        InputError: no folder, an empty one, names that no view has, sizes that no photograph has; no such model.
     """
     if document["segmentation"]["sam2"] is not None:
         return sam2.raw_inputs(document["segmentation"]["sam2"])
@@ -46,13 +42,13 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 
 def prepare(job: Job, surface: Surface) -> None:
-    """Let the model make the masks that the settings ask it for."""
+    """Make the masks with the model, if the settings name one."""
     if job.settings.segmentation.sam2 is not None:
         surface.kept["labels"] = sam2.label_maps(job, surface.capture)
 
 
 def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None) -> Objects:
-    """Objects from the masks; where there are none, pieces of the mesh."""
+    """Make objects of the masks, and of pieces of the mesh where there are no masks."""
     own = settings.segmentation
     files = None if own.sam2 is not None else MaskFiles.of_capture(settings, surface.capture)
     options = ConsensusOptions(own.visible, own.contained, own.split, own.consensus, own.min_points)
@@ -70,12 +66,26 @@ def segment(surface: Surface, settings: SimpleNamespace, fold: int | None = None
 
 
 def perturbs(surface: Surface) -> bool:
-    """Always."""
+    """Return True: every run leaves out photographs and masks."""
     return True
 
 
 def cluster_views(surface: Surface, views: list[View], load: Load, options: ConsensusOptions, piece: np.ndarray) -> Objects:
-    """Objects from the label maps `load(view)` (H, W) int, 0 = no mask; `piece` (m,) of the mesh settles the rest."""
+    """Make objects of the label maps of views (Eq. O.8 to O.17).
+
+    Args:
+        surface: mesh and photographs.
+        views: to use.
+        load: view -> (H, W) int label map, 0 = no mask.
+        options: of the clustering.
+        piece: (m,) piece of the mesh of every face; decides where no mask does.
+
+    Returns:
+        The objects.
+
+    Raises:
+        InputError: no mask covers enough surface points.
+    """
     capture = surface.capture
     edge = POINT_FOOTPRINTS * _footprint(capture, views)
     points = surface_points(capture, views, edge)
@@ -94,11 +104,11 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
     count, known = int(cluster.max(initial=-1)) + 1, cluster >= 0
     number = np.bincount(cluster[known], minlength=count)
     size = np.bincount(cluster[known], np.asarray(masks.in_mask.sum(1)).ravel()[known], count) / np.maximum(number, 1)
-    votes = joined(_votes(surface, views, load, masks, cluster, max(GAP, GAP_POINTS * edge)))
+    votes = merge_votes(_votes(surface, views, load, masks, cluster, max(GAP, GAP_VOXELS * edge)))
     label, bare, agreeing = label_faces(votes, size, number, piece)
     elected = np.unique(label[label >= 0])
     home = fill_within(label, piece, bare, surface.pairs)
-    label, parted, united = _judged(surface, views, load, home, piece)
+    label, parted, united = _part_and_join(surface, views, load, home, piece)
     label, voted, agreement = _with_origin(label, home, elected, agreeing)
     facts = {
         "masks": len(cluster),
@@ -116,10 +126,17 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
 def _with_origin(
     label: np.ndarray, home: np.ndarray, elected: np.ndarray, agreeing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels (F,) renumbered from 0, and of every object whether masks made it and how far pixels agree (1 where none did).
+    """Renumber labels and find the origin of every object.
 
-    An object that was parted or joined has both from what its faces were elected into: `home` (F,), which is of masks if
-    among `elected`, and then agrees as `agreeing[home]` says; mean over the faces.
+    Args:
+        label: (F,) final objects.
+        home: (F,) objects before the views parted or joined them.
+        elected: those of `home` that come from masks.
+        agreeing: agreement of the pixels for each of `home`.
+
+    Returns:
+        (F,) labels from 0; (objects,) bool, whether masks made the object; (objects,) mean agreement over its faces, 1 without
+        masks.
     """
     label = np.unique(label, return_inverse=True)[1]
     by_masks = np.isin(home, elected)
@@ -127,9 +144,21 @@ def _with_origin(
     return label, np.bincount(label, by_masks) > 0, np.bincount(label, own) / np.bincount(label)
 
 
-def _judged(surface: Surface, views: list[View], load: Load, label: np.ndarray, piece: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Labels of faces with what the views do not hold together as objects of its own, numbered after the others, and what they
-    do as one; how many more and how many fewer objects that made."""
+def _part_and_join(
+    surface: Surface, views: list[View], load: Load, label: np.ndarray, piece: np.ndarray
+) -> tuple[np.ndarray, int, int]:
+    """Part objects that the views see as several and join those that they see as one (docs/method/objects.md#part-and-join).
+
+    Args:
+        surface: mesh and photographs.
+        views: to use.
+        load: view -> (H, W) int label map, 0 = no mask.
+        label: (F,) objects.
+        piece: (F,) pieces of the mesh.
+
+    Returns:
+        (F,) new objects, and the numbers of objects that parting added and joining removed.
+    """
     pieces_in_all = int(piece.max()) + 1
     code, fragment = np.unique(label.astype(np.int64) * pieces_in_all + piece, return_inverse=True)
 
@@ -140,14 +169,14 @@ def _judged(surface: Surface, views: list[View], load: Load, label: np.ndarray, 
 
     seen = sightings(pixels(view) for view in views)
     elected = code // pieces_in_all
-    parted = keep_together(elected, seen)
-    united = join_together(parted, seen)
+    parted = part_objects(elected, seen)
+    united = join_objects(parted, seen)
     before, between, after = (len(np.unique(objects)) for objects in (elected, parted, united))
     return united[fragment], between - before, between - after
 
 
 def surface_points(capture: CaptureReader, views: list[View], edge: float) -> np.ndarray:
-    """(n, 3) float32 photographed surface points, one a voxel of this edge (metres): the first that was seen."""
+    """Return surface points (n, 3) float32 that photographs show, one per voxel of `edge` metres: the first that was seen."""
     keys, points = np.zeros(0, np.uint64), np.zeros((0, 3), np.float32)
     origin = grid_origin(capture.mesh()[0], edge)
     for view in views:
@@ -160,7 +189,7 @@ def surface_points(capture: CaptureReader, views: list[View], edge: float) -> np
 
 
 def _footprint(capture: CaptureReader, views: list[View]) -> float:
-    """Median size of a pixel on the surface, in metres."""
+    """Return the median size of a pixel on the surface, in metres."""
     sizes = []
     for view in views:
         depth = capture.gbuffer(view)[0]

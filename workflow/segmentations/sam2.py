@@ -1,9 +1,9 @@
-"""Masks by SAM 2 (Ravi et al. 2024) for segmentation `masks`, through transformers; the weights are the user's.
+"""Masks by SAM 2 (Ravi et al. 2024) for segmentation `masks`, through transformers; users provide the weights.
 
-A grid of points is put to the model, which answers each with three masks: what it lies on, a part, a part of that. What the
-model trusts and what does not hang on the threshold stays, of nearly equal masks the surest; small masks lie on large ones
-(docs/segmentation.md). transformers' image processor and mask pipeline need torchvision, which the environment does not have;
-what they would do, scaling and the choice of masks, is done here and in `iif_core.objects.mask_proposals`.
+The model receives a grid of points and returns three masks for each: an object, a part of it, and a smaller part. Confident masks
+that do not depend on the exact threshold are kept, and of nearly equal ones the most confident; small masks lie on large ones
+(docs/method/objects.md#proposals). transformers' own image processor and mask pipeline need torchvision, which the environment
+does not have; scaling and selection are therefore done here and in `iif_core.objects.mask_proposals`.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
-from iif_core.objects.mask_proposals import point_grid, suppressed, threshold_stability
+from iif_core.objects.mask_proposals import point_grid, suppress_overlaps, threshold_stability
 from workflow.artifacts.files import read_exr
 from workflow.models.checkpoint import (
     Checkpoint,
     Origin,
-    header,
-    locate,
+    find_checkpoint,
     read_json,
     require_accepted,
     require_device,
     require_packages,
+    tensor_header,
     weights_in,
 )
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scene.photograph import seen
+from workflow.scene.photograph import picture_for_model
 
 ORIGIN = Origin(
     repository="facebook/sam2.1-hiera-large",
@@ -40,28 +40,28 @@ ORIGIN = Origin(
     section="segmentation.sam2",
     index="config.json",
     layout="transformers' layout",
-    page="docs/segmentation.md",
+    page="docs/guide/segmentation.md",
 )
 PACKAGES = ("transformers", "safetensors", "torch")
 KINDS = ("sam2", "sam2_video")
-"""`model_type` of the published checkpoints: the one for video holds the one for pictures."""
+"""`model_type` of the published checkpoints; the one for video contains the one for pictures."""
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet's pictures, by which SAM 2 normalises its input."""
+"""Colours of ImageNet's pictures, with which SAM 2 normalises its input."""
 POINTS_AT_ONCE, MASKS_AT_ONCE = 64, 16
 
 Row = tuple[int, int, int, str]
-"""view_id, masks that the thresholds let through, masks of the view, what went wrong."""
+"""view_id, masks that pass the thresholds, masks of the view, reason for missing masks."""
 
 
 def check(own: dict[str, Any]) -> Checkpoint:
-    """The checkpoint that the settings' section names.
+    """Find and check the checkpoint that the settings section names.
 
     Raises:
-        InputError: a package, the folder or a file of it missing; another model or revision; licence not accepted.
+        InputError: a package, the folder or one of its files is missing; another model or revision; licence not accepted.
     """
     require_packages("`segmentation: {kind: masks, sam2: {...}}`", PACKAGES)
     require_device(own["device"], ORIGIN)
-    folder, revision = locate(own["checkpoint"], own["revision"], ORIGIN)
+    folder, revision = find_checkpoint(own["checkpoint"], own["revision"], ORIGIN)
     config = read_json(folder / "config.json", ORIGIN)
     if config.get("model_type") not in KINDS:
         raise InputError(
@@ -69,13 +69,13 @@ def check(own: dict[str, Any]) -> Checkpoint:
             f" model. {ORIGIN.repository} and its smaller versions are meant"
         )
     weights = weights_in(folder, "model")
-    header(weights)
+    tensor_header(weights)
     require_accepted(own["accept_license"], folder, ORIGIN)
     return Checkpoint(folder, revision, config, {"": weights}, (folder / "config.json", weights))
 
 
 def raw_inputs(own: dict[str, Any]) -> list[Path]:
-    """The files of the checkpoint, checked; raises InputError."""
+    """Check the checkpoint and list its files; raises InputError."""
     return list(check(own).files)
 
 
@@ -83,23 +83,25 @@ class Generator:
     """The loaded model, float32."""
 
     def __init__(self, own: SimpleNamespace):
-        """`own`: the settings' section; its checkpoint is checked again."""
-        from workflow.models.loading import device_named, network, quiet
+        """Load the model of the settings section `own`, whose checkpoint is checked again."""
+        from workflow.models.loading import load_network, named_device, quiet
 
         self.own, self.checkpoint = own, check(vars(own))
-        self.device = device_named(own.device, ORIGIN)
+        self.device = named_device(own.device, ORIGIN)
         with quiet("transformers"):
             import torch
             from transformers import Sam2Model
 
-            self.model = network(self.checkpoint, "", Sam2Model, dtype=torch.float32).to(self.device)
+            self.model = load_network(self.checkpoint, "", Sam2Model, dtype=torch.float32).to(self.device)
         self.side = self.model.config.prompt_encoder_config.image_size
 
     def labels(self, picture: np.ndarray) -> tuple[np.ndarray, int, str]:
-        """(H, W) int32 label map, 0 = no mask, of a picture (H, W, 3) in [0, 1] as it is displayed; how many masks the thresholds
-        let through; what went wrong."""
+        """Return the label map (H, W) int32, 0 = no mask, of a display-encoded picture (H, W, 3) in [0, 1].
+
+        With it come the number of masks that pass the thresholds, and the reason for missing masks.
+        """
         masks, score, lost = self.proposals(picture)
-        kept = suppressed(masks, score, self.own.overlap)
+        kept = suppress_overlaps(masks, score, self.own.overlap)
         if not len(kept):
             wrong = f"{lost} answers are not finite" if lost else "no mask passed confidence and stability"
             return np.zeros(picture.shape[:2], np.int32), 0, wrong
@@ -107,15 +109,15 @@ class Generator:
         return flatten_masks(list(masks[kept])), len(masks), wrong
 
     def proposals(self, picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-        """Masks (n, H, W) bool that pass confidence and stability, their confidence (n,), and answers that are not finite."""
+        """Return masks (n, H, W) bool that pass the thresholds, their confidence (n,), and the number of non-finite outputs."""
         import torch
 
-        from workflow.models.loading import exact
+        from workflow.models.loading import deterministic
 
         masks, scores, lost = [np.zeros((0, *picture.shape[:2]), bool)], [np.zeros(0, np.float32)], 0
         points = torch.from_numpy(point_grid(self.own.points_per_side) * self.side).to(self.device)
         try:
-            with exact(self.device):
+            with deterministic(self.device):
                 embedding = self.model.get_image_embeddings(self._seen(picture))
                 for some in points.split(POINTS_AT_ONCE):
                     answer = self.model(
@@ -141,7 +143,7 @@ class Generator:
         return np.concatenate(masks), np.concatenate(scores), lost
 
     def _seen(self, picture: np.ndarray) -> Any:
-        """(1, 3, side, side): squeezed to the model's square, low-pass filtered where it shrinks, normalised."""
+        """Return (1, 3, side, side): resized to the model's square, low-pass filtered where it shrinks, normalised."""
         import torch
 
         planes = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1), np.float32))[None]
@@ -150,7 +152,7 @@ class Generator:
         return ((square - mean) / deviation).to(self.device)
 
     def _masks(self, logits: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Masks (n, H, W) of logits (n, h, w), and which of them are stable and not empty."""
+        """Return masks (n, H, W) of logits (n, h, w), and which of them are stable and not empty."""
         import torch
 
         large = torch.nn.functional.interpolate(logits[None], shape, mode="bilinear")[0].cpu().numpy()
@@ -159,13 +161,12 @@ class Generator:
 
 
 def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
-    """Label map (H, W) of every photograph that is used, by name; written as masks/<view>.exr, with masks.parquet and model.json.
+    """Make the label map (H, W) of every photograph that is not held out; writes masks/<view>.exr, masks.parquet, model.json.
 
-    A job that was killed goes on after the last view that it finished, as long as settings, photographs, weights and code are
-    the same.
+    A job that was interrupted continues after the last finished view if settings, photographs, weights and code are unchanged.
 
     Raises:
-        InputError: the checkpoint cannot be used; not a single mask in any view.
+        InputError: the checkpoint is unusable, or no view has any mask.
     """
     own, views = job.settings.segmentation.sam2, capture.used
     generator: Generator | None = None
@@ -201,7 +202,7 @@ def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
 
 
 def _made(job: Job, capture: CaptureReader, view: View, generator: Generator) -> Row:
-    labels, proposals, wrong = generator.labels(seen(view, capture, linear=False))
+    labels, proposals, wrong = generator.labels(picture_for_model(view, capture, linear=False))
     name = f"masks/{view.name}.exr"
     job.writer.exr(name, {"mask.id": labels.astype(np.uint32)})
     row = view.view_id, proposals, len(np.unique(labels[labels > 0])), wrong
@@ -210,7 +211,7 @@ def _made(job: Job, capture: CaptureReader, view: View, generator: Generator) ->
 
 
 def _kept(job: Job, view: View) -> Row | None:
-    """Row of a view that an interrupted run of this very job has finished."""
+    """Return the row of a view that an interrupted run of the same job has finished, else None."""
     done = job.writer.noted(f"unfinished/{view.name}.json")
     if done is None or done.get("by") != job.fingerprint or not job.writer.keep(f"masks/{view.name}.exr", done["file"]):
         return None

@@ -1,4 +1,4 @@
-"""What every kind of segmentation reads: photographs, mesh and what follows from them; and what it returns."""
+"""Input and output of every kind of segmentation: mesh and photographs, and objects."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ import numpy as np
 from iif_core.surface.segments import face_adjacency
 from workflow.scene.normal_form import CaptureReader, View
 
-FOLDS = 3
-"""Perturbed runs: each leaves out every third photograph."""
+FOLDS = 3  # perturbed runs; each leaves out every third photograph
 
 
 @dataclass(frozen=True)
 class Objects:
-    """object_of_face (m,) int32 from 0 without gaps; name of every object and the share of pixels that agree.
+    """A segmentation.
 
-    facts: numbers about how it came about, for segmentation.json.
+    Attributes:
+        object_of_face: (m,) int32 from 0 without gaps.
+        names: of the objects.
+        agreement: (objects,) share of the pixels that agree.
+        facts: numbers for segmentation.json.
     """
 
     object_of_face: np.ndarray
@@ -30,10 +33,12 @@ class Objects:
 
 @dataclass(frozen=True)
 class Stability:
-    """How far the objects depend on what should not decide them (docs/segmentation.md).
+    """Agreement of the objects with those of perturbed runs (docs/method/objects.md#stability).
 
-    value: mean adjusted Rand index between the result and the perturbed runs; None if there is nothing to perturb.
-    of_object: (objects,) mean best overlap over union with an object of the perturbed runs; NaN where nothing is seen.
+    Attributes:
+        value: mean adjusted Rand index between the result and the perturbed runs; None if nothing is perturbed.
+        of_object: (objects,) mean of the best intersection over union with an object of a perturbed run; NaN if not seen.
+        runs: adjusted Rand index of each run.
     """
 
     value: float | None
@@ -42,7 +47,7 @@ class Stability:
 
 
 class Surface:
-    """Mesh and photographs of a scene; what is costly is kept, `kept` is for the kinds."""
+    """Mesh and photographs of a scene. Costly properties are cached; plug-ins may cache results in `kept`."""
 
     def __init__(self, capture: CaptureReader):
         self.capture = capture
@@ -51,17 +56,17 @@ class Surface:
 
     @cached_property
     def pairs(self) -> np.ndarray:
-        """Faces that share an edge, (e, 2)."""
+        """Pairs of faces that share an edge, (e, 2)."""
         return face_adjacency(self.faces, self.vertices)
 
     def views(self, fold: int | None = None) -> list[View]:
-        """All photographs but those held out, or of them those that are not in this fold (all, where nothing would be left)."""
+        """Return the photographs that are not held out; with `fold` without those of the fold, unless none would remain."""
         views = self.capture.used
         return [view for i, view in enumerate(views) if fold is None or i % FOLDS != fold] or views
 
     @cached_property
     def pixels_of_face(self) -> list[np.ndarray]:
-        """Pixels that see each face, (m,) for every fold."""
+        """Numbers of pixels that see each face, (m,) for every fold."""
         out = [np.zeros(len(self.faces), np.int64) for _ in range(FOLDS)]
         for i, view in enumerate(self.capture.used):
             face = self.capture.gbuffer(view)[1]
@@ -69,7 +74,7 @@ class Surface:
         return out
 
     def pixels(self, fold: int | None = None) -> np.ndarray:
-        """Pixels of `views(fold)` that see each face, (m,) int64."""
+        """Return the numbers of pixels of `views(fold)` that see each face, (m,) int64."""
         kept = [p for i, p in enumerate(self.pixels_of_face) if i != fold]
         total = np.sum(kept, axis=0)
         return total if total.any() else np.sum(self.pixels_of_face, axis=0)

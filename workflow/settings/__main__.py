@@ -6,4 +6,4 @@ from workflow.settings import reference_markdown, schema_json
 
 if __name__ == "__main__":
     Path("config/scene.schema.json").write_text(schema_json())
-    Path("docs/settings.md").write_text(reference_markdown())
+    Path("docs/reference/settings.md").write_text(reference_markdown())

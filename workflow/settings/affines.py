@@ -1,34 +1,41 @@
-"""Fitting the materials to the photographs: affines, camera response, scale."""
+"""Settings of the fit of materials to the photographs: affine maps, camera response, scale."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from iif_core.fitting.problem import FitOptions, SgdOptions
 from workflow.settings.section import Section
+
+_DIRECT, _DESCENT = FitOptions(), SgdOptions()
+_BASELINES = ("base", "object_mean", "texture_average", "fipt", "iris")
+_DIRECT_ALONE = ("iterations", "population", "robust_width")
+_DESCENT_ALONE = ("epochs", "batch", "rate")
+_OBJECTS_ALONE = (*_DIRECT_ALONE, *_DESCENT_ALONE, "scale", "texture")  # `pixels` too, but it comes with a quality
 
 
 class ResponseFile(Section):
     """A measured camera response."""
 
     file: Path
-    """CSV or Parquet with columns `x, R, G, B` (exposed radiance from 0 to 1, sensor values), or NPY (3, samples) over
-    even steps of x."""
+    """CSV or Parquet with columns `x, R, G, B` (exposed radiance from 0 to 1, sensor values), or NPY of shape (3, samples) over
+    evenly spaced x."""
 
 
 class WhitePatch(Section):
-    """Surface of known albedo: an object, or a box of pixels in one view."""
+    """Surface of known albedo: an object, or a rectangle of pixels in one view."""
 
     object: str | None = None
-    """Its name (objects.parquet)."""
+    """Name of the object (objects.parquet)."""
     view: str | None = None
-    """View of the box."""
+    """View that holds the rectangle."""
     box: tuple[int, int, int, int] | None = None
-    """Left, top, right, bottom in pixels; right and bottom excluded."""
+    """Left, top, right, bottom in pixels; right and bottom are excluded."""
     albedo: float = Field(gt=0, le=1)
-    """Its albedo, mean over the channels, linear."""
+    """Albedo of the surface: mean over the channels, linear."""
 
     @model_validator(mode="after")
     def _one_place(self) -> WhitePatch:
@@ -41,9 +48,9 @@ class KnownLamp(Section):
     """An emitter of known radiance."""
 
     emitter_id: int = Field(ge=0)
-    """Its number (emitters.parquet)."""
+    """Number of the emitter (emitters.parquet)."""
     radiance: tuple[float, float, float]
-    """R, G, B in the units that the result shall have; the mean counts."""
+    """R, G, B in the units that the result shall have; their mean is used."""
 
     @field_validator("radiance")
     @classmethod
@@ -54,7 +61,7 @@ class KnownLamp(Section):
 
 
 class KnownScale(Section):
-    """What fixes the scale of light and albedo: exactly one."""
+    """What fixes the scale between light and albedo: exactly one of the three."""
 
     white_patch: WhitePatch | None = None
     """Surface of known albedo."""
@@ -72,44 +79,54 @@ class KnownScale(Section):
 
 
 class Affines(Section):
-    """One affine per object and the camera response."""
+    """One affine map per object, and the camera response."""
+
+    IDLE: ClassVar = {
+        "model": {model: ("model: objects", _OBJECTS_ALONE) for model in _BASELINES},
+        "solver": {
+            "direct": ("solver: sgd", _DESCENT_ALONE),
+            "sgd": ("solver: direct", _DIRECT_ALONE),
+            "adam": ("solver: direct", _DIRECT_ALONE),
+        },
+    }
 
     model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
-    """`objects`: one affine an object; the others are baselines over the same light: `base` fits nothing, `object_mean`: the
-    predictions' mean of each object, `texture_average`: the photographs' mean colour of each surface cell taken as albedo,
-    `fipt`, `iris`: a free BRDF in every surface cell (docs/studies.md)."""
+    """`objects`: one affine map per object. The others are baselines under the same light: `base`: nothing is fitted;
+    `object_mean`: the mean of the predictions of each object; `texture_average`: the mean colour of each surface cell in the
+    photographs, taken as albedo; `fipt`, `iris`: a free BRDF in every surface cell (docs/development/studies.md)."""
     solver: Literal["direct", "sgd", "adam"] = "direct"
-    """`objects`: `direct` Gauss-Newton; `sgd`: the paper's optimiser on the paper's loss; `adam`: the same with its safe variant.
-    `fipt`, `iris`: `direct` exact per cell; `adam` as published."""
+    """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
+    loss. With `fipt`, `iris`: `direct`: exact for every cell; `adam`: gradient descent on the same loss."""
     response: Literal["auto", "identity", "srgb", "gamma", "ggcm", "spline"] | ResponseFile = "auto"
-    """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`; NPY
-    (3, samples)). `auto`: identity for HDR; for LDR the smallest of srgb, gamma, ggcm and spline that explains how
-    differently exposed photographs show the same surface, srgb where there are none."""
-    iterations: int = Field(60, ge=1, le=500)
-    """`direct`: most Gauss-Newton steps; it ends when a step changes nothing."""
+    """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`, or NPY
+    of shape (3, samples)). `auto`: identity for HDR; for LDR the simplest of srgb, gamma, ggcm and spline that explains how
+    photographs of different exposure show the same surface, and srgb where no surface is shown by several exposures."""
+    iterations: int = Field(_DIRECT.iterations, ge=1, le=500)
+    """`direct`: largest number of Gauss-Newton steps; the fit ends earlier when a step changes nothing."""
     pixels: int = Field(200000, ge=100)
-    """Pixels in the fit (drawn evenly over objects)."""
-    population: bool = True
-    """`direct`: objects lean on what the well-determined ones have in common, as far as those agree; otherwise on `ridge`."""
-    ridge: float = Field(0.002, gt=0)
-    """`direct` without `population`: pull towards identity, per pixel."""
-    robust_width: float = Field(0.1, gt=0)
-    """`direct`: Cauchy width of the residual in sensor units."""
-    epochs: int = Field(3, ge=1)
-    """`sgd`, `adam`: passes over the pixels; the rate falls to a fifth after each."""
-    batch: int = Field(32768, ge=1)
-    """`sgd`, `adam`: pixels of a step."""
-    rate: float | None = Field(None, gt=0)
-    """`sgd`, `adam`: step size; default 10 and 0.01."""
+    """`objects`: pixels in the fit, drawn evenly over the objects."""
+    population: bool = _DIRECT.population
+    """`direct`: the prior of every object is the distribution of the well-determined objects of the scene (empirical Bayes);
+    `false`: a fixed, weak prior."""
+    robust_width: float = Field(_DIRECT.robust_width, gt=0)
+    """`direct`: width of the Cauchy loss of the residual, in sensor units."""
+    epochs: int = Field(_DESCENT.epochs, ge=1)
+    """`sgd`, `adam`: passes over the pixels; the step size falls to a fifth after each."""
+    batch: int = Field(_DESCENT.batch, ge=1)
+    """`sgd`, `adam`: pixels in one step."""
+    rate: float | None = Field(_DESCENT.rate, gt=0)
+    """`sgd`, `adam`: step size; the default is 10 for `sgd` and 0.01 for `adam`."""
     scale: Literal["found", "prior"] | KnownScale = "found"
-    """What fixes the factor between light and albedo. `found`: the light as stage emission found it, by how much of it is
-    indirect (always so for HDR, unless a known scale is given); `prior`: the prior's mean albedo; or what is known: {white_patch:
+    """`objects`: what fixes the factor between light and albedo. `found`: the level of the light that stage `emission` found from
+    the share of indirect light (always so for HDR, unless a known scale is given); `prior`: the mean albedo of the prior; or a
+    known quantity: {white_patch:
     {object: NAME, albedo: 0.9}}, {white_patch: {view: NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id:
     0, radiance: [5, 5, 4]}} or {mean_albedo: 0.4}."""
 
     texture: Literal["auto", "base", "photographs"] = "auto"
-    """`objects`: `base`: the base texture through the affines; `photographs`: with what they show of every cell beyond that, slow
-    changes inside an object left out; `auto`: `photographs` for `prior: {kind: retinex}`, which had no light to divide by."""
+    """`objects`: albedo of the surface cells. `base`: the base texture under the affine maps; `photographs`: the same, plus the
+    detail that the photographs show in each cell, without slow changes across an object; `auto`: `photographs` for
+    `prior: {kind: retinex}`, which was made before the light was known, `base` otherwise."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Affines:

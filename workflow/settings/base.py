@@ -1,13 +1,15 @@
-"""Fusing the predictions of all views."""
+"""Settings of stage `base`; the defaults of the direct solver are those of `FusionOptions`."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from iif_core.fusion.options import FusionOptions
 from workflow.settings.section import Section
 
+_DEFAULT = FusionOptions()  # the direct solver's
 _DIRECT_ALONE = ("sweeps", "ridge", "temperature", "anneal", "final_temperature", "seams", "robust", "objective")
 _SGD_ALONE = ("preset", "texture", "iterations", "median_gradient")  # the sizes of the hash grid come with a quality
 
@@ -15,11 +17,13 @@ _SGD_ALONE = ("preset", "texture", "iterations", "median_gradient")  # the sizes
 class Base(Section):
     """Fusing the K predictions of all views into one 3D base texture."""
 
+    IDLE: ClassVar = {"solver": {"direct": ("solver: sgd", _SGD_ALONE), "sgd": ("solver: direct", _DIRECT_ALONE)}}
+
     solver: Literal["direct", "sgd"] = "direct"
     """`direct`: alternating closed forms on surface cells; `sgd`: the paper's optimiser, to compare with."""
     variant: Literal["full", "uniform", "image_affine", "texel_mean", "object_mean", "raw"] = "full"
-    """`full`: affines and selection; `uniform`: affines, no selection; `image_affine`: one affine an image instead of one an
-    object and image; the means, and `raw` = the first prediction of each view as it is: baselines."""
+    """`full`: affine maps and selection; `uniform`: affine maps without selection; `image_affine`: one affine map per image
+    instead of one per object and image; baselines: the means, and `raw` = the first prediction of each view unchanged."""
     predictions: int | None = Field(None, ge=1)
     """Use only the first so many predictions of each view; default: all."""
     cell_edge: float | None = Field(None, gt=0)
@@ -30,26 +34,27 @@ class Base(Section):
     """Weight of pixels next to another object: real predictions bleed across borders."""
     footprint_power: float = Field(0.0, ge=0, le=4)
     """Weight pixels by (median footprint / own footprint) to this power: prefers near and frontal views of a surface."""
-    objective: Literal["least_squares", "distribution"] = "least_squares"
-    """`direct`: `distribution` then minimises the paper's own loss for the selection found."""
-    robust: bool = False
-    """`direct`: cells take an M-estimate instead of the mean (outliers in few views, at the price of sharpness)."""
-    sweeps: int = Field(9, ge=1, le=200)
+    objective: Literal["least_squares", "distribution"] = _DEFAULT.objective
+    """`direct`: `distribution` afterwards minimises the paper's own loss for the selection found."""
+    robust: bool = _DEFAULT.robust
+    """`direct`: cells take an M-estimate instead of the mean, which resists outliers in few views and costs sharpness."""
+    sweeps: int = Field(_DEFAULT.sweeps, ge=1, le=200)
     """`direct`: alternations."""
-    polish: int = Field(25, ge=1, le=1000)
+    polish: int = Field(_DEFAULT.polish, ge=1, le=1000)
     """`direct`, `objective: distribution`: sweeps on the paper's loss."""
-    ridge: float = Field(0.01, gt=0)
-    """`direct`: pull of the affines towards identity, per pixel."""
-    temperature: float = Field(1.0, ge=0)
+    ridge: float = Field(_DEFAULT.ridge, gt=0)
+    """`direct`: strength of the ridge of the affine maps towards the identity, per pixel."""
+    temperature: float = Field(_DEFAULT.temperature, ge=0)
     """`direct`: selection temperature of the first sweep, in units of a segment's median error."""
-    anneal: float = Field(0.6, gt=0, lt=1)
+    anneal: float = Field(_DEFAULT.anneal, gt=0, lt=1)
     """`direct`: factor on the selection temperature per sweep."""
-    final_temperature: float = Field(0.1, ge=0)
-    """`direct`: where annealing stops; 0 = the single best prediction, more = near-ties are averaged."""
-    seams: bool = True
+    final_temperature: float = Field(_DEFAULT.final_temperature, ge=0)
+    """`direct`: temperature at which annealing stops; 0 = the single best prediction, more = near-ties are averaged."""
+    seams: bool = _DEFAULT.seams
     """`direct`: close seams between parts of an object that no photograph shows together."""
     preset: Literal["safe", "paper"] = "safe"
-    """`sgd`: `paper` = the published behaviour; `safe` = with the treatments of docs/base.md. Decides what is not set below."""
+    """`sgd`: `paper` = the published behaviour; `safe` = with the numerical safeguards of docs/method/fusion.md#schedules. Sets
+    the defaults of the settings below."""
     texture: Literal["cells", "hashgrid"] | None = None
     """`sgd`: texture model; default: `cells`, `preset: paper` the hash grid."""
     iterations: int | None = Field(None, ge=1)
@@ -59,24 +64,15 @@ class Base(Section):
     hash_entries: int | None = Field(None, ge=8, le=24)
     """`sgd`, hash grid: log2 of the entries a level; default: 17, `preset: paper` 19."""
     median_gradient: bool | None = None
-    """`sgd`: follow the slope of the median over the predictions; default: no, `preset: paper` yes."""
+    """`sgd`: follow the derivative of the median over the predictions; default: no, `preset: paper` yes."""
     judge: bool = False
-    """Evaluate the paper's loss of the result, of `sgd` also that of `direct` at the same selection (base.json)."""
+    """Evaluate the paper's loss of the result, and for `sgd` also that of `direct` at the same selection (base.json)."""
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Base:
         if self.solver == "sgd" and self.variant != "full":
             raise ValueError(
                 f"`solver: sgd` fits `variant: full` alone, not `{self.variant}`; use `solver: direct` for the others"
-            )
-        idle = _SGD_ALONE if self.solver == "direct" else _DIRECT_ALONE
-        default = {name: Base.model_fields[name].get_default() for name in idle}
-        named = [name for name in idle if name in self.model_fields_set and getattr(self, name) != default[name]]
-        if named:
-            other = "sgd" if self.solver == "direct" else "direct"
-            raise ValueError(
-                f"{', '.join(f'`{name}`' for name in named)}: read by `solver: {other}` alone and without effect on `solver:"
-                f" {self.solver}`; remove it, or set the solver"
             )
         if self.objective == "distribution" and self.variant not in ("full", "image_affine"):
             raise ValueError(f"`objective: distribution` needs a selection; `variant: {self.variant}` makes none")

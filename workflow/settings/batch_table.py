@@ -1,12 +1,11 @@
-"""config/batch.tsv: one scene a line, run together by `snakemake scenes` (docs/batch.md).
+"""config/batch.tsv: one scene per line, run together by `snakemake scenes` (docs/guide/batch.md).
 
-A mistake about which scenes there are (encoding, header, cells, names) stops before any job, all of them in one message. A
-mistake in what one scene is (its base, settings, data) refuses that scene alone, with the reason. Imports nothing heavy.
+Mistakes about which scenes there are (encoding, header, cells, names) stop the run before any job, all in one message. A mistake
+in one scene (its base, settings, data) refuses that scene alone, with the reason. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ from typing import Any
 import yaml
 
 from iif_core.errors import InputError
-from workflow.settings.names import RESERVED, SCENE_NAME, scene_names
+from workflow.settings.names import RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
 from workflow.settings.yaml_file import read_yaml
 
 TABLE = Path("config/batch.tsv")
+PRESETS = "config/quality/"
 COLUMNS = ("name", "source", "path", "base", "overrides")
 _NAME = re.compile(SCENE_NAME)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
@@ -29,7 +29,7 @@ _SHOWN = 20  # problems in one message
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table, its cells stripped; `number` counts from 1 with the header and comments."""
+    """One line of the table, with its cells stripped; `number` counts from 1 and includes the header and comments."""
 
     number: int
     name: str
@@ -39,12 +39,12 @@ class Line:
     overrides: str = ""
 
     def at(self, column: str = "") -> str:
-        """Where in the table: `config/batch.tsv, line 7, column overrides`."""
+        """Return the place in the table: `config/batch.tsv, line 7, column overrides`."""
         return f"{TABLE}, line {self.number}" + (f", column {column}" if column else "")
 
     @property
     def is_plain(self) -> bool:
-        """Only a name: config/scenes/<name>.yaml as it is."""
+        """Whether the line has only a name: it then means config/scenes/<name>.yaml unchanged."""
         return not (self.source or self.path or self.base or self.overrides)
 
 
@@ -52,16 +52,21 @@ class Line:
 
 
 def read_table(root: Path = Path(".")) -> tuple[Line, ...]:
-    """The lines of the table; without a table every scene that has a file (`number` 0).
+    """Return the lines of the table; without a table, every scene that has a file (with `number` 0).
 
     Raises:
-        InputError: every mistake about which scenes there are, with line and column.
+        InputError: names every mistake about which scenes there are, with line and column.
     """
-    path = root / TABLE
+    path = _table(root)
     if not path.is_file():
         return tuple(Line(0, name) for name in scene_names(root))
     status = path.stat()
     return _read_table(path, (status.st_size, status.st_mtime_ns))
+
+
+def _table(root: Path) -> Path:
+    """The table that belongs to the scenes of the working folder (or, where it has none, to those of the repository)."""
+    return configuration("scenes", root).with_name(TABLE.name)
 
 
 @lru_cache(8)
@@ -93,7 +98,7 @@ def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
 
 
 def _text_of(path: Path) -> str:
-    """UTF-8 with or without byte order mark, any of the usual ends of line."""
+    """Return the text of a UTF-8 file, with or without byte order mark, with any of the usual line ends."""
     data = path.read_bytes()
     if b"\0" in data:
         raise InputError(f"{TABLE}: holds zero bytes (UTF-16, or no text at all); save it as UTF-8, columns separated by tabs")
@@ -111,8 +116,7 @@ def _check_header(cells: list[str], number: int, text: str) -> None:
         raise InputError(f"{where}: the header has one column, {text.strip()!r}; columns are separated by tabs, not by spaces")
     for i, cell in enumerate(cells):
         if cell not in COLUMNS:
-            near = difflib.get_close_matches(cell, COLUMNS, 1)
-            hint = f" Did you mean {near[0]}?" if near else ""
+            hint = did_you_mean(cell, COLUMNS)
             raise InputError(f"{where}: column {i + 1} is called {cell!r}.{hint} Allowed: {', '.join(COLUMNS)}")
         if cell in cells[:i]:
             raise InputError(f"{where}: column {cell} stands twice; remove one")
@@ -157,17 +161,17 @@ def _problem_of_file(line: Line, folder: Path) -> str:
 
 
 def find(name: str, root: Path = Path(".")) -> Line | None:
-    """The line that makes a scene; None for a scene with a file of its own, a study's, and one that is not listed."""
-    if "--" in name or (root / "config/scenes" / f"{name}.yaml").is_file() or not (root / TABLE).is_file():
+    """Return the line that describes a scene; None for a scene with a file of its own, of a study, or not in the table."""
+    if "--" in name or scene_path(name, root).is_file() or not _table(root).is_file():
         return None
     return next((line for line in read_table(root) if line.name == name and not line.is_plain), None)
 
 
 def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
-    """(where it stands, settings) of a line, lowest first: its base, its columns, its overrides.
+    """Return (place, settings) of the layers of a line, lowest first: its base, its columns, its overrides.
 
     Raises:
-        InputError: no such base, or overrides that cannot be read.
+        InputError: there is no such base, or the overrides cannot be read.
     """
     out: list[tuple[str, dict[str, Any]]] = []
     if line.base:
@@ -182,7 +186,8 @@ def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]
 
 
 def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str], str]:
-    """Tells where the value of a dotted key comes from: the layer that names most of it, the upper one of two."""
+    """Return a function that tells where the value of a dotted key comes from: the layer that names most of it, the upper one
+    of two. A preset is named only for keys that it sets itself: what is missing is missing in the table."""
 
     def where(dotted: str) -> str:
         best, found = line.at(), 0
@@ -192,7 +197,8 @@ def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str]
                 if not isinstance(node, dict) or part not in node:
                     break
                 depth, node = depth + 1, node[part]
-            if depth and depth >= found:
+            whole = depth == dotted.count(".") + 1
+            if depth and depth >= found and (whole or not name.startswith(PRESETS)):
                 best, found = name, depth
         missing = dotted == "source.path" and found < 2
         return line.at("path") if missing else best
@@ -202,12 +208,11 @@ def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str]
 
 def _base(line: Line, root: Path) -> tuple[str, dict[str, Any]]:
     name = Path(line.base).stem if line.base.startswith("config/scenes/") else line.base
-    path = root / "config/scenes" / f"{name}.yaml"
+    path = scene_path(name, root)
     if not path.is_file():
         names = scene_names(root)
-        near = difflib.get_close_matches(name, names, 1)
-        hint = f" Did you mean {near[0]}?" if near else ""
-        raise InputError(f"{line.at('base')}: config/scenes/{name}.yaml not found.{hint} Known: {', '.join(names) or 'none'}.")
+        known = f"{did_you_mean(name, names)} Known: {', '.join(names) or 'none'}."
+        raise InputError(f"{line.at('base')}: config/scenes/{name}.yaml not found.{known}")
     return f"config/scenes/{name}.yaml (base of {line.at()})", _read_base(path, path.stat().st_mtime_ns)
 
 
@@ -217,10 +222,10 @@ def _read_base(path: Path, _stamp: int) -> dict[str, Any]:
 
 
 def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
-    """`capture.views=24;prior.samples=8` as a tree; values are YAML, a `;` always ends one.
+    """Return `capture.views=24;prior.samples=8` as a tree; values are YAML, and `;` always ends a value.
 
     Raises:
-        InputError: begins with `where`; says which entry.
+        InputError: the message begins with `where` and names the entry.
     """
     out: dict[str, Any] = {}
     seen: list[str] = []

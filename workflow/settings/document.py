@@ -10,7 +10,7 @@ from workflow.settings.section import Section
 
 
 def schema_json() -> str:
-    """JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
+    """Return the JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
     schema = SceneSettings.model_json_schema()
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
@@ -19,12 +19,12 @@ _BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below", "min
 
 
 def _bound(rule: Any) -> str:
-    """`at least 1` of pydantic's `Ge(ge=1)`."""
+    """Return `at least 1` for pydantic's `Ge(ge=1)`."""
     return ", ".join(f"{words} {getattr(rule, name)}" for name, words in _BOUNDS.items() if hasattr(rule, name))
 
 
 def reference_markdown() -> str:
-    """The settings as a page: key, default, allowed values, meaning (docs/settings.md)."""
+    """Return the settings as a page: key, default, allowed values, meaning (docs/reference/settings.md)."""
     lines = ["# Settings", "", "Made from `workflow/settings/` by `python -m workflow.settings`; do not edit.", ""]
 
     def rows(model: type[Section], prefix: str) -> None:

@@ -1,15 +1,21 @@
-"""What is wrong with a scene file, in words."""
+"""Messages for errors in a scene file."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from pydantic import ValidationError
 
+from workflow.settings.names import did_you_mean
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
+
+REMOVED = {
+    "metrics.views": " It was removed, because all views are always scored; delete it.",
+    "affines.ridge": " It was removed, because it had no effect; delete it.",
+}
+"""Keys of earlier versions: what to do about them."""
 
 
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
@@ -27,20 +33,22 @@ def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
 
 
 def _dotted(where: tuple[str | int, ...]) -> str:
-    """`prior.samples`: the keys as they stand in the file, without pydantic's names of alternatives."""
+    """Return the keys as they stand in the file (`prior.samples`), without pydantic's names of alternatives."""
     tags = {tag for union in UNIONS.values() for tag in union}
     parts = [str(part) for part in where]
     return ".".join(p for i, p in enumerate(parts) if not (i == 1 and p in tags) and not _is_alternative(parts, i))
 
 
 def _is_alternative(parts: list[str], i: int) -> bool:
-    """Whether part `i` names one of several types that a value may have (`literal['found','prior']`, `WhitePatch`), not a key."""
+    """Return whether part `i` is no key but names one of several types of a value (`literal['found','prior']`, `WhitePatch`)."""
     return i > 0 and ("[" in parts[i] or parts[i] == "float" or parts[i][:1].isupper())
 
 
 def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
-    """A value that fits none of its alternatives fails once in each: keep what is wrong inside the one that was meant, else all
-    of them in one sentence."""
+    """Reduce the errors of a value that fits none of its alternatives, which pydantic reports once for each alternative.
+
+    Errors inside the alternative that was meant are kept; without such, all are joined into one sentence.
+    """
     groups: dict[Any, list[Any]] = {}
     for number, problem in enumerate(problems):
         parts = [str(part) for part in problem["loc"]]
@@ -57,7 +65,7 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
 
 
 def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
-    """One line a problem; `origin` tells the file of a dotted key."""
+    """Return one line per problem; `origin` maps a dotted key to its file."""
     lines = []
     for problem in _one_of_each_choice(error.errors()):
         where = problem["loc"]
@@ -68,8 +76,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
-            near = difflib.get_close_matches(str(where[-1]), allowed, 1)
-            hint = f" Did you mean `{near[0]}`?" if near else ""
+            hint = REMOVED.get(dotted) or did_you_mean(where[-1], allowed, "`{}`")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(f"{path}: `{dotted}`: found {found!r}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`.")

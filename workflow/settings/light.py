@@ -1,57 +1,63 @@
-"""Emitters, and the light that they cast."""
+"""Settings of the emitters and of the light that they cast."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from iif_core.light.emission.sgd import SgdOptions
 from workflow.settings.section import Section
+
+_SGD = SgdOptions()
 
 
 class Emission(Section):
-    """Emitters: which faces, how bright."""
+    """Which faces of the mesh emit light, and how bright they are."""
+
+    IDLE: ClassVar = {"solver": {"direct": ("solver: sgd", ("preset", "iterations"))}}
 
     saturation: float = Field(0.99, gt=0, le=1)
-    """Sensor value at which a pixel counts as saturated."""
+    """Sensor value from which a pixel counts as saturated."""
     min_observations: int = Field(8, ge=1)
-    """Pixels that must have seen a face (or patch) before it can be an emitter."""
+    """Pixels that must show a face (or a group of faces) before it can be an emitter."""
     cache_edge: float = Field(0.06, gt=0)
     """Edge of a radiance-cache voxel in metres."""
     max_bounces: int = Field(6, ge=1, le=64)
-    """Path length where the cache does not answer."""
+    """Longest path, in bounces, where the radiance cache holds no value."""
     rows: int = Field(40000, ge=100)
-    """Pixels whose transport rows are traced."""
+    """Number of pixels whose light transport is traced."""
     samples: int = Field(16, ge=2)
-    """Paths a row (two independent halves)."""
+    """Paths per pixel, over two independent halves."""
     prune: float = Field(0.01, ge=0, lt=1)
-    """Groups below this share of the total power are dropped."""
+    """Groups of faces below this share of the total emitted power are dropped."""
     environment: Literal["auto", "on", "off"] = "auto"
-    """Environment light (16 x 32 texels in groups; twelve directions where the mesh is open) for rays that escape;
-    `auto`: when enough of them do."""
+    """Light from outside the mesh: groups of 16 x 32 texels, or twelve directions where the mesh is open. `auto`: included when
+    enough rays leave the mesh and what they meet is not black."""
     solver: Literal["direct", "sgd"] = "direct"
-    """`direct`: non-negative least squares; `sgd`: the paper's descent on the same rows, to compare with."""
-    preset: Literal["safe", "paper"] = "safe"
-    """`sgd`: `paper` = the published rate and pruning; `safe` = steps scaled by the diagonal, averaged."""
-    iterations: int = Field(10000, ge=1)
-    """`sgd`: batches of 1024 rows."""
+    """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison."""
+    preset: Literal["safe", "paper"] = _SGD.preset
+    """`sgd`: `paper`: the published step size and pruning; `safe`: steps scaled by the diagonal of the normal matrix, and the
+    average of the last iterates."""
+    iterations: int = Field(_SGD.steps, ge=1)
+    """`sgd`: steps, of 1024 pixels each."""
 
 
 class Shading(Section):
-    """Cached incident shading: diffuse and split specular."""
+    """Incident light that is cached for the fits: diffuse, and specular at several roughness levels."""
 
     samples: int = Field(32, ge=2)
-    """Paths a pixel (specular) and paths a cell to begin with (diffuse), over both halves."""
+    """Paths per pixel (specular), and paths per surface cell to begin with (diffuse), over both independent halves."""
     levels: int = Field(10, ge=3, le=32)
-    """Roughness levels."""
+    """Number of roughness levels."""
     cell_edge: float = Field(0.03, gt=0)
-    """Diffuse light is cached once a piece of surface of this edge (metres), for all views."""
+    """Edge in metres of the surface cells for which diffuse light is cached, once for all views."""
     noise: float = Field(0.1, gt=0)
-    """Relative standard error of diffuse light (median of an object) at which no more paths are added."""
+    """Relative standard error of diffuse light (median over an object) below which no more paths are added."""
     max_samples: int = Field(512, ge=2)
-    """Most paths a cell."""
+    """Largest number of paths per cell."""
     max_bounces: int = Field(6, ge=1, le=64)
-    """Path length where the radiance cache does not answer."""
+    """Longest path, in bounces, where the radiance cache holds no value."""
     indirect: Literal["auto", "cache", "path"] = "auto"
-    """`cache`: paths end at surface whose radiance was photographed; `path`: always traced with the base materials; `auto`:
-    `cache` where enough of what the surface sees was photographed."""
+    """Indirect light. `cache`: paths end at surface whose radiance was photographed; `path`: paths go on with the base
+    materials; `auto`: `cache` if enough of the surface that secondary rays meet was photographed."""

@@ -1,8 +1,7 @@
-"""From files to the settings of a scene."""
+"""Load the settings of a scene from its files."""
 
 from __future__ import annotations
 
-import difflib
 import re
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,13 @@ from pydantic import ValidationError
 from iif_core.errors import InputError
 from workflow.settings import batch_table, study_files
 from workflow.settings.explain import explain
-from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
-from workflow.settings.scene import SceneSettings
+from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
+from workflow.settings.scene import SECTIONS_THAT_CHOOSE, SceneSettings
 from workflow.settings.yaml_file import read_yaml
 
 
 def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
-    """`upper` over `lower`, key by key; a different `kind` replaces the whole section."""
+    """Return `upper` merged over `lower`, key by key; a different `kind` replaces the whole section."""
     out = dict(lower)
     for key, value in upper.items():
         below = out.get(key)
@@ -31,9 +30,12 @@ def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
 
 
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
-    """Path of a scene's file, of a study's derived scene its parent's; an unknown scene is an error with the nearest name."""
+    """Return the file of a scene; for a derived scene of a study, the file of the scene that it is derived from.
 
-    if (root / "config/scenes" / f"{scene}.yaml").is_file():
+    Raises:
+        InputError: no such scene (the message suggests the nearest name), or a name that a scene cannot have.
+    """
+    if scene_path(scene, root).is_file():
         if not re.fullmatch(SCENE_NAME, scene):
             raise InputError(
                 f"config/scenes/{scene}.yaml: a scene cannot be called {scene!r}; allowed are letters from a to z, digits, _"
@@ -43,34 +45,34 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
             raise InputError(f"config/scenes/{scene}.yaml: results/ uses {scene!r} otherwise; rename the file")
     parts = study_files.derived(scene, root)
     scene = parts.scene if parts else scene
-    path = root / "config/scenes" / f"{scene}.yaml"
+    path = scene_path(scene, root)
     if not path.is_file():
         files = scene_names(root)
         listed = [line.name for line in batch_table.read_table(root) if line.name not in files]
-        near = difflib.get_close_matches(scene, files + listed, 1)
-        hint = f" Did you mean scenes/{near[0]}?" if near else ""
         more = f" and {len(listed)} of {batch_table.TABLE}" if listed else ""
         raise InputError(
-            f"config/scenes/{scene}.yaml: not found.{hint} Known scenes: {', '.join(files) or 'none'}{more}."
-            " Add a file there to add a scene (docs/own-data.md)."
+            f"config/scenes/{scene}.yaml: not found.{did_you_mean(scene, files + listed, 'scenes/{}')}"
+            f" Known scenes: {', '.join(files) or 'none'}{more}."
+            " Add a file there to add a scene (docs/guide/own-data.md)."
         )
     return path
 
 
 def scene_origin(scene: str, root: Path = Path(".")) -> str:
-    """Where a scene is described, for messages: its file, or its line of the batch batch_table."""
-
+    """Return where a scene is described, for messages: its file, or its line of the batch table."""
     line = batch_table.find(scene, root)
     return line.at() if line else str(scene_file(scene, root))
 
 
 def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSettings:
-    """Settings of `scene` at `quality`; an `InputError` names file, key, what was found and what is allowed."""
+    """Return the settings of `scene` at `quality`.
+
+    Raises:
+        InputError: names the file, the key, what was found and what is allowed.
+    """
     if quality not in QUALITIES:
         raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
-
-    preset_file = root / "config/quality" / f"{quality}.yaml"
-    preset = read_yaml(preset_file) if preset_file.is_file() else {}
+    preset = read_yaml(configuration(f"quality/{quality}.yaml", root))
     if line := batch_table.find(scene, root):
         layers = [(f"config/quality/{quality}.yaml", preset), *batch_table.layers(line, root)]
         try:
@@ -78,7 +80,7 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         except ValidationError as error:
             raise InputError(explain(error, batch_table.blame(line, layers))) from None
     path = scene_file(scene, root)
-    shown = path.relative_to(root) if path.is_absolute() else path
+    shown = path.relative_to(root) if path.is_relative_to(root) else path
     layers = [("", preset), (str(shown), read_yaml(path))]
     if parts := study_files.derived(scene, root):
         layers += study_files.layers(parts, root)
@@ -96,5 +98,8 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
 def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for _, layer in layers:
+        for name, section in SECTIONS_THAT_CHOOSE.items():
+            if isinstance(out.get(name), dict) and isinstance(layer.get(name), dict):
+                out[name] = section.without_idle(out[name], layer[name])
         out = merge(out, layer)
     return out

@@ -1,16 +1,62 @@
-"""Names of scenes and qualities, and which scenes have a file."""
+"""Names of qualities and scenes, where their files lie, and what an unknown name was probably meant to be."""
 
 from __future__ import annotations
 
+import difflib
+import os
+from collections.abc import Iterable
 from pathlib import Path
 
+REPOSITORY = Path(__file__).resolve().parents[2]
 QUALITIES = ("draft", "standard", "paper")
 SCENE_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 """What a scene may be called: its name is a folder, a target of Snakemake and part of the names of variants."""
 RESERVED = ("batch", "studies", "weights")
-"""Folders of results/ that are no scene's."""
+"""Folders of results/ that do not belong to a scene."""
+
+
+def configuration(part: str, root: Path = Path(".")) -> Path:
+    """Return `config/<part>` of the working folder where it exists, otherwise that of the repository.
+
+    A working folder with a `config/scenes/` of its own uses its own scenes only. The paths inside a scene file always count
+    from the working folder.
+    """
+    own = root / "config" / part
+    return own if own.exists() else REPOSITORY / "config" / part
+
+
+def scene_path(scene: str, root: Path = Path(".")) -> Path:
+    """Return where the file of a scene lies, or would lie."""
+    return configuration("scenes", root) / f"{scene}.yaml"
 
 
 def scene_names(root: Path = Path(".")) -> list[str]:
-    """Every scene that has a file."""
-    return sorted(path.stem for path in (root / "config/scenes").glob("*.yaml"))
+    """Return the name of every scene that has a file, sorted."""
+    return sorted(path.stem for path in configuration("scenes", root).glob("*.yaml"))
+
+
+def did_you_mean(name: object, known: Iterable[str], form: str = "{}") -> str:
+    """Return ` Did you mean X?` for the known name that is most similar to `name`; empty if none is similar.
+
+    >>> did_you_mean("kichen", ["kitchen", "hall"], "scenes/{}")
+    ' Did you mean scenes/kitchen?'
+    """
+    near = difflib.get_close_matches(str(name), list(known), 1)
+    return f" Did you mean {form.format(near[0])}?" if near else ""
+
+
+def did_you_mean_path(path: Path) -> str:
+    """Return ` Did you mean X?` where the first missing part of `path` has a similar name beside it; otherwise empty."""
+    missing = path
+    while not missing.parent.exists():
+        missing = missing.parent
+    try:
+        beside = sorted(os.listdir(missing.parent))
+    except OSError:
+        return ""
+    near = difflib.get_close_matches(missing.name, beside, 1)
+    if not near:
+        return ""
+    found = missing.parent / near[0]
+    whole = found / path.relative_to(missing)
+    return f" Did you mean {whole if whole.exists() else found}?"

@@ -1,8 +1,6 @@
-"""What is made of the result: re-rendering, scores, files, page."""
+"""Settings of what is made from the result: re-rendering, scores, files, page."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 from pydantic import Field
 
@@ -13,34 +11,32 @@ class Render(Section):
     """Re-rendering of the views from the recovered scene."""
 
     samples: int = Field(16, ge=1)
-    """Paths a pixel."""
+    """Paths per pixel."""
     max_bounces: int = Field(16, ge=1, le=64)
-    """Path length."""
+    """Longest path, in bounces."""
     denoise: bool = True
-    """Denoise the re-renderings (they are looked at and compared, nothing is fitted to them)."""
+    """Denoise the re-renderings. They are looked at and compared; nothing is fitted to them."""
 
 
 class Metrics(Section):
-    """What is compared."""
+    """Scores of the result. All views and all metrics are always computed; only an optional one is set here."""
 
-    views: Literal["all"] = "all"
-    """Views that are scored."""
     lpips_vgg: bool = False
-    """Score albedo (of the result, the base and the first prediction; as it is and scaled) also with LPIPS on VGG16, as the
-    paper does. Needs its weights: `snakemake --cores 1 results/weights/lpips_vgg.npz`. Triples the time of the stage."""
+    """Also score the albedo of the result, of the base and of the first prediction with LPIPS on VGG16, raw and scaled, as in
+    the paper. This needs weights (`snakemake --cores 1 results/weights/lpips_vgg.npz`) and triples the time of the stage."""
 
 
 class Export(Section):
     """Files for other programs."""
 
     max_faces_glb: int = Field(2_000_000, ge=1000)
-    """Faces in scene.glb; above, it is refused with a note rather than written for minutes."""
+    """Largest number of faces in scene.glb; for larger meshes the file is left out with a note."""
 
 
 class Report(Section):
     """The page."""
 
     views: int = Field(6, ge=1)
-    """Views shown."""
+    """Number of views shown."""
     credit: str = ""
-    """Line under the title (artist, licence)."""
+    """Line under the title, such as artist and licence."""

@@ -1,4 +1,4 @@
-"""Where the K material predictions come from."""
+"""Settings of the prior: where the K material predictions of every photograph come from."""
 
 from __future__ import annotations
 
@@ -12,79 +12,81 @@ from workflow.settings.section import Section
 
 class PriorBase(Section):
     samples: int = Field(8, ge=1, le=256)
-    """Predictions a photograph, K."""
+    """Predictions per photograph, K."""
     seed: int | None = Field(None, ge=0, lt=2**31)
-    """Seed of the predictions alone; default: the scene's."""
+    """Seed of the predictions alone; by default the seed of the scene. Without effect on `kind: files`."""
 
 
 class SimulatedPrior(PriorBase):
-    """Ground truth, spoilt the way RGB-X fails (needs a source with truth)."""
+    """Ground truth with errors like those of RGB-X. Needs a source with ground truth."""
 
     kind: Literal["simulated"]
     strength: float = Field(1.0, ge=0, le=4)
-    """0 = truth; 1 = the raw errors that the paper reports for RGB-X."""
+    """Strength of the errors: 0 = ground truth; 1 = errors as large as the paper reports for RGB-X."""
 
 
 class FilesPrior(PriorBase):
-    """Maps of any model: `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`."""
+    """Maps that any model has made: `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`."""
 
     kind: Literal["files"]
     path: Path | None = None
-    """Folder that holds `predictions/`; default: the source's folder."""
+    """Folder that holds `predictions/`; by default the folder of the source."""
     albedo_space: Literal["linear", "srgb"] = "linear"
-    """Encoding of the albedo files."""
+    """Colour space of the albedo files."""
     roughness_is: Literal["perceptual", "alpha"] = "perceptual"
-    """`alpha` = r^2 (microfacet)."""
+    """Whether the files hold perceptual roughness r or the microfacet width alpha = r^2."""
 
 
 class RetinexPrior(PriorBase):
-    """No weights: photograph / light gathered from all photographs, then colour retinex (docs/real-scenes.md). A baseline, not
-    a learned prior."""
+    """A baseline that needs no weights, not a learned prior: photographs divided by the light gathered from all of them, then
+    colour retinex (docs/method/priors.md#retinex-baseline)."""
 
     kind: Literal["retinex"]
     mean_albedo: float = Field(0.4, gt=0, lt=1)
-    """Mean albedo that each hypothesis is scaled to."""
+    """Mean albedo to which each prediction is scaled."""
 
 
 class DiffusionPrior(PriorBase):
     accept_license: bool = False
-    """`true` says that you read the licence of the weights and may use them for this."""
+    """Set to `true` if you have read the licence of the weights and may use them for this."""
     tile: int = Field(1024, ge=64, le=4096, multiple_of=64)
-    """Larger pictures are sampled in tiles of this edge (pixels that the model sees), which overlap by a quarter."""
+    """Edge in pixels of the tiles in which larger pictures are sampled; they overlap by a quarter."""
     batch: int | None = Field(None, ge=1)
-    """Samples at once; default: 4 on a GPU, on a CPU one a thread."""
+    """Samples computed together; by default 4 on a GPU, and one per thread on a CPU."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """`auto`: the GPU if torch sees one."""
+    """`auto`: the GPU if torch finds one."""
     precision: Literal["auto", "float32", "float16", "bfloat16"] = "auto"
-    """Of the U-Net; `auto`: float16 on a GPU, float32 on a CPU. The rest is float32."""
+    """Precision of the U-Net; `auto`: float16 on a GPU, float32 on a CPU. The rest of the model is float32."""
 
 
 class RgbxPrior(DiffusionPrior):
-    """RGB-X, a diffusion model whose weights you bring (docs/priors.md). Non-commercial research only."""
+    """RGB-X, a diffusion model whose weights you bring (docs/guide/priors.md). Non-commercial research only."""
 
     kind: Literal["rgbx"]
     checkpoint: str = "zheng95z/rgb-to-x"
-    """Folder in diffusers' layout, or the name of a repository in the local cache of Hugging Face. Nothing is downloaded."""
+    """Folder in the layout of diffusers, or the name of a repository in the local cache of Hugging Face. Nothing is
+    downloaded."""
     revision: str | None = Field("b38b3fd73a14ea62f3953fc54bc4ac67b067bae0", pattern=r"^[0-9a-f]{7,40}$")
-    """Commit of the checkpoint that is meant, or its first digits; where a folder tells none, it is not compared."""
+    """Expected commit of the checkpoint, or its first digits; not compared with a folder that does not state its commit."""
     steps: int = Field(50, ge=1, le=1000)
     """Denoising steps."""
     longest_side: int = Field(1024, ge=64, le=8192)
-    """Photographs are scaled to this size, in pixels, for the model; the maps are scaled back."""
+    """Longest side in pixels to which photographs are scaled for the model; the maps are scaled back."""
 
 
 class MarigoldPrior(DiffusionPrior):
-    """Marigold-IID appearance, a diffusion model whose weights you bring (docs/priors.md)."""
+    """Marigold-IID appearance, a diffusion model whose weights you bring (docs/guide/priors.md)."""
 
     kind: Literal["marigold"]
     checkpoint: str = "prs-eth/marigold-iid-appearance-v1-1"
-    """Folder in diffusers' layout, or the name of a repository in the local cache of Hugging Face. Nothing is downloaded."""
+    """Folder in the layout of diffusers, or the name of a repository in the local cache of Hugging Face. Nothing is
+    downloaded."""
     revision: str | None = Field("e7280a0a0fc5a0df0b36050882b3d8b77da22fd9", pattern=r"^[0-9a-f]{7,40}$")
-    """Commit of the checkpoint that is meant, or its first digits; where a folder tells none, it is not compared."""
+    """Expected commit of the checkpoint, or its first digits; not compared with a folder that does not state its commit."""
     steps: int | None = Field(None, ge=1, le=1000)
-    """Denoising steps; default: what the checkpoint recommends (4)."""
+    """Denoising steps; by default as many as the checkpoint recommends (4)."""
     longest_side: int | None = Field(None, ge=64, le=8192)
-    """Photographs are scaled to this size, in pixels, for the model; default: what the checkpoint recommends (768)."""
+    """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
 Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior | RgbxPrior | MarigoldPrior, Field(discriminator="kind")]

@@ -1,4 +1,4 @@
-"""Everything about one scene: the sections together, as a model and as a tree of plain values."""
+"""All settings of one scene, as a validated model and as a tree of plain values."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from workflow.settings.source import Capture, Source
 
 
 class SceneSettings(Section):
-    """Everything about one scene."""
+    """All settings of one scene."""
 
     source: Source
     """Where photographs, cameras and mesh come from."""
@@ -36,9 +36,9 @@ class SceneSettings(Section):
     export: Export = Export()
     report: Report = Report()
     relight: list[Relighting] = Field(default_factory=list)
-    """Pictures under other light and from elsewhere, made on demand."""
+    """Pictures under other light and from other positions, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
-    """Seed of everything random."""
+    """Seed of all random numbers."""
 
     @field_validator("segmentation", mode="before")
     @classmethod
@@ -56,28 +56,35 @@ class SceneSettings(Section):
 
 
 def _members(union: Any) -> dict[str, type[Section]]:
-    """The sections of a union by their `kind`."""
+    """Return the sections of a union by their `kind`."""
     sections = get_args(get_args(union)[0])
     return {get_args(section.model_fields["kind"].annotation)[0]: section for section in sections}
 
 
 UNIONS = {"source": _members(Source), "prior": _members(Prior), "segmentation": _members(Segmentation)}
-"""Sections whose `kind` chooses what other keys they have: kind -> its model."""
+"""Sections whose `kind` decides which other keys they have: section -> kind -> model."""
+
+SECTIONS_THAT_CHOOSE: dict[str, type[Section]] = {
+    name: field.annotation
+    for name, field in SceneSettings.model_fields.items()
+    if isinstance(field.annotation, type) and issubclass(field.annotation, Section) and field.annotation.IDLE
+}
+"""Sections with a setting, such as `solver`, that leaves others of the same section without effect."""
 
 
 def section_in(annotation: Any) -> Any:
-    """The section in `list[Section]` and `Section | None`; other types as they are."""
+    """Return the section in `list[Section]` or `Section | None`; other types unchanged."""
     inner = [t for t in getattr(annotation, "__args__", ()) if isinstance(t, type) and issubclass(t, Section)]
     return inner[0] if inner else annotation
 
 
 def dump(settings: SceneSettings) -> dict[str, Any]:
-    """Plain JSON values of the settings."""
+    """Return the settings as plain JSON values."""
     return settings.model_dump(mode="json")
 
 
 def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """The parts of a dumped settings tree named by dotted `keys`."""
+    """Return the parts of a dumped settings tree that dotted `keys` name."""
     out: dict[str, Any] = {}
     for key in keys:
         value: Any = document

@@ -1,4 +1,4 @@
-"""Where photographs, cameras and mesh come from, and how they are taken."""
+"""Settings of the source: where photographs, cameras and mesh come from, and how many photographs are taken."""
 
 from __future__ import annotations
 
@@ -11,91 +11,94 @@ from workflow.settings.section import Section
 
 
 class BuiltinSource(Section):
-    """The room that the project makes itself; needs nothing from outside."""
+    """A room that the project makes itself; nothing from outside is needed."""
 
     kind: Literal["builtin"]
     scene: Literal["kitchen", "tiny"] = "kitchen"
-    """`kitchen`: a furnished room; `tiny`: a few boxes for tests."""
+    """`kitchen`: a furnished room; `tiny`: a few boxes, for tests."""
 
 
 class MitsubaSource(Section):
-    """Any Mitsuba 3 scene XML; the workflow renders photographs, G-buffers and ground truth itself."""
+    """Any Mitsuba 3 scene; the workflow renders photographs, G-buffers and ground truth itself."""
 
     kind: Literal["mitsuba"]
     path: Path
-    """The scene's XML file."""
+    """XML file of the scene."""
     max_bounces: int = Field(16, ge=1, le=64)
-    """Path length of the rendered photographs."""
+    """Longest path of the rendered photographs, in bounces."""
     drop_transparent: bool = True
-    """Leave dielectric surfaces out of the mesh (a scan has none either); recorded, pixels behind them are not scored."""
+    """Leave transparent (dielectric) surfaces out of the mesh, as a scan does. This is recorded, and pixels behind them are not
+    scored."""
 
 
 class PhotographedSource(Section):
     alignment: Literal["check", "warn", "off"] = "check"
-    """Reproject the mesh against depth, sparse points or image edges; `check` refuses a mismatch with the measured
-    disagreement."""
+    """Compare the projected mesh with depth images, sparse points or image edges; `check` refuses a mismatch and reports the
+    measured disagreement."""
     alignment_tolerance: float = Field(0.05, gt=0)
-    """Largest accepted median relative depth disagreement, where depth images or sparse points exist."""
+    """Largest accepted median relative difference of depth, where depth images or sparse points exist."""
     registration: Literal["auto", "off"] = "auto"
-    """`auto`: poses, focal length and principal point corrected by what mesh and other photographs show, if held-out surface
-    agrees; blurred and badly posed photographs left out. `off`: as given."""
+    """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
+    the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
 
 
 class FolderSource(PhotographedSource):
-    """Your own scene: cameras (`transforms.json` or a COLMAP model), images and a mesh in one folder (docs/own-data.md)."""
+    """A scene of your own: cameras (`transforms.json` or a COLMAP model), images and a mesh in one folder
+    (docs/guide/own-data.md)."""
 
     kind: Literal["folder"]
     path: Path
     """The folder."""
     cameras: str | None = None
-    """transforms.json, or the folder of a COLMAP model, inside the folder; default: `transforms.json`, else `sparse/0`,
-    `sparse`, `colmap/sparse/0`, `colmap`."""
+    """transforms.json, or the folder of a COLMAP model, inside the folder; by default the first of `transforms.json`, `sparse/0`,
+    `sparse`, `colmap/sparse/0` and `colmap` that exists."""
     images: str = "images"
-    """COLMAP: what the names of its images count from."""
+    """COLMAP: folder that the names of its images are relative to."""
     mesh: str | None = None
-    """Mesh file inside the folder; default: the only one of mesh.ply, mesh.obj, mesh.glb."""
+    """Mesh file inside the folder; by default the only one of mesh.ply, mesh.obj and mesh.glb."""
     unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
-    """Unit of mesh and camera positions (a number = metres per unit)."""
+    """Unit of mesh and camera positions; a number is metres per unit."""
     axes: Literal["opengl", "opencv"] = "opengl"
     """Camera axes of `transform_matrix`."""
     pixel_centre: Literal["auto", "half", "integer"] = "auto"
-    """Where principal points count from: centres at (u+0.5) or at integers; auto reads `pixel_centres_at` of the file."""
+    """Convention of principal points: pixel centres at half-integers or at integers; `auto` reads `pixel_centres_at` of the
+    file."""
     applied_transform: Literal["keep", "undo"] = "keep"
-    """`undo`: the mesh is in the frame before nerfstudio's `applied_transform` (a mesh that COLMAP made)."""
+    """`undo`: the mesh is in the frame before nerfstudio's `applied_transform`, as a mesh made by COLMAP is."""
     frames: str | None = None
-    """Keep only images whose file path matches this glob."""
+    """Keep only images whose file path matches this glob pattern."""
 
 
 class ScanNetppSource(PhotographedSource):
-    """A scene of ScanNet++ as released: `dslr/` and `scans/` in one folder (docs/own-data.md)."""
+    """A scene of ScanNet++ as released: `dslr/` and `scans/` in one folder (docs/guide/own-data.md)."""
 
     kind: Literal["scannetpp"]
     path: Path
-    """The scene's folder, such as `data/scannetpp/data/2a1b555966`."""
+    """Folder of the scene, such as `data/scannetpp/data/2a1b555966`."""
     images: Literal["dslr", "undistorted"] = "dslr"
-    """`dslr`: fisheye `resized_images`, undistorted here; `undistorted`: what the toolbox made of them."""
+    """`dslr`: the fisheye `resized_images`, undistorted here; `undistorted`: the images that the toolbox has undistorted."""
     lists: Literal["all", "train"] = "all"
-    """`all`: photographs of the test list are held out; `train`: they are left out."""
+    """`all`: hold out the photographs of the test list; `train`: leave them out."""
     world: Literal["nerfstudio", "mesh"] = "nerfstudio"
-    """Frame of the poses in transforms.json: as released (turned against the mesh), or the mesh's own."""
+    """Frame of the poses in transforms.json: as released (rotated against the mesh), or that of the mesh."""
     drop_bad: bool = True
     """Leave out photographs that the release marks as bad (`is_bad`)."""
 
 
 class FiptSource(PhotographedSource):
-    """A scene of FIPT or IIF, synthetic (`train/transforms.json`) or real (`cam.txt`, `K_list.txt`) (docs/own-data.md)."""
+    """A scene of FIPT or IIF, synthetic (`train/transforms.json`) or real (`cam.txt`, `K_list.txt`) (docs/guide/own-data.md)."""
 
     kind: Literal["fipt"]
     path: Path
-    """The scene's folder: holds scene.obj."""
+    """Folder of the scene, which holds scene.obj."""
     mesh: str = "scene.obj"
     """Mesh file inside the folder."""
     unit: Literal["m", "cm", "mm", "km", "ft", "in"] | float = "m"
-    """Unit of mesh and camera positions (a number = metres per unit)."""
+    """Unit of mesh and camera positions; a number is metres per unit."""
     validation: Literal["test", "none"] = "test"
-    """Synthetic: photographs of `val/` are held out, or left out."""
+    """Synthetic scenes: hold out the photographs of `val/` (`test`), or leave them out (`none`)."""
     ids: Literal["auto", "parts", "semantic", "none"] = "auto"
-    """Object ids: `parts` = `IndexMA`, `semantic` = `segmentation`; `auto`: the first of them that exists."""
+    """Object ids: `parts` = `IndexMA`, `semantic` = `segmentation`; `auto`: the first of the two that exists."""
 
 
 Source = Annotated[BuiltinSource | MitsubaSource | FolderSource | ScanNetppSource | FiptSource, Field(discriminator="kind")]
@@ -105,21 +108,21 @@ class Capture(Section):
     """How the photographs encode radiance, and how many are taken."""
 
     dynamic_range: Literal["ldr", "hdr"] = "ldr"
-    """`ldr`: 8-bit through an unknown response; `hdr`: linear radiance."""
+    """`ldr`: 8-bit values through an unknown camera response; `hdr`: linear radiance."""
     views: int = Field(16, ge=1)
-    """Photographs to render, or the largest number to take (evenly spread) from those that exist."""
+    """Number of photographs to render, or the largest number to take, evenly spread, from those that exist."""
     width: int = Field(160, ge=16, le=8192)
-    """Image width in pixels (existing photographs are reduced to fit width x height, aspect kept)."""
+    """Image width in pixels; existing photographs are reduced to fit width x height, with their aspect ratio kept."""
     height: int = Field(160, ge=16, le=8192)
     """Image height in pixels."""
     samples: int = Field(128, ge=1)
-    """Paths a pixel for rendered photographs."""
+    """Paths per pixel for rendered photographs."""
     exposure: Literal["given", "estimate"] = "given"
-    """`estimate`: gains of the views from surface that they share."""
+    """`estimate`: find the exposures of the photographs from surface that several of them show."""
     denoise: bool = False
-    """Denoise rendered photographs: fewer samples do, at the price of a bias of a few per cent."""
+    """Denoise rendered photographs: fewer samples suffice, at the price of a bias of a few per cent."""
     test_every: int = Field(0, ge=0)
-    """Every n-th view is held out: no stage before `render` and `metrics` reads its photograph (0 = none)."""
+    """Hold out every n-th view: no stage before `render` and `metrics` reads its photograph (0 = none)."""
 
     @field_validator("test_every")
     @classmethod

@@ -1,13 +1,12 @@
-"""Studies: tables of variants (settings) x scenes x seeds that the ordinary rules run; docs/studies.md tells how to write one.
+"""Studies: tables of variants (settings) x scenes x seeds, run by the ordinary rules (docs/development/studies.md).
 
-A *derived scene* `<scene>--<study>-<variant>-s<seed>` is the scene's own file, with the scene's entry of
-`config/studies/scenes.yaml` over it, with the variant's settings over that, and `prior.seed: <seed>`. `<scene>--s<seed>` is the
-same without a variant: what all studies share (photographs, predictions, segments) lies there. Imports nothing heavy.
+A *derived scene* `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
+`config/studies/scenes.yaml`, over these the settings of the variant, and `prior.seed: <seed>`. `<scene>--s<seed>` is the same
+without a variant and holds what all studies share: photographs, predictions, segments.
 """
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import re
 from functools import lru_cache
@@ -17,8 +16,9 @@ from typing import Any, Literal, NamedTuple
 from pydantic import Field, ValidationError
 
 from iif_core.errors import InputError
+from iif_core.evaluation import catalogue
 from workflow.registry import STAGES
-from workflow.settings.names import scene_names
+from workflow.settings.names import configuration, did_you_mean, scene_names, scene_path
 from workflow.settings.section import Section
 from workflow.settings.yaml_file import read_yaml
 
@@ -30,28 +30,27 @@ _DERIVED = re.compile(
     rf"(?P<scene>[A-Za-z0-9_-]+?)--(?:(?P<study>{STUDY})-(?P<variant>{_VARIANT.pattern})-)?s(?P<seed>0|[1-9]\d{{0,8}})"
 )
 
-METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg", "coverage_50", "coverage_80", "coverage_95", "log_l2", "iou")
-METRICS += ("shading_left", "shading_slope", "view_spread")
-QUANTITIES = ("albedo", "roughness", "metallic", "emission", "rgb", "rgb_held_out")
-Protocol = Literal["raw", "scaled", "oracle_affine"]
+METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
+"""Metrics that a study can show."""
+QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out")
 
 
 class Variant(Section):
     """One row of the table."""
 
     label: str = ""
-    """Words for tables and pictures; default: the variant's name."""
+    """Label in tables and pictures; by default the name of the variant."""
     row: str = ""
-    """`scores: metrics`: which row of variants.parquet is scored; default: `result`."""
+    """`scores: metrics`: row of variants.parquet that is scored; by default `result`."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
 
 
 class Paper(Section):
-    """What a publication prints for a variant."""
+    """Numbers that a publication gives for a variant."""
 
-    protocol: Protocol
-    """Protocol that its numbers were scored under."""
+    protocol: catalogue.ProtocolName
+    """Protocol under which its numbers were scored."""
     values: dict[str, float]
     """`quantity/metric` -> number."""
 
@@ -64,9 +63,9 @@ class Plot(Section):
     x: str = ""
     """`line`, `history`: setting on the horizontal axis, dotted, e.g. `base.predictions`."""
     group: list[str] = []
-    """Settings that tell one line (or colour) from another."""
+    """Settings that distinguish lines (or colours)."""
     history: str = "entropy"
-    """`history`: which column of base.json's history."""
+    """`history`: column of the history in base.json."""
     log: bool = False
     """Logarithmic horizontal axis."""
 
@@ -75,25 +74,25 @@ class Study(Section):
     """One file under config/studies/."""
 
     title: str
-    """Above the table and the picture."""
+    """Title of the table and the picture."""
     scenes: list[str] = Field(min_length=1)
     """Names of entries in config/studies/scenes.yaml."""
     seeds: list[int] = Field([0, 1, 2], min_length=1)
-    """Seeds of the prior; everything else keeps the scene's seed."""
+    """Seeds of the prior; everything else keeps the seed of the scene."""
     scores: Literal["base_scores", "metrics"] = "base_scores"
     """Stage whose scores are collected: of the base texture, or of the result and its re-rendering."""
     costs: list[str] = ["base"]
-    """Stages whose times are added up."""
-    protocols: list[Protocol] = Field(["raw", "oracle_affine"], min_length=1)
+    """Stages whose times are added."""
+    protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
     """Protocols in the printed table and the picture; the Parquet file has all."""
     common: dict[str, dict[str, Any]] = {}
-    """Settings of all variants, under their own."""
+    """Settings of all variants; those of a variant override them."""
     reference: str = ""
-    """Variant that the printed table compares the others with: the difference stands in brackets."""
+    """Variant with which the printed table compares the others; differences are in brackets."""
     variants: dict[str, Variant] = {}
     """Name -> variant."""
     grids: list[dict[str, list[Any]]] = []
-    """Each: dotted setting -> values; every combination is a variant, named after its values."""
+    """Each maps dotted settings to values; every combination is a variant, named after its values."""
     paper: dict[str, Paper] = {}
     """Variant -> published numbers."""
     show: list[str] = ["albedo/psnr", "albedo/ssim", "albedo/lpips", "roughness/l2", "metallic/l2"]
@@ -102,7 +101,7 @@ class Study(Section):
 
 
 class Derived(NamedTuple):
-    """A derived scene's name, taken apart; `study` and `variant` are empty for what all studies share."""
+    """Parts of the name of a derived scene; `study` and `variant` are empty for what all studies share."""
 
     scene: str
     study: str
@@ -111,34 +110,33 @@ class Derived(NamedTuple):
 
 
 def study_names(root: Path = Path(".")) -> list[str]:
-    """Every study that has a file."""
-    return sorted(path.stem for path in (root / FOLDER).glob("*.yaml") if path.name != SCENES.name)
+    """Return the name of every study that has a file, sorted."""
+    return sorted(path.stem for path in configuration("studies", root).glob("*.yaml") if path.name != SCENES.name)
 
 
 def load_study(name: str, root: Path = Path(".")) -> Study:
-    """The study, its grids written out as variants.
+    """Return the study, with its grids expanded into variants.
 
     Raises:
-        InputError: names file, key, what was found and what is allowed.
+        InputError: names the file, the key, what was found and what is allowed.
     """
     path = FOLDER / f"{name}.yaml"
     names = study_names(root)
     if name not in names:
-        near = difflib.get_close_matches(name, names, 1)
-        hint = f" Did you mean {near[0]}?" if near else ""
         raise InputError(
-            f"{path}: not found.{hint} Known studies: {', '.join(names) or 'none'}; benchmarks"
-            " of kernels: hashgrid, base_cost (docs/studies.md)."
+            f"{path}: not found.{did_you_mean(name, names)} Known studies: {', '.join(names) or 'none'}; benchmarks"
+            " of kernels: hashgrid, base_cost (docs/development/studies.md)."
         )
     if not re.fullmatch(STUDY, name):
         raise InputError(f"{path}: name of a study {name!r}: allowed are lower-case letters, digits and _, a letter first")
-    return _load_study(path, root, (root / path).stat().st_mtime_ns)
+    file = configuration("studies", root) / path.name
+    return _load_study(path, file, root, file.stat().st_mtime_ns)
 
 
 @lru_cache(64)
-def _load_study(path: Path, root: Path, _stamp: int) -> Study:
+def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     try:
-        study = Study.model_validate(read_yaml(root / path))
+        study = Study.model_validate(read_yaml(file))
     except ValidationError as error:
         raise InputError(_explain(error, path)) from None
     variants = dict(study.variants)
@@ -178,8 +176,7 @@ def _load_study(path: Path, root: Path, _stamp: int) -> Study:
             raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")
     for scene in study.scenes:
         if scene not in shared:
-            near = difflib.get_close_matches(scene, shared, 1)
-            hint = f" Did you mean {near[0]}?" if near else ""
+            hint = did_you_mean(scene, shared)
             raise InputError(f"{path}: `scenes`: {scene} is not in {SCENES}.{hint} Allowed here: {', '.join(shared)}.")
     return study.model_copy(update={"variants": variants})
 
@@ -200,16 +197,15 @@ def _grid(grid: dict[str, list[Any]], where: str) -> dict[str, Variant]:
 
 
 def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
-    """Scene -> settings that every study uses for it (config/studies/scenes.yaml)."""
-    path = root / SCENES
+    """Return scene -> settings that every study uses for it (config/studies/scenes.yaml)."""
+    path = configuration("studies", root) / SCENES.name
     if not path.is_file():
-        raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (docs/studies.md)")
+        raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (docs/development/studies.md)")
     document = read_yaml(path)
     known = scene_names(root)
     for scene, overrides in document.items():
         if scene not in known:
-            near = difflib.get_close_matches(str(scene), known, 1)
-            hint = f" Did you mean {near[0]}?" if near else ""
+            hint = did_you_mean(scene, known)
             raise InputError(f"{SCENES}: {scene}: no such scene.{hint} Known scenes: {', '.join(known) or 'none'}.")
         if overrides is not None and not isinstance(overrides, dict):
             raise InputError(f"{SCENES}: `{scene}`: found {overrides!r}, needed settings, e.g. {{capture: {{views: 24}}}}")
@@ -217,8 +213,8 @@ def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
 
 
 def derived(name: str, root: Path = Path(".")) -> Derived | None:
-    """Parts of the name of a derived scene; None for a scene with a file of its own, or for any other name."""
-    if "--" not in name or (root / "config/scenes" / f"{name}.yaml").is_file():
+    """Return the parts of the name of a derived scene; None for a scene with a file of its own, or for any other name."""
+    if "--" not in name or scene_path(name, root).is_file():
         return None
     match = _DERIVED.fullmatch(name)
     if not match:
@@ -227,7 +223,7 @@ def derived(name: str, root: Path = Path(".")) -> Derived | None:
 
 
 def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
-    """(where it stands, settings) that a derived scene puts over the file of its scene, in order."""
+    """Return (place, settings) of the layers that a derived scene puts over the file of its scene, in order."""
     shared = scene_overrides(root)
     if parts.scene not in shared:
         raise InputError(f"{SCENES}: {parts.scene} is not listed. Known there: {', '.join(shared) or 'none'}.")
@@ -235,8 +231,7 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
     if parts.study:
         study = load_study(parts.study, root)
         if parts.variant not in study.variants:
-            near = difflib.get_close_matches(parts.variant, study.variants, 1)
-            hint = f" Did you mean {near[0]}?" if near else ""
+            hint = did_you_mean(parts.variant, study.variants)
             raise InputError(
                 f"{FOLDER / parts.study}.yaml: no variant {parts.variant}.{hint} Known: {', '.join(study.variants)}."
             )
@@ -247,10 +242,11 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
 
 
 def bases(name: str, root: Path = Path(".")) -> list[str]:
-    """Derived scenes whose folders hold what `name` has in common with others, most common first.
+    """Return the derived scenes whose folders may hold results that `name` shares, the most general first.
 
-    They are what all studies share, then the variants of its own study up to itself, of the first seed and of its own: so
-    a variant that differs late (a baseline of the last fit) finds everything before it where the first variant left it.
+    These are what all studies share, then the variants of its own study up to itself, with the first seed and with its own. A
+    variant that differs late, such as a baseline of the last fit, thus finds everything before that stage in the folder of the
+    first variant.
     """
     parts = derived(name, root)
     if parts is None:
@@ -267,7 +263,11 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
 
 
 def scene_of(study: str, scene: str, variant: str, seed: int) -> str:
-    """Name of the derived scene."""
+    """Return the name of a derived scene.
+
+    >>> scene_of("aggregation", "kitchen", "full", 0)
+    'kitchen--aggregation-full-s0'
+    """
     return f"{scene}--{study}-{variant}-s{seed}"
 
 
@@ -279,8 +279,7 @@ def _explain(error: ValidationError, path: Path) -> str:
         if problem["type"] == "extra_forbidden":
             model = {1: Study, 2: Plot}.get(len(where), Paper if where[0] == "paper" else Variant)
             allowed = list(model.model_fields)
-            near = difflib.get_close_matches(str(where[-1]), allowed, 1)
-            hint = f" Did you mean `{near[0]}`?" if near else ""
+            hint = did_you_mean(where[-1], allowed, "`{}`")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif problem["type"] == "missing":
             lines.append(f"{path}: `{dotted}`: missing. Add it; config/studies/aggregation.yaml is a complete example.")

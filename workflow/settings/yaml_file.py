@@ -1,4 +1,4 @@
-"""YAML files of settings: read strictly, with errors that name file and line."""
+"""Strict reading of YAML files, with errors that name file and line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from iif_core.errors import InputError
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a key that stands twice in one mapping is an error, not a silent choice."""
+    """YAML in which a key that occurs twice in one mapping is an error."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [self.construct_object(key, deep=deep) for key, _ in node.value]
@@ -22,7 +22,11 @@ class _StrictLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A file of `key: value` lines; an `InputError` names file and line."""
+    """Return the content of a file of `key: value` lines.
+
+    Raises:
+        InputError: the file is not UTF-8, not valid YAML, or holds something else; names file and line.
+    """
     try:
         document = yaml.load(path.read_text(encoding="utf-8"), _StrictLoader)
     except UnicodeDecodeError as error:

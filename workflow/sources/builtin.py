@@ -1,8 +1,7 @@
-"""Source `builtin`: a room that the project makes itself -> photographs, cameras, mesh and ground truth.
+"""Source `builtin`: photographs, cameras, mesh and ground truth of a room that the project makes itself.
 
-The photographs are path traced with the workflow's own reflectance model and the same textures that the
-truth maps show, so that nothing stands between model and data but Monte Carlo noise, eight bits and a
-response that the solver is not told.
+The photographs are path traced with the workflow's own reflectance model and with the textures of the truth maps. Model and data
+therefore differ only by Monte Carlo noise, quantisation to eight bits and a camera response that the solver does not know.
 """
 
 from __future__ import annotations
@@ -25,17 +24,17 @@ Array = np.ndarray
 
 RESPONSE = "filmic"
 MAX_BOUNCES = 16
-_METER = 4096  # pixels a view that set the exposure
-_COVERAGE_POINTS = 8000
+METERING_PIXELS = 4096  # per view; their radiance sets the exposure
+COVERAGE_POINTS = 8000
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """None: the room is made, not read."""
+    """Return no files: the room is made, not read."""
     return []
 
 
 def capture(job: Job) -> None:
-    """Build the room, photograph it, and write the normal form with truth."""
+    """Build the room, photograph it, and write the normal form with ground truth."""
     from workflow.runtime import native
 
     native.prepare()
@@ -52,7 +51,7 @@ def capture(job: Job) -> None:
 
 
 class _Capture:
-    """One capture: the room on the device, its views, and what is to be said about them."""
+    """One capture: the room on the device and its views."""
 
     def __init__(self, job: Job, room: Room):
         from iif_core.light.transport.emitters import Emitters
@@ -67,13 +66,8 @@ class _Capture:
 
     def run(self) -> None:
         views = self._plan()
-        self.writer.mesh(
-            self.room.vertices,
-            self.room.faces,
-            self.room.object_id,
-            list(self.room.names),
-            self.room.emission,
-        )
+        room = self.room
+        self.writer.mesh(room.vertices, room.faces, room.object_id, list(room.names), room.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
@@ -101,15 +95,15 @@ class _Capture:
             self.job.progress(i + 1, len(views), "rendered views")
 
     def _view(self, view: View, radiance: Array) -> tuple[Array, Array]:
-        """Write G-buffer and truth, fill in `radiance`; radiance and mask of the pixels for metering."""
-        from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+        """Write G-buffer and truth and fill in `radiance`; return radiance and mask of the pixels for metering."""
+        from iif_core.camera.pinhole import direction_derivatives
         from iif_core.light.transport.geometry import trace
         from iif_core.light.transport.render import render
+        from iif_core.light.transport.scene import PathOptions, Scene
 
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
-        rays = rays.reshape(-1, 3)
+        rays = view.directions().reshape(-1, 3)
         face, depth = trace(self.geometry, origin, rays)
         hit = face >= 0
         depth = np.where(hit, depth, 0).astype(np.float32)
@@ -120,8 +114,8 @@ class _Capture:
 
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
-        scene = (self.geometry, self.material, self.emitters)
-        image = render(*scene, origin, rays, self.settings.samples, MAX_BOUNCES, seed, jitter=steps)
+        scene = Scene(self.geometry, self.material, self.emitters)
+        image = render(scene, origin, rays, PathOptions(self.settings.samples, MAX_BOUNCES, seed), jitter=steps)
         if self.settings.denoise:
             normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.geometry.normals[on], 0)
             image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
@@ -139,11 +133,11 @@ class _Capture:
                 hit.reshape(shape),
             ),
         )
-        step = max(1, len(image) // _METER)
+        step = max(1, len(image) // METERING_PIXELS)
         return image[::step], ~emission.any(1)[::step]
 
     def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
-        """Write the photographs; the views with their exposures."""
+        """Write the photographs and return the views with their exposures."""
         from iif_core.camera.simulation import expose, exposures, response_curve
 
         self.response = None
@@ -161,7 +155,7 @@ class _Capture:
     def _finish(self, views: list[View]) -> None:
         from workflow.sources.rooms.coverage import seen_from, surface_points
 
-        points = surface_points(self.room, _COVERAGE_POINTS)
+        points = surface_points(self.room, COVERAGE_POINTS)
         opening = self.room.field_of_view
 
         def count(cameras: list[Array], aspect: float) -> Array:
@@ -176,13 +170,7 @@ class _Capture:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:
             notes.append(NOTE)
-        facts = {
-            "room": self.room.name,
-            "coverage": {
-                "seen_once": round(once, 4),
-                "seen_twice": round(twice, 4),
-                "points": _COVERAGE_POINTS,
-            },
-        }
+        coverage = {"seen_once": round(once, 4), "seen_twice": round(twice, 4), "points": COVERAGE_POINTS}
+        facts = {"room": self.room.name, "coverage": coverage}
         samples = None if self.response is None else self.response.samples()
         self.writer.finish("builtin", self.settings.dynamic_range, True, notes, samples, facts)

@@ -1,10 +1,10 @@
-"""Source `fipt`: scenes of FIPT and of Intrinsic Image Fusion (docs/own-data.md, METHOD 4.1, 4.2).
+"""Source `fipt`: scenes of FIPT and of Intrinsic Image Fusion (docs/guide/own-data.md, docs/method/camera.md#axes-and-pixels).
 
     synthetic   scene.obj, train/ and val/: transforms.json, Image/NNN_0001.{exr,png}, Image/cam/{exposure,crf}.npy,
                 BaseCol, Roughness, Metallic, Emit, IndexMA/NNN_0001.exr, segmentation/NNN.exr
     real        scene.obj, cam.txt, K_list.txt, Image/NNN_0001.{exr,png}, segmentation/NNN.exr
 
-`capture.dynamic_range` decides between exr (radiance) and png (through the response, with exposures).
+`capture.dynamic_range` selects exr (radiance) or png (sensor values, with exposures).
 """
 
 from __future__ import annotations
@@ -22,17 +22,24 @@ from workflow.sources import folder
 from workflow.sources.folder_scene import images, mesh, transforms
 from workflow.sources.folder_scene.inputs import Inputs
 
-LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Camera axes of the synthetic scenes (x left, y up, z forward) to OpenCV's."""
-SQUARE = 2e-3
-"""Largest |cosine| between viewing direction and up vector of a real camera."""
+OPENCV_FROM_LEFT_UP_FORWARD = np.diag([-1.0, -1.0, 1.0, 1.0])  # from the camera axes of the synthetic scenes
+MAX_COSINE_TO_UP = 2e-3  # between viewing direction and up vector of a real camera
 TRUTH = {"albedo": "BaseCol", "roughness": "Roughness", "metallic": "Metallic", "emission": "Emit"}
 IDS = {"parts": "IndexMA", "semantic": "segmentation"}
 
 
 @dataclass
 class Listed:
-    """Cameras as entries of transforms.json with `_at`: folder and index of the photograph."""
+    """Cameras as entries of transforms.json, with `_at`: folder and index of the photograph.
+
+    Attributes:
+        path: file of the cameras, for messages.
+        entries: one per photograph.
+        flip: (4, 4), from OpenCV's camera axes to those of the entries.
+        homes: folders of photographs.
+        also: further files that were read.
+        notes: what was left out, in words.
+    """
 
     path: Path
     entries: list[dict[str, Any]]
@@ -43,10 +50,10 @@ class Listed:
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Files that the capture reads; everything that can be checked without pixels is checked here.
+    """List the files that the capture reads, after checking everything that can be checked without pixels.
 
     Raises:
-        InputError: what is missing or does not fit, by name.
+        InputError: missing or inconsistent files, by name.
     """
     return find_inputs(document["source"], document["capture"]).files()
 
@@ -57,7 +64,11 @@ def capture(job: Job) -> None:
 
 
 def find_inputs(source: dict[str, Any], settings: dict[str, Any]) -> Inputs:
-    """The checked scene: cameras of OpenCV axes, and the files that belong to them."""
+    """Find and check the cameras of a scene, with OpenCV axes, and the files that belong to them.
+
+    Raises:
+        InputError: missing or inconsistent files, by name.
+    """
     home = transforms.folder_at(source, "scene.obj")
     encoded = settings["dynamic_range"] == "ldr"
     if (home / "train/transforms.json").is_file():
@@ -105,7 +116,7 @@ def _entry(home: Path, place: Path, index: int, encoded: bool, **keys: Any) -> d
 
 
 def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
-    found = Listed(home / "train/transforms.json", [], LEFT_UP_FORWARD, [])
+    found = Listed(home / "train/transforms.json", [], OPENCV_FROM_LEFT_UP_FORWARD, [])
     for split in ("train", "val"):
         path = home / split / "transforms.json"
         if split == "val" and (source["validation"] == "none" or not path.is_file()):
@@ -122,7 +133,7 @@ def _synthetic(home: Path, source: dict[str, Any], encoded: bool) -> Listed:
             found.entries.append(_entry(home, home / split, i, encoded, **shared, **keys))
         found.homes.append(home / split)
         found.also.append(path)
-    if len(found.homes) == 1:  # without val/ nothing decides what is held out but `capture.test_every`
+    if len(found.homes) == 1:  # without val/, `capture.test_every` alone decides which views are held out
         found.entries = [{**entry, "_split": None} for entry in found.entries]
     return found
 
@@ -143,7 +154,7 @@ def _real(home: Path, encoded: bool) -> Listed:
 
 
 def _triples(path: Path, what: str) -> np.ndarray:
-    """(n, 3, 3) of a file: n, then three lines of three numbers a camera."""
+    """Read (n, 3, 3) from a file that holds n, then three lines of three numbers per camera."""
     if not path.is_file():
         raise InputError(f"{path}: not found; a real FIPT scene needs cam.txt and K_list.txt")
     try:
@@ -160,16 +171,16 @@ def _triples(path: Path, what: str) -> np.ndarray:
 
 
 def _looking(path: Path, index: int, origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """OpenCV pose: z towards the target, y = -up, x = y cross z."""
+    """Return the OpenCV pose with z towards the target, y = -up and x = y cross z."""
     ahead, length = target - origin, np.linalg.norm(up)
     distance = np.linalg.norm(ahead)
     if distance < 1e-9 or length < 1e-9:
         raise InputError(f"{path}: camera {index}: looks at its own place, or has no up vector")
     z, y = ahead / distance, -up / length
-    if abs(z @ y) > SQUARE:
+    if abs(z @ y) > MAX_COSINE_TO_UP:
         raise InputError(
-            f"{path}: camera {index}: viewing direction and up vector are not square (cosine {-z @ y:.4g}, allowed {SQUARE:g});"
-            " three lines a camera are origin, look-at point, up"
+            f"{path}: camera {index}: viewing direction and up vector are not square (cosine {-z @ y:.4g}, allowed"
+            f" {MAX_COSINE_TO_UP:g}); three lines a camera are origin, look-at point, up"
         )
     pose = np.eye(4)
     pose[:3, :3] = np.stack([np.cross(y, z), y, z], 1)
@@ -181,7 +192,10 @@ def _looking(path: Path, index: int, origin: np.ndarray, target: np.ndarray, up:
 
 
 def _sensor(found: Listed, used: list[tuple[Path, int]]) -> tuple[tuple[float, ...], np.ndarray | None, list[Path]]:
-    """Exposures of the photographs that are used, the true response (3, 101) if it is there, and the files of both."""
+    """Read the exposures of the photographs that are used and, where the scene has it, the true response (3, 101).
+
+    Returns them with the files of both.
+    """
     files, tables = [], {}
     for home in found.homes:
         path = home / "Image/cam/exposure.npy"
@@ -216,7 +230,7 @@ def _array(path: Path) -> np.ndarray:
 
 
 def _truth(found: Listed, at: dict[str, tuple[Path, int]]) -> dict[str, dict[str, Path]]:
-    """The four truth maps of every photograph, and its radiance; empty where a kind has no folder."""
+    """List the four truth maps of every photograph and its radiance; empty if the folder of a kind is missing."""
     absent = sorted({name for name in TRUTH.values() for home in found.homes if not (home / name).is_dir()})
     if absent:
         if len(absent) < len(TRUTH):
@@ -235,7 +249,7 @@ def _truth(found: Listed, at: dict[str, tuple[Path, int]]) -> dict[str, dict[str
 
 
 def _ids(found: Listed, wanted: str, at: dict[str, tuple[Path, int]]) -> tuple[dict[str, Path], list[Path]]:
-    """Id maps of the photographs, and the lists of ids that each may hold."""
+    """List the id maps of the photographs and the files that say which ids each may contain."""
     if wanted == "none":
         return {}, []
     kinds = IDS if wanted == "auto" else {wanted: IDS[wanted]}
@@ -255,7 +269,7 @@ def _ids(found: Listed, wanted: str, at: dict[str, tuple[Path, int]]) -> tuple[d
 
 
 def _listed_ids(lists: list[Path]) -> dict[Path, list[np.ndarray]]:
-    """Folder of id maps -> ids that occur in every photograph, by object_ids.txt (a line of numbers each)."""
+    """Read object_ids.txt, a line of numbers per photograph: folder of id maps -> ids that occur in each photograph."""
     out = {}
     for path in lists:
         try:
@@ -267,8 +281,11 @@ def _listed_ids(lists: list[Path]) -> dict[Path, list[np.ndarray]]:
 
 
 def load_ids(listed: dict[Path, list[np.ndarray]], path: Path, turn: int = 1) -> np.ndarray:
-    """(H, W) int32 of the first channel of an EXR; -1 where it lies between integers (anti-aliased edges, METHOD H44), is
-    negative or not finite, or where object_ids.txt does not list the id for this photograph (blends of two others)."""
+    """Read object ids (H, W) int32 from the first channel of an EXR, -1 = none.
+
+    There is no id where the value is negative, not finite or between integers (anti-aliased edges,
+    docs/method/numerics.md#ids-between-integers), nor where object_ids.txt does not list it for this photograph (blends).
+    """
     values = images.load_map(path, 1)
     known = np.isfinite(values)
     whole = np.rint(np.where(known, values, -1))

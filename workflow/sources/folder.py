@@ -1,7 +1,7 @@
-"""Source `folder`: a scene of your own, in the form tools already write (docs/own-data.md).
+"""Source `folder`: the user's own scene, in the form that common tools write (docs/guide/own-data.md).
 
-`raw_inputs` checks everything that headers and JSON can tell, while Snakemake plans; `capture` removes distortion,
-reduces the photographs, traces the mesh and measures whether the two belong together.
+`raw_inputs` checks everything that headers and JSON can show, while Snakemake plans. `capture` removes distortion, reduces the
+photographs, traces the mesh and measures whether the two belong together.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from iif_core.camera.distortion import Pinhole, pinhole_inside, undistort_image
 from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
+from iif_core.surface.triangles import face_geometry
 from workflow.runtime import native
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureWriter, Truth, View
@@ -23,17 +24,15 @@ from workflow.sources.folder_scene import alignment, exposure, images, mesh, reg
 from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.transforms import Frame
 
-MIN_COVERAGE = 0.01
-"""A view whose rays hit the mesh less often than this looks at nothing."""
-SQUARE_PIXELS = 0.1
-"""|log(fl_x / fl_y)| above which a note asks whether that is right: real lenses stay below 0.01."""
+MIN_COVERAGE = 0.01  # share of the rays of a view that must hit the mesh
+MAX_LOG_PIXEL_ASPECT = 0.1  # |log(fl_x / fl_y)| above which a note asks whether it is right; real lenses stay below 0.01
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Files that the capture reads; everything that can be checked without pixels is checked here.
+    """List the files that the capture reads, after checking everything that can be checked without pixels.
 
     Raises:
-        InputError: what is missing or does not fit, by name.
+        InputError: missing or inconsistent files, by name.
     """
     return find_inputs(document["source"], document["capture"]).files()
 
@@ -42,18 +41,18 @@ def capture(job: Job) -> None:
     """Write the normal form of the folder.
 
     Raises:
-        InputError: the mesh cannot be used, no view sees it, or photographs and mesh do not belong together.
+        InputError: the mesh is unusable, no view sees it, or photographs and mesh do not belong together.
     """
     capture_photographs(job, find_inputs(vars(job.settings.source), vars(job.settings.capture), points=True))
 
 
 def capture_photographs(job: Job, inputs: Inputs) -> None:
-    """Write the normal form of photographs with known cameras and a mesh, wherever these were found."""
+    """Write the normal form of photographs with known cameras and a mesh, whichever source found them."""
     _Capture(job, inputs).run()
 
 
 class _Capture:
-    """State of one capture: settings, mesh, notes."""
+    """One capture: settings, mesh and notes."""
 
     def __init__(self, job: Job, inputs: Inputs):
         self.job, self.source, self.settings, self.inputs = job, job.settings.source, job.settings.capture, inputs
@@ -67,7 +66,7 @@ class _Capture:
         self.forms: dict[str, set[str]] = {}
         self.alignment = alignment.Alignment.empty()
         count = len(inputs.transforms.frames)
-        self.tried = {inputs.transforms.frames[i].name for i in transforms.spread(count, alignment.TRIAL_VIEWS)}
+        self.tried = {inputs.transforms.frames[i].name for i in transforms.evenly_spread(count, alignment.TRIAL_VIEWS)}
         self.trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]] = []
 
     def run(self) -> None:
@@ -80,7 +79,7 @@ class _Capture:
         if self.mesh.from_nodes and self.inputs.instances:
             self.mesh.instance = self.mesh.names = None
         self._build()
-        self.normals = self._face_normals()
+        self.normals = face_geometry(self.mesh.vertices, self.mesh.faces)[0].astype(np.float32)
         given = self._given_exposures()
         frames, poses, found = self._registered(frames, poses, given)
         shared = exposure.SharedSurface(len(frames), self.encoded)
@@ -105,7 +104,7 @@ class _Capture:
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
             if self.settings.exposure == "estimate" and view.split != "test":
-                points = view.world_from_camera[:3, 3] + depth[..., None] * alignment.directions(_pinhole(view), pose)
+                points = view.world_from_camera[:3, 3] + depth[..., None] * view.directions()
                 footprint = float(np.median(depth[face >= 0])) / view.fx
                 shared.add(photo, valid & (face >= 0), points, footprint)
             views.append(view)
@@ -145,24 +144,19 @@ class _Capture:
         no_object = np.full(len(self.mesh.faces), -1, np.int32)
         self.geometry = build_geometry(self.mesh.vertices, self.mesh.faces, no_object)
 
-    def _face_normals(self) -> np.ndarray:
-        corners = self.mesh.vertices[self.mesh.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return (normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)).astype(np.float32)
-
     def _target(self, frame: Frame) -> Pinhole:
-        """The pinhole camera at full size."""
+        """Return the pinhole camera at full size."""
         return frame.camera if frame.lens.is_identity else pinhole_inside(frame.lens, frame.camera)
 
-    def _view(self, frame: Frame, pose: np.ndarray, view_id: int, gain: float) -> View:
+    def _view(self, frame: Frame, pose: np.ndarray, view_id: int, gain: float, longest: float = np.inf) -> View:
         full = self._target(frame)
-        size = images.fitted_size(full.width, full.height, self.settings.width, self.settings.height)
-        camera = alignment.scaled(full, *size)
+        limits = min(longest, self.settings.width), min(longest, self.settings.height)
+        camera = alignment.scaled(full, *images.fitted_size(full.width, full.height, *limits))
         intrinsics = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
         return View(view_id, frame.name, *intrinsics, pose, gain if self.encoded else 1.0)
 
     def _split(self, frame: Frame, number: int) -> str:
-        """Lists of the data set come before every n-th photograph."""
+        """Return `train` or `test`; lists of the data set take precedence over `capture.test_every`."""
         if self.listed:
             return frame.split or "train"
         every = self.settings.test_every
@@ -171,16 +165,12 @@ class _Capture:
     def _registered(
         self, frames: tuple[Frame, ...], poses: list[np.ndarray], gains: list[float]
     ) -> tuple[tuple[Frame, ...], list[np.ndarray], registration.Registered]:
-        """Frames and poses as the mesh and the other photographs speak for."""
+        """Return frames and poses registered with the mesh and the other photographs."""
         if self.source.registration == "off":
             return frames, poses, registration.Registered(list(frames), poses, {}, {}, [], [])
         counts, notes, photos = dict(self.counts), list(self.notes), []
         for i, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
-            full = self._target(frame)
-            width, height = min(registration.WIDTH, self.settings.width), min(registration.WIDTH, self.settings.height)
-            camera = alignment.scaled(full, *images.fitted_size(full.width, full.height, width, height))
-            size = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            view = View(i, frame.name, *size, pose)
+            view = self._view(frame, pose, i, gains[i], registration.WIDTH)
             depth, face = self._trace(view)
             photos.append(None)
             if (face >= 0).mean() < MIN_COVERAGE:
@@ -191,16 +181,16 @@ class _Capture:
             photos[-1] = Photo(photo, valid, depth, normal, (view.fx, view.fy), (view.cx, view.cy), pose, held)
             self.job.progress(i + 1, len(frames), "photographs registered")
         self.counts, self.notes = counts, notes
-        found = registration.registered(frames, poses, photos, self.conventions.axes, self.metres)
+        found = registration.register_frames(frames, poses, photos, self.conventions.axes, self.metres)
         self.notes += found.notes
         self.notes += [f"view {name} left out: {reason}" for name, reason in found.left_out.items()]
         return tuple(found.frames), found.poses, found
 
     def _trace(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth (0 = miss) and face ids of a view."""
+        """Return z-depth (0 = miss) and face ids of a view."""
         from iif_core.light.transport.geometry import trace
 
-        rays = alignment.directions(_pinhole(view), view.world_from_camera)
+        rays = view.directions()
         face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
         shape = rays.shape[:2]
         return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape)
@@ -214,13 +204,13 @@ class _Capture:
         return pixels
 
     def _resized(self, frame: Frame, view: View, pixels: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Undistorted and reduced by area."""
+        """Return the picture undistorted and reduced by area."""
         if not frame.lens.is_identity:
             pixels, valid = undistort_image(pixels, frame.lens, frame.camera, self._target(frame), valid)
         return images.reduce_area(pixels, valid, view.width, view.height)
 
     def _photo(self, frame: Frame, view: View, gain: float) -> tuple[np.ndarray, np.ndarray]:
-        """Sensor values, or radiance (exposure divided out), of the size of `view`; and which pixels count."""
+        """Return sensor values, or radiance (divided by the exposure), at the size of `view`, and the pixels that may be used."""
         photo = images.load_photo(frame.image, frame.turn)
         self._upright(frame, frame.image, photo.pixels)
         if photo.form:
@@ -287,7 +277,7 @@ class _Capture:
                 f"{self.inputs.transforms.path}: none of {count} cameras sees {self.inputs.mesh.name} (rays that"
                 f" hit it: {max(dropped.values()):.1%} at most); "
                 + (better or f"mesh and poses differ in frame or unit, or their axes ({self.conventions.axes}) are wrong")
-                + " (docs/own-data.md)"
+                + " (docs/guide/own-data.md)"
             )
         for name, share in dropped.items():
             self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the mesh)")
@@ -311,7 +301,7 @@ class _Capture:
         alignment.raise_or_note(warning, "warn", self.notes)
 
     def _advice(self, seen: list[tuple[Frame, View]]) -> str:
-        """Which other reading of the poses fits depth images or sparse points, in words; empty without them."""
+        """Return which other convention fits the depth images or sparse points, in words; empty without them."""
         pairs = [(f, _pinhole(v)) for f, v in seen if f.depth is not None or (f.seen is not None and len(f.seen))]
         if not pairs:
             return ""
@@ -320,7 +310,7 @@ class _Capture:
         return alignment.explain(pairs, self._depth_along, axes, self.metres, known, unit, tolerance)
 
     def _blind_advice(self, blind: list[tuple[Frame, View]]) -> str:
-        """The same for photographs none of which sees the mesh as read."""
+        """Return the same for photographs of which none sees the mesh."""
         for frame, view in blind:
             if frame.name in self.tried:
                 self._try(frame, view, *self._photo(frame, view, 1.0))
@@ -332,7 +322,7 @@ class _Capture:
         self.trials.append((frame, small, *images.reduce_area(photo, valid, small.width, small.height)))
 
     def _edge_advice(self) -> str:
-        """Which other reading of the poses fits the photographs' edges clearly better, in words."""
+        """Return which other convention fits the edges of the photographs clearly better, in words."""
         axes, known = self.conventions.axes, self.inputs.transforms.known
         now = self.alignment.report()["edge_correlation"]
         return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, now)
@@ -341,7 +331,7 @@ class _Capture:
         return self._surface_along(origin, rays)[0]
 
     def _surface_along(self, origin: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """z-depth (h, w) with 0 = miss, and normals (h, w, 3)."""
+        """Return z-depth (h, w) with 0 = miss, and normals (h, w, 3), along rays (h, w, 3)."""
         from iif_core.light.transport.geometry import trace
 
         face, t = trace(self.geometry, origin, rays.reshape(-1, 3))
@@ -360,7 +350,7 @@ class _Capture:
         return exposure.read_given(self.inputs.exposures, [(f.name, f.file_path) for f in frames])
 
     def _estimated(self, shared: exposure.SharedSurface, used: list[Frame], views: list[View]) -> list[View]:
-        """Exposures of all views but the held-out ones, which keep 1: theirs are found when they are scored."""
+        """Return the views with estimated exposures; held-out views keep 1, because scoring estimates theirs."""
         every, own = views, [i for i, view in enumerate(views) if view.split != "test"]
         used, views = [used[i] for i in own], [views[i] for i in own]
         gains = shared.gains()
@@ -392,18 +382,16 @@ class _Capture:
             "masked": f"masked pixels are ignored ({sum(f.mask is not None for f in frames)} masks)",
         }
         self.notes += [f"photographs: {self.counts[k]} {text}" for k, text in words.items() if self.counts[k]]
-        meaning = {
-            "grey": "the same value in R, G and B",
-            "16-bit": "values / 65535",
-            "16-bit grey": "values / 65535, the same in R, G and B",
-        }
+        grey, deep = "the same value in R, G and B", "values / 65535"
+        meaning = {"grey": grey, "16-bit": deep, "16-bit grey": f"{deep}, the same in R, G and B"}
         self.notes += [f"photographs: {len(names)} {form}: {meaning[form]}" for form, names in sorted(self.forms.items())]
         turned = sum(f.turn != 1 for f in frames)
         if turned:
             self.notes.append(f"photographs: {turned} turned upright by their EXIF orientation, as `w` x `h` say")
 
     def _note_views(self, frames: tuple[Frame, ...], views: list[View]) -> None:
-        ratio = next((f.camera.fx / f.camera.fy for f in frames if abs(np.log(f.camera.fx / f.camera.fy)) > SQUARE_PIXELS), None)
+        aspects = (f.camera.fx / f.camera.fy for f in frames)
+        ratio = next((aspect for aspect in aspects if abs(np.log(aspect)) > MAX_LOG_PIXEL_ASPECT), None)
         if ratio:
             self.notes.append(
                 f"WARNING fl_x / fl_y is {ratio:.3g}: are the pixels that far from square, or is one of them wrong?"

@@ -1,13 +1,13 @@
-"""Source `mitsuba`: any Mitsuba 3 XML -> photographs, cameras, mesh and ground truth.
+"""Source `mitsuba`: photographs, cameras, mesh and ground truth of any Mitsuba 3 scene.
 
-The photographs are Mitsuba's path tracing of the scene as it is (its own BSDFs, glass, bump maps); mesh and material
-truth are what the workflow's model can say about it (`mitsuba_scene.materials`). What lies between is in `capture.json`
-as notes.
+Mitsuba path traces the photographs from the scene as it is, with its own BSDFs, glass and bump maps. Mesh and material truth are
+the approximation of the scene by the workflow's model (`mitsuba_scene.materials`); `capture.json` notes every difference.
 """
 
 from __future__ import annotations
 
 import tempfile
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,18 +24,22 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-FIELD_OF_VIEW = 75.0
-"""Degrees across the wider side, of the views that are not the scene's own."""
+FIELD_OF_VIEW = 75.0  # degrees across the wider side, for all views except the scene's own
 RESPONSE = "filmic"
-_METER = 4096  # pixels a view that set the exposure
-_OFF = 1e-4
-"""Share of the depth by which mesh and original surface may differ before truth is void there (glass in between)."""
-_OFF_ROUND = 0.01
+METERING_PIXELS = 4096  # per view; their radiance sets the exposure
+DEPTH_TOLERANCE = 1e-4
+"""Relative difference of depth between mesh and original surface above which a pixel has no truth (glass in between)."""
+ROUND_DEPTH_TOLERANCE = 0.01
 """The same on spheres, cylinders and disks, which are tessellated."""
+TESSELLATED = ("sphere", "cylinder", "disk")
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """The XML and every file that it names; refuses what is missing or malformed before any job starts."""
+    """Return the XML and every file that it names.
+
+    Raises:
+        InputError: a file is missing or malformed.
+    """
     return referenced_files(Path(document["source"]["path"]))
 
 
@@ -54,7 +58,7 @@ def capture(job: Job) -> None:
 
 
 class _Capture:
-    """The steps of one capture; holds the scene, its mesh and what is to be said about them."""
+    """One capture: the scene, its mesh and the notes about both."""
 
     def __init__(self, job: Job):
         self.job, self.settings, self.source = job, job.settings.capture, job.settings.source
@@ -100,7 +104,7 @@ class _Capture:
         from workflow.sources.mitsuba_scene.path import fibonacci_sphere
 
         self.facts: dict[str, Any] = {}
-        loose: dict[str, int] = {}
+        loose: Counter[str] = Counter()
         for emitter in self.loaded.scene.emitters():
             if emitter.is_environment():
                 self.facts["environment"] = {
@@ -108,7 +112,7 @@ class _Capture:
                     "mean_radiance": _mean_radiance(emitter, fibonacci_sphere(4096)),
                 }
             elif emitter.class_name() not in ("AreaLight", "DirectionalArea"):
-                loose[emitter.class_name()] = loose.get(emitter.class_name(), 0) + 1
+                loose[emitter.class_name()] += 1
         self.notes += [f"{n} {kind}: light that is not on the mesh, no emission truth" for kind, n in loose.items()]
 
     def _note_faces(self, transparent: Array, thin: Array) -> None:
@@ -119,7 +123,7 @@ class _Capture:
             self.notes.append(f"{thin.sum()} faces of low opacity left out of the mesh; no truth where a ray meets one")
 
     def _plan(self, solid_mesh: Any, glass: bool) -> list[View]:
-        """Geometry for tracing, and the views."""
+        """Build the geometry for tracing and choose the views."""
         from iif_core.light.transport.geometry import build_geometry, trace
         from workflow.sources.mitsuba_scene import path
 
@@ -130,7 +134,7 @@ class _Capture:
         up = path.upright(-sensors[0][0][:3, 1])
         wide = np.tan(np.radians(FIELD_OF_VIEW / 2)) / max(width, height)
         given = [(pose, path.Lens(tangent, tangent * height / width)) for pose, tangent in sensors]
-        found = path.plan(
+        found = path.plan_views(
             lambda o, d: trace(solid, o, d),
             lambda o, d: trace(self.geometry, o, d),
             self.mesh.vertices,
@@ -159,7 +163,7 @@ class _Capture:
         return views
 
     def _sensors(self) -> list[tuple[Array, float]]:
-        """(world_from_camera, tangent of half the horizontal field of view) of the XML's perspective sensors."""
+        """Return (world_from_camera, tangent of half the horizontal field of view) of the XML's perspective sensors."""
         import mitsuba as mi
 
         from iif_core.camera.pinhole import look_at
@@ -183,7 +187,7 @@ class _Capture:
     # ------------------------------------------------------------------------------------------------------ views
 
     def _views(self, views: list[View], radiance: Array) -> None:
-        """G-buffer, render and truth of every view; radiance is kept for the photographs."""
+        """Write G-buffer and truth of every view and fill in `radiance`, from which the photographs are made."""
         from workflow.sources.mitsuba_scene import render
 
         integrator = render.path_integrator(self.source.max_bounces)
@@ -203,20 +207,18 @@ class _Capture:
             self.writer.truth(view.name, replace(truth, radiance=image))
             radiance[i] = image
             self.usable.append(np.packbits(valid))
-            step = max(1, image.shape[0] * image.shape[1] // _METER)
+            step = max(1, image.shape[0] * image.shape[1] // METERING_PIXELS)
             dark = (valid & ~truth.emission.any(-1)).ravel()[::step]
             self.meter.append((image.reshape(-1, 3)[::step], dark))
             self.job.progress(i + 1, len(views), "rendered views")
 
     def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
-        """z-depth, face ids and material truth at the pixel centres (radiance still to come)."""
-        from iif_core.camera.pinhole import pixel_directions
+        """Return z-depth, face ids and material truth at the pixel centres; the radiance of the truth is still 0."""
         from iif_core.light.transport.geometry import trace
         from workflow.sources.mitsuba_scene import materials, render
 
         origin = view.world_from_camera[:3, 3]
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
-        rays = rays.reshape(-1, 3)
+        rays = view.directions().reshape(-1, 3)
         face, t = trace(self.geometry, origin, rays)
         hit = np.flatnonzero(face >= 0)
         if view.view_id == 0 and not len(hit):
@@ -226,8 +228,8 @@ class _Capture:
         surface = self.table.evaluate(self.mesh, on, materials.barycentric_of(self.mesh, on, point))
         front = (self.geometry.normals[on] * rays[hit]).sum(1) < 0
         original = render.original_distance(self.loaded.scene, origin, rays[hit])
-        tessellated = np.array([shape.plugin in ("sphere", "cylinder", "disk") for shape in self.mesh.shapes])
-        slack = np.where(tessellated[self.mesh.shape[on]], _OFF_ROUND, _OFF)
+        tessellated = np.array([shape.plugin in TESSELLATED for shape in self.mesh.shapes])
+        slack = np.where(tessellated[self.mesh.shape[on]], ROUND_DEPTH_TOLERANCE, DEPTH_TOLERANCE)
         undisturbed = np.abs(original - t[hit]) <= slack * t[hit]
         two_sided = self.table.of_faces(self.mesh, "two_sided")[on]
 
@@ -249,15 +251,12 @@ class _Capture:
         return np.where(face >= 0, t, 0).reshape(shape).astype(np.float32), face.reshape(shape), truth
 
     def _normals(self, view: View, face: Array) -> Array:
-        """World normals towards the camera (H, W, 3), 0 where nothing is hit."""
-        from iif_core.camera.pinhole import pixel_directions
-
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        """Return world normals towards the camera (H, W, 3), 0 where nothing is hit."""
         normal = np.where(face[..., None] >= 0, self.geometry.normals[np.maximum(face, 0)], 0)
-        return np.where((normal * rays).sum(-1, keepdims=True) > 0, -normal, normal)
+        return np.where((normal * view.directions()).sum(-1, keepdims=True) > 0, -normal, normal)
 
     def _photographs(self, views: list[View], radiance: Array) -> list[View]:
-        """Sensor values (LDR) or radiance (HDR) of every view; the views with their exposures."""
+        """Write sensor values (LDR) or radiance (HDR) of every view; return the views with their exposures."""
         from iif_core.camera.simulation import expose, exposures, response_curve
         from workflow.sources.folder_scene.exposure import SharedSurface
 
@@ -278,10 +277,9 @@ class _Capture:
         return self._estimated(shared, views) if self.settings.exposure == "estimate" else views
 
     def _share(self, shared: Any, view: View, image: Array, valid: Array) -> None:
-        from iif_core.camera.pinhole import pixel_directions
         from iif_core.light.transport.geometry import trace
 
-        rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
+        rays = view.directions()
         face, t = trace(self.geometry, view.world_from_camera[:3, 3], rays.reshape(-1, 3))
         hit = (face >= 0).reshape(valid.shape)
         points = view.world_from_camera[:3, 3] + np.where(hit, t.reshape(valid.shape), 0)[..., None] * rays
@@ -289,7 +287,7 @@ class _Capture:
         shared.add(image, valid & hit, points, footprint)
 
     def _estimated(self, shared: Any, views: list[View]) -> list[View]:
-        """The views with exposures estimated from their photographs; the true ones are kept among the facts."""
+        """Return the views with exposures estimated from their photographs, and record the true ones in the facts."""
         gains = shared.gains()
         self.facts["exposure_estimated"] = True
         self.facts["exposure_truth"] = [round(view.exposure, 8) for view in views]
@@ -308,7 +306,7 @@ class _Capture:
 
 
 def _mean_radiance(emitter: Any, directions: Array) -> list[float]:
-    """Mean RGB radiance of an environment light over the sphere."""
+    """Return the mean RGB radiance of an environment light over the sphere."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,10 +1,10 @@
-"""Source `scannetpp`: a scene of ScanNet++ as released (docs/own-data.md, METHOD 4.3).
+"""Source `scannetpp`: a scene of ScanNet++ as released (docs/guide/own-data.md, docs/method/camera.md#axes-and-pixels).
 
     scans/mesh_aligned_0.05.ply, segments.json, segments_anno.json
     dslr/resized_images, resized_anon_masks, nerfstudio/transforms.json, colmap/, train_test_lists.json
 
-Poses of nerfstudio/transforms.json are in a world that is turned against the mesh: MESH_FROM_NERFSTUDIO brings them back,
-and colmap/, which is in the mesh's frame, is asked whether that is true of this scene.
+The poses of nerfstudio/transforms.json are in a world that is turned against the mesh. MESH_FROM_NERFSTUDIO undoes the turn, and
+the result is compared with colmap/, which is in the frame of the mesh.
 """
 
 from __future__ import annotations
@@ -24,21 +24,20 @@ from workflow.sources.folder_scene import colmap, mesh, transforms
 from workflow.sources.folder_scene.inputs import Inputs
 
 MESH_FROM_NERFSTUDIO = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-"""Rows 0, 1 change places, row 2 turns its sign: a rotation and its own inverse."""
+"""Exchanges rows 0 and 1 and negates row 2: a rotation that is its own inverse."""
 PLACES = {
     "dslr": ("resized_images", "resized_anon_masks", "nerfstudio/transforms.json"),
     "undistorted": ("undistorted_images", "undistorted_anon_masks", "nerfstudio/transforms_undistorted.json"),
 }
 """`source.images` -> photographs, masks and cameras below dslr/."""
-SAME_PLACE, SAME_TURN = 0.01, 0.01
-"""Metres and radians by which two pose files of one release may differ (rounding)."""
+MAX_DISTANCE, MAX_ANGLE = 0.01, 0.01  # metres and radians by which two pose files of one release may differ (rounding)
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """Files that the capture reads; everything that can be checked without pixels is checked here.
+    """List the files that the capture reads, after checking everything that can be checked without pixels.
 
     Raises:
-        InputError: what is missing or does not fit, by name.
+        InputError: missing or inconsistent files, by name.
     """
     return find_inputs(document["source"], document["capture"]).files()
 
@@ -49,8 +48,18 @@ def capture(job: Job) -> None:
 
 
 def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> Inputs:
-    """The checked scene: cameras in the mesh's frame, and the files that belong to them. points: read the sparse points of
-    colmap/ too (slow), for the check of the mesh."""
+    """Find and check the cameras of a scene, in the frame of the mesh, and the files that belong to them.
+
+    Args:
+        source, settings: the dumped settings sections `source` and `capture`.
+        points: also read the sparse points of colmap/, which is slow, for the check of the mesh.
+
+    Returns:
+        The checked scene.
+
+    Raises:
+        InputError: missing or inconsistent files, by name.
+    """
     home = transforms.folder_at(source, "dslr/ and scans/")
     for name in ("dslr", "scans"):
         if not (home / name).is_dir():
@@ -67,7 +76,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     notes += _masks(entries, masks)
     world = MESH_FROM_NERFSTUDIO if source["world"] == "nerfstudio" else None
     listed = transforms.frames_of(cameras, document, entries, pictures, source, settings, world)
-    listed, also = _agrees_with_colmap(listed, dslr / "colmap", source["world"], points)
+    listed, also = _compared_with_colmap(listed, dslr / "colmap", source["world"], points)
     mesh_path = scans / "mesh_aligned_0.05.ply"
     if not mesh_path.is_file():
         raise InputError(f"{mesh_path}: not found; download the scene's `scans` too")
@@ -81,7 +90,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
 def _entries(
     document: dict[str, Any], cameras: Path, dslr: Path, pictures: Path, source: dict[str, Any]
 ) -> tuple[list[dict[str, Any]], list[str], list[Path]]:
-    """Frames of both lists by file name, with their `_split`; what was left out, in words; the list file."""
+    """Return the frames of both lists with their `_split`, notes about those left out, and the list file."""
     entries = [{**e, "_split": "train"} for e in transforms.entries_of(cameras, document)]
     if document.get("test_frames"):
         entries += [{**e, "_split": "test"} for e in transforms.entries_of(cameras, document, "test_frames")]
@@ -111,7 +120,7 @@ def _entries(
 
 
 def _lists(path: Path) -> dict[str, str]:
-    """File name -> train or test, of train_test_lists.json."""
+    """Read train_test_lists.json: file name -> train or test."""
     try:
         document = json.loads(path.read_text())
         found = {key: [str(name) for name in document[key]] for key in ("train", "test")}
@@ -124,7 +133,7 @@ def _lists(path: Path) -> dict[str, str]:
 
 
 def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
-    """Give every entry its anonymisation mask; where the release has none, say so."""
+    """Add the anonymisation masks to the entries; returns a note where the release has none."""
     if not masks.is_dir():
         return [f"no {masks.name}/: nothing is masked"]
     for entry in entries:
@@ -133,13 +142,22 @@ def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
     return []
 
 
-def _agrees_with_colmap(
+def _compared_with_colmap(
     listed: transforms.Transforms, model: Path, world: str, points: bool
 ) -> tuple[transforms.Transforms, list[Path]]:
-    """Compare the poses with colmap/, which is in the mesh's frame; the frames with its sparse points, its files.
+    """Compare the poses with colmap/, which is in the frame of the mesh.
+
+    Args:
+        listed: the frames.
+        model: folder of the COLMAP model, which may be missing.
+        world: `source.world`.
+        points: whether the frames get the sparse points that they see.
+
+    Returns:
+        The frames, and the files of the model.
 
     Raises:
-        InputError: they differ, naming `source.world` where that explains it.
+        InputError: the poses differ; the message names `source.world` where that explains it.
     """
     if not colmap.is_model(model):
         return listed, []
@@ -148,11 +166,11 @@ def _agrees_with_colmap(
     pairs = [(f, named[Path(f.file_path).name].pose) for f in listed.frames if Path(f.file_path).name in named]
     if not pairs:
         return listed, list(found.files)
-    moved, turned = _apart([f.matrix for f, _ in pairs], [p for _, p in pairs])
-    if moved > SAME_PLACE or turned > SAME_TURN:
+    moved, turned = _difference([f.matrix for f, _ in pairs], [p for _, p in pairs])
+    if moved > MAX_DISTANCE or turned > MAX_ANGLE:
         before = [MESH_FROM_NERFSTUDIO @ f.matrix for f, _ in pairs]  # its own inverse
-        other = _apart(before, [p for _, p in pairs])
-        fits = other[0] <= SAME_PLACE and other[1] <= SAME_TURN
+        other = _difference(before, [p for _, p in pairs])
+        fits = other[0] <= MAX_DISTANCE and other[1] <= MAX_ANGLE
         advice = (
             f"`source.world: {'mesh' if world == 'nerfstudio' else 'nerfstudio'}` fits"
             if fits
@@ -169,8 +187,8 @@ def _agrees_with_colmap(
     return replace(listed, frames=tuple(frames)), list(found.files)
 
 
-def _apart(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, float]:
-    """Median distance (metres) and angle (radians) between poses of OpenGL and of OpenCV axes."""
+def _difference(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, float]:
+    """Return the median distance (metres) and angle (radians) between poses of OpenGL and of OpenCV axes."""
     a, b = np.array([transforms.opencv_pose(m, "opengl", 1.0) for m in opengl]), np.array(opencv)
     chord = np.linalg.norm(a[:, :3, :3] - b[:, :3, :3], axis=(1, 2)) / np.sqrt(8)  # = sin(angle / 2)
     distance = np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
@@ -178,7 +196,7 @@ def _apart(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[float, f
 
 
 def _annotation(scans: Path) -> tuple[Any, list[Path]]:
-    """What reads the object ids of the vertices, and its files; None where the scene is not annotated."""
+    """Return a function that reads the object ids of the vertices (None for a scene without annotation), and its files."""
     files = [scans / "segments.json", scans / "segments_anno.json"]
     there = [path.is_file() for path in files]
     if not any(there):
@@ -189,9 +207,9 @@ def _annotation(scans: Path) -> tuple[Any, list[Path]]:
 
 
 def vertex_ids(segments: Path, annotation: Path) -> mesh.VertexIds:
-    """Object of every vertex: `objectId` of the group whose segments hold the vertex's segment; 0 and none are -1.
+    """Read the object of every vertex: the `objectId` of the group that contains the vertex's segment; -1 for 0 and for none.
 
-    Where groups overlap, the one with fewer vertices (the more specific) wins.
+    Where groups overlap, the one with fewer vertices, which is more specific, is used.
 
     Raises:
         InputError: files of another form.

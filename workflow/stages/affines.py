@@ -13,17 +13,18 @@ from iif_core.camera.response import Response, response_facts, response_from_fac
 from iif_core.errors import InputError
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.gauge import Gauge, pin
-from iif_core.fitting.problem import MATTE, FitOptions, FitProblem, FitResult, albedo_uncertainty, apply_affines
+from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.pixels import fair_shares
+from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
-from iif_core.fitting.sgd import SgdOptions, fit_affines_sgd
+from iif_core.fitting.sgd import fit_affines_sgd
+from iif_core.reflectance.material import CHANNELS, MATTE_GLOSS, apply_affines
 from workflow import decisions
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
-    MATERIAL,
     BaseScene,
     base_maps,
     pixel_gains,
@@ -84,8 +85,8 @@ def _fitted(
     with job.timed("solve"):
         free = _solver(job, prior, matte)(problem, start)
     if matte:
-        free.affine[:, 12:] = MATTE
-    return pin(problem, free, find_gauge(problem, places)), free
+        free.affine[:, 12:] = MATTE_GLOSS
+    return apply_gauge(problem, free, find_gauge(problem, places)), free
 
 
 def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) -> Callable[[FitProblem, Response], FitResult]:
@@ -95,7 +96,6 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
         options = FitOptions(
             iterations=settings.iterations,
             population=settings.population,
-            ridge=settings.ridge,
             robust_width=settings.robust_width,
             response_prior=prior,
             matte=matte,
@@ -226,20 +226,6 @@ def _eligible(
     return _Chosen(pixels.index[use], pixels.object_id[use], pixels.value[use])
 
 
-def fair_shares(counts: np.ndarray, budget: int) -> np.ndarray:
-    """Share of each object's pixels to keep, (O,): the same number for every object until the budget is used, all
-    of the
-    pixels of those that have fewer."""
-    counts = np.asarray(counts, np.float64)
-    if counts.sum() <= budget:
-        return np.ones(len(counts))
-    order = np.sort(counts)
-    below = np.r_[0.0, np.cumsum(order)[:-1]]
-    limits = (budget - below) / np.arange(len(order), 0, -1)
-    limit = limits[np.argmax(limits <= order)]
-    return np.minimum(1.0, limit / np.maximum(counts, 1.0))
-
-
 def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
@@ -349,7 +335,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
 
 def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     cells = job.read("base").table("cells.parquet")
-    base = np.stack([cells[name] for name in MATERIAL], 1)
+    base = np.stack([cells[name] for name in CHANNELS], 1)
     deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
@@ -358,7 +344,7 @@ def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
         fitted[:, :3] = albedo
     columns = {
         "cell_id": cells["cell_id"],
-        **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(MATERIAL)},
+        **{name: fitted[:, i].astype(np.float32) for i, name in enumerate(CHANNELS)},
     }
     job.writer.table("cells.parquet", {**columns, "uncertainty": spread.astype(np.float32)})
 
@@ -400,7 +386,7 @@ def _plan(
 ) -> list[decisions.Decision]:
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
-    medians, glossy, gains = np.zeros(problem.n_objects), np.ones(problem.n_objects), np.ones(problem.n_objects)
+    medians, glossy = np.zeros(problem.n_objects), np.ones(problem.n_objects)
     order = np.argsort(object_id, kind="stable")
     bounds = np.searchsorted(object_id[order], np.arange(problem.n_objects + 1))
     for o in range(problem.n_objects):
@@ -408,13 +394,11 @@ def _plan(
         if len(own):
             medians[o] = np.median(problem.base[own, 4])
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
-            gains[o] = fitted[own, :3].mean() / max(float(problem.base[own, :3].mean()), 1e-3)
     metal = np.any(fit.affine[:, 14:] != 0, 1)  # of an object that keeps its prediction too, which is not fitted
     return [
         decisions.camera_response(dynamic_range, calibration),
         decisions.metallic(metal & fit.free.any(1), medians),
         decisions.specular(glossy, metal, scatter),
         decisions.affine_size(fit.model),
-        decisions.second_pass(gains, fit.pixels),
         decisions.scale(**fit.facts["scale"]),
     ]

@@ -1,4 +1,4 @@
-"""capture: photographs, cameras and mesh of any source -> the normal form."""
+"""Stage capture: writes photographs, cameras and mesh of any source in the normal form."""
 
 from __future__ import annotations
 
@@ -8,6 +8,6 @@ from workflow.runtime.job import Job
 
 
 def run(job: Job) -> None:
-    """Let the source that the scene names write its capture (`workflow/sources/<kind>.py`)."""
+    """Call the source that the scene names, `workflow/sources/<kind>.py`."""
     source = importlib.import_module(f"workflow.sources.{job.settings.source.kind}")
     source.capture(job)

@@ -13,9 +13,10 @@ from iif_core.light.emission.candidates import emitter_candidates
 from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.gains import LEVEL_OF_PRIOR
-from iif_core.light.emission.groups import EmitterGroups, group_emitters
+from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
 from iif_core.light.emission.loss import reference_loss
-from iif_core.light.emission.problem import EmissionProblem, Halves, PixelRows, assemble, initial_radiance, white_surface
+from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.problem import EmissionProblem, Halves, assemble, initial_radiance, white_surface
 from iif_core.light.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
 from iif_core.light.emission.sensor import Sensor
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
@@ -26,6 +27,7 @@ from workflow.scene.base_scene import ViewPixels, read_base_scene
 from workflow.scene.emission_pixels import (
     SEEDS,
     Photographs,
+    ViewRecords,
     calibrated,
     choose_rows,
     escaping_share,
@@ -53,12 +55,13 @@ def run(job: Job) -> None:
     notes: list[str] = []
     known = view_exposures(capture, notes)
     unknown = Sensor(response("identity"), capture.is_hdr, job.settings.emission.saturation)
-    photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, known))
+    records = ViewRecords(job, capture, scene)
+    photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, known, records))
     notes.extend([camera.gauge] if camera.gauge else [])
     statistics, threshold = statistics_of_faces(photos)
     adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least)
-    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, min_observations=least)
+    groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, GroupingOptions(min_observations=least))
     job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
     cache, sums, escape, brightness = radiance_cache(photos, groups)
     secondary = escaping_share(photos)
@@ -155,7 +158,7 @@ def _not_above_white(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
     return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
 
 
-def _initial(photos: Photographs, groups: EmitterGroups, rows: PixelRows, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
+def _initial(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
     """Radiance seen on the groups, and with the environment's."""
     seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
     return seen, seen if sky is None else np.concatenate([seen, sky.radiance])
@@ -212,20 +215,22 @@ def _trace(
     material = material if met is None else met
     from iif_core.light.transport.cache import RadianceCache
     from iif_core.light.transport.matrix import transport_matrix
+    from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     # Predicted metalness is rarely right and would darken the diffuse light of half the room; only the certain is
     # believed.
     metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
-    surface = (pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
+    points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
     samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
+    texels = sky.columns + groups.size if sky else None
+    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels)
     halves, gloss = [], []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        columns = (groups.of_face, groups.size + (sky.size if sky else 0), side)
-        paths = (samples, settings.max_bounces, seed + half, cache, sky.columns + groups.size if sky else None)
-        matrix, cached = transport_matrix(geometry, material, *surface, *columns, *paths)
+        paths = PathOptions(samples, settings.max_bounces, seed + half)
+        matrix, cached = transport_matrix(Scene(geometry, material, None, cache), points, columns, paths)
         halves.append((matrix.sum(1), cached.sum(1)))
         dielectric = (metallic == 0)[:, None]
         gloss.append((matrix[:, 1] * dielectric[:, None], cached[:, 1] * dielectric))

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from iif_core.evaluation import metrics
+from iif_core.evaluation.catalogue import LPIPS_NETWORKS, METRICS_OF, PROTOCOLS_OF
 from iif_core.evaluation.lpips import Weights
+from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.models.lpips import FETCH_VGG
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.no_reference import truth_free_scores
 from workflow.scoring.scores import (
-    MATERIALS,
     UNITS,
     MaterialTruth,
     ScoreRows,
@@ -39,7 +40,7 @@ BASELINES = {
 MEAN_METRICS = ("l2", "psnr")
 """What `prior_mean_k` has: the others take most of the stage's time when every prediction is scored with them."""
 
-LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(metrics.LPIPS_NETWORKS))
+LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(LPIPS_NETWORKS))
 """Variant -> learned metrics of its albedo."""
 
 
@@ -48,7 +49,7 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     rows = ScoreRows()
     networks = perceptual_networks(with_vgg=job.settings.metrics.lpips_vgg)
-    networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in (*MATERIALS, "rgb")}
+    networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in (*PROPERTIES, "rgb")}
     if job.settings.metrics.lpips_vgg and capture.has_truth and "vgg" not in networks:
         job.log.warning("metrics.lpips_vgg: %s; the other scores are computed without", FETCH_VGG)
         rows.missing.append({"quantity": "albedo", "metric": "lpips_vgg", "reason": FETCH_VGG})
@@ -112,15 +113,15 @@ def _view_scores(
         if job.read(stage).has(file):
             channels = job.read(stage).exr(file)
             cell_id = ids_from_disk(channels["cell.id"]) if variant == "base" else cell_id
-            for quantity in MATERIALS:
+            for quantity in PROPERTIES:
                 yield variant, view.name, quantity, _scores(materials, variant, material_maps(channels), quantity)
     if not job.read("prior").has(file):
         return
     channels = job.read("prior").exr(file)
-    each: dict[str, list[list[metrics.Score]]] = {quantity: [] for quantity in MATERIALS}
+    each: dict[str, list[list[metrics.Score]]] = {quantity: [] for quantity in PROPERTIES}
     for number, k in enumerate(prediction_numbers(channels)):
         maps = material_maps(channels, f"prior.{k:03d}.")
-        for quantity in MATERIALS:
+        for quantity in PROPERTIES:
             each[quantity].append(materials.scores(maps, quantity, only=MEAN_METRICS))
             if number == 0:
                 yield "prior_k0", view.name, quantity, _scores(materials, "prior_k0", maps, quantity)
@@ -128,7 +129,7 @@ def _view_scores(
         if lists:
             yield "prior_mean_k", view.name, quantity, _mean_scores(lists)
     for variant, maps in means.maps(materials.object_id, cell_id):
-        for quantity in MATERIALS:
+        for quantity in PROPERTIES:
             yield variant, view.name, quantity, _scores(materials, variant, maps, quantity)
 
 
@@ -137,10 +138,10 @@ def _scores(materials: MaterialTruth, variant: str, maps: dict[str, np.ndarray],
     learned = LEARNED.get(variant, ()) if quantity == "albedo" else ()
     visual = ("raw", "scaled")
     if variant == "result":
-        every = [m for m in metrics.METRICS_OF[quantity] if m != "lpips_vgg"]
+        every = [m for m in METRICS_OF[quantity] if m != "lpips_vgg"]
         vgg = materials.scores(maps, quantity, ("lpips_vgg",), visual) if "lpips_vgg" in learned else []
         return materials.scores(maps, quantity, every) + vgg
-    only = [m for m in metrics.METRICS_OF[quantity] if m not in metrics.LPIPS_NETWORKS or m in learned]
+    only = [m for m in METRICS_OF[quantity] if m not in LPIPS_NETWORKS or m in learned]
     return materials.scores(maps, quantity, only, visual)
 
 
@@ -220,7 +221,7 @@ def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
             out["l2_ratio"] = round(prior["l2"]["mean"] / result["l2"]["mean"], 4)
         return out
 
-    gains = {q: {p: gain(q, p) for p in metrics.PROTOCOLS_OF[q]} for q in MATERIALS}
+    gains = {q: {p: gain(q, p) for p in PROTOCOLS_OF[q]} for q in PROPERTIES}
     return {
         "has_truth": capture.has_truth,
         "variants": {name: BASELINES[name] for name in means if name in BASELINES},

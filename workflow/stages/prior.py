@@ -1,4 +1,4 @@
-"""prior: K material predictions of every view, from whichever prior the scene names."""
+"""Stage prior: writes K material predictions of every view, from the prior that the scene names."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 
 Row = tuple[int, int, bool, str]
-"""view_id, k, whether the prediction is used, why not (or what was done to it)."""
+"""view_id, k, whether the prediction is used, reason if not (or how it was repaired)."""
 
 
 def run(job: Job) -> None:
-    """Write maps/<view>.exr with the usable predictions of each view (but test views), and predictions.parquet; of a prior that
-    is a model of its own also model.json.
+    """Write maps/<view>.exr with the usable predictions of each view that is not held out, predictions.parquet and model.json.
 
-    A job that was killed goes on after the last view that it finished, as long as settings, inputs and code are the same.
+    Only learned models have a model.json. A job that was interrupted continues after the last finished view if settings, inputs
+    and code are unchanged.
 
     Raises:
-        InputError: not a single prediction can be used.
+        InputError: no prediction can be used.
     """
     capture = CaptureReader(job.read("capture"))
     prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
@@ -65,7 +65,7 @@ def _predicted(job: Job, prior: ModuleType, capture: CaptureReader, view: View, 
 
 
 def _kept(job: Job, view: View) -> list[Row] | None:
-    """Rows of a view that an interrupted run of this very job has finished."""
+    """Return the rows of a view that an interrupted run of the same job has finished, else None."""
     done = job.writer.noted(f"unfinished/{view.name}.json")
     if done is None or done.get("by") != job.fingerprint:
         return None

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from workflow.artifacts.files import sha256_of, write_json, write_parquet
+from workflow.artifacts.files import inside, sha256_of, write_json, write_parquet
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job, library_versions
 from workflow.runtime.timings import read_timings
@@ -47,7 +47,7 @@ def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[s
     """Fill the folder, its manifest last; returns the files of the manifest."""
     temporary.mkdir(parents=True)
     for stage, name in deliverables(readers):
-        place(readers[stage].path(name), temporary / name)
+        place(readers[stage].path(name), inside(temporary, name))
     timings = read_timings(job.scene)
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
     write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCHEMA})

@@ -1,4 +1,4 @@
-"""relight: the recovered scene under other light and from elsewhere, with the BRDF and the materials of the re-renderings."""
+"""relight: renders the recovered scene under other light and along other camera paths (docs/method/light.md#relighting)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,10 +26,13 @@ from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 from workflow.settings import require_relighting
 
+if TYPE_CHECKING:
+    from iif_core.light.transport.scene import Scene
+
 _SEEDS = 0x72656C69  # keeps the random streams of this stage apart from those of others
 MAP_ROWS = 128
-"""Environment files are averaged down to this many rows."""
-SHEET_COLUMNS = 6
+"""Environment files are averaged down to at most this many rows."""
+SHEET_COLUMNS = 6  # frames of each relighting on the contact sheet
 
 
 def run(job: Job) -> None:
@@ -63,7 +67,7 @@ def _relight(
     number: int,
     wanted: SimpleNamespace,
 ) -> tuple[dict, list[np.ndarray]]:
-    """Render all frames of one relighting; returns facts and the 8-bit pictures."""
+    """Render and write all frames of one relighting; returns facts and the 8-bit pictures."""
     if wanted.denoise:
         require_denoiser()
     camera, times = _Camera.of(capture, wanted), frame_times(wanted.camera.frames)
@@ -93,7 +97,7 @@ def _relight(
 
 @dataclass(frozen=True)
 class _Camera:
-    """Key poses (k, 4, 4) and the intrinsics of all frames."""
+    """Key poses (k, 4, 4) and the intrinsics of all frames, in pixels."""
 
     poses: np.ndarray
     fx: float
@@ -125,7 +129,7 @@ class _Camera:
 
 
 def _light(scene: Recovered, wanted: SimpleNamespace, up: np.ndarray) -> Light:
-    """The scene's light as it is asked for; an emitter that is off reflects like any other surface."""
+    """The light of the scene as the settings ask for it; an emitter that is off reflects like any other surface."""
     found, factor = scene.light, np.float32(wanted.emitters)
     if wanted.environment == "keep":
         environment = found.environment
@@ -140,21 +144,23 @@ def _light(scene: Recovered, wanted: SimpleNamespace, up: np.ndarray) -> Light:
 
 
 def _read_environment(path: Path, up: np.ndarray, turn: float) -> np.ndarray:
-    """(H, W, 3) map in world axes of a latitude-longitude picture: top row = up, to the right = clockwise from above."""
+    """(H, W, 3) map in world axes from a latitude-longitude picture: top row = up, to the right = clockwise seen from above."""
     channels = read_exr(path)
     if not {"R", "G", "B"} <= set(channels):
         raise InputError(f"{path}: found the channels {', '.join(channels)}; an environment needs R, G and B")
-    image = as_map(np.maximum(rgb(channels).astype(np.float32), 0))[:, ::-1]  # our columns run counter-clockwise
+    image = as_map(np.maximum(rgb(channels).astype(np.float32), 0))[:, ::-1]  # columns of a map run counter-clockwise
     rows = min(MAP_ROWS, len(image))
     points = 2 * -(-len(image) // rows)
     return resample(image, axes_of_map(up, turn), rows, 2 * rows, points)
 
 
-def _world(scene: Recovered, light: Light, wanted: SimpleNamespace, time: float) -> tuple:
-    """Geometry, materials and emitters on the device, the sphere where it is at `time` in [0, 1]."""
+def _world(scene: Recovered, light: Light, wanted: SimpleNamespace, time: float) -> Scene:
+    """Geometry, materials and emitters on the device, with the sphere at its place at `time` in [0, 1]."""
+    from iif_core.light.transport.scene import Scene
+
     if wanted.sphere is None:
         geometry, material = scene.surface.traceable(light.emits)
-        return geometry, material, light.emitters(geometry)
+        return Scene(geometry, material, light.emitters(geometry))
     ball = wanted.sphere
     start = np.asarray(ball.center, np.float64)
     centre = start if ball.path_to is None else start + time * (np.asarray(ball.path_to, np.float64) - start)
@@ -167,23 +173,22 @@ def _world(scene: Recovered, light: Light, wanted: SimpleNamespace, time: float)
         np.concatenate([light.emits, np.ones(count, bool)]),
         light.environment,
     )
-    return geometry, material, with_ball.emitters(geometry)
+    return Scene(geometry, material, with_ball.emitters(geometry))
 
 
-def _frame(world: tuple, camera: _Camera, pose: np.ndarray, wanted: SimpleNamespace, seed: int) -> np.ndarray:
+def _frame(world: Scene, camera: _Camera, pose: np.ndarray, wanted: SimpleNamespace, seed: int) -> np.ndarray:
     """(H, W, 3) float32 radiance."""
     from iif_core.light.transport.render import first_hits, render
+    from iif_core.light.transport.scene import PathOptions
 
-    geometry, material, emitters = world
     shape, eye = (camera.height, camera.width, 3), pose[:3, 3]
     directions = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose).reshape(-1, 3)
     jitter = direction_derivatives(camera.fx, camera.fy, pose)
-    radiance = render(
-        geometry, material, emitters, eye, directions, wanted.samples, wanted.max_bounces, seed=seed, jitter=jitter
-    ).reshape(shape)
+    paths = PathOptions(wanted.samples, wanted.max_bounces, seed)
+    radiance = render(world, eye, directions, paths, jitter).reshape(shape)
     if not wanted.denoise:
         return radiance
-    albedo, normals, _ = first_hits(geometry, material, eye, directions)
+    albedo, normals, _ = first_hits(world.geometry, world.material, eye, directions)
     return denoise(radiance, albedo.reshape(shape), normals.reshape(shape))
 
 
@@ -196,7 +201,7 @@ def _png(picture: np.ndarray) -> bytes:
 
 
 def _sheet(rows: list[list[np.ndarray]], gap: int = 4) -> np.ndarray:
-    """One row a relighting, on white."""
+    """One row for each relighting, on white."""
     height = sum(max(p.shape[0] for p in row) + gap for row in rows) + gap
     width = max(sum(p.shape[1] + gap for p in row) for row in rows) + gap
     out = np.full((height, width, 3), 255, np.uint8)

@@ -1,4 +1,5 @@
-"""render: every view again, from the recovered materials and emitters, by path tracing."""
+"""render: re-renders every view from the recovered materials and emitters by path tracing
+(docs/method/shading.md#re-rendering)."""
 
 from __future__ import annotations
 
@@ -8,11 +9,12 @@ from scipy.ndimage import minimum_filter
 from iif_core.camera.pinhole import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from iif_core.evaluation.consistency import held_out_gain
+from iif_core.reflectance.material import BLACK
 from workflow import decisions
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BLACK, pixel_gains, read_gains
+from workflow.scene.base_scene import pixel_gains, read_gains
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 
@@ -20,23 +22,25 @@ _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of 
 
 
 def run(job: Job) -> None:
-    """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps.
+    """Write maps/<view>.exr, which is published: the re-rendering, its sensor value, emission and the fitted maps; and
+    held_out.parquet.
 
-    Sensor value: the re-rendering through the gains of the view and the fitted response, clipped to [0, 1]. A held-out
-    photograph whose exposure nobody gave (automatic exposure) gets the gain with which its own re-rendering is nearest to it,
-    a gain a channel where the camera's white balance was found to change: held_out.parquet. Nothing else is taken from its
-    colours.
+    The sensor value is the re-rendering through the gains of the view and the fitted response, clipped to [0, 1]. A held-out
+    photograph of unknown exposure gets the gain with which its own re-rendering is nearest to it, one for each channel where
+    the white balance of the camera was found to change. Nothing else is taken from its colours.
     """
     capture, scene = CaptureReader(job.read("capture")), read_recovered(job)
     curve, gains = read_response(job.read("affines")), read_gains(job)
     geometry, material = scene.surface.traceable(scene.light.emits)
     from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
 
     if job.settings.render.denoise:
         require_denoiser()
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
+    world = Scene(geometry, material, emitters)
     found: dict[int, np.ndarray] = {}
     through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > decisions.ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
@@ -44,17 +48,10 @@ def run(job: Job) -> None:
         job.progress(done, len(capture.views), "views re-rendered")
         eye = view.world_from_camera[:3, 3]
         _, face_id = capture.gbuffer(view)
-        radiance = render(
-            geometry,
-            material,
-            emitters,
-            eye,
-            _directions(view).reshape(-1, 3),
-            job.settings.render.samples,
-            job.settings.render.max_bounces,
-            seed=((job.seed << 32) | _SEEDS) << 32 | view.view_id,
-            jitter=_steps(view, face_id, through_holes),
-        ).reshape(view.height, view.width, 3)
+        seed = ((job.seed << 32) | _SEEDS) << 32 | view.view_id
+        paths = PathOptions(job.settings.render.samples, job.settings.render.max_bounces, seed)
+        jitter = _pixel_steps(view, face_id, through_holes)
+        radiance = render(world, eye, _directions(view).reshape(-1, 3), paths, jitter).reshape(view.height, view.width, 3)
         if not np.isfinite(radiance).all():
             raise InputError(f"view {view.name}: re-rendered radiance is not finite; please report it with the scene")
         fitted = _fitted(job, view)
@@ -78,7 +75,7 @@ def run(job: Job) -> None:
 
 
 def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:
-    """Materials and uncertainty of stage affines (half) and object ids (UINT) of one view, as far as it has them."""
+    """Fitted materials and uncertainty (half) and object ids (UINT) of one view, as far as the stages wrote them."""
     file = f"maps/{view.name}.exr"
     channels: dict[str, np.ndarray] = {}
     if job.read("affines").has(file):
@@ -91,7 +88,7 @@ def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:
 
 
 def _without_emitters(fitted: dict[str, np.ndarray], emits: np.ndarray) -> dict[str, np.ndarray]:
-    """The fitted maps with emitters as the model has them: black, rough, no metal (METHOD 2.9)."""
+    """The fitted maps with the material that the model gives to emitters: black, rough, not metallic."""
     values = {**dict(zip(("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic"), BLACK, strict=True)), "uncertainty": 0}
     return {
         name: np.where(emits, np.float16(values[name]), channel) if name in values else channel
@@ -99,9 +96,11 @@ def _without_emitters(fitted: dict[str, np.ndarray], emits: np.ndarray) -> dict[
     }
 
 
-def _steps(view: View, face_id: np.ndarray, holes: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What a pixel's rays move by, to the right and down: (3,) each. Behind the holes of an open mesh (`holes`) are the
-    directions that light it, not what the camera would see, so there pixels next to a miss, (n, 3), stay in their middle."""
+def _pixel_steps(view: View, face_id: np.ndarray, holes: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Change of direction (3,) to the next pixel on the right and below; (n, 3) each where the mesh has large `holes`.
+
+    Behind holes lie the directions that light the room, not what the camera would see, so pixels next to a miss have step 0:
+    their rays stay in the middle."""
     steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
     if not holes:
         return steps
@@ -112,7 +111,7 @@ def _steps(view: View, face_id: np.ndarray, holes: bool) -> tuple[np.ndarray, np
 def _guides(
     scene: Recovered, fitted: dict[str, np.ndarray], face_id: np.ndarray, eye: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fitted albedo and the normals that face the camera, (H, W, 3) each, 0 where nothing is seen."""
+    """Fitted albedo and the normals on the side of the camera, (H, W, 3) each, 0 where nothing is seen."""
     albedo = rgb(fitted, "albedo") if "albedo.R" in fitted else np.zeros((*face_id.shape, 3), np.float32)
     surface = scene.surface
     facing = np.sign(np.einsum("ij,ij->i", surface.normals, eye - surface.vertices[surface.faces[:, 0]]))

@@ -146,7 +146,7 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
 
 
 def _objects_fact(job: Job, count: int) -> str:
-    """How many, where from, and how far they depend on what should not decide them (docs/segmentation.md)."""
+    """How many, where from, and how far they depend on what should not decide them (docs/guide/segmentation.md)."""
     facts = _document(job, "segmentation", "segmentation.json")
     if not facts:
         return str(count)

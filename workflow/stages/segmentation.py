@@ -1,4 +1,4 @@
-"""segmentation: which face belongs to which object, and the segments that follow in every view."""
+"""Stage segmentation: assigns faces to objects and derives the segments of every view."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.surface.mesh import face_geometry
 from iif_core.surface.segments import interior, partition_agreement, segment_table
+from iif_core.surface.triangles import face_geometry
 from workflow import decisions
 from workflow.artifacts.store import ids_to_disk
 from workflow.runtime.job import Job
@@ -20,10 +20,10 @@ from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface
 
 
 def run(job: Job) -> None:
-    """Read the capture, decide objects, measure how stable they are, write faces, objects, segments, maps and facts.
+    """Read the capture, find the objects, measure their stability, write faces, objects, segments, maps and facts.
 
     Raises:
-        InputError: what the kind needs is not there.
+        InputError: the input that the kind needs is missing.
     """
     capture = CaptureReader(job.read("capture"))
     surface = Surface(capture)
@@ -88,10 +88,18 @@ def _object_map(face_id: np.ndarray, object_of_face: np.ndarray) -> np.ndarray:
 
 
 def measure_stability(job: Job, kind: ModuleType, surface: Surface, objects: Objects) -> Stability:
-    """Agreement of the objects with those of the perturbed runs, weighted by the pixels that the run had.
+    """Measure the agreement of the objects with those of perturbed runs, weighted by pixels (docs/method/objects.md#stability).
 
-    A run that finds nothing to go by (the only photograph with ids is left out) is not counted; nor are any where the runs
-    change nothing: ids of faces.
+    A run without input, as when the only photograph with ids is left out, is not counted.
+
+    Args:
+        job: for settings and progress.
+        kind: the segmentation plug-in.
+        surface: mesh and photographs.
+        objects: the result.
+
+    Returns:
+        The stability; without a value if the runs change nothing.
     """
     count, values, best = len(objects.names), [], []
     folds = range(FOLDS) if kind.perturbs(surface) else ()
@@ -107,7 +115,7 @@ def measure_stability(job: Job, kind: ModuleType, surface: Surface, objects: Obj
     if not values:
         return Stability(None, np.full(count, np.nan), [])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # objects that nobody sees
+        warnings.simplefilter("ignore", RuntimeWarning)  # for objects that no view sees
         return Stability(float(np.mean(values)), np.nanmean(best, axis=0), values)
 
 

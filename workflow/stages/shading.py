@@ -1,16 +1,15 @@
-"""shading: the light that arrives at every pixel, as a diffuse lobe and split specular lobes (METHOD 2.7, COMPUTE
-5)."""
+"""shading: the light that arrives at every pixel, integrated over the diffuse lobe and the split specular lobes
+(docs/method/shading.md)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin
-from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, diffuse_of_cells, joined
+from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
 from workflow import decisions
 from workflow.artifacts.store import split_rgb
 from workflow.runtime.job import Job
@@ -28,44 +27,36 @@ from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
     from iif_core.light.transport.cache import RadianceCache
-    from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import Geometry
-    from iif_core.light.transport.materials import CellMaterials
+    from iif_core.light.transport.scene import Scene
 
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
-COVERAGE_RAYS = 8192
+COVERAGE_RAYS = 8192  # by which the share of surface that the radiance cache knows is measured
 
 
 def roughness_levels(count: int) -> np.ndarray:
-    """(count,) float64 from 0.02 to 1: closer together at the glossy end, where lobes change fastest.
+    """Return (count,) float64 roughness levels from 0.02 to 1, closer together at the glossy end (Eq. S.4).
 
-    r_j = 0.02 + 0.98 (j / (count - 1))^1.5. On metals linear spacing costs 7.4 % at 6 levels and 1.8 % at 10
-    (COMPUTE 5).
+    >>> roughness_levels(3).round(3)
+    array([0.02 , 0.366, 1.   ])
     """
     return 0.02 + 0.98 * (np.arange(count) / (count - 1)) ** 1.5
 
 
-@dataclass(frozen=True)
-class _World:
-    """What paths meet, on the device."""
-
-    geometry: Geometry
-    material: CellMaterials
-    emitters: Emitters
-    cache: RadianceCache | None
-
-
 def run(job: Job) -> None:
-    """Write maps/<view>.exr with two independent halves of the cache (0 where nothing was hit), levels.parquet, shading.json."""
+    """Write maps/<view>.exr with two independent halves of the integrals (0 where nothing was hit), levels.parquet and
+    shading.json."""
+    from iif_core.light.transport.scene import Scene
+
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     levels = roughness_levels(job.settings.shading.levels)
     light = read_light(job, len(scene.faces))
     cells = _cells(job, capture, scene)
-    # What no photograph shows reflects as the light has it: with the base albedos a room loses some per cent of its light there.
+    # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
     decision = _indirect(job, geometry, cache, light, cells)
-    world = _World(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
+    world = Scene(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
     with job.timed("diffuse"):
         diffuse = _diffuse(job, world, cells)
     with job.timed("specular"):
@@ -84,7 +75,7 @@ def _cells(job: Job, capture: CaptureReader, scene: BaseScene) -> ShadingCells:
 
 
 def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, cells: ShadingCells) -> decisions.Decision:
-    """Whether the radiance cache stands for indirect light: by how much of what the surface sees it knows."""
+    """Decide whether paths end in the radiance cache, by the share of visible surface that it contains (Eq. S.14)."""
     from iif_core.light.transport.geometry import cosine_directions, trace
 
     rng = np.random.default_rng([job.seed, _SEEDS])
@@ -103,32 +94,23 @@ def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, 
     )
 
 
-def _diffuse(job: Job, world: _World, cells: ShadingCells) -> DiffuseShading:
+def _diffuse(job: Job, world: Scene, cells: ShadingCells) -> DiffuseShading:
+    """Diffuse integrals of all cells, twice."""
+    from iif_core.light.transport.scene import PathOptions
     from iif_core.light.transport.shading import shading_caches
 
     settings = job.settings.shading
 
     def trace(points: np.ndarray, normals: np.ndarray, paths: int, seed: int) -> np.ndarray:
-        # Seen head-on: without specular levels the viewer does not matter.
-        return shading_caches(
-            world.geometry,
-            world.material,
-            world.emitters,
-            points,
-            normals,
-            normals,
-            [],
-            paths,
-            settings.max_bounces,
-            seed,
-            world.cache,
-        )[0]
+        # Seen head-on: without specular levels the direction of the viewer does not matter.
+        return shading_caches(world, points, normals, normals, [], PathOptions(paths, settings.max_bounces, seed))[0]
 
     found = diffuse_of_cells(
         cells, trace, settings.samples, settings.noise, settings.max_samples, (job.seed << 32 | _SEEDS) << 32 | 0xFFFFFFFF
     )
     job.log.info(
-        "diffuse light of %d cells: %.0f paths each, noise %.1f %% at first, %.1f %% at last (%d objects above %.1f %%)",
+        "diffuse light of %d cells: %.0f paths each; noise %.1f %% after the first paths, %.1f %% at the end"
+        " (%d objects above %.1f %%)",
         len(cells),
         found.samples.mean(),
         100 * found.noise_first,
@@ -143,18 +125,18 @@ def _views(
     job: Job,
     capture: CaptureReader,
     scene: BaseScene,
-    world: _World,
+    world: Scene,
     levels: np.ndarray,
     cells: ShadingCells,
     diffuse: DiffuseShading,
 ) -> None:
-    """Specular levels of every pixel, and the diffuse light of its cell joined with what the same paths say about it."""
+    """Write specular levels of every pixel, and the diffuse light of its cell averaged with that of its own paths (Eq. S.19)."""
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
         pixels = view_pixels(job, capture, scene, view)
         cell = cells.find(pixels.points, pixels.normals, pixels.object_id)
         own, s0, s1 = _traced(job, world, levels, view, pixels)
-        parts = joined(diffuse.diffuse[:, cell], diffuse.noise_last, own), s0, s1
+        parts = combine_estimates(diffuse.diffuse[:, cell], diffuse.noise_last, own), s0, s1
         if not all(np.isfinite(part).all() for part in parts):
             raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
         channels: dict[str, np.ndarray] = {}
@@ -167,27 +149,16 @@ def _views(
     job.progress(len(capture.views), len(capture.views), "views cached")
 
 
-def _traced(job: Job, world: _World, levels: np.ndarray, view: View, pixels: ViewPixels) -> tuple[np.ndarray, ...]:
-    """Diffuse (2, n, 3) and specular (2, n, J, 3) twice of the pixels of a view, two independent halves."""
+def _traced(job: Job, world: Scene, levels: np.ndarray, view: View, pixels: ViewPixels) -> tuple[np.ndarray, ...]:
+    """Diffuse (2, n, 3) and specular (2, n, J, 3) twice of the pixels of a view, in two independent halves."""
+    from iif_core.light.transport.scene import PathOptions
     from iif_core.light.transport.shading import shading_caches
 
-    settings = job.settings.shading
-    halves = [
-        shading_caches(
-            world.geometry,
-            world.material,
-            world.emitters,
-            pixels.points,
-            pixels.normals,
-            pixels.wo,
-            levels,
-            max(1, settings.samples // 2),
-            settings.max_bounces,
-            _seed(job, view.view_id) * 2 + half,
-            world.cache,
-        )
-        for half in range(2)
+    settings, surface = job.settings.shading, (pixels.points, pixels.normals, pixels.wo)
+    paths = [
+        PathOptions(max(1, settings.samples // 2), settings.max_bounces, _seed(job, view.view_id) * 2 + half) for half in range(2)
     ]
+    halves = [shading_caches(world, *surface, levels, half) for half in paths]
     return tuple(np.stack(part) for part in zip(*halves, strict=True))
 
 

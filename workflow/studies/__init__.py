@@ -1,1 +1,1 @@
-"""Studies: their files, their tables and their plots."""
+"""Studies: their tables and their plots."""

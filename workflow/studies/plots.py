@@ -8,23 +8,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from iif_core.evaluation.catalogue import METRICS, PROTOCOLS
 from workflow.settings.study_files import Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-PROTOCOLS = {"raw": "as it is", "scaled": "one gain per image and channel", "oracle_affine": "best affine per object (oracle)"}
 _MARKERS = {"raw": "o", "scaled": "^", "oracle_affine": "s"}
 _LINES = {"raw": "-", "scaled": ":", "oracle_affine": "--"}
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # told apart by everyone (Okabe, Ito)
-_UNITS = {"psnr": "PSNR / dB", "ssim": "SSIM", "l2": "L2", "flip": "FLIP", "lpips": "LPIPS (AlexNet)", "lpips_vgg": "LPIPS (VGG)"}
-_UNITS |= {"log_l2": "L2 of log(1 + E)", "iou": "IoU"}
-_UNITS |= {f"coverage_{n}": f"share within {n} % interval" for n in (50, 80, 95)}
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # colour-blind safe (Okabe, Ito)
 _PANEL = (3.1, 2.9)  # inches
 
 
 def draw(study: Study, frame: pd.DataFrame, histories: Mapping[Any, list[dict[str, float]]], path: Path) -> None:
-    """Draw the study's picture as PNG: a row of panels for each scene, a panel for each metric that is shown."""
+    """Draw a study as PNG: a row of panels for each scene, a panel for each metric.
+
+    Args:
+        study: what to draw.
+        frame: table of the study.
+        histories: cell -> history of its solver, for `plot.kind: history`.
+        path: file that is written.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -57,7 +61,7 @@ def draw(study: Study, frame: pd.DataFrame, histories: Mapping[Any, list[dict[st
                     _scatter(axes, study, of_scene, key, protocol)
                 else:
                     _lines(axes, study, of_scene, key)
-                below = f"\n{PROTOCOLS[protocol]}" if protocol else ""
+                below = f"\n{PROTOCOLS[protocol].words}" if protocol else ""
                 axes.set_title(f"{scene}: {key.split('/')[0]}{below}", fontsize=9)
             if kind == "history":
                 _curves(row[-1], study, {cell: h for cell, h in histories.items() if cell.scene == scene})
@@ -90,7 +94,7 @@ def _setting(study: Study, variant: str, dotted: str) -> Any:
 
 
 def _groups(study: Study) -> dict[str, list[str]]:
-    """Words for a line (values of the settings that group) -> its variants."""
+    """Label of a line (values of the settings that group) -> its variants."""
     out: dict[str, list[str]] = {}
     for name in study.variants:
         values = [_setting(study, name, dotted) for dotted in study.plot.group]
@@ -99,32 +103,33 @@ def _groups(study: Study) -> dict[str, list[str]]:
 
 
 def _others(study: Study, variant: str) -> str:
-    """What the variant sets besides what its group has in common: `16, 0.4`."""
+    """Values that the variant sets besides those that its group has in common: `16, 0.4`."""
     settings = study.variants[variant].overrides
     dotted = [(f"{section}.{key}", value) for section, keys in settings.items() for key, value in keys.items()]
     return ", ".join(str(value) for name, value in dotted if name not in study.plot.group)
 
 
 def _axis(axes: Any, key: str, which: str, values: pd.Series) -> None:
-    metric = key.split("/")[1]
-    getattr(axes, f"set_{which}label")(_UNITS.get(metric, metric), fontsize=8)
-    if metric in ("l2", "log_l2"):
+    metric = METRICS[key.split("/")[1]]
+    label = metric.axis or " / ".join(filter(None, (metric.label, metric.unit)))
+    getattr(axes, f"set_{which}label")(label, fontsize=8)
+    if metric.wide_range:
         _logarithmic_if_wide(axes, which, values)
     axes.grid(alpha=0.3)
     axes.tick_params(labelsize=8)
 
 
 def _logarithmic_if_wide(axes: Any, which: str, values: pd.Series) -> None:
-    """Narrow ranges are read more easily on a linear axis, and 0 has no place on another."""
+    """Use a logarithmic axis for positive values that span more than a factor of 10."""
     if len(values) and values.min() > 0 and values.max() > 10 * values.min():
         getattr(axes, f"set_{which}scale")("log")
 
 
 def _dots(axes: Any, study: Study, frame: pd.DataFrame, key: str, first: bool) -> None:
-    """Variants from top to bottom."""
+    """Draw the variants from top to bottom."""
     names = list(study.variants)
     for shift, protocol, colour in zip((-0.12, 0.12, 0.0), study.protocols, _COLOURS, strict=False):
-        chosen, words = _of(frame, key, protocol), PROTOCOLS[protocol]
+        chosen, words = _of(frame, key, protocol), PROTOCOLS[protocol].words
         points = [(i, *_mean_and_spread(v)) for i, n in enumerate(names) if len(v := chosen[chosen["variant"] == n]["value"])]
         if points:
             y, mean, spread = np.array(points).T
@@ -141,10 +146,10 @@ def _dots(axes: Any, study: Study, frame: pd.DataFrame, key: str, first: bool) -
 
 
 def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
-    """Score over a setting, a colour a group."""
+    """Draw the score over a setting, one colour per group."""
     for colour, (words, names) in zip(_cycle(), _groups(study).items(), strict=False):
         for protocol in study.protocols:
-            kind, chosen, points = PROTOCOLS[protocol], _of(frame, key, protocol), []
+            kind, chosen, points = PROTOCOLS[protocol].words, _of(frame, key, protocol), []
             for name in names:
                 x, values = _setting(study, name, study.plot.x), chosen[chosen["variant"] == name]["value"]
                 if x is not None and len(values):
@@ -169,7 +174,7 @@ def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
 
 
 def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: str) -> None:
-    """Score over CPU time; filled: on the Pareto front, which is drawn as a line."""
+    """Draw the score over CPU time; filled markers are on the Pareto front, which is drawn as a line."""
     chosen, front = _of(frame, key, protocol), []
     for colour, (words, names) in zip(_cycle(), _groups(study).items(), strict=False):
         axes.plot([], [], "o", mfc="none", color=colour, label=words or "variants")
@@ -196,7 +201,7 @@ def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: s
 
 
 def _curves(axes: Any, study: Study, histories: Mapping[Any, list[dict[str, float]]]) -> None:
-    """A quantity of the solver over its sweeps, mean over the seeds, a colour a variant."""
+    """Draw a quantity of the solver over its sweeps, mean over the seeds, one colour per variant."""
     from matplotlib import colormaps
 
     names = list(study.variants)
@@ -221,7 +226,7 @@ def _cycle() -> Iterator[str]:
 
 
 def _legend(figure: Any, grid: Any) -> None:
-    """One legend under all panels for what they have in common."""
+    """Draw one legend under all panels."""
     found: dict[str, Any] = {}
     for axes in grid.ravel():
         if axes.get_legend() is None:

@@ -1,6 +1,6 @@
-"""What a study needs, and its table: results/studies/<study>.parquet, .md and .png from the scores and times of its jobs.
+"""What a study runs, and its table: results/studies/<study>.parquet, .md and .png from the scores and times of its jobs.
 
-The Snakefile imports this module, so what is heavy is imported inside.
+The Snakefile imports this module, so heavy modules are imported inside functions.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iif_core.errors import InputError
+from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF
 from workflow.artifacts.files import write_atomically
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.timings import read_parts, read_timings
@@ -22,38 +23,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RESULTS = Path("results/studies")
-HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "l2": False, "flip": False, "lpips": False, "lpips_vgg": False}
-HIGHER_IS_BETTER |= {"log_l2": False, "iou": True}
-NAMES = {
-    "psnr": "PSNR",
-    "ssim": "SSIM",
-    "l2": "L2",
-    "flip": "FLIP",
-    "lpips": "LPIPS (AlexNet)",
-    "lpips_vgg": "LPIPS (VGG)",
-    "log_l2": "L2 of log(1 + E)",
-    "iou": "IoU",
-}
-HIGHER_IS_BETTER |= {"psnr_3d": True, "view_spread": False}
-NAMES["psnr_3d"] = "PSNR over cells, one affine an object"
-NAMES |= {
-    "shading_left": "shading left (correlation with light inside objects)",
-    "shading_slope": "shading left (slope over light inside objects)",
-    "view_spread": "spread of log albedo over views",
-}
-NAMES |= {f"coverage_{n}": f"share within the claimed {n} % interval" for n in (50, 80, 95)}
-PROTOCOLS = {"raw": "raw", "scaled": "scaled", "oracle_affine": "oracle"}
-EXPLAINED = {
-    "raw": "as it is",
-    "scaled": "after one gain per image and channel, which 8-bit photographs leave open",
-    "oracle_affine": "each object mapped by its best affine to the truth first, an upper bound and not a result",
-}
 COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb")
 KEY = ["scene", "quantity", "metric", "protocol"]
 
 
 class Cell(NamedTuple):
-    """One variant of one scene with one seed; `name` is its derived scene."""
+    """One variant of one scene with one seed; `name` is the name of its derived scene."""
 
     scene: str
     variant: str
@@ -62,7 +37,7 @@ class Cell(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What a study runs, and the scenes that it has to leave out with the reason."""
+    """What a study runs, and the scenes that it leaves out with the reason."""
 
     study: study_files.Study
     cells: tuple[Cell, ...]
@@ -71,7 +46,7 @@ class Plan(NamedTuple):
 
 @lru_cache(None)
 def plan(name: str, quality: str) -> Plan:
-    """Check every setting of every variant, then leave out the scenes whose data are not there.
+    """Check the settings of every variant, and leave out the scenes whose data are missing.
 
     Raises:
         InputError: a mistake in the study's file or in settings that it leads to.
@@ -96,12 +71,12 @@ def plan(name: str, quality: str) -> Plan:
 
 
 def home(cell: Cell, quality: str, stage: str = "base_scores") -> Path:
-    """Folder of a stage's result."""
+    """Return the folder of a stage's result."""
     return Path("results") / fp.home(stage, cell.name, quality) / stage
 
 
 def left_out(name: str, quality: str) -> list[str]:
-    """What the table will lack, and why."""
+    """List what the table will lack, and why."""
     study, _, skipped = plan(name, quality)
     notes = [f"without {scene}: {reason}" for scene, reason in skipped.items()]
     if any(key.endswith("lpips_vgg") for key in study.show) and not Path("results/weights/lpips_vgg.npz").is_file():
@@ -112,13 +87,13 @@ def left_out(name: str, quality: str) -> list[str]:
 
 
 def inputs(name: str, quality: str) -> list[str]:
-    """Manifests that the study collects; variants that agree with what studies share have one in common."""
+    """List the manifests that the study collects; variants whose results agree share one."""
     study, cells, _ = plan(name, quality)
     return sorted({str(home(cell, quality, study.scores) / "manifest.json") for cell in cells})
 
 
 def fingerprint(name: str, quality: str) -> str:
-    """Changes when the study's file, its code, its scores or the scenes that can be run do."""
+    """Compute a digest that changes with the study's file, its code, its scores or the scenes that can be run."""
     study, cells, skipped = plan(name, quality)
     facts = {
         "study": study.model_dump(mode="json"),
@@ -143,11 +118,8 @@ def write_study(name: str, quality: str) -> None:
     logging.getLogger("study").info("\n%s", text)
 
 
-# ---------------------------------------------------------------------------------------------------------------- table
-
-
 def table(name: str, quality: str) -> pd.DataFrame:
-    """One row a scene, variant, seed, quantity, metric and protocol (docs/studies.md), and one a scene that was left out."""
+    """Collect one row per scene, variant, seed, quantity, metric and protocol, and one per scene that was left out."""
     import pandas as pd
 
     study, cells, skipped = plan(name, quality)
@@ -192,28 +164,22 @@ COLUMNS = [
 
 
 def _write_table(frame: pd.DataFrame, path: Path) -> None:
-    import pandas as pd
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    columns = {}
-    for name, kind in COLUMNS:
-        values = [None if pd.isna(value) else value for value in frame[name].tolist()]
-        if kind == "int64":
-            values = [None if value is None else int(value) for value in values]
-        columns[name] = pa.array(values, getattr(pa, "bool_" if kind == "bool" else kind)())
-    pq.write_table(pa.table(columns), path, compression="zstd")
+    kinds = {"bool": pa.bool_(), "float64": pa.float64(), "int64": pa.int64(), "string": pa.string()}
+    schema = pa.schema([(name, kinds[kind]) for name, kind in COLUMNS])
+    table = pa.Table.from_pandas(frame, schema, preserve_index=False).replace_schema_metadata(None)
+    pq.write_table(table, path, compression="zstd")
 
 
 def _protocol_of(paper: study_files.Paper, quantity: str) -> str:
-    """The protocol that a publication's numbers follow: `raw` for quantities that its own does not apply to."""
-    from iif_core.evaluation.metrics import PROTOCOLS_OF
-
+    """The protocol of a publication's numbers; `raw` for quantities to which its own does not apply."""
     return paper.protocol if paper.protocol in PROTOCOLS_OF[quantity] else "raw"
 
 
 def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, str, str], tuple[float, int]]:
-    """(quantity, metric, protocol) -> (mean over views, views)."""
+    """(quantity, metric, protocol) -> (mean over views, number of views)."""
     import pandas as pd
 
     from workflow.artifacts import StageReader
@@ -231,8 +197,10 @@ def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, s
 
 
 def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
-    """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`); what
-    one of them did not record is missing."""
+    """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`).
+
+    A value that one of the jobs did not record is None.
+    """
     jobs, solver = [], {}
     for stage in stages:
         scene = fp.home(stage, cell.name, quality)
@@ -260,7 +228,7 @@ def _pareto(frame: pd.DataFrame) -> pd.Series:
 
     out = pd.Series([None] * len(frame), index=frame.index, dtype=object)
     for key, group in frame[frame["value"].notna()].groupby(KEY):
-        better = HIGHER_IS_BETTER.get(key[2])
+        better = METRICS[key[2]].higher_is_better
         means = group.groupby("variant")[["value", "cpu_seconds"]].mean()
         if better is None or means["cpu_seconds"].isna().any():
             continue
@@ -270,16 +238,13 @@ def _pareto(frame: pd.DataFrame) -> pd.Series:
 
 
 def pareto_front(costs: list[float], values: list[float], higher_is_better: bool) -> list[bool]:
-    """Which points no other point beats: none is at least as good in both and better in one. Equal points stand together."""
+    """Find the points to which no other point is at least as good in both values and better in one."""
     points = [(cost, -value if higher_is_better else value) for cost, value in zip(costs, values, strict=True)]
     return [not any(q != p and q[0] <= p[0] and q[1] <= p[1] for q in points) for p in points]
 
 
-# ----------------------------------------------------------------------------------------------------------------- page
-
-
 def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str]) -> str:
-    """The table as Markdown: a block a metric, ours raw and with the oracle beside what the paper prints; then the costs."""
+    """Format the table as Markdown: a block per metric, then the costs."""
     lines = [f"# {study.title}", ""]
     for scene, reason in skipped.items():
         lines += [f"Left out: {scene}. {reason}", ""]
@@ -292,7 +257,7 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
     if study.reference:
         label = study.variants[study.reference].label or study.reference
         lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
-    explained = "; ".join(f"*{PROTOCOLS[protocol]}*: {EXPLAINED[protocol]}" for protocol in study.protocols)
+    explained = "; ".join(f"*{PROTOCOLS[protocol].short}*: {PROTOCOLS[protocol].explanation}" for protocol in study.protocols)
     lines += [f"{note}. {explained}. The paper's numbers are of other scenes; in brackets the protocol that they follow.", ""]
     front = study.plot.kind == "pareto"
     if front:
@@ -307,16 +272,16 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
             columns += [("mean", protocol) for protocol in study.protocols if ("mean", protocol) not in columns and columns]
             columns = [c for c in columns if (chosen["protocol"] == c[1]).any()]
         if not columns:
-            lines += [f"## {quantity} {NAMES.get(metric, metric)}", "", f"Not scored{_why(metric)}.", ""]
+            lines += [f"## {quantity} {METRICS[metric].label}", "", f"Not scored{_why(metric)}.", ""]
             continue
         printed = any(key in paper.values for paper in study.paper.values())
-        head = [f"{scene} {PROTOCOLS[protocol]}" for scene, protocol in columns] + ["paper"] * printed
+        head = [f"{scene} {PROTOCOLS[protocol].short}" for scene, protocol in columns] + ["paper"] * printed
         body = []
         for name, label in labels.items():
             row = [label]
             for scene, protocol in columns:
                 cell = chosen[(chosen["protocol"] == protocol) & (chosen["variant"] == name)]
-                if scene == "mean":  # of the scenes' means, so that each counts once
+                if scene == "mean":  # of the means of the scenes, which count equally
                     row.append(_mean_cell(metric, cell.groupby("scene")["value"].mean().tolist()))
                     continue
                 cell = cell[cell["scene"] == scene]
@@ -328,10 +293,10 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
             paper = study.paper.get(name)
             if printed:
                 known = paper is not None and key in paper.values
-                protocol = PROTOCOLS[_protocol_of(paper, quantity)] if paper else ""
+                protocol = PROTOCOLS[_protocol_of(paper, quantity)].short if paper else ""
                 row.append(f"{_shown(metric, paper.values[key])} ({protocol})" if paper and known else "")
             body.append(row)
-        lines += [f"## {quantity} {NAMES.get(metric, metric)}{_direction(metric)}", "", *_markdown(["variant", *head], body), ""]
+        lines += [f"## {quantity} {METRICS[metric].label}{_direction(metric)}", "", *_markdown(["variant", *head], body), ""]
     what = "the base texture" if study.costs == ["base"] else ", ".join(study.costs)
     lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
     return "\n".join(lines)
@@ -354,17 +319,17 @@ def _why(metric: str) -> str:
 
 
 def _direction(metric: str) -> str:
-    unit = " in dB" if metric == "psnr" else ""
-    better = HIGHER_IS_BETTER.get(metric)
+    unit = f" in {METRICS[metric].unit}" if METRICS[metric].unit else ""
+    better = METRICS[metric].higher_is_better
     return unit if better is None else f"{unit} ({'higher' if better else 'lower'} is better)"
 
 
 def _shown(metric: str, value: float) -> str:
-    return f"{value:.2f}" if metric == "psnr" else f"{value:.3g}" if metric in ("l2", "log_l2") else f"{value:.3f}"
+    return f"{value:.3g}" if METRICS[metric].wide_range else f"{value:.{METRICS[metric].decimals}f}"
 
 
 def _moved(metric: str, cell: pd.DataFrame, chosen: pd.DataFrame, reference: str) -> str:
-    """Mean over the seeds, and in brackets how far it is from the reference's, seed by seed (± standard deviation)."""
+    """Mean over the seeds, and in brackets its difference from the reference, seed by seed (± standard deviation)."""
     import numpy as np
 
     keys = ["scene", "protocol", "seed"]
@@ -395,7 +360,7 @@ def _mean(values: list[float], digits: int) -> str:
 
 
 def _markdown(head: list[str], body: list[list[str]], words: int = 1) -> list[str]:
-    """Aligned, so that it reads in a terminal too; the first `words` columns to the left, numbers to the right."""
+    """Format an aligned table; the first `words` columns are left-aligned, the others right-aligned."""
     widths = [max(len(row[i]) for row in [head, *body]) for i in range(len(head))]
 
     def line(row: list[str]) -> str:

@@ -1,4 +1,4 @@
-"""Which family of curves, and what is known then."""
+"""Choice among families of response curves (Eq. C.24), with the exposures given or estimated along with the curve."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.calibration.likelihood import maximise
-from iif_core.camera.calibration.rows import DARK, FIT_ROWS, Channel, channel_rows, joined, log_factor
+from iif_core.camera.calibration.rows import MAX_ROWS, MIN_VALUE, Channel, channel_rows, concatenate_channels, log_factor
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import START, Response, response
 
 CANDIDATES = ("srgb", "gamma", "ggcm", "spline")
-"""What `auto` chooses from, smallest first."""
+"""Families that `auto` compares, smallest first."""
 GAUGE = (
     "exposures were found together with the response: any power p of the exposures goes with f(x^(1 / p)) and fits as well;"
     " the power is the one of a curve near sRGB"
 )
-_SIGNIFICANT = 2.0
-_PRIOR = 1.0  # standard deviation of a parameter around its start
-_CHANNEL_PRIOR = 0.05  # and of a channel around the curve of all channels
+_SIGNIFICANT = 2.0  # standard errors
+_SIGMA = 1.0  # standard deviation of a parameter around its start
+_CHANNEL_SIGMA = 0.05  # standard deviation of a parameter of one channel around that of all channels
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class Fitted:
     """One candidate.
 
     Attributes:
-        response: parameters (3, P), one row a channel.
+        response: parameters (3, P), one row per channel.
         covariance: (3 P, 3 P) of the parameters row by row.
-        score: log likelihood less the price of the parameters (Takeuchi), in units of independent rows.
-        clusters: (L,) the score's parts, whose spread says what a difference is worth.
+        score: log likelihood less the price of the parameters (Eq. C.22).
+        clusters: (L,) log likelihood of every cluster.
         width: robust spread of n.
     """
 
@@ -48,16 +48,16 @@ class CalibratedResponse:
     """Result of `calibrate_response`.
 
     Attributes:
-        response: chosen curve, (3, P); the start where the data say nothing.
-        covariance: (3 P, 3 P) of its parameters; the prior's where the data say nothing.
-        exposure: (V,) of the views: the given ones, or those found with the curve (mean over the channels).
-        gains: exposure, white balance and vignetting found with the curve; None where exposures are given.
-        gauge: what cannot be known, in words; empty with given exposures.
+        response: chosen curve, (3, P); the start if the data are insufficient.
+        covariance: (3 P, 3 P) of its parameters; that of the prior if the data are insufficient.
         stops: largest difference of exposure within a patch, in stops.
         rows: (patch, view, channel) rows used.
         before, after: robust spread of log radiance within patches with the starting curve and with the chosen one.
-        candidates: {family, parameters, score, behind, error} each: `behind` the best by so much, +- `error`.
+        candidates: {family, parameters, score, behind, error} each; `behind` is the distance to the best score.
         reason: the choice in words.
+        exposure: (V,) of the views, given or estimated (mean over the channels).
+        gauge: what cannot be determined, in words; empty with given exposures.
+        gains: exposure, white balance and vignetting estimated with the curve; None where exposures are given.
     """
 
     response: Response
@@ -82,17 +82,18 @@ def calibrate_response(
     min_rows: int = 200,
     given: bool = True,
 ) -> CalibratedResponse:
-    """The smallest of `families` that no other beats significantly, fitted.
-
-    Significantly: its score is behind the best one's by more than two standard errors of the difference, which the
-    spread over clusters gives.
+    """Fit all families and choose the smallest one that no other beats significantly (Eq. C.24).
 
     Args:
-        rows: `overlap.patch_rows` of all views; exposure: (V,) of the views, known up to one factor.
-        families: candidates, smallest first; one = no choice. Families without parameters are compared as they are.
+        rows: `overlap.patch_rows` of all views.
+        exposure: (V,) of the views, known up to one factor; only their mean is used unless `given`.
+        families: candidates, smallest first. Families without parameters are compared as they are.
         saturation: sensor values from here on are bounds.
-        min_stops, min_rows: below, the start of the first family comes back.
-        given: exposures are known. Otherwise they are found together with each candidate; `exposure` gives their mean.
+        min_stops, min_rows: exposure range and number of rows that are needed to fit a curve.
+        given: exposures are known; otherwise they are estimated together with each candidate.
+
+    Returns:
+        The chosen curve; the start of the first family if the data are insufficient.
     """
     if not needs_rows(families):
         start = response(families[0])
@@ -107,10 +108,10 @@ def calibrate_response(
     if not enough:
         gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
         return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, gains, given)
-    common = joined([channel_rows(rows, c, gains, saturation, min_stops, FIT_ROWS // len(enough)) for c in enough])
+    common = concatenate_channels([channel_rows(rows, c, gains, saturation, min_stops, MAX_ROWS // len(enough)) for c in enough])
     if not given:
-        # Which terms it takes is asked of the richest curve, fitted with one gain a view: under a wrong curve, channels of
-        # different brightness seem to need gains of their own.
+        # The terms of the gains are chosen under the richest curve, fitted with one gain per view: under a wrong curve,
+        # channels of different brightness seem to need gains of their own.
         rich = _fit(families[-1], common, channels, enough).response
         gains = _gains(rows, rich, gains, choose=True)
         logs = log_factor(rows, gains)
@@ -118,7 +119,7 @@ def calibrate_response(
     fits, found = [], []
     for family in families:
         fit, views = _fit(family, common, channels, enough), gains
-        if not given:  # the gains that go with this curve, and the curve that goes with them
+        if not given:  # the gains under this curve, and the curve under these gains
             views = _gains(rows, fit.response, gains)
             logs = log_factor(rows, views)
             fit = _fit(family, common.exposed(logs), [channel.exposed(logs) for channel in channels], enough)
@@ -126,7 +127,7 @@ def calibrate_response(
         found.append(views)
     table, best = _compared(families, fits)
     chosen = next(i for i, entry in enumerate(table) if entry["behind"] <= _SIGNIFICANT * entry["error"])
-    before = maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _PRIOR, 0)
+    before = maximise(common, response(families[chosen]), np.array(START[families[chosen]]), _SIGMA, 0)
     used = sum(len(channels[c].cell) + len(channels[c].full) for c in enough)
     views = found[chosen]
     return CalibratedResponse(
@@ -145,41 +146,41 @@ def calibrate_response(
 
 
 def candidates(setting: str, dynamic_range: str) -> tuple[str, ...]:
-    """Families that a setting allows: `identity` for HDR whatever is set; `auto` is any of `CANDIDATES` for LDR."""
+    """Families that a setting allows: `identity` for HDR in any case; all of `CANDIDATES` for `auto` and LDR."""
     if dynamic_range == "hdr":
         return ("identity",)
     return CANDIDATES if setting == "auto" else (setting,)
 
 
 def needs_rows(families: Sequence[str]) -> bool:
-    """Whether there is anything to choose or to fit."""
+    """Whether there is a family to choose or a parameter to fit."""
     return len(families) > 1 or bool(START[families[0]])
 
 
 def given_response(curve: Response, reason: str, exposure: np.ndarray) -> CalibratedResponse:
-    """A response that is not to be fitted."""
+    """Result for a response that is not fitted."""
     size = curve.params.size
     return CalibratedResponse(curve, np.zeros((size, size)), 0.0, 0, 0.0, 0.0, [], reason, np.asarray(exposure, np.float64))
 
 
 def calibration_facts(found: CalibratedResponse) -> dict[str, object]:
-    """What is known about the choice, as plain values for a JSON file."""
+    """Convert the outcome of the choice to plain values for a JSON file."""
     names = ("stops", "rows", "before", "after", "candidates", "reason", "gauge")
     return {"covariance": found.covariance.tolist(), **{name: getattr(found, name) for name in names}}
 
 
 def gain_rows(rows: PatchRows, curve: Response) -> GainRows:
-    """The rows as `camera_gains` wants them: linear under a curve, unsaturated, not dark."""
-    values = curve.inverse(np.where(rows.clipped | ~(rows.value > DARK), np.nan, rows.value))
+    """Convert rows for `gains`: linear under a curve; saturated and dark values become NaN."""
+    values = curve.inverse(np.where(rows.clipped | ~(rows.value > MIN_VALUE), np.nan, rows.value))
     radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
     return GainRows(rows.patch.astype(np.int64), rows.view, values, radius2, rows.block)
 
 
 def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = False) -> CameraGains:
-    """Gains that a curve implies where views overlap, their mean that of `start`: with the terms that `start` was found to
-    need (exposure and vignetting if nobody asked), or, to `choose`, those that held-out surface speaks for.
+    """Gains under a curve, scaled to the mean exposure of `start`.
 
-    The power that is open is one for all channels: white balance is taken as uncorrelated with exposure.
+    With `choose`, the terms of the model that held-out surface supports; otherwise those that `start` was found to need, or
+    exposure and vignetting if it has no evidence. The undetermined power is one for all channels (Eq. C.28).
     """
     linear, n_views = gain_rows(rows, curve).thinned(), len(start.gain)
     if choose:
@@ -194,7 +195,7 @@ def _gains(rows: PatchRows, curve: Response, start: CameraGains, choose: bool = 
 
 
 def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(V, 3) gains whose chroma does not go with exposure."""
+    """(V, 3) gains without the correlation between chroma and exposure (Eq. C.28)."""
     logs = np.log(gain)
     level = logs.mean(1, keepdims=True)
     chroma, x = logs - level, np.where(seen[:, None], level - level[seen].mean() if seen.any() else 0.0, 0.0)
@@ -210,12 +211,12 @@ def _unknown(
         reason = f"exposures differ by less than {min_stops:g} stop where photographs overlap: taken as {family}"
     else:
         reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
-    covariance = _PRIOR**2 * np.eye(start.params.size)
+    covariance = _SIGMA**2 * np.eye(start.params.size)
     return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 
 
 def _compared(families: Sequence[str], fits: Sequence[Fitted]) -> tuple[list[dict[str, object]], int]:
-    """What each family is behind the best one, +- a standard error from the spread over the clusters; and the best."""
+    """Distance of each family to the best score with its standard error over the clusters, and the best family."""
     scores = np.array([fit.score for fit in fits])
     best = int(scores.argmax())
     table: list[dict[str, object]] = []
@@ -238,19 +239,19 @@ def _because(table: list[dict[str, object]], chosen: int, best: int, rows: int, 
 
 
 def _fit(family: str, together: Channel, channels: Sequence[Channel], enough: Sequence[int]) -> Fitted:
-    """One curve for all channels first; each channel then has to earn its difference."""
+    """Fit one curve to all channels, then each channel with a narrow prior around the common curve."""
     start = response(family)
     mean = np.array(START[family])
-    common = maximise(together, start, mean, _PRIOR)
+    common = maximise(together, start, mean, _SIGMA)
     size = start.params.size
     params, covariance = np.tile(common.params, (3, 1)), np.zeros((3 * size, 3 * size))
     score, clusters, widths = 0.0, {}, []
     for c in range(3):
         part = slice(c * size, (c + 1) * size)
         if c not in enough:
-            covariance[part, part] = common.covariance + _CHANNEL_PRIOR**2 * np.eye(size)
+            covariance[part, part] = common.covariance + _CHANNEL_SIGMA**2 * np.eye(size)
             continue
-        own = maximise(channels[c], start.with_params(common.params), common.params, _CHANNEL_PRIOR)
+        own = maximise(channels[c], start.with_params(common.params), common.params, _CHANNEL_SIGMA)
         params[c], covariance[part, part] = own.params, own.covariance
         score += own.score
         widths.append(own.width)

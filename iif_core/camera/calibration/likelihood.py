@@ -1,4 +1,4 @@
-"""One curve on one set of rows: the likelihood of the sensor values, its maximum, its curvature."""
+"""The likelihood of the sensor values under one curve (Eq. C.19), its maximum and its curvature."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from iif_core.camera.calibration.rows import KNOTS, Channel
 from iif_core.camera.response import Response
 
-_FREEDOM = 4.0
-_ROUNDING = 0.29 / 255.0
-_BLOCK_ROWS = 50.0  # rows' worth of the common width in the width of a block
+_FREEDOM = 4.0  # degrees of freedom of Student's t distribution
+_ROUNDING = 0.29 / 255.0  # standard deviation of rounding to 8 bits
+_BLOCK_ROWS = 50.0  # weight of the common width in the width of a block, in rows
 _ROUNDS = 5
 
 
 @dataclass
 class _Noise:
-    """Width of n: of all rows, and of every block relative to it."""
+    """Width of n: common width, and the width of every block relative to it (Eq. C.18)."""
 
     width: float
     block: np.ndarray
@@ -33,7 +33,7 @@ def _tables(curve: Response) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _table_slopes(curve: Response, log_x: np.ndarray, log_gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Their derivatives by the parameters, (knots, P): d log x = -df / (x f') where I is held."""
+    """Derivatives of the tables by the parameters, (knots, P): d log x = -df / (x f') at constant I."""
     x = np.exp(log_x)
     _, slope, by_params = curve.evaluate(x)
     dx = -by_params / (x * slope)[:, None]
@@ -41,7 +41,7 @@ def _table_slopes(curve: Response, log_x: np.ndarray, log_gain: np.ndarray) -> t
 
 
 def _levels(data: Channel, y: np.ndarray, scale2: np.ndarray, rounds: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """Robust level of every patch (C,) and the weights (n,) that make it."""
+    """Robust level of every patch (C,) and the weights (n,) of its rows (Eq. C.20)."""
     size = data.cells
     weight = 1.0 / scale2
     for _ in range(rounds):
@@ -50,9 +50,11 @@ def _levels(data: Channel, y: np.ndarray, scale2: np.ndarray, rounds: int = 10) 
     return level, weight
 
 
-def _reached(above: np.ndarray, width: float) -> np.ndarray:
-    """Probability that a level `above` the edge of saturation is seen saturated: logistic stand-in for the normal
-    distribution; 2 % of the saturated rows may be highlights or errors."""
+def _saturation_probability(above: np.ndarray, width: float) -> np.ndarray:
+    """Probability that a level `above` the edge of saturation is seen saturated (Eq. C.21).
+
+    A logistic function approximates the normal distribution; 2 % of the saturated rows may be highlights or errors.
+    """
     return 0.02 + 0.98 / (1.0 + np.exp(np.clip(-1.702 * above / width, -60.0, 60.0)))
 
 
@@ -66,25 +68,33 @@ class _Fit:
 
 
 def maximise(data: Channel, curve: Response, mean: np.ndarray, deviation: float, rounds: int = _ROUNDS) -> _Fit:
-    """Parameters (P,) of one curve: robust weights and the width of the noise in turn with a smooth inner problem.
+    """Maximise the likelihood of one curve: robust weights and noise widths alternate with a smooth inner problem.
 
-    `rounds` 0: the noise alone, at the parameters of `curve`."""
-    noise, worth = _Noise(0.05, np.ones(int(data.block.max(initial=-1)) + 1)), 1.0
-    noise, weight, deviations = _settle(data, curve, noise)
+    Args:
+        data: rows.
+        curve: start of the parameters.
+        mean, deviation: Gaussian prior of the parameters (P,).
+        rounds: number of alternations; 0 estimates the noise at the parameters of `curve` only.
+
+    Returns:
+        Parameters, covariance, score, log likelihood of the clusters, and spread of the deviations.
+    """
+    noise, independence = _Noise(0.05, np.ones(int(data.block.max(initial=-1)) + 1)), 1.0
+    noise, weight, deviations = _fit_noise(data, curve, noise)
     for number in range(rounds if curve.names else 0):
         last = number == rounds - 1
         if last:
-            worth = _curvature(data, curve, weight, noise, mean, deviation, 1.0)[1]
-        curve = _improve(data, curve, weight, noise, mean, deviation, worth, 30 if last else 12)
-        noise, weight, deviations = _settle(data, curve, noise)
-    covariance, _, price = _curvature(data, curve, weight, noise, mean, deviation, worth)
+            independence = _curvature(data, curve, weight, noise, mean, deviation, 1.0)[1]
+        curve = _improve(data, curve, weight, noise, mean, deviation, independence, 30 if last else 12)
+        noise, weight, deviations = _fit_noise(data, curve, noise)
+    covariance, _, price = _curvature(data, curve, weight, noise, mean, deviation, independence)
     score, clusters = _likelihood(data, curve, noise)
     width = float(1.4826 * np.median(np.abs(deviations))) if len(deviations) else 0.0
     return _Fit(curve.params, covariance, score - price, clusters, width)
 
 
-def _settle(data: Channel, curve: Response, noise: _Noise) -> tuple[_Noise, np.ndarray, np.ndarray]:
-    """Width of the noise at a curve, weights (n,) and deviations (n,) from the patches' levels."""
+def _fit_noise(data: Channel, curve: Response, noise: _Noise) -> tuple[_Noise, np.ndarray, np.ndarray]:
+    """Noise at a curve, weights (n,), and deviations (n,) from the levels of the patches."""
     log_x, log_gain = (data.at(table) for table in _tables(curve))
     y = log_x - data.log_e
     for _ in range(5):
@@ -100,21 +110,21 @@ def _improve(
     noise: _Noise,
     mean: np.ndarray,
     deviation: float,
-    worth: float,
+    independence: float,
     steps: int,
 ) -> Response:
-    """The curve at the minimum of `_inner` with weights and noise held."""
+    """Curve at the minimum of `_inner` for constant weights and noise."""
     from scipy.optimize import minimize
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-        return _inner(data, curve, theta, weight, noise.width, mean, deviation, worth)
+        return _inner(data, curve, theta, weight, noise.width, mean, deviation, independence)
 
     options = {"maxiter": steps, "ftol": 1e-10}
     return curve.with_params(minimize(objective, curve.params, jac=True, method="L-BFGS-B", options=options).x)
 
 
 def _widths(data: Channel, noise: _Noise, ratio: np.ndarray) -> _Noise:
-    """One step of the fixed point at which the mean of weight x squared deviation is one, overall and per block."""
+    """One step of the fixed point at which the mean of weight x squared deviation is 1, overall and per block."""
     total = max(float(data.share.sum()), 1e-12)
     overall = ratio.sum() / total
     size = len(noise.block)
@@ -133,9 +143,9 @@ def _inner(
     width: float,
     mean: np.ndarray,
     deviation: float,
-    worth: float,
+    independence: float,
 ) -> tuple[float, np.ndarray]:
-    """Negative log posterior with fixed weights, and its gradient."""
+    """Negative log posterior for constant weights, and its gradient."""
     inside = curve.with_params(theta)
     log_x, log_gain = _tables(inside)
     dx, dg = _table_slopes(inside, log_x, log_gain)
@@ -146,19 +156,19 @@ def _inner(
     n = y - level[data.cell]
     cost = float((data.share * (0.5 * weight * n**2 + data.at(log_gain))).sum())
     by_x, by_g = data.share * weight * n, data.share
-    pull = np.zeros(len(theta))
+    by_bounds = np.zeros(len(theta))
     if len(data.full):
         edge, edge_slope = np.interp(data.saturation, KNOTS, log_x), _at(dx, data.saturation)
         above = level[data.full] + data.full_e - edge
-        reached = _reached(above, width)
+        reached = _saturation_probability(above, width)
         cost -= float(np.log(reached).sum())
         by_level = -1.702 / width * (reached - 0.02) * (1.0 - (reached - 0.02) / 0.98) / reached
-        pull -= by_level.sum() * edge_slope
+        by_bounds -= by_level.sum() * edge_slope
         by_x = by_x + weight * (np.bincount(data.full, by_level, size) / total)[data.cell]
-    gradient = dx.T @ data.spread(by_x) + dg.T @ data.spread(by_g) + pull
+    gradient = dx.T @ data.scatter(by_x) + dg.T @ data.scatter(by_g) + by_bounds
     away, beyond = (theta - mean) / deviation**2, theta - inside.params
-    cost = worth * cost + 0.5 * float(((theta - mean) * away).sum()) + 1e3 * float((beyond**2).sum())
-    return cost, worth * gradient + away + 2e3 * beyond
+    cost = independence * cost + 0.5 * float(((theta - mean) * away).sum()) + 1e3 * float((beyond**2).sum())
+    return cost, independence * gradient + away + 2e3 * beyond
 
 
 def _at(table: np.ndarray, value: float) -> np.ndarray:
@@ -174,13 +184,13 @@ def _curvature(
     noise: _Noise,
     mean: np.ndarray,
     deviation: float,
-    worth: float,
+    independence: float,
 ) -> tuple[np.ndarray, float, float]:
-    """Covariance of the parameters, (P, P); how many independent rows a row is worth (at most 1); and the price of the
-    parameters in log likelihood.
+    """Covariance of the parameters (P, P), independence of a row (at most 1) and price of the parameters (Eq. C.22, C.23).
 
-    The sandwich H^-1 J H^-1 of scores summed over clusters says how far the likelihood overstates what it knows.
-    `_inner` majorises the likelihood; H has the curvature of Student's t itself, which is flatter."""
+    The scores are summed over clusters. `_inner` majorises the likelihood; H has the curvature of Student's t itself, which is
+    flatter.
+    """
     theta, size = curve.params, curve.params.size
     if not size:
         return np.zeros((0, 0)), 1.0, 0.0
@@ -202,7 +212,7 @@ def _curvature(
     hessian = 0.5 * (hessian + hessian.T) - lever.T @ ((data.share * excess)[:, None] * lever)
     values, vectors = np.linalg.eigh(hessian)
     values = np.maximum(values, 1e-6 * max(float(values.max()), 1e-6))
-    # A row's deviation has lost the part that its patch's level took up.
+    # The share (m - 1) / m accounts for the level of the patch.
     score = np.sqrt(data.share)[:, None] * (weight * n)[:, None] * lever + data.share[:, None] * dg
     owner = np.unique(data.cluster, return_inverse=True)[1]
     summed = np.stack([np.bincount(owner, score[:, k]) for k in range(size)], -1)
@@ -210,10 +220,10 @@ def _curvature(
     prior = np.eye(size) / deviation**2
     known = np.linalg.inv((vectors * values) @ vectors.T + prior)
     price = float(np.trace(known @ spread))
-    # Free directions alone: what the prior decides is no sign of rows that err together.
-    worth = float(np.clip(np.trace(known @ (vectors * values) @ vectors.T) / max(price, 1e-12), 1e-4, 1.0))
-    adjusted = np.linalg.inv(worth * (vectors * values) @ vectors.T + prior)
-    return adjusted @ (worth**2 * spread + prior) @ adjusted, worth, price
+    # The traces exclude the prior: directions that it determines say nothing about correlated rows.
+    independence = float(np.clip(np.trace(known @ (vectors * values) @ vectors.T) / max(price, 1e-12), 1e-4, 1.0))
+    adjusted = np.linalg.inv(independence * (vectors * values) @ vectors.T + prior)
+    return adjusted @ (independence**2 * spread + prior) @ adjusted, independence, price
 
 
 def _likelihood(data: Channel, curve: Response, noise: _Noise) -> tuple[float, dict[int, float]]:
@@ -225,7 +235,9 @@ def _likelihood(data: Channel, curve: Response, noise: _Noise) -> tuple[float, d
     n = y - level[data.cell]
     tail = 0.5 * (_FREEDOM + 1.0) * np.log1p(n**2 / (_FREEDOM * scale2))
     rows = -data.share * (tail + 0.5 * np.log(scale2) + gain)
-    bounds = np.log(_reached(level[data.full] + data.full_e - np.interp(data.saturation, KNOTS, log_x), noise.width))
+    bounds = np.log(
+        _saturation_probability(level[data.full] + data.full_e - np.interp(data.saturation, KNOTS, log_x), noise.width)
+    )
     names, owner = np.unique(np.concatenate([data.cluster, data.full_cluster]), return_inverse=True)
     summed = np.bincount(owner, np.concatenate([rows, bounds]))
     return float(rows.sum() + bounds.sum()), dict(zip(names.tolist(), summed.tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""Rows of shared surface as the fit of a curve wants them: by channel, thinned, with the gains of their views."""
+"""Rows of shared surface for fitting a response curve: by channel, thinned, with the gains of their views."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ import numpy as np
 from iif_core.camera.gains import CameraGains
 from iif_core.camera.overlap import PatchRows
 
-DARK = 4.0 / 255.0
-FIT_ROWS = 8_000
+MIN_VALUE = 4.0 / 255.0
+"""Smallest sensor value that is used (docs/method/numerics.md#logarithm-of-zero)."""
+MAX_ROWS = 8_000
+"""Number of rows per channel that are fitted."""
 KNOTS = np.linspace(0.1, 1.0, 257) ** 2  # sensor values where log x and the gain are tabulated
 
 
 def log_factor(rows: PatchRows, gains: CameraGains) -> np.ndarray:
-    """(n, 3) log of what radiance was multiplied by in each row; NaN where the exposure is not known."""
+    """Compute the log of the factor of radiance in each row, (n, 3); NaN where the exposure is not known."""
     radius2 = np.zeros(len(rows.view)) if rows.radius2 is None else rows.radius2
     factor = gains.factor(rows.view, radius2)
     return np.log(np.where(np.isfinite(factor) & (factor > 0), factor, np.nan))
@@ -24,17 +26,27 @@ def log_factor(rows: PatchRows, gains: CameraGains) -> np.ndarray:
 
 @dataclass
 class Channel:
-    """Rows of one channel (or of several one after another); n unsaturated ones and b bounds on C patches."""
+    """Rows of one channel, or of several channels in sequence: n unsaturated rows and b bounds on C patches.
+
+    Attributes:
+        cell: (n,) patch; value: (n,) sensor value; log_e: (n,) log factor of radiance; block, cluster: (n,) int.
+        full, full_e, full_cluster: (b,) patch, log factor and cluster of the bounds.
+        row, full_row: entries of the flattened (rows, 3) table.
+        stops: largest difference of exposure within a patch, in stops.
+        saturation: sensor value from which on rows are bounds.
+        knot, part: position of the values between the entries of KNOTS.
+        share: (n,) factor (m - 1) / m of the likelihood.
+    """
 
     cell: np.ndarray
     value: np.ndarray
     log_e: np.ndarray
     block: np.ndarray
     cluster: np.ndarray
-    full: np.ndarray  # (b,) patch of the bounds
+    full: np.ndarray
     full_e: np.ndarray
     full_cluster: np.ndarray
-    row: np.ndarray  # (n,) entry of the flattened (rows, 3) table
+    row: np.ndarray
     full_row: np.ndarray
     stops: float
     saturation: float
@@ -49,7 +61,7 @@ class Channel:
         self.share = (1.0 - 1.0 / np.maximum(members, 1))[self.cell]
 
     def exposed(self, log_factor: np.ndarray) -> Channel:
-        """The same rows under other gains: `log_factor`, (all rows, 3)."""
+        """The same rows under other gains, `log_factor` (all rows, 3)."""
         return replace(self, log_e=log_factor.ravel()[self.row], full_e=log_factor.ravel()[self.full_row])
 
     @property
@@ -57,23 +69,35 @@ class Channel:
         return int(max(self.cell.max(initial=-1), self.full.max(initial=-1))) + 1
 
     def at(self, table: np.ndarray) -> np.ndarray:
-        """(n, ...) values of a table on the knots."""
+        """Interpolate a table on the knots at the rows, (n, ...)."""
         part = self.part.reshape(-1, *[1] * (table.ndim - 1))
         return table[self.knot] * (1.0 - part) + table[self.knot + 1] * part
 
-    def spread(self, row: np.ndarray) -> np.ndarray:
-        """(knots,) sums of row values at the knots: the transpose of `at`."""
+    def scatter(self, row: np.ndarray) -> np.ndarray:
+        """Sum row values (n,) at the knots: the transpose of `at`."""
         size = len(KNOTS)
         return np.bincount(self.knot, row * (1.0 - self.part), size) + np.bincount(self.knot + 1, row * self.part, size)
 
 
 def channel_rows(
-    rows: PatchRows, c: int, gains: CameraGains, saturation: float, min_stops: float, budget: int = FIT_ROWS
+    rows: PatchRows, c: int, gains: CameraGains, saturation: float, min_stops: float, budget: int = MAX_ROWS
 ) -> Channel:
-    """About `budget` rows on patches whose exposures span `min_stops` and that some view saw unsaturated."""
+    """Select the rows of one channel, on patches whose exposures differ enough and that some view shows unsaturated.
+
+    Args:
+        rows: shared surface.
+        c: channel.
+        gains: gains of the views.
+        saturation: sensor value from which on rows are bounds.
+        min_stops: exposure range, in stops, that a patch needs.
+        budget: approximate number of rows.
+
+    Returns:
+        Rows of the channel.
+    """
     value, clipped = rows.value[:, c], rows.clipped[:, c]
     log_e = log_factor(rows, gains)[:, c]
-    use = np.flatnonzero(np.isfinite(value) & (value > DARK) & np.isfinite(log_e))
+    use = np.flatnonzero(np.isfinite(value) & (value > MIN_VALUE) & np.isfinite(log_e))
     owner = np.unique(rows.patch[use], return_inverse=True)[1]
     size = int(owner.max(initial=-1)) + 1
     low, high = np.full(size, np.inf), np.full(size, -np.inf)
@@ -105,8 +129,10 @@ def channel_rows(
 
 
 def _thinned(owner: np.ndarray, value: np.ndarray, clipped: np.ndarray, kept: np.ndarray, budget: int) -> np.ndarray:
-    """(patches,) bool: of the patches `kept` whole ones for about `budget` rows, evenly over ten ranges of brightness:
-    the few that come near saturation tie down the scale of x."""
+    """Choose whole patches of `kept` for about `budget` rows, (patches,) bool, evenly over ten ranges of brightness.
+
+    The few patches near saturation determine the scale of x, so they must not be outnumbered.
+    """
     size = int(owner.max(initial=-1)) + 1
     top = np.zeros(size)
     np.maximum.at(top, owner, np.where(clipped, 0.0, value))
@@ -123,8 +149,8 @@ def _thinned(owner: np.ndarray, value: np.ndarray, clipped: np.ndarray, kept: np
     return wanted
 
 
-def joined(channels: Sequence[Channel]) -> Channel:
-    """Several channels as one: patches of their own, common clusters."""
+def concatenate_channels(channels: Sequence[Channel]) -> Channel:
+    """Concatenate channels: patches stay separate, clusters are common."""
     offsets = np.cumsum([0] + [channel.cells for channel in channels])
     own, common = ("cell", "full"), ("value", "log_e", "block", "cluster", "full_e", "full_cluster", "row", "full_row")
     parts = {name: np.concatenate([getattr(channel, name) for channel in channels]) for name in common}

@@ -1,6 +1,6 @@
-"""Materials of earlier methods on the same cached shading: a free BRDF in every surface cell (METHOD 6.2, 6.3).
+"""Materials of earlier methods over the same cached shading (docs/method/fitting.md#earlier-methods-on-the-same-light).
 
-Where our method gives an object sixteen numbers, FIPT and IRIS give every surface point five. `problem` reduces the pixels
-of a cell to sums that hold the whole loss, `direct` minimises it exactly per cell, `adam` as the publications do, both
-judged by `loss.losses`; `camera` fits the camera response with the cells' albedo eliminated (IRIS).
+FIPT and IRIS give every surface point a free material of five numbers. `problem` reduces the pixels of a cell to sums that hold
+the whole loss, `direct` minimises it by search and `adam` by gradient descent, both judged by `loss.losses`. `camera` fits the
+camera response with the albedo of the cells eliminated (IRIS).
 """

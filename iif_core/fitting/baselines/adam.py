@@ -1,4 +1,4 @@
-"""Cells fitted as the publications fit them: Adam on all numbers at once, part means and scale not differentiated."""
+"""Free cells fitted by projected Adam on all numbers at once; part means and scale are not differentiated."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from iif_core.fitting.baselines.loss import (
     prior_scale,
 )
 from iif_core.fitting.baselines.problem import CellProblem
-from iif_core.reflectance.brdf import R_MIN
-
-_LOW = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
+from iif_core.numerics.adam import Moments
+from iif_core.reflectance.material import LOWEST
 
 
 @dataclass(frozen=True)
 class AdamOptions:
-    """Kingma and Ba's constants; the rate falls to a fifth after 60 % and again after 80 % of the steps.
+    """Schedule of Adam; the rate falls to a fifth after 60 % and again after 80 % of the steps.
 
-    The publications take 1e-3 on a hash grid, where a step moves thousands of points; a free cell needs a larger one.
+    The publications use the rate 1e-3 on a hash grid, where one step moves thousands of points; a free cell needs a larger one.
     """
 
     iterations: int = 600
@@ -42,22 +41,30 @@ def solve_adam(
     prior: np.ndarray | None = None,
     adam: AdamOptions | None = None,
 ) -> CellFit:
-    """The loss of `solve_direct` by projected Adam on (C, 5) numbers; the last step is the result."""
+    """Minimise the loss of `direct.solve_direct` by projected Adam.
+
+    Args:
+        problem: the cells; options: weights of the loss; prior: (C, 3) albedo of each cell's object, if the loss has that term.
+        adam: schedule.
+
+    Returns:
+        The cells after the last step; `history` holds the loss of every fiftieth step.
+    """
     options, adam = options or CellOptions(), adam or AdamOptions()
     target = checked_prior(problem, options, prior)
     value = np.tile(np.array(adam.start, np.float64), (len(problem.pixels), 1))
-    first, second = np.zeros_like(value), np.zeros_like(value)
+    moments = Moments(value.shape, adam.decay)
     pixels = max(float(problem.pixels[problem.known].sum()), 1e-300)
     scale, history = 1.0, []
     for step in range(adam.iterations):
         if options.prior:
             scale = prior_scale(problem, value, target)
         slope = gradient(problem, value, options, target, scale, part_means(problem, value, options))
-        first = adam.decay[0] * first + (1 - adam.decay[0]) * slope
-        second = adam.decay[1] * second + (1 - adam.decay[1]) * slope**2
+        moments.add(slope)
         rate = adam.rate * 0.2 ** ((step >= 0.6 * adam.iterations) + (step >= 0.8 * adam.iterations))
-        rate *= np.sqrt(1 - adam.decay[1] ** (step + 1)) / (1 - adam.decay[0] ** (step + 1))
-        value = np.clip(value - rate * first / (np.sqrt(second) + 1e-12), _LOW, 1.0)
+        first, second = moments.bias()
+        rate *= np.sqrt(second) / first
+        value = np.clip(value - rate * moments.mean / (np.sqrt(moments.square) + 1e-12), LOWEST, 1.0)
         if step % 50 == 0 or step == adam.iterations - 1:
             history.append(float(losses(problem, value, options, target).sum() / pixels))
     if options.prior:
@@ -69,7 +76,15 @@ def solve_adam(
 def gradient(
     problem: CellProblem, value: np.ndarray, options: CellOptions, target: np.ndarray, scale: float, means: np.ndarray
 ) -> np.ndarray:
-    """(C, 5) derivative of the loss per pixel of each cell, part means (O, 2) and scale held."""
+    """Return the derivative of the loss of each cell, divided by its pixels.
+
+    Args:
+        problem: the cells; value: (C, 5) materials; options: weights of the loss; target: (C, 3) prior albedo.
+        scale: s of Eq. M.46; means: (O, 2) mean roughness and metallic of the parts; both are held.
+
+    Returns:
+        (C, 5); 0 for unknown cells.
+    """
     a, r, m = value[:, :3], value[:, 3], value[:, 4:5]
     j, share = bracket(problem.levels, r)
     cell, t = np.arange(len(j)), share[:, None, None]

@@ -1,7 +1,7 @@
-"""Camera response with a free albedo in every cell: Gauss-Newton on the response, the albedos eliminated (METHOD 6.3).
+"""Camera response with a free albedo in every cell: Gauss-Newton on the response, the albedos eliminated.
 
-What the photographs leave to the response is what no albedo explains: the same cell under different light or exposure,
-and the pull of cells to their object's prior. Roughness and metalness are solved anew between the steps.
+The response is determined by what no albedo explains: the same cell under different light or exposure, and the prior albedo of
+the objects. Roughness and metallic are solved again between the steps.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from iif_core.fitting.baselines.loss import F0, IRIS, CellFit, CellOptions, best
 from iif_core.fitting.baselines.problem import BOUND_WEIGHT, CellProblem, CellSums, PixelRows
 from iif_core.fitting.levels import interpolate_levels
 
-RESPONSE_PULL = 1e-3
-"""IRIS's weight of the mean squared response parameters; here of their distance to the start."""
+RESPONSE_WEIGHT = 1e-3
+"""Weight of the mean squared distance of the response parameters from the start; IRIS weighs the parameters themselves."""
 _HALVINGS = 6
-_SEARCH_EVERY = 5  # steps; roughness and metalness move little with the response, their search takes most of the time
+_SEARCH_EVERY = 5
+"""Steps between searches of roughness and metallic, which move little with the response and take most of the time."""
 
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Fitted response, and the loss of the pixels after each accepted step (mean over pixels and channels)."""
+    """Fitted response, and the loss of the pixels before each step (mean over pixels and channels)."""
 
     response: Response
     history: list[float]
@@ -32,7 +33,7 @@ class CameraFit:
 
 @dataclass(frozen=True)
 class _State:
-    """Pixels of known cells in the order of their cells, and the cells' materials."""
+    """Pixels of known cells in the order of their cells, and what the steps need of the cells' materials."""
 
     rows: PixelRows
     starts: np.ndarray
@@ -41,8 +42,8 @@ class _State:
     gain: np.ndarray  # (n, 3) dL/da
     rest: np.ndarray  # (n, 3) L at a = 0
     weight: np.ndarray  # (n, 3)
-    pull: np.ndarray  # (c, 1)
-    goal: np.ndarray  # (c, 3)
+    prior_weight: np.ndarray  # (c, 1)
+    goal: np.ndarray  # (c, 3) prior albedo over the scale
 
 
 def fit_camera(
@@ -54,20 +55,21 @@ def fit_camera(
     iterations: int = 12,
     dark: float = 0.0,
 ) -> CameraFit:
-    """Response of the pixels `rows`, whose cells are free.
+    """Fit the response to pixels whose cells have free materials.
 
     Args:
-        rows: pixels; sums: an empty collector of the cells (ids, objects, levels); prior: (C, 3) albedo of each cell's
-        object; dark: see `PixelRows.usable`.
+        rows: pixels; sums: an empty collector of the cells (ids, objects, levels).
+        response: start; prior: (C, 3) albedo of each cell's object.
+        options: weights of the loss; iterations: largest number of steps; dark: see `PixelRows.usable`.
 
     Returns:
-        `CameraFit`; the response as given where it has no parameters or nothing is usable.
+        The fit; the given response if it has no parameters or no pixel is usable.
     """
     rows = rows.take(np.flatnonzero(rows.usable(dark)))
     rows = rows.take(np.argsort(rows.cell, kind="stable"))
     if not response.params.size or not len(rows.cell):
         return CameraFit(response, [])
-    # Only the cells that have pixels here: the others would be solved for nothing.
+    # Cells without pixels do not matter here.
     present, own = np.unique(rows.cell, return_inverse=True)
     rows, prior = replace(rows, cell=own), prior[present]
     sums = CellSums(sums.object_id[present], sums.n_objects, sums.levels)
@@ -90,10 +92,10 @@ def fit_camera(
 
 
 def _albedo_again(problem: CellProblem, fit: CellFit, prior: np.ndarray, options: CellOptions) -> CellFit:
-    """The fit with albedo and scale for another response, roughness and metalness as they were."""
-    pull = options.prior * problem.pixels[:, None] * fit.scale**2
+    """Solve albedo and scale for another response, with roughness and metallic held."""
+    prior_weight = options.prior * problem.pixels[:, None] * fit.scale**2
     goal = prior / fit.scale if fit.scale > 0 else prior
-    albedo = best_albedo(problem.dd, lobes_at(problem, fit.value[:, 3]), fit.value[:, 4:], pull, goal)
+    albedo = best_albedo(problem.dd, lobes_at(problem, fit.value[:, 3]), fit.value[:, 4:], prior_weight, goal)
     value = np.where(problem.known[:, None], np.concatenate([albedo, fit.value[:, 3:]], 1), 0.0)
     scale = prior_scale(problem, value, prior) if options.prior else fit.scale
     return replace(fit, value=value, scale=scale, known=problem.known)
@@ -113,13 +115,13 @@ def _state(rows: PixelRows, problem: CellProblem, fit: CellFit, prior: np.ndarra
     s0, s1 = (interpolate_levels(s, problem.levels, r)[0] for s in (rows.s0, rows.s1))
     gain = (1.0 - m) * rows.diffuse + m * s0
     weight = rows.weight[:, None] * np.where(rows.saturated, BOUND_WEIGHT, 1.0)
-    pull = options.prior * problem.pixels[cell, None] * fit.scale**2
+    prior_weight = options.prior * problem.pixels[cell, None] * fit.scale**2
     goal = prior[cell] / fit.scale if fit.scale > 0 else prior[cell]
-    return _State(rows, starts, cell, fit.value[cell, :3], gain, F0 * (1.0 - m) * s0 + s1, weight, pull, goal)
+    return _State(rows, starts, cell, fit.value[cell, :3], gain, F0 * (1.0 - m) * s0 + s1, weight, prior_weight, goal)
 
 
 def _spread(state: _State, of_cell: np.ndarray) -> np.ndarray:
-    """Values of cells (c, ...) at their pixels (n, ...)."""
+    """Repeat values of cells (c, ...) for their pixels (n, ...)."""
     return np.repeat(of_cell, np.diff(np.r_[state.starts, len(state.rows.cell)]), axis=0)
 
 
@@ -131,19 +133,19 @@ def _cost(state: _State, albedo: np.ndarray, response: Response, begin: np.ndarr
     error = response(_exposed(state, albedo)) - state.rows.value
     error = np.where(state.rows.saturated, np.minimum(error, 0.0), error)
     pixels = float(state.rows.weight.sum())
-    data = float((state.weight * error**2).sum() + (state.pull * (albedo - state.goal) ** 2).sum())
-    return data / (3.0 * pixels) + RESPONSE_PULL * float(np.mean((response.params - begin) ** 2))
+    data = float((state.weight * error**2).sum() + (state.prior_weight * (albedo - state.goal) ** 2).sum())
+    return data / (3.0 * pixels) + RESPONSE_WEIGHT * float(np.mean((response.params - begin) ** 2))
 
 
 def _step(state: _State, response: Response, begin: np.ndarray, cost: float) -> Response | None:
-    """The response after one damped step that lowers the cost, or None."""
+    """Return the response after the first of the halved steps that lowers the cost, or None."""
     f, slope, by_parameter = response.evaluate(_exposed(state, state.albedo))
     error = f - state.rows.value
     idle = state.rows.saturated & (error > 0)
     weight = np.where(idle, 0.0, state.weight)
     by_albedo = slope * state.rows.exposure[:, None] * state.gain
-    h_aa = np.add.reduceat(weight * by_albedo**2, state.starts) + state.pull
-    g_a = np.add.reduceat(weight * by_albedo * error, state.starts) + state.pull * (state.albedo - state.goal)
+    h_aa = np.add.reduceat(weight * by_albedo**2, state.starts) + state.prior_weight
+    g_a = np.add.reduceat(weight * by_albedo * error, state.starts) + state.prior_weight * (state.albedo - state.goal)
     h_aw = np.add.reduceat((weight * by_albedo)[..., None] * by_parameter, state.starts)  # (c, 3, P)
     free = (h_aa > 0) & ~((state.albedo <= 0) & (g_a > 0)) & ~((state.albedo >= 1) & (g_a < 0))
     inverse = np.where(free, 1.0 / np.where(free, h_aa, 1.0), 0.0)
@@ -153,7 +155,7 @@ def _step(state: _State, response: Response, begin: np.ndarray, cost: float) -> 
     shared = response.params.ndim == 1
     if shared:
         h, g = h.sum(0, keepdims=True), g.sum(0, keepdims=True)
-    ridge = RESPONSE_PULL * 3.0 * float(state.rows.weight.sum()) / response.params.size
+    ridge = RESPONSE_WEIGHT * 3.0 * float(state.rows.weight.sum()) / response.params.size
     away = np.atleast_2d(response.params - begin)
     full = h + ridge * np.eye(h.shape[1])
     move = -np.linalg.solve(full, (g + ridge * away)[..., None])[..., 0]

@@ -1,8 +1,8 @@
-"""Cells solved exactly: albedo in closed form, roughness and metalness by search, parts by fixed point.
+"""Free cells solved by search: albedo in closed form, roughness and metallic from candidates, parts by fixed point.
 
-For given r and m a cell's albedo is one ratio per channel. Between two levels the loss is linear in r, so its minimum
-over the albedo is concave there and the best r is a level or the part's mean, where |r - r_o| has its kink: a search over
-the levels and that mean misses nothing. Metalness is searched on a grid and at the part's mean.
+For given r and m the albedo of a cell is a ratio in each channel (Eq. M.48). Between two levels the loss is linear in r, so its
+minimum over the albedo is concave there, and the best r is a level or the mean of the part, where |r - r_o| has its kink. The
+search over the levels and that mean is therefore exact. Metallic is searched on a grid and at the mean of the part.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from iif_core.fitting.baselines.problem import CellProblem
 
 METALNESS = np.linspace(0.0, 1.0, 11)
 STARTS = ((1.0, 0.0), (1.0, 0.2), (0.85, 0.3), (0.8, 0.0), (0.4, 0.0), (0.85, 0.85), (0.4, 1.0), (0.15, 1.0))
-"""Means of the parts to start the fixed point from, rough to glossy, dielectric to metal. The best is kept per object, judged on
-`_FEW` of its cells."""
-_CELLS = 1 << 13
-_FEW = 400
+"""Starts of the fixed point: mean roughness and metallic of a part. The best is kept for each object, judged on `_START_CELLS` of
+its cells."""
+_CELLS_AT_ONCE = 1 << 13
+_START_CELLS = 400
 
 
 def solve_direct(
@@ -37,29 +37,29 @@ def solve_direct(
     rounds: int = 4,
     scales: int = 2,
 ) -> CellFit:
-    """Minimise the loss of every cell.
+    """Minimise the loss of every cell (Eq. M.46).
 
     Args:
-        problem: see `CellProblem`; options: weights; prior: (C, 3) albedo that `options.prior` pulls to.
+        problem: the cells; options: weights of the loss; prior: (C, 3) albedo of each cell's object, if the loss has that term.
         rounds: fixed-point steps of the part means, from each of `STARTS`.
         scales: alternations with the scale of the prior term.
 
     Returns:
-        `CellFit`, finite; the loss in `history` falls or stays.
+        The cells, all finite; the loss in `history` never rises.
     """
     options = options or CellOptions()
     target = checked_prior(problem, options, prior)
     problem_pixels = max(float(problem.pixels[problem.known].sum()), 1e-300)
     value, scale = np.zeros((len(problem.pixels), 5)), 1.0
     cost, history = np.full(problem.n_objects, np.inf), []
-    if options.prior:  # the scale starts where the light alone puts the albedo of rough dielectrics
+    if options.prior:  # the scale starts from the albedo of rough dielectrics without a prior
         rough = problem.lobes[:, -1].astype(np.float64)
         alone = best_albedo(problem.dd, rough, np.zeros((len(rough), 1)), 0.0, 0.0)
         scale = prior_scale(problem, alone, target)
     for _ in range(scales if options.prior else 1):
         table = _search(problem, options, target, scale)
-        candidate = _parts(problem, options, target, scale, table, rounds)
-        # An object keeps what it has where the other fixed point is worse.
+        candidate = _solve_parts(problem, options, target, scale, table, rounds)
+        # An object keeps its cells if the new fixed point is worse.
         better = losses(problem, candidate, options, target, scale) < cost
         value = np.where(better[problem.object_id, None], candidate, value)
         if options.prior:
@@ -70,36 +70,36 @@ def solve_direct(
     return CellFit(np.where(known[:, None], value, 0.0), known, scale, history)
 
 
-def _pull(problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """The prior term as pull (a - target)^2: (C, 1), (C, 3)."""
-    pull = options.prior * problem.pixels * scale * scale
-    return pull[:, None], target / scale if scale > 0 else target
+def _prior_term(problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return weight (C, 1) and goal (C, 3) of the prior term, weight (a - goal)^2."""
+    prior_weight = options.prior * problem.pixels * scale * scale
+    return prior_weight[:, None], target / scale if scale > 0 else target
 
 
 def _search(problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float) -> np.ndarray:
-    """(C, J, M) float32: loss without propagation at every level and metalness, albedo at its best."""
+    """Return the loss without propagation at every level and metallic with the best albedo, (C, J, M) float32."""
     table = np.empty((len(problem.pixels), len(problem.levels), len(METALNESS)), np.float32)
-    for start in range(0, len(table), _CELLS):
-        part = slice(start, start + _CELLS)
+    for start in range(0, len(table), _CELLS_AT_ONCE):
+        part = slice(start, start + _CELLS_AT_ONCE)
         few = problem.take(part)
-        pull, goal = _pull(few, options, target[part], scale)
+        prior_weight, goal = _prior_term(few, options, target[part], scale)
         for j, level in enumerate(problem.levels):
             lobes = few.lobes[:, j].astype(np.float64)
             for k, metal in enumerate(METALNESS):
-                a = best_albedo(few.dd, lobes, metal, pull, goal)
-                cost = (data_loss(few.dd, lobes, a, metal) + pull * (a - goal) ** 2).mean(1)
+                a = best_albedo(few.dd, lobes, metal, prior_weight, goal)
+                cost = (data_loss(few.dd, lobes, a, metal) + prior_weight * (a - goal) ** 2).mean(1)
                 table[part, j, k] = cost + few.pixels * options.regulariser * (1.0 - level + metal)
     return table
 
 
-def _parts(
+def _solve_parts(
     problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float, table: np.ndarray, rounds: int
 ) -> np.ndarray:
-    """(C, 5): fixed point of the part means, from the start of each object that is best on some of its cells."""
+    """Return the fixed point of the part means, (C, 5), from the start that is best on some cells of each object."""
     best, cost = np.tile(STARTS[0], (problem.n_objects, 1)), np.full(problem.n_objects, np.inf)
     if not options.propagation:
         return _fixed_point(problem, options, target, scale, table, best, 1)[0]
-    some = _some(problem)
+    some = _choose_cells(problem)
     few, few_target, few_table = problem.take(some), target[some], table[some]
     for start in STARTS:
         means = np.tile(start, (problem.n_objects, 1))
@@ -110,14 +110,14 @@ def _parts(
     return _fixed_point(problem, options, target, scale, table, best, rounds)[0]
 
 
-def _some(problem: CellProblem) -> np.ndarray:
-    """Indices of known cells, at most about `_FEW` an object, evenly spread."""
+def _choose_cells(problem: CellProblem) -> np.ndarray:
+    """Return the indices of known cells, evenly spread, at most about `_START_CELLS` of each object."""
     known = np.flatnonzero(problem.known)
     owner = problem.object_id[known]
     order = np.argsort(owner, kind="stable")
     count = np.bincount(owner, minlength=problem.n_objects)
     rank = np.arange(len(known)) - np.repeat(np.cumsum(count) - count, count)
-    stride = np.maximum(1, count // _FEW)[owner[order]]
+    stride = np.maximum(1, count // _START_CELLS)[owner[order]]
     return np.sort(known[order][rank % stride == 0])
 
 
@@ -130,7 +130,7 @@ def _fixed_point(
     means: np.ndarray,
     rounds: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Cells for given means and means of the cells, in turn: the best step of each object, (C, 5), and its loss (O,)."""
+    """Alternate cells for given means and means of the cells; return the best step of each object, (C, 5), and its loss (O,)."""
     best, cost = np.zeros((len(problem.pixels), 5)), np.full(problem.n_objects, np.inf)
     for _ in range(rounds):
         value = _cells_at(problem, options, target, scale, table, means)
@@ -148,10 +148,10 @@ def _fixed_point(
 def _cells_at(
     problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float, table: np.ndarray, means: np.ndarray
 ) -> np.ndarray:
-    """(C, 5): the best of every cell for given part means (O, 2)."""
+    """Return the best material of every cell for given part means (O, 2), (C, 5)."""
     value = np.empty((len(problem.pixels), 5))
-    for start in range(0, len(value), _CELLS):
-        part = slice(start, start + _CELLS)
+    for start in range(0, len(value), _CELLS_AT_ONCE):
+        part = slice(start, start + _CELLS_AT_ONCE)
         few = problem.take(part)
         mean_r, mean_m = means[few.object_id].T
         weight = (options.propagation * few.pixels)[:, None]
@@ -159,13 +159,13 @@ def _cells_at(
         total = table[part] + (weight * away_r)[:, :, None] + (weight * away_m)[:, None, :]
         j, k = np.divmod(total.reshape(len(mean_r), -1).argmin(1), len(METALNESS))
         on_r, on_m = problem.levels[j], METALNESS[k]
-        pull, goal = _pull(few, options, target[part], scale)
+        prior_weight, goal = _prior_term(few, options, target[part], scale)
         cost = np.full(len(mean_r), np.inf)
         for r, m in ((on_r, on_m), (mean_r, on_m), (on_r, mean_m), (mean_r, mean_m)):
             lobes, metal = lobes_at(few, r), m[:, None]
-            a = best_albedo(few.dd, lobes, metal, pull, goal)
+            a = best_albedo(few.dd, lobes, metal, prior_weight, goal)
             away = np.abs(r - mean_r) + np.abs(m - mean_m)
-            own = (data_loss(few.dd, lobes, a, metal) + pull * (a - goal) ** 2).mean(1)
+            own = (data_loss(few.dd, lobes, a, metal) + prior_weight * (a - goal) ** 2).mean(1)
             own += few.pixels * (options.regulariser * (1.0 - r + m) + options.propagation * away)
             better = own < cost
             value[part] = np.where(better[:, None], np.concatenate([a, r[:, None], metal], 1), value[part])

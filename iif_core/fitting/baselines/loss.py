@@ -1,4 +1,4 @@
-"""What the cells are judged by: data, regulariser, propagation within parts, pull to a prior (METHOD 6.2, 6.3)."""
+"""The loss of free cells: data, regulariser, propagation within parts, distance from a prior (Eq. M.45 to M.48)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from iif_core.fitting.baselines.problem import CellProblem
 from iif_core.reflectance.brdf import F0_DIELECTRIC as F0
 from iif_core.reflectance.brdf import R_MIN
 
-_PART_FLOOR = 1e-4  # METHOD 6.2: weight = mean specular radiance + 1e-4
+_PART_FLOOR = 1e-4
+"""Added to the weight of a cell in the means of its part (Eq. M.47)."""
 
 
 @dataclass(frozen=True)
@@ -21,8 +22,8 @@ class CellOptions:
     Attributes:
         regulariser: of |r - 1| + m.
         propagation: of |r - r_o| + |m - m_o|, with r_o, m_o weighted means of the cells of object o.
-        part_weight: what the means are weighted with: `specular` radiance (FIPT) or `gloss` = 1 - r (IRIS).
-        prior: of |s a - a_o|^2, a_o the prior's mean albedo of the object, s one scale for all (IRIS: 1e-2).
+        part_weight: weight of a cell in these means: `specular` radiance (FIPT) or `gloss`, 1 - r (IRIS).
+        prior: of |s a - a_o|^2, a_o the mean predicted albedo of the object and s one scale for all (IRIS: 1e-2).
     """
 
     regulariser: float = 5e-4
@@ -47,7 +48,7 @@ class CellFit:
         value: (C, 5) albedo, roughness, metallic; unknown cells hold 0.
         known: (C,) bool, see `CellProblem.known`.
         scale: s of the prior term.
-        history: loss after each step, mean over pixels.
+        history: loss after each step, mean over the pixels.
     """
 
     value: np.ndarray
@@ -57,39 +58,55 @@ class CellFit:
 
 
 def bracket(levels: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level below each roughness, and the share of the level above."""
+    """Return the level below each roughness, and the share of the level above."""
     j = np.clip(np.searchsorted(levels, roughness, side="right") - 1, 0, len(levels) - 2)
     return j, np.clip((roughness - levels[j]) / (levels[j + 1] - levels[j]), 0.0, 1.0)
 
 
 def lobes_at(problem: CellProblem, roughness: np.ndarray) -> np.ndarray:
-    """(C, 5, 3) sums at a roughness per cell, interpolated between levels."""
+    """Return the sums at one roughness for each cell, interpolated between levels, (C, 5, 3)."""
     j, share = bracket(problem.levels, roughness)
     cell, t = np.arange(len(j)), share[:, None, None]
     return (1.0 - t) * problem.lobes[cell, j] + t * problem.lobes[cell, j + 1]
 
 
 def data_loss(dd: np.ndarray, lobes: np.ndarray, albedo: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """(..., 3) squared error of sensor values, summed over the pixels of each cell; metallic (..., 1)."""
+    """Return the squared error of sensor values, summed over the pixels of each cell (Eq. M.45).
+
+    Args:
+        dd: (..., 3); lobes: (..., 5, 3) sums of the cells at their roughness.
+        albedo: (..., 3); metallic: (..., 1).
+
+    Returns:
+        (..., 3).
+    """
     k_d, k_s = (1.0 - metallic) * albedo, F0 * (1.0 - metallic) + metallic * albedo
     ss, sd, sz, dz, zz = (lobes[..., i, :] for i in range(5))
     return k_d * k_d * dd + k_s * k_s * ss + 2.0 * (k_d * k_s * sd - k_d * dz - k_s * sz) + zz
 
 
 def best_albedo(
-    dd: np.ndarray, lobes: np.ndarray, metallic: np.ndarray, pull: np.ndarray | float, target: np.ndarray | float
+    dd: np.ndarray, lobes: np.ndarray, metallic: np.ndarray, weight: np.ndarray | float, target: np.ndarray | float
 ) -> np.ndarray:
-    """Albedo in [0, 1] that minimises `data_loss` + pull (a - target)^2, in closed form; 0 / 0 gives 0."""
+    """Return the albedo that minimises `data_loss` + weight (a - target)^2 (Eq. M.48).
+
+    Args:
+        dd: (..., 3); lobes: (..., 5, 3) sums of the cells; metallic: (..., 1).
+        weight, target: of the prior term.
+
+    Returns:
+        (..., 3) in [0, 1]; 0 where nothing determines it.
+    """
     k_0 = F0 * (1.0 - metallic)
     ss, sd, sz, dz = (lobes[..., i, :] for i in range(4))
     rest = 1.0 - metallic
-    square = rest * rest * dd + metallic * metallic * ss + 2.0 * metallic * rest * sd + pull
-    cross = rest * (dz - k_0 * sd) + metallic * (sz - k_0 * ss) + pull * target
+    square = rest * rest * dd + metallic * metallic * ss + 2.0 * metallic * rest * sd + weight
+    cross = rest * (dz - k_0 * sd) + metallic * (sz - k_0 * ss) + weight * target
     return np.clip(np.divide(cross, square, out=np.zeros_like(cross), where=square > 0), 0.0, 1.0)
 
 
 def part_means(problem: CellProblem, value: np.ndarray, options: CellOptions) -> np.ndarray:
-    """(O, 2) weighted mean roughness and metalness of each object; 1 and 0 where nothing is known."""
+    """Return weighted mean roughness and metallic of each object, (O, 2); 1 and 0 where no cell is known."""
     weight = np.where(problem.known, part_weights(problem, value, options), 0.0)
     total = np.bincount(problem.object_id, weight, problem.n_objects)
     means = [np.bincount(problem.object_id, weight * value[:, c], problem.n_objects) for c in (3, 4)]
@@ -98,7 +115,7 @@ def part_means(problem: CellProblem, value: np.ndarray, options: CellOptions) ->
 
 
 def part_weights(problem: CellProblem, value: np.ndarray, options: CellOptions) -> np.ndarray:
-    """(C,) weight of a cell in the means of its part: its pixels times their mean specular radiance, or times 1 - r."""
+    """Return the weight of each cell in the means of its part (Eq. M.47), (C,)."""
     if options.part_weight == "gloss":
         return problem.pixels * (1.0 - value[:, 3] + _PART_FLOOR)
     j, share = bracket(problem.levels, value[:, 3])
@@ -109,7 +126,7 @@ def part_weights(problem: CellProblem, value: np.ndarray, options: CellOptions) 
 
 
 def prior_scale(problem: CellProblem, value: np.ndarray, prior: np.ndarray) -> float:
-    """The one scale s that minimises sum |s a - prior|^2 over pixels; 1 for black cells."""
+    """Return the scale s that minimises sum |s a - prior|^2 over the pixels (Eq. M.47); 1 for black cells."""
     weight = np.where(problem.known, problem.pixels, 0.0)[:, None]
     square = float((weight * value[:, :3] ** 2).sum())
     return float((weight * value[:, :3] * prior).sum() / square) if square > 0 else 1.0
@@ -118,13 +135,15 @@ def prior_scale(problem: CellProblem, value: np.ndarray, prior: np.ndarray) -> f
 def losses(
     problem: CellProblem, value: np.ndarray, options: CellOptions, prior: np.ndarray | None = None, scale: float | None = None
 ) -> np.ndarray:
-    """(O,) loss of each object, summed over its pixels: the one judge of all solvers.
-
-    mean over channels of the squared error, + regulariser (|r - 1| + m) + propagation (|r - r_o| + |m - m_o|)
-    + prior mean over channels of (s a - a_o)^2, with r_o, m_o, s at their values for these cells.
+    """Return the loss of each object, summed over its pixels, by which all solvers are judged (Eq. M.46).
 
     Args:
-        value: (C, 5); prior: (C, 3) of each cell's object, needed where `options.prior` is not 0; scale: s, if it is held.
+        problem: the cells; value: (C, 5) materials; options: weights.
+        prior: (C, 3) albedo of each cell's object, needed if `options.prior` is not 0.
+        scale: s if it is held; None: its value for these cells.
+
+    Returns:
+        (O,) float64.
     """
     r, m = np.clip(value[:, 3], R_MIN, 1.0), value[:, 4]
     cost = data_loss(problem.dd, lobes_at(problem, r), value[:, :3], m[:, None]).mean(1)
@@ -138,10 +157,10 @@ def losses(
 
 
 def checked_prior(problem: CellProblem, options: CellOptions, prior: np.ndarray | None) -> np.ndarray:
-    """(C, 3) prior albedo; zeros where the loss has no such term.
+    """Return the prior albedo, (C, 3); zeros if the loss has no such term.
 
     Raises:
-        InputError: the loss has one and there is no prior, or one of another shape.
+        InputError: the loss has the term, and the prior is missing, not finite or of another shape.
     """
     if not options.prior:
         return np.zeros((len(problem.pixels), 3))
@@ -152,7 +171,7 @@ def checked_prior(problem: CellProblem, options: CellOptions, prior: np.ndarray 
 
 
 def object_means(problem: CellProblem, value: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """(O, 5) mean of the known cells of each object over their pixels; `unseen` (O, 5) without any."""
+    """Return the mean of the known cells of each object over their pixels, (O, 5); `unseen` (O, 5) where there is none."""
     weight = np.where(problem.known, problem.pixels, 0.0)
     total = np.bincount(problem.object_id, weight, problem.n_objects)
     sums = [np.bincount(problem.object_id, weight * value[:, c], problem.n_objects) for c in range(5)]
@@ -160,15 +179,15 @@ def object_means(problem: CellProblem, value: np.ndarray, unseen: np.ndarray) ->
 
 
 def fill_unknown(fit: CellFit, problem: CellProblem, unseen: np.ndarray) -> np.ndarray:
-    """(C, 5) values with unknown cells at the mean of their object's known ones, or at `unseen` (O, 5) without any."""
+    """Return materials (C, 5) in which unknown cells have the mean of their object, or `unseen` (O, 5) where it has none."""
     return np.where(fit.known[:, None], fit.value, object_means(problem, fit.value, unseen)[problem.object_id])
 
 
 def albedo_deviation(problem: CellProblem, value: np.ndarray) -> np.ndarray:
-    """(C,) standard error of the cells' albedo, mean over channels, at most 1: sigma / sqrt(sum w^2 G^2).
+    """Return the standard error of the cells' albedo, sigma / sqrt(sum w^2 G^2), mean over the channels and at most 1, (C,).
 
-    sigma^2 is the squared error per pixel that all cells leave, with one degree of freedom spent per cell and channel;
-    r, m are taken as known, so it is a lower bound. Cells that nothing was seen of: 1.
+    sigma^2 is the squared error of a pixel over all cells, with one degree of freedom spent for each cell and channel. Roughness
+    and metallic are taken as known, so it is a lower bound. Unknown cells have 1.
     """
     known, metal = problem.known, value[:, 4:5]
     lobes = lobes_at(problem, np.clip(value[:, 3], R_MIN, 1.0))

@@ -1,13 +1,12 @@
-"""The loss of a free BRDF per surface cell, reduced to sums over the cell's pixels.
+"""The loss of a free material in every surface cell, reduced to sums over the pixels of the cell (Eq. M.1, M.45).
 
-A pixel shows radiance L = k_d D + k_s S0(r) + S1(r), k_d = (1 - m) a, k_s = 0.04 (1 - m) + m a (METHOD 2.7). With the
-sensor's slope w = e f'(e y) at the observed radiance y = f^-1(I) / e, the squared error of the sensor value is to first
-order w^2 (L - y)^2, so that at roughness level j, with Z = y - S1_j,
+With the slope w = e f'(e y) of the sensor at the observed radiance y = f^-1(I) / e, the squared error of the sensor value is to
+first order w^2 (L - y)^2. At roughness level j, with Z = y - S1_j, it is in each channel
 
-    loss_j(a, m) = k_d^2 DD + k_s^2 SS + 2 k_d k_s SD - 2 k_d DZ - 2 k_s SZ + ZZ
+    loss_j(a, m) = k_d^2 DD + k_s^2 SS + 2 k_d k_s SD - 2 k_d DZ - 2 k_s SZ + ZZ,
 
-per channel, where DD, SS, ... are sums of w^2 D D, w^2 S0 S0, ... over the pixels of the cell: whatever the number of
-photographs, a cell is 15 J + 3 numbers. Between levels the loss (not the shading) is interpolated.
+where DD, SS, ... are sums of w^2 D D, w^2 S0 S0, ... over the pixels of the cell. A cell is 15 J + 3 numbers, whatever the number
+of photographs. Between levels the loss, not the shading, is interpolated.
 """
 
 from __future__ import annotations
@@ -23,9 +22,9 @@ from iif_core.numerics.color import SRGB_KNEE
 SUMS = 5
 """SS, SD, SZ, DZ, ZZ of a level."""
 DARK = 1e-3
-"""Pixels that get less diffuse light than this share of the median have leverage and no information (METHOD H59)."""
+"""Share of the median diffuse light below which pixels are left out (docs/method/numerics.md#pixels-without-light)."""
 BOUND_WEIGHT = 1e-3
-"""A saturated value is a lower bound: it decides only where the cell has no other value in its channel."""
+"""Weight of a saturated value, which bounds the radiance from below: it decides only where the cell has no other value."""
 _PIECE = 1 << 15
 
 
@@ -36,7 +35,7 @@ class PixelRows:
     Attributes:
         cell: (n,) int surface cell, -1 is left out.
         weight: (n,) of the pixel in the loss.
-        diffuse: (n, 3); s0, s1: (n, J, 3) cached shading (METHOD 2.7).
+        diffuse: (n, 3) D of Eq. M.1; s0, s1: (n, J, 3) S0 and S1 at the levels.
         value: (n, 3) sensor value (HDR: radiance); exposure: (n,); saturated: (n, 3) bool, `value` is a lower bound.
     """
 
@@ -59,11 +58,11 @@ class PixelRows:
             raise InputError(f"pixels of cells: shading of shapes {self.s0.shape}, {self.s1.shape}, needed ({n}, J, 3) twice")
 
     def take(self, choice: np.ndarray) -> PixelRows:
-        """Some of the pixels."""
+        """Return some of the pixels."""
         return PixelRows(**{name: array[choice] for name, array in self.__dict__.items()})
 
     def usable(self, dark: float = 0.0) -> np.ndarray:
-        """(n,) bool: in a cell, finite, with positive weight and exposure, and more exposed diffuse light than `dark`."""
+        """Return which pixels have a cell, finite values, positive weight and exposure, and more light than `dark`, (n,)."""
         use = (self.cell >= 0) & np.isfinite(self.weight) & (self.weight > 0)
         use &= np.isfinite(self.exposure) & (self.exposure > 1e-6) & np.isfinite(self.value).all(1)
         use &= np.isfinite(self.diffuse).all(1) & np.isfinite(self.s0).all((1, 2)) & np.isfinite(self.s1).all((1, 2))
@@ -72,13 +71,13 @@ class PixelRows:
         return use
 
     def light(self) -> np.ndarray:
-        """(n,) exposed diffuse light, summed over the channels."""
+        """Return the exposed diffuse light, summed over the channels, (n,)."""
         return self.diffuse.sum(1) * self.exposure
 
     def radiance(self, response: Response) -> tuple[np.ndarray, np.ndarray]:
-        """Observed radiance y = f^-1(I) / e and squared slope w^2 = (e f'(e y))^2 of the sensor there, (n, 3) each.
+        """Return observed radiance y = f^-1(I) / e and squared slope w^2 = (e f'(e y))^2 of the sensor there, (n, 3) each.
 
-        `identity` is HDR: the loss of FIPT, measured through the sRGB curve, which is continued as a power above 1.
+        For `identity` (HDR) the loss is that of FIPT, measured through the sRGB curve, which is continued as a power above 1.
         """
         if response.family == "identity":
             y = np.maximum(self.value.astype(np.float64), 0.0)
@@ -91,12 +90,12 @@ class PixelRows:
 
 @dataclass(frozen=True)
 class CellProblem:
-    """The loss of all cells; C cells, J levels. Made by `CellSums`.
+    """The loss of all cells, as `CellSums` collects it; C cells, J levels.
 
     Attributes:
         object_id: (C,) int in [0, n_objects).
         levels: (J,) roughness of the levels, increasing.
-        pixels: (C,) summed pixel weight, 0 = nothing was seen of the cell.
+        pixels: (C,) summed pixel weight; 0 = the cell was not seen.
         dd: (C, 3); lobes: (C, J, 5, 3) SS, SD, SZ, DZ, ZZ.
         specular: (C, J, 2) sums of S0 and S1, mean over the channels.
     """
@@ -111,11 +110,11 @@ class CellProblem:
 
     @property
     def known(self) -> np.ndarray:
-        """(C,) bool: cells that light reached in every channel of some pixel."""
+        """Cells that light reached in every channel of some pixel, (C,) bool."""
         return (self.pixels > 0) & (self.dd > 0).all(1)
 
     def take(self, choice: np.ndarray) -> CellProblem:
-        """Some of the cells."""
+        """Return some of the cells."""
         return CellProblem(
             self.object_id[choice],
             self.n_objects,
@@ -128,7 +127,7 @@ class CellProblem:
 
 
 class CellSums:
-    """Collects a `CellProblem` from pixels that arrive in any number of pieces; memory grows with the cells alone."""
+    """Collects a `CellProblem` from pixels in any number of pieces; memory grows with the number of cells alone."""
 
     def __init__(self, object_id: np.ndarray, n_objects: int, levels: np.ndarray):
         levels = np.asarray(levels, np.float64)
@@ -145,7 +144,7 @@ class CellSums:
         self._specular = np.zeros((cells, count, 2), np.float32)
 
     def add(self, rows: PixelRows, response: Response, dark: float = 0.0) -> None:
-        """Add pixels, seen through `response`; those that `PixelRows.usable` refuses are left out."""
+        """Add the usable pixels (`PixelRows.usable`), seen through `response`."""
         rows = rows.take(np.flatnonzero(rows.usable(dark)))
         rows = rows.take(np.argsort(rows.cell, kind="stable"))
         for start in range(0, len(rows.cell), _PIECE):
@@ -168,5 +167,5 @@ class CellSums:
             self._specular[cell, j] += np.add.reduceat(means, starts)
 
     def problem(self) -> CellProblem:
-        """What was collected."""
+        """Return the sums collected so far."""
         return CellProblem(self.object_id, self.n_objects, self.levels, self._pixels, self._dd, self._lobes, self._specular)

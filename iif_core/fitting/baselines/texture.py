@@ -1,7 +1,7 @@
-"""Albedo at the resolution of the photographs, once roughness and metalness are known block by block.
+"""Albedo of surface cells, once roughness and metallic are known for blocks of cells (Eq. M.49).
 
-A surface cell of the base is smaller than a pixel and seen once or twice: enough for a colour, not for five numbers. So the
-cells of a block share roughness, metalness and diffuse light, which vary slowly, and each keeps an albedo of its own.
+A surface cell of the base is smaller than a pixel and seen once or twice, which is enough for a colour but not for five numbers.
+The cells of a block therefore share roughness, metallic and diffuse light, which vary slowly, and each has its own albedo.
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ from iif_core.fitting.baselines.problem import BOUND_WEIGHT, PixelRows
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.surface.cells import pack_keys
 
-SHRINK = 0.5
-"""Pull of a cell towards its block, in pixels of average sensitivity."""
+BLOCK_WEIGHT = 0.5
+"""Weight of the albedo of its block in a cell, in pixels of average sensitivity."""
 
 
 def blocks_of(ijk: np.ndarray, object_id: np.ndarray, edge: int) -> tuple[np.ndarray, np.ndarray]:
-    """Block of every cell, (C,), and object of every block, (B,): cubes of `edge` cells a side, one object each."""
+    """Group the cells of each object into cubes of `edge` cells; return the block of each cell (C,) and its object (B,)."""
     keys = pack_keys(np.asarray(ijk, np.int64) // edge, object_id)
     _, first, block = np.unique(keys, return_index=True, return_inverse=True)
     return block.reshape(-1), np.asarray(object_id)[first]
 
 
 class BlockLight:
-    """Diffuse light of blocks: the mean over their pixels. It does not depend on the view, so its noise averages out."""
+    """Mean diffuse light of blocks over their pixels; it does not depend on the view, so its noise averages out."""
 
     def __init__(self, blocks: int):
         self._sums, self._count = np.zeros((blocks, 3)), np.zeros(blocks)
 
     def add(self, block: np.ndarray, diffuse: np.ndarray) -> None:
-        """Pixels: block (n,), diffuse (n, 3); what is not finite is left out."""
+        """Add pixels: block (n,) int, -1 = none, diffuse (n, 3); values that are not finite are left out."""
         use = np.isfinite(diffuse).all(1) & (block >= 0)
         for c in range(3):
             self._sums[:, c] += np.bincount(block[use], diffuse[use, c], len(self._sums))
         self._count += np.bincount(block[use], minlength=len(self._count))
 
     def mean(self) -> np.ndarray:
-        """(B, 3) float32; 0 where nothing was seen."""
+        """Return the means, (B, 3) float32; 0 for blocks without pixels."""
         return (self._sums / np.maximum(self._count, 1)[:, None]).astype(np.float32)
 
 
 class AlbedoSums:
-    """Collects what the albedo of every cell needs, from pixels in any number of pieces; 8 numbers a cell."""
+    """Collects the sums of Eq. M.49 from pixels in any number of pieces; 8 numbers for each cell."""
 
     def __init__(self, cells: int):
         self._square, self._cross, self._pixels = np.zeros((cells, 3)), np.zeros((cells, 3)), np.zeros(cells)
@@ -53,7 +53,12 @@ class AlbedoSums:
     def add(
         self, rows: PixelRows, levels: np.ndarray, roughness: np.ndarray, metallic: np.ndarray, curve: Response, dark: float = 0.0
     ) -> None:
-        """Pixels of cells `rows.cell`, with the roughness and metalness (n,) of their blocks."""
+        """Add pixels.
+
+        Args:
+            rows: pixels, with the cell of each; levels: (J,) roughness of the cached levels.
+            roughness, metallic: (n,) of each pixel's block; curve: camera response; dark: see `PixelRows.usable`.
+        """
         use = np.flatnonzero(rows.usable(dark))
         rows, m = rows.take(use), metallic[use, None]
         y, slope = rows.radiance(curve)
@@ -69,12 +74,12 @@ class AlbedoSums:
 
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """sum w G^2 (C, 3), sum w G (y - h) (C, 3), sum of the pixels' weights (C,), for L = a G + h."""
+        """Sums of w G^2 (C, 3), of w G (y - h) (C, 3) and of the pixels' weights (C,), for L = a G + h."""
         return self._square, self._cross, self._pixels
 
     def scatter(self, least: float = 3.0) -> float:
-        """Root mean square of y - h - a G (weighed as in the sums) at the best a of each cell, over cells of pixels of at least
-        this weight: what changes with the view beyond what the gloss h explains. 0 where there is no such cell."""
+        """Return the root mean square of y - h - a G at the best albedo a of each cell (Eq. M.44): how much the views of a cell
+        differ beyond what the gloss h explains. Over cells whose pixels weigh at least `least`; 0 without such a cell."""
         seen = (self._pixels >= least)[:, None] & (self._square > 0)
         fitted = np.where(seen, self._cross**2 / np.where(seen, self._square, 1.0), 0.0).sum(1)
         judged = seen.all(1)
@@ -82,17 +87,22 @@ class AlbedoSums:
         return float(np.sqrt(total / max(3.0 * float(self._pixels[judged].sum()), 1e-300)))
 
     def albedo(
-        self, block: np.ndarray, prior: np.ndarray | None = None, weight: float = 0.0, shrink: float = SHRINK
+        self, block: np.ndarray, prior: np.ndarray | None = None, weight: float = 0.0, shrink: float = BLOCK_WEIGHT
     ) -> np.ndarray:
-        """(C, 3) in [0, 1]: minimiser of sum w^2 (a G + h - y)^2 + shrink g (a - block)^2 + weight n (a - prior)^2.
+        """Return the albedo that minimises sum w^2 (a G + h - y)^2 + shrink g (a - block)^2 + weight n (a - prior)^2.
 
         Args:
-            block: (C, 3) albedo of each cell's block, also for cells without pixels; prior: (C, 3); g: mean of w^2 G^2.
+            block: (C, 3) albedo of each cell's block, which cells without pixels keep.
+            prior: (C, 3) albedo; weight: of the prior for each pixel.
+            shrink: weight of the block in pixels of average sensitivity g, the mean of w^2 G^2.
+
+        Returns:
+            (C, 3) in [0, 1].
         """
         average = self._square.sum(0) / max(float(self._pixels.sum()), 1e-300)
         square, cross = self._square + shrink * average, self._cross + shrink * average * block
         if weight and prior is not None:
-            pull = weight * self._pixels[:, None]
-            square, cross = square + pull, cross + pull * prior
+            prior_weight = weight * self._pixels[:, None]
+            square, cross = square + prior_weight, cross + prior_weight * prior
         known = (self._pixels[:, None] > 0) & (square > 0)
         return np.clip(np.where(known, cross / np.where(known, square, 1.0), block), 0.0, 1.0)

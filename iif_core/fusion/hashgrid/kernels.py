@@ -1,23 +1,25 @@
-"""CPU kernels of the hash grid (`iif_core.fusion.hashgrid`): one level or one run of sample blocks per call, no locks.
+"""CPU kernels of the hash grid: one level or one run of sample blocks per call, without locks.
 
-Everything here works on pieces that no other call writes, so a pool of any size gives the same bytes.
-Layouts, all float32:
+Every call writes arrays that no other call writes, so a pool of any size gives the same bytes. Layouts, all float32:
 
 * coordinates (3, N): a batch in Morton order, inside [0, 1 - 1e-6];
-* a block holds `BLOCK` consecutive samples, sample-contiguous: `encoded` (blocks, inputs, BLOCK) is what the encoder
-  writes and the first layer reads; `hidden` (blocks, layers, width, BLOCK). The last block is filled up with zeros;
+* a block holds `BLOCK` consecutive samples in its last axis: `encoded` (blocks, inputs, BLOCK) is what the encoder writes
+  and the first layer reads; `hidden` (blocks, layers, width, BLOCK). The last block is filled up with zeros;
 * the widths of the network are multiples of `TILE`, filled up with zero weights.
 
-Indices are unsigned, or rows are taken out as views first: Numba then drops the test for negative indices, which
-is what lets LLVM vectorise. `error_model="numpy"` does the same for division.
+Indices are unsigned, or rows are taken out as views first: numba then drops the test for negative indices, which lets LLVM
+vectorise. `error_model="numpy"` does the same for division.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
-BLOCK = 512  # samples: one block of inputs, hidden values and slopes stays in a second-level cache of 1 MB
+BLOCK = 512  # samples; inputs, hidden values and derivatives of one block stay in a second-level cache of 1 MB
 TILE = 4  # rows and columns of a register tile in the matrix products
 SPAN = 128  # floats per flag of `live`
 MORTON_BITS = 10  # per axis
@@ -29,16 +31,39 @@ _TOP = np.float32(1 - 1e-6)
 _kernel = {"nogil": True, "cache": True, "error_model": "numpy"}
 _exact = {**_kernel, "fastmath": {"contract", "nsz"}}
 _sums = {**_kernel, "fastmath": {"contract", "nsz", "reassoc"}}
-# What other loops call is inlined: see iif_core.fusion.kernels.
+# Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
 _inlined = {"forceinline": True}
+
+
+class Weights(NamedTuple):
+    """Weights of the network (or their gradients), filled up to multiples of TILE."""
+
+    w_in: NDArray
+    """(width, inputs)."""
+    w_mid: NDArray
+    """(layers - 1, width, width)."""
+    w_out: NDArray
+    """(outputs, width)."""
+    biases: NDArray
+    """(layers, width)."""
+    b_out: NDArray
+    """(outputs,)."""
+
+
+class Transposed(NamedTuple):
+    """The matrices of `Weights`, each transposed and contiguous."""
+
+    w_in: NDArray
+    w_mid: NDArray
+    w_out: NDArray
 
 
 @njit(**_kernel)
 def sort_points(u, coordinates):
-    """Clamped coordinates in Morton order -> (order (N,) uint32, whether all are finite).
+    """Write the clamped coordinates `u` (N, 3) in Morton order to `coordinates` (3, N), so that neighbours in the batch read
+    the same rows of the table.
 
-    Neighbours in the batch then meet the same table rows. `u` (N, 3); `coordinates` (3, N) is written.
-    Ties keep the order of the batch.
+    Returns the order (N,) uint32, in which ties keep the order of the batch, and whether all coordinates are finite.
     """
     n = u.shape[0]
     key = np.empty(n, np.uint32)
@@ -83,47 +108,60 @@ def sort_points(u, coordinates):
 
 @njit(**_sums)
 def fetch(table):
-    """Reads a table once in order, which brings it into cache sooner than the scattered reads after it would."""
+    """Read a table once in order, which brings it into cache sooner than the scattered reads after it would."""
     total = np.float32(0)
     for i in range(0, table.shape[0], 8):
         total += table[i, 0]
     return total
 
 
-@njit(**_exact)
-def encode_level(coordinates, resolution, hashed, table, encoded, row):
-    """Trilinear features of one level: rows `row`, `row + 1` of every block of `encoded`.
-
-    `table` (entries, 2): the entries of this level; entries is a power of two where `hashed`.
-    """
-    n = coordinates.shape[1]
-    scale = np.float32(resolution - 1)
-    last = np.uint64(resolution - 2)
-    mask = np.uint64(table.shape[0] - 1)
+@njit(**_exact, **_inlined)
+def _strides(entries, resolution, hashed):
+    """Scale of the coordinates, last cell, mask of the hash, and factors on y and z in the index of a vertex."""
     stride_y = _PRIME_Y if hashed else np.uint64(resolution)
     stride_z = _PRIME_Z if hashed else np.uint64(resolution) * np.uint64(resolution)
+    return np.float32(resolution - 1), np.uint64(resolution - 2), np.uint64(entries - 1), stride_y, stride_z
+
+
+@njit(**_exact, **_inlined)
+def _corners(ux, uy, uz, grid, hashed):
+    """Rows of the table of the eight vertices around a point, x fastest, and the point's place in its cell."""
+    scale, last, mask, stride_y, stride_z = grid
+    px, py, pz = ux * scale, uy * scale, uz * scale
+    x, y, z = min(np.uint64(px), last), min(np.uint64(py), last), min(np.uint64(pz), last)
+    wx, wy, wz = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
+    y0, z0, x1 = y * stride_y, z * stride_z, x + _ONE
+    y1, z1 = y0 + stride_y, z0 + stride_z
+    if hashed:
+        r00, r10, r01, r11 = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+        i0, i1, i2, i3 = (x ^ r00) & mask, (x1 ^ r00) & mask, (x ^ r10) & mask, (x1 ^ r10) & mask
+        i4, i5, i6, i7 = (x ^ r01) & mask, (x1 ^ r01) & mask, (x ^ r11) & mask, (x1 ^ r11) & mask
+    else:
+        i0, i2, i4, i6 = x + y0 + z0, x + y1 + z0, x + y0 + z1, x + y1 + z1
+        i1, i3, i5, i7 = i0 + _ONE, i2 + _ONE, i4 + _ONE, i6 + _ONE
+    return (i0, i1, i2, i3, i4, i5, i6, i7), (wx, wy, wz)
+
+
+@njit(**_exact)
+def encode_level(coordinates, resolution, hashed, table, encoded, row) -> None:
+    """Interpolate the features of one level trilinearly (Eq. F.58).
+
+    Args:
+        coordinates: (3, N); resolution: vertices per side; hashed: whether vertices are hashed or indexed directly.
+        table: (entries, 2) entries of this level; their number is a power of two where `hashed`.
+        encoded: rows `row` and `row + 1` of every block are written.
+        row: first row of the level.
+    """
+    n = coordinates.shape[1]
+    grid = _strides(table.shape[0], resolution, hashed)
     for block in range(encoded.shape[0]):
         low = block * BLOCK
         count = min(BLOCK, n - low)
-        xs, ys, zs = (
-            coordinates[0, low : low + count],
-            coordinates[1, low : low + count],
-            coordinates[2, low : low + count],
-        )
+        high = low + count
+        xs, ys, zs = coordinates[0, low:high], coordinates[1, low:high], coordinates[2, low:high]
         first, second = encoded[block, row], encoded[block, row + 1]
         for s in range(count):
-            px, py, pz = xs[s] * scale, ys[s] * scale, zs[s] * scale
-            x, y, z = min(np.uint64(px), last), min(np.uint64(py), last), min(np.uint64(pz), last)
-            wx, wy, wz = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
-            y0, z0, x1 = y * stride_y, z * stride_z, x + _ONE
-            y1, z1 = y0 + stride_y, z0 + stride_z
-            if hashed:
-                r00, r10, r01, r11 = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-                i0, i1, i2, i3 = (x ^ r00) & mask, (x1 ^ r00) & mask, (x ^ r10) & mask, (x1 ^ r10) & mask
-                i4, i5, i6, i7 = (x ^ r01) & mask, (x1 ^ r01) & mask, (x ^ r11) & mask, (x1 ^ r11) & mask
-            else:
-                i0, i2, i4, i6 = x + y0 + z0, x + y1 + z0, x + y0 + z1, x + y1 + z1
-                i1, i3, i5, i7 = i0 + _ONE, i2 + _ONE, i4 + _ONE, i6 + _ONE
+            (i0, i1, i2, i3, i4, i5, i6, i7), (wx, wy, wz) = _corners(xs[s], ys[s], zs[s], grid, hashed)
             a0, b0, a1, b1 = table[i0, 0], table[i0, 1], table[i1, 0], table[i1, 1]
             a2, b2, a3, b3 = table[i2, 0], table[i2, 1], table[i3, 0], table[i3, 1]
             a4, b4, a5, b5 = table[i4, 0], table[i4, 1], table[i5, 0], table[i5, 1]
@@ -138,74 +176,48 @@ def encode_level(coordinates, resolution, hashed, table, encoded, row):
 
 
 @njit(**_exact)
-def scatter_level(coordinates, resolution, hashed, slopes, row, gradient):
-    """Adds to `gradient` (entries, 2) what rows `row`, `row + 1` of `slopes` (blocks, inputs, BLOCK) say: the transpose
-    of `encode_level`."""
+def scatter_level(coordinates, resolution, hashed, slopes, row, gradient) -> None:
+    """Add the gradient of one level's table: the transpose of `encode_level`.
+
+    Args:
+        coordinates, resolution, hashed, row: as in `encode_level`.
+        slopes: (blocks, inputs, BLOCK) derivatives of the loss with respect to the encoded samples.
+        gradient: (entries, 2), is added to.
+    """
     n = coordinates.shape[1]
-    scale = np.float32(resolution - 1)
-    last = np.uint64(resolution - 2)
-    mask = np.uint64(gradient.shape[0] - 1)
-    stride_y = _PRIME_Y if hashed else np.uint64(resolution)
-    stride_z = _PRIME_Z if hashed else np.uint64(resolution) * np.uint64(resolution)
+    grid = _strides(gradient.shape[0], resolution, hashed)
     one = np.float32(1)
     for block in range(slopes.shape[0]):
         low = block * BLOCK
         count = min(BLOCK, n - low)
-        xs, ys, zs = (
-            coordinates[0, low : low + count],
-            coordinates[1, low : low + count],
-            coordinates[2, low : low + count],
-        )
+        high = low + count
+        xs, ys, zs = coordinates[0, low:high], coordinates[1, low:high], coordinates[2, low:high]
         first, second = slopes[block, row], slopes[block, row + 1]
         for s in range(count):
-            px, py, pz = xs[s] * scale, ys[s] * scale, zs[s] * scale
-            x, y, z = min(np.uint64(px), last), min(np.uint64(py), last), min(np.uint64(pz), last)
-            wx, wy, wz = px - np.float32(x), py - np.float32(y), pz - np.float32(z)
-            y0, z0, x1 = y * stride_y, z * stride_z, x + _ONE
-            y1, z1 = y0 + stride_y, z0 + stride_z
-            if hashed:
-                r00, r10, r01, r11 = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
-                i0, i1, i2, i3 = (x ^ r00) & mask, (x1 ^ r00) & mask, (x ^ r10) & mask, (x1 ^ r10) & mask
-                i4, i5, i6, i7 = (x ^ r01) & mask, (x1 ^ r01) & mask, (x ^ r11) & mask, (x1 ^ r11) & mask
-            else:
-                i0, i2, i4, i6 = x + y0 + z0, x + y1 + z0, x + y0 + z1, x + y1 + z1
-                i1, i3, i5, i7 = i0 + _ONE, i2 + _ONE, i4 + _ONE, i6 + _ONE
+            (i0, i1, i2, i3, i4, i5, i6, i7), (wx, wy, wz) = _corners(xs[s], ys[s], zs[s], grid, hashed)
             a, b = first[s], second[s]
             vx, vy, vz = one - wx, one - wy, one - wz
-            w = vy * vz
-            aw, bw = a * w, b * w
-            gradient[i0, 0] += vx * aw
-            gradient[i0, 1] += vx * bw
-            gradient[i1, 0] += wx * aw
-            gradient[i1, 1] += wx * bw
-            w = wy * vz
-            aw, bw = a * w, b * w
-            gradient[i2, 0] += vx * aw
-            gradient[i2, 1] += vx * bw
-            gradient[i3, 0] += wx * aw
-            gradient[i3, 1] += wx * bw
-            w = vy * wz
-            aw, bw = a * w, b * w
-            gradient[i4, 0] += vx * aw
-            gradient[i4, 1] += vx * bw
-            gradient[i5, 0] += wx * aw
-            gradient[i5, 1] += wx * bw
-            w = wy * wz
-            aw, bw = a * w, b * w
-            gradient[i6, 0] += vx * aw
-            gradient[i6, 1] += vx * bw
-            gradient[i7, 0] += wx * aw
-            gradient[i7, 1] += wx * bw
+            for w, near, far in ((vy * vz, i0, i1), (wy * vz, i2, i3), (vy * wz, i4, i5), (wy * wz, i6, i7)):
+                aw, bw = a * w, b * w
+                gradient[near, 0] += vx * aw
+                gradient[near, 1] += vx * bw
+                gradient[far, 0] += wx * aw
+                gradient[far, 1] += wx * bw
 
 
 @njit(**_exact)
-def adam(parameters, first, second, gradient, live, beta1, beta2, rate, root, eps):
-    """One Adam update of flat arrays, which also zeroes the gradient.
+def adam(parameters, first, second, gradient, live, factors) -> None:
+    """Update flat arrays by one step of Adam (Eq. F.55) and zero the gradient.
 
-    m <- m + (1 - beta1)(g - m), v <- beta2 v + (1 - beta2) g^2, p <- p - rate m / (root sqrt(v) + eps) with
-    rate = lr / (1 - beta1^t), root = 1 / sqrt(1 - beta2^t). `live` (ceil(n / SPAN),) bool: spans whose moments are
-    not all zero; a span that is not live and has no gradient stays as it is, which is what the formula says too.
+    m <- m + (1 - beta1)(g - m), v <- beta2 v + (1 - beta2) g^2, p <- p - rate m / (root sqrt(v) + eps).
+
+    Args:
+        parameters, first, second, gradient: (n,) float32 p, m, v and g.
+        live: (ceil(n / SPAN),) bool, spans whose moments are not all zero. A span that is not live and has no gradient is
+            skipped; the formula would leave it unchanged too.
+        factors: numerics.adam.AdamFactors.
     """
+    beta1, beta2, rate, root, eps = factors
     zero = np.float32(0)
     fresh1, fresh2 = np.float32(1) - beta1, np.float32(1) - beta2
     for span in range(live.shape[0]):
@@ -287,22 +299,10 @@ def _outer(d, x, g, h):
                 g31 += t * b
                 g32 += t * c
                 g33 += t * e
-            g[j, i] += g00
-            g[j, i + 1] += g01
-            g[j, i + 2] += g02
-            g[j, i + 3] += g03
-            g[j + 1, i] += g10
-            g[j + 1, i + 1] += g11
-            g[j + 1, i + 2] += g12
-            g[j + 1, i + 3] += g13
-            g[j + 2, i] += g20
-            g[j + 2, i + 1] += g21
-            g[j + 2, i + 2] += g22
-            g[j + 2, i + 3] += g23
-            g[j + 3, i] += g30
-            g[j + 3, i + 1] += g31
-            g[j + 3, i + 2] += g32
-            g[j + 3, i + 3] += g33
+            rows = ((g00, g01, g02, g03), (g10, g11, g12, g13), (g20, g21, g22, g23), (g30, g31, g32, g33))
+            for r in range(4):
+                for c in range(4):
+                    g[j + r, i + c] += rows[r][c]
 
 
 @njit(**_exact, **_inlined)
@@ -330,8 +330,14 @@ def _backed(w_transposed, d, hidden, out):
 
 
 @njit(**_exact)
-def network_forward(low, high, order, encoded, w_in, w_mid, w_out, biases, b_out, hidden, output):
-    """Blocks low ... high - 1 through the network; `output` (N, outputs) gets its rows in the order of the batch."""
+def network_forward(low, high, order, encoded, weights, hidden, output) -> None:
+    """Send the blocks low ... high - 1 through the network.
+
+    Args:
+        low, high: range of blocks; order: (N,) of `sort_points`; encoded: inputs of the network; weights: `Weights`.
+        hidden: (blocks, layers, width, BLOCK) and output: (N, outputs), in the order of the batch, are written.
+    """
+    w_in, w_mid, w_out, biases, b_out = weights
     n = order.shape[0]
     layers = biases.shape[0]
     y = np.empty((w_out.shape[0], BLOCK), np.float32)
@@ -348,14 +354,17 @@ def network_forward(low, high, order, encoded, w_in, w_mid, w_out, biases, b_out
 
 
 @njit(**_exact)
-def network_backward(
-    low, high, order, encoded, hidden, slope, w_in_t, w_mid_t, w_out_t, g_in, g_mid, g_out, g_biases, g_bias_out, slopes
-):
-    """Transpose of `network_forward` for blocks low ... high - 1.
+def network_backward(low, high, order, encoded, hidden, slope, transposed, gradient, slopes) -> None:
+    """Propagate derivatives of the loss back through the network: the transpose of `network_forward`.
 
-    `slope` (N, outputs): of the loss by the outputs. Adds to the weight gradients g_*, writes `slopes` (of the loss by
-    `encoded`). `w_*_t`: transposed weights.
+    Args:
+        low, high, order, encoded, hidden: as in `network_forward`.
+        slope: (N, outputs) derivatives of the loss with respect to the outputs.
+        transposed: `Transposed` weights; gradient: `Weights`, is added to.
+        slopes: derivatives with respect to `encoded`, are written.
     """
+    w_in_t, w_mid_t, w_out_t = transposed
+    g_in, g_mid, g_out, g_biases, g_bias_out = gradient
     n = order.shape[0]
     layers, width = g_biases.shape
     d_out = np.zeros((g_out.shape[0], BLOCK), np.float32)

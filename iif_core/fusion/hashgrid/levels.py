@@ -1,4 +1,4 @@
-"""Levels of the table and shapes of the network: what both backends share."""
+"""Levels of the table and shape of the network, which both engines of the hash grid share."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 
-UPPER = 1 - 1e-6  # coordinates are clamped to [0, UPPER] (H7)
-ROWS = 8  # levels start at multiples of this many entries: a cache line of 64 bytes at two features
-FINEST = 1 << 22  # cells beyond this are not resolved by float32 coordinates
+UPPER = 1 - 1e-6  # coordinates are clamped to [0, UPPER]
+ROWS = 8  # levels start at multiples of this many entries, a cache line of 64 bytes with two features
+FINEST = 1 << 22  # vertices per side that float32 coordinates resolve
 
 
 @dataclass(frozen=True)
 class HashGridOptions:
-    """Shape of a hash-grid texture; the defaults are the paper's (METHOD 2.3.5): 27.95 M + 9.0 k parameters.
+    """Shape of a hash-grid texture; the defaults are the paper's, with 27.95 million + 8,970 parameters.
 
-    levels, features a level (the numba backend knows 2), log2_entries: at most 2^log2_entries entries a level;
-    base_resolution, growth: vertices per side, see `layout`; hidden, hidden_layers, outputs: network (ReLU, biases);
-    init_scale: the table starts uniform in +-init_scale;
-    finest: cap on the vertices per side (H8: about the extent of the scene over the footprint of a pixel). Levels
-    beyond the first that reaches it are left out, since they would repeat it. None: no cap.
+    Attributes:
+        levels: number of levels; features: per level (the numba engine supports 2).
+        log2_entries: a level has at most 2^log2_entries entries.
+        base_resolution, growth: vertices per side of the levels (Eq. F.57).
+        hidden, hidden_layers, outputs: widths and depth of the network (ReLU, biases).
+        init_scale: the table starts uniform in +-init_scale.
+        finest: largest number of vertices per side, None = no limit. Levels beyond the first that reaches it are left out,
+            since they would repeat it (docs/method/numerics.md#hash-grid-finer-than-a-pixel).
     """
 
     levels: int = 32
@@ -58,8 +61,8 @@ class HashGridOptions:
 
 @dataclass(frozen=True)
 class Level:
-    """One level: `resolution` vertices per side, entries `start` to `start + entries` of the table; `hashed` where
-    resolution^3 exceeds the entries."""
+    """One level with `resolution` vertices per side and the entries `start` to `start + entries` of the table; it is
+    `hashed` if resolution^3 exceeds the entries."""
 
     resolution: int
     start: int
@@ -68,11 +71,10 @@ class Level:
 
 
 def layout(options: HashGridOptions) -> tuple[Level, ...]:
-    """Levels of the table: resolution_l = ceil(base growth^l - 1) + 1 up to `finest` (METHOD 2.3.5); the spacing of
-    vertices is 1 / (resolution - 1).
+    """Return the levels of the table (Eqs. F.57, F.59); vertices are 1 / (resolution - 1) apart.
 
-    Level l is indexed directly, x + r (y + r z), while r^3 <= 2^log2_entries, then hashed,
-    (x ^ 2654435761 y ^ 805459861 z) mod 2^log2_entries. Raises InputError beyond the accuracy of float32 coordinates.
+    Raises:
+        InputError: a resolution beyond the accuracy of float32 coordinates.
     """
     levels: list[Level] = []
     start = 0
@@ -95,7 +97,12 @@ def layout(options: HashGridOptions) -> tuple[Level, ...]:
 
 
 def parameter_counts(options: HashGridOptions) -> tuple[int, int]:
-    """Parameters of the encoding and of the network."""
+    """Return the numbers of parameters of the encoding and of the network.
+
+    Example:
+        >>> parameter_counts(HashGridOptions())
+        (27954106, 8970)
+    """
     levels = layout(options)
     encoding = options.features * sum(level.entries for level in levels)
     widths = widths_of(options, levels)
@@ -103,15 +110,17 @@ def parameter_counts(options: HashGridOptions) -> tuple[int, int]:
 
 
 def widths_of(options: HashGridOptions, levels: tuple[Level, ...]) -> list[int]:
+    """Return the widths of the network from inputs to outputs."""
     return [options.features * len(levels), *[options.hidden] * options.hidden_layers, options.outputs]
 
 
 def row_count(levels: tuple[Level, ...]) -> int:
+    """Return the rows of the table, with levels at their starts."""
     return levels[-1].start + -(-levels[-1].entries // ROWS) * ROWS
 
 
 def named_zeros(options: HashGridOptions, levels: tuple[Level, ...]) -> dict[str, NDArray]:
-    """Zeros of the shape of every parameter, by name (views of one zero: they cost no memory)."""
+    """Return zeros of the shape of every parameter, by name; they are views of one zero and cost no memory."""
     shapes = {"table": (sum(level.entries for level in levels), options.features)}
     widths = widths_of(options, levels)
     for i, (inputs, outputs) in enumerate(zip(widths, widths[1:], strict=False)):
@@ -121,6 +130,7 @@ def named_zeros(options: HashGridOptions, levels: tuple[Level, ...]) -> dict[str
 
 
 def initial(options: HashGridOptions, levels: tuple[Level, ...], seed: int) -> dict[str, NDArray]:
+    """Draw the initial parameters: table and weights uniform, biases 0."""
     random = np.random.default_rng(seed)
     start = {}
     for name, zeros in named_zeros(options, levels).items():
@@ -136,11 +146,12 @@ def initial(options: HashGridOptions, levels: tuple[Level, ...], seed: int) -> d
 
 
 def not_finite() -> InputError:
+    """Return the error for coordinates that are not finite."""
     return InputError("hash grid: some coordinates are not finite (NaN or infinite); drop those samples before")
 
 
 def packed(levels: tuple[Level, ...], table: NDArray) -> NDArray:
-    """Table with every level at its start, from levels one after another."""
+    """Place levels that follow one another at their starts in the table."""
     out = np.zeros((row_count(levels), table.shape[1]), np.float32)
     low = 0
     for level in levels:
@@ -150,4 +161,5 @@ def packed(levels: tuple[Level, ...], table: NDArray) -> NDArray:
 
 
 def unpacked(levels: tuple[Level, ...], table: NDArray) -> NDArray:
+    """Return the levels of a table one after another: the inverse of `packed`."""
     return np.concatenate([table[level.start : level.start + level.entries] for level in levels])

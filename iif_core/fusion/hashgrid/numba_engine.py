@@ -1,4 +1,4 @@
-"""The backend for CPUs: compiled kernels over one level or one run of sample blocks at a time."""
+"""The engine for CPUs: compiled kernels over one level or one run of sample blocks at a time."""
 
 from __future__ import annotations
 
@@ -15,18 +15,21 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion.hashgrid.levels import HashGridOptions, Level, not_finite, packed, unpacked, widths_of
+from iif_core.numerics.adam import AdamFactors, adam_factors
 
 if TYPE_CHECKING:
     import torch
 
-PENDING = 1 << 20  # samples whose table gradient may wait for `step`
-FETCHED = 32  # a table of fewer entries than this times the samples is read in order first
+    from iif_core.fusion.hashgrid.kernels import Transposed
+
+MAX_PENDING_SAMPLES = 1 << 20  # samples whose table gradient may wait for `step`
+MAX_ENTRIES_PER_SAMPLE = 32  # a table of fewer entries per sample is first read in order, which brings it into cache
 
 
 class _Buffers:
-    """Arrays of a pass to be used again: fresh memory costs a page fault per 4 kB.
+    """Arrays of earlier passes for reuse, because fresh memory costs a page fault per 4 kB.
 
-    Only atomic operations of the deque: the garbage collector may give arrays back at any moment.
+    Uses only atomic operations of the deque, because the garbage collector may give arrays back at any moment.
     """
 
     def __init__(self, kept: int = 6) -> None:
@@ -49,7 +52,7 @@ class _Buffers:
 
 
 class _Pass:
-    """What a forward pass keeps for its backward pass; the large arrays go back when the graph goes."""
+    """Arrays that a forward pass keeps for its backward pass; the large ones are given back when the graph is deleted."""
 
     def __init__(
         self, buffers: _Buffers, coordinates: NDArray, order: NDArray, encoded: NDArray, hidden: NDArray, version: int
@@ -62,21 +65,23 @@ class _Pass:
 
 
 class _Network:
-    """Weights (or their gradients, or moments) as views of one flat float32 array, widths filled up to TILE."""
+    """Weights (or their gradients or moments) as views of one flat float32 array, widths filled up to TILE."""
 
-    def __init__(self, widths: list[int], tile: int, flat: NDArray | None = None) -> None:
+    def __init__(self, widths: list[int], flat: NDArray | None = None) -> None:
+        from iif_core.fusion.hashgrid.kernels import TILE, Weights
+
         self.widths = widths
-        inputs, hidden, outputs = (-(-width // tile) * tile for width in (widths[0], widths[1], widths[-1]))
+        inputs, hidden, outputs = (-(-width // TILE) * TILE for width in (widths[0], widths[1], widths[-1]))
         layers = len(widths) - 2
         shapes = [(hidden, inputs), (layers - 1, hidden, hidden), (outputs, hidden), (layers, hidden), (outputs,)]
         ends = np.cumsum([math.prod(shape) for shape in shapes])
         self.flat = np.zeros(ends[-1], np.float32) if flat is None else flat
         pieces = np.split(self.flat, ends[:-1])
-        self.arrays = tuple(piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True))
+        self.arrays = Weights(*(piece.reshape(shape) for piece, shape in zip(pieces, shapes, strict=True)))
         self.inputs, self.hidden, self.layers = inputs, hidden, layers
 
     def named(self) -> dict[str, NDArray]:
-        """Views without the filling, by the names of `HashGridTexture.state`."""
+        """Return views without the filling, by the names of `HashGridTexture.state`."""
         w_in, w_mid, w_out, biases, b_out = self.arrays
         weights, offsets = [w_in, *w_mid, w_out], [*biases, b_out]
         out = {}
@@ -85,16 +90,17 @@ class _Network:
             out[f"bias_{i}"] = offsets[i][:outputs]
         return out
 
-    def transposed(self) -> tuple[NDArray, NDArray, NDArray]:
-        w_in, w_mid, w_out = self.arrays[:3]
-        return np.ascontiguousarray(w_in.T), np.ascontiguousarray(w_mid.transpose(0, 2, 1)), np.ascontiguousarray(w_out.T)
+    def transposed(self) -> Transposed:
+        from iif_core.fusion.hashgrid.kernels import Transposed
+
+        return Transposed(*(np.ascontiguousarray(array.swapaxes(-1, -2)) for array in self.arrays[:3]))
 
 
 @dataclass
 class _TableUpdate:
-    """One Adam update of the table, from slopes not yet scattered: per level, in any order, each level once."""
+    """One Adam update of the table from derivatives that are not yet scattered, applied once to every level in any order."""
 
-    numbers: tuple[np.float32, ...]
+    factors: AdamFactors
     pending: list[tuple[NDArray, NDArray]]
     gradient: NDArray | None
 
@@ -102,12 +108,12 @@ class _TableUpdate:
         rows, scratch = engine.rows(number), None
         if self.gradient is not None:
             gradient = self.gradient[rows]
-        else:  # a few MB of zeros that stay in cache from level to level; adam leaves them zero
+        else:  # zeros that stay in cache from level to level, and that `adam` zeroes again
             scratch = engine.scratch.pop() if engine.scratch else np.zeros_like(engine.table[: max(engine.entries)])
             gradient = scratch[: engine.entries[number]]
         engine.scatter(number, self.pending, gradient)
         arrays = (engine.table[rows], engine.first[rows], engine.second[rows], gradient)
-        engine.kernels.adam(*(array.reshape(-1) for array in arrays), engine.live[number], *self.numbers)
+        engine.kernels.adam(*(array.reshape(-1) for array in arrays), engine.live[number], self.factors)
         if scratch is not None:
             engine.scratch.append(scratch)
 
@@ -116,10 +122,10 @@ class _TableUpdate:
 
 
 class NumbaEngine:
-    """Every level is visited once per iteration, while it is in cache: scatter, update, and encode for the next batch.
+    """Engine that visits every level once per iteration: scatter, update, and encode for the next batch.
 
-    So `backward` leaves (coordinates, slopes), `step` queues the update of the table, and the next forward pass (or
-    whoever asks for the state) does it.
+    A level is then read from memory once. `backward` only stores (coordinates, derivatives), `step` queues the update of the
+    table, and the next forward pass, or the next request for the state, applies it.
     """
 
     BLOCKS = 8  # per task of the network; fixed, because it decides the order of sums
@@ -133,9 +139,9 @@ class NumbaEngine:
         self.device = torch.device("cpu")
         self.options, self.levels, self.threads = options, levels, threads
         self.pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        self.token = torch.zeros((), requires_grad=True)  # what makes autograd come back here
+        self.token = torch.zeros((), requires_grad=True)  # makes autograd call `backward`
         widths = widths_of(options, levels)
-        network = [_Network(widths, kernels.TILE) for _ in range(4)]
+        network = [_Network(widths) for _ in range(4)]
         self.network, self.network_first, self.network_second, self.network_gradient = network
         self.buffers = _Buffers()
         self.version = 0  # of the parameters
@@ -175,13 +181,13 @@ class NumbaEngine:
             level, table = self.levels[number], self.table[self.rows(number)]
             if update is not None:
                 update.apply(self, number)
-            elif level.entries < FETCHED * len(u):
+            elif level.entries < MAX_ENTRIES_PER_SAMPLE * len(u):
                 self.kernels.fetch(table)
             self.kernels.encode_level(coordinates, level.resolution, level.hashed, table, encoded, 2 * number)
 
         def network(low: int) -> None:
             high = min(low + self.BLOCKS, blocks)
-            self.kernels.network_forward(low, high, order, encoded, *net.arrays, hidden, output)
+            self.kernels.network_forward(low, high, order, encoded, net.arrays, hidden, output)
 
         self.run(encode, reversed(range(len(self.levels))))
         self.run(network, range(0, blocks, self.BLOCKS))
@@ -195,7 +201,6 @@ class NumbaEngine:
         blocks = len(kept.encoded)
         if not blocks:
             return
-        tile = self.kernels.TILE
         transposed = self.network.transposed()
         slopes = self.buffers.take(*kept.encoded.shape)
         tasks = range(0, blocks, self.BLOCKS)
@@ -203,17 +208,17 @@ class NumbaEngine:
 
         def network(low: int) -> None:
             high = min(low + self.BLOCKS, blocks)
-            gradient = _Network(self.network.widths, tile, partial[low // self.BLOCKS]).arrays
-            self.kernels.network_backward(low, high, kept.order, kept.encoded, kept.hidden, slope, *transposed, *gradient, slopes)
+            gradient = _Network(self.network.widths, partial[low // self.BLOCKS]).arrays
+            self.kernels.network_backward(low, high, kept.order, kept.encoded, kept.hidden, slope, transposed, gradient, slopes)
 
         self.run(network, tasks)
         self.network_gradient.flat += partial.sum(axis=0)
         self.pending.append((kept.coordinates, slopes))
-        if sum(coordinates.shape[1] for coordinates, _ in self.pending) > PENDING:
+        if sum(coordinates.shape[1] for coordinates, _ in self.pending) > MAX_PENDING_SAMPLES:
             self.flush()
 
     def flush(self) -> None:
-        """Scatters all pending slopes into a gradient of the whole table, so that their memory is free again."""
+        """Scatter all pending derivatives into a gradient of the whole table, which frees their memory."""
         if self.gradient is None:
             self.gradient = np.zeros_like(self.table)
         self.run(lambda number: self.scatter(number, self.pending, self.gradient[self.rows(number)]), range(len(self.levels)))
@@ -233,20 +238,19 @@ class NumbaEngine:
             self.kernels.scatter_level(coordinates, level.resolution, level.hashed, slopes, 2 * number, gradient)
 
     def step(self, lr: float, beta1: float, beta2: float, eps: float) -> None:
+        """Update the network and queue the update of the table; Args: as in `HashGridTexture.step`."""
         self.settle()
         self.steps += 1
         self.version += 1
-        rate = lr / (1 - beta1**self.steps)
-        root = 1 / math.sqrt(1 - beta2**self.steps)
-        numbers = tuple(np.float32(value) for value in (beta1, beta2, rate, root, eps))
-        self.queued = _TableUpdate(numbers, self.pending, self.gradient)
+        factors = adam_factors(lr, self.steps, beta1, beta2, eps)
+        self.queued = _TableUpdate(factors, self.pending, self.gradient)
         self.pending, self.gradient = [], None
         network = (self.network, self.network_first, self.network_second, self.network_gradient)
         live = np.ones(-(-self.network.flat.size // self.kernels.SPAN), bool)
-        self.kernels.adam(*(net.flat for net in network), live, *numbers)
+        self.kernels.adam(*(net.flat for net in network), live, factors)
 
     def settle(self) -> None:
-        """Applies the queued update of the table now."""
+        """Apply the queued update of the table now."""
         update, self.queued = self.queued, None
         if update is not None:
             self.run(lambda number: update.apply(self, number), reversed(range(len(self.levels))))

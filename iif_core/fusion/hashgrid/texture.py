@@ -1,4 +1,4 @@
-"""The texture that the two backends make."""
+"""The hash-grid texture, in front of its two engines."""
 
 from __future__ import annotations
 
@@ -20,12 +20,17 @@ if TYPE_CHECKING:
 class HashGridTexture:
     """Texture f(u): (N, 3) float32 in [0, 1]^3 -> (N, outputs) float32, trained by its own Adam.
 
-    The outputs compose with any torch graph; `backward` of that graph adds to gradients kept here (not to `.grad` of
-    the coordinates, which are constants), `step` uses and zeroes them. Same input and seed give the same bytes on the
-    CPU for any number of threads (CUDA adds table gradients in no fixed order).
+    The outputs compose with any torch graph. `backward` of that graph adds to gradients that are kept here (coordinates are
+    constants and get none); `step` uses and zeroes them. The same input and seed give the same bytes on the CPU for any
+    number of threads; CUDA adds the gradients of the table in no fixed order.
 
-    `backend`: "numba" (CPU), "torch" (any device), or None: numba on the CPU if `features` is 2, else torch.
-    Network weights start uniform in +-sqrt(6 / (inputs + outputs)) of the layer, biases at 0. Raises InputError.
+    Args:
+        options: shape; None = the paper's. seed: of the initial parameters.
+        device: torch device; threads: of the numba engine.
+        backend: "numba" (CPU), "torch" (any device), or None = numba on the CPU if `features` is 2, else torch.
+
+    Raises:
+        InputError: an unknown engine or one that does not support the device or the options.
     """
 
     def __init__(
@@ -58,14 +63,15 @@ class HashGridTexture:
         self.backend = backend
 
     def __call__(self, u: torch.Tensor) -> torch.Tensor:
-        """Raw outputs (N, outputs) float32 at u (N, 3), clamped to [0, 1 - 1e-6]; N may be 0.
+        """Return the raw outputs (N, outputs) float32 at u (N, 3), which is clamped to [0, 1 - 1e-6]; N may be 0.
 
-        Raises InputError for another shape, an integer type, coordinates that ask for a gradient or are not finite.
+        Raises:
+            InputError: another shape, an integer type, coordinates that require a gradient or are not finite.
         """
         return self._engine.apply(self._checked(u))
 
     def evaluate(self, u: torch.Tensor, chunk: int = 1 << 17) -> torch.Tensor:
-        """The same without a graph, `chunk` samples at a time: memory beyond the result does not grow with N."""
+        """Return the raw outputs without a graph, computed for `chunk` samples at a time to limit memory."""
         import torch
 
         if chunk < 1:
@@ -78,32 +84,36 @@ class HashGridTexture:
         return out
 
     def step(self, lr: float, beta1: float = 0.9, beta2: float = 0.999, eps: float = 1e-8) -> None:
-        """One Adam update of table and network with the gradients gathered since the last one, then zeroes them.
+        """Update table and network by Adam (Eq. F.55) with the gradients since the last step, and zero them.
 
-        As torch.optim.Adam on dense gradients: entries without a gradient go on by their momentum.
+        Args:
+            lr: learning rate; beta1, beta2: decay of the moments; eps: added to the root of the second one.
+
+        Raises:
+            InputError: numbers out of range.
         """
         if not (0 < lr < math.inf and 0 <= beta1 < 1 and 0 <= beta2 < 1 and eps > 0):
             raise InputError(f"hash grid: lr {lr}, beta {beta1}, {beta2}, eps {eps}; need lr, eps > 0 and 0 <= beta < 1")
         self._engine.step(lr, beta1, beta2, eps)
 
     def gradients(self) -> dict[str, NDArray]:
-        """Copies of the gradients gathered since the last step, by the names of `state`; for tests and diagnosis."""
+        """Return copies of the gradients since the last step, by the names of `state`; for tests and diagnosis."""
         return self._engine.gradients()
 
     def zero_grad(self) -> None:
-        """Forgets the gradients gathered since the last step."""
+        """Discard the gradients since the last step."""
         self._engine.zero_grad()
 
     def state(self) -> dict[str, NDArray]:
-        """Copies of parameters and Adam moments, float32, the same for both backends.
+        """Return copies of parameters and Adam moments, float32, in one form for both engines.
 
-        "table" (entries, features), levels one after another; "weight_i" (outputs, inputs), "bias_i"; each also as
-        "first.<name>", "second.<name>"; "steps": number of updates so far. Gradients are not part of it.
+        "table" (entries, features) holds levels one after another; "weight_i" is (outputs, inputs), "bias_i" (outputs,); the
+        moments are "first.<name>" and "second.<name>"; "steps" is the number of updates. Gradients are not included.
         """
         return self._engine.state()
 
     def load_state(self, state: dict[str, NDArray]) -> None:
-        """Takes over what `state` gave, of any backend, and forgets gathered gradients. Raises InputError."""
+        """Take over the `state` of a texture of any engine and discard gradients; InputError if it has other shapes."""
         expected = {name: value.shape for name, value in named_zeros(self.options, self.levels).items()}
         expected = {prefix + name: shape for name, shape in expected.items() for prefix in ("", "first.", "second.")}
         expected["steps"] = ()

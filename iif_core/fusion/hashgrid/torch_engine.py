@@ -1,4 +1,4 @@
-"""The backend for any device: torch operations."""
+"""The engine for any device, in torch operations."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class TorchEngine:
-    """The same in torch operations; indices are int32, whose products wrap as the hash needs, up to the look-up."""
+    """Engine in torch operations. Indices are int32 up to the look-up; their products wrap as the hash needs."""
 
     PRIMES = (1, 2654435761 - (1 << 32), 805459861)
 
@@ -29,7 +29,7 @@ class TorchEngine:
             raise InputError(f"hash grid: {row_count(levels)} entries; int32 indices reach {(1 << 31) // options.features}")
         direct = [level for level in levels if not level.hashed]
         hashed = [level for level in levels if level.hashed]
-        # a GPU wants few large operations, a CPU small ones that stay in cache; direct levels come first anyway
+        # A GPU is faster with few large operations, a CPU with small ones that stay in cache. Direct levels come first.
         together = [group for group in (direct, hashed) if group] if self.device.type != "cpu" else [[x] for x in levels]
         self.groups = [
             (
@@ -53,7 +53,7 @@ class TorchEngine:
         return torch.nn.functional.linear(x, self.parameters[f"weight_{last}"], self.parameters[f"bias_{last}"])
 
     def corners(self, u: torch.Tensor, group: tuple) -> tuple[torch.Tensor, torch.Tensor]:
-        """Table rows (8 * levels * N,) int32 and weights (8, levels, N) of the corners."""
+        """Return rows of the table (8 * levels * N,) int32 and weights (8, levels, N) of the corners (Eqs. F.58, F.59)."""
         import torch
 
         hashed, resolution, start = group
@@ -99,12 +99,13 @@ class TorchEngine:
             part = slope[low : low + levels * features].view(levels, features, len(u))
             row, weight = self.corners(u, group)
             place = row.long() * features
-            for feature in range(features):  # many times faster on a CPU than whole rows
+            for feature in range(features):  # much faster on a CPU than whole rows
                 flat.index_add_(0, place + feature, (weight * part[:, feature]).view(-1))
             low += levels * features
         return gradient
 
     def step(self, lr: float, beta1: float, beta2: float, eps: float) -> None:
+        """Update network and table; Args: as in `HashGridTexture.step`."""
         import torch
 
         for parameter in self.parameters.values():

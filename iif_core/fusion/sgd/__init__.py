@@ -1,1 +1,1 @@
-"""The paper's optimiser (METHOD 2.3): `solve_base_sgd`; see solve.py."""
+"""The paper's optimiser (docs/method/fusion.md#sgd): `solve.solve_sgd`, with a compiled and a torch engine."""

@@ -1,15 +1,16 @@
 """Compiled loss of a batch and its gradient in closed form: what automatic differentiation would give, in one pass.
 
-A batch is sorted by segment. A tile is up to `TILE` pixels of one segment: its corrections are a few numbers, and
-loops run over the pixels of a plane, which the compiler turns into vector instructions. The real type is that of
-`raw`: float32 to solve, float64 to check. Formulae: METHOD 2.3.2-2.3.7.
+A batch is sorted by segment. A tile is up to `TILE` pixels of one segment: its affine maps are a few numbers, and loops
+run over the pixels of a plane, which the compiler turns into vector instructions. The real type is that of the raw
+outputs: float32 to solve, float64 to check. Formulae: Eqs. F.1 to F.15 and F.50 to F.54.
 
-Sums of a segment are made by whoever works on its run and by nobody else: the same bytes for any number of threads.
+The sums of a segment are made by one thread, so the bytes do not depend on the number of threads.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -18,32 +19,112 @@ from numba.extending import overload
 from numpy.typing import NDArray
 
 from iif_core.fusion.kernels import sorting_network
+from iif_core.reflectance.material import LOWEST
 
 TILE = 64
 _kernel = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})
-# What other loops call is inlined: see iif_core.fusion.kernels.
+# Loops that other loops call are inlined: docs/method/numerics.md#sums-that-depend-on-the-compiler.
 _inlined = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"}, forceinline=True)
 _sums = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "reassoc"}, forceinline=True)
 
 LOCATION = np.array([0, 1, 2, 6, 8])
-"""Raw outputs that hold the location of each channel (METHOD 2.3.5); roughness is mapped to [0.02, 1]."""
+"""Raw outputs that hold the location of each channel (Eq. F.50)."""
 SCALE = np.array([3, 4, 5, 7, 9])
 """Raw outputs that hold the Laplace scale of each channel."""
 _PROPERTY = np.array([0, 0, 0, 1, 2])
-_LOW = np.float32([0, 0, 0, 0.02, 0])
+_LOW = np.float32(LOWEST)
 
 SUMS = 5
-"""data, label, regulariser (without its weight), entropy in nats, mean gain; each times the share of the pixels."""
+"""Number of sums: data, label, regulariser (without its weight), entropy in nats, mean gain, each times the share of the
+pixels."""
 
 _LOG2E, _LN2_HIGH, _LN2_LOW = np.float32(1.44269504), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _C2, _C3, _C4, _C5, _C6 = (np.float32(1 / math.factorial(i)) for i in range(2, 7))
 
 
-def selection_networks(k: int) -> tuple[NDArray, NDArray]:
-    """Comparators that bring the lower median of n values to place (n - 1) // 2, n = 0 ... k.
+class Batch(NamedTuple):
+    """Pixels of a batch, sorted by segment. Run r is the pixels start[r] ... start[r + 1] - 1, all of one segment."""
 
-    (k + 1, m, 2) int64 and how many of each count (k + 1,): sorting networks without the comparators that this place
-    does not depend on.
+    start: NDArray
+    """(R + 1,) int64."""
+    segment: NDArray
+    """(R,) segment of each run."""
+    pool: NDArray
+    """(P, K, 5) predictions, words (kernels.as_words) or real."""
+    pixels: NDArray
+    """(N,) int32 rows of the pool."""
+    share: NDArray
+    """(N,) real weights of the pixels, sum 1."""
+    raw: NDArray
+    """(N, 10) real raw outputs of the texture at the pixels."""
+
+
+class SegmentTables(NamedTuple):
+    """Maps and selection of every segment and prediction."""
+
+    affine: NDArray
+    """(S, K, CROSS) real."""
+    alpha: NDArray
+    """(S, K, 3) real selection weights."""
+    log_alpha: NDArray
+    """(S, K, 3) real."""
+    usable: NDArray
+    """(S, K) bool."""
+    networks: NDArray
+    """Comparators by the number of usable predictions, and their counts: `selection_networks`."""
+    lengths: NDArray
+
+
+class LossSettings(NamedTuple):
+    """Numbers and choices of the loss; the numbers have the real type of the raw outputs."""
+
+    temperature: np.floating
+    """Temperature of the errors."""
+    floor: np.floating
+    """Smallest Laplace scale."""
+    data_weight: np.floating
+    regulariser: np.floating
+    smooth: bool
+    """Floor of the texture's scale: sqrt(s^2 + floor^2) instead of max(s, floor)."""
+    median_gradient: bool
+    """Follow the derivative of the reference scale b_ref."""
+    inward: bool
+    """Keep gradients of clamped values that lead back into the valid range."""
+
+
+class Gradients(NamedTuple):
+    """Outputs of `batch_loss`; all but `d_raw` are added to."""
+
+    d_raw: NDArray
+    """(N, 10) real derivative of the loss with respect to the raw outputs."""
+    d_affine: NDArray
+    """(S, K, CROSS) real."""
+    d_alpha: NDArray
+    """(S, K, 3) real, of the data term alone."""
+    votes: NDArray
+    """(S, K, 3) real sums of share times q (Eq. F.11)."""
+    error: NDArray
+    """(S, K, 3) float64 sums of share times L1 error."""
+    sums: NDArray
+    """(R, SUMS) float64."""
+
+
+class _Scratch(NamedTuple):
+    """Memory of a tile: `bits` and `v` (5, K, TILE) of `_planes`, `u` (5, K, TILE), `distance` (K, TILE), `planes`
+    (5, 5, TILE)."""
+
+    bits: NDArray
+    v: NDArray
+    u: NDArray
+    distance: NDArray
+    planes: NDArray
+
+
+def selection_networks(k: int) -> tuple[NDArray, NDArray]:
+    """Return comparators that bring the lower median of n values to place (n - 1) // 2, for n = 0 ... k.
+
+    These are sorting networks without the comparators on which that place does not depend: (k + 1, m, 2) int64, and the
+    number of comparators that count for each n, (k + 1,).
     """
     pruned = []
     for n in range(k + 1):
@@ -120,7 +201,7 @@ def _exp(x, m):
 
 @overload(_exp)
 def _exp_of(x, m):
-    """x[:m] = e^x; float32 by a polynomial to 2 units in the last place, not below e^-87."""
+    """x[:m] = e^x; for float32 a polynomial, accurate to 2 units in the last place and not below e^-87."""
     if x.dtype == types.float32:
         return lambda x, m: _exp_float(x, m)
 
@@ -178,7 +259,7 @@ def _select(planes, network, length, m):
 
 @_sums
 def _labels(u, mu, share, which, log_alpha, temperature, m, e, votes, error):
-    """Votes q and errors of the predictions of a tile added to `votes`, `error`; returns its label loss."""
+    """Add votes q and errors of the predictions of a tile to `votes` and `error`; return its label loss."""
     loss = np.float64(0)
     n_used = len(which)
     low = np.empty(TILE, u.dtype)
@@ -224,7 +305,7 @@ def _labels(u, mu, share, which, log_alpha, temperature, m, e, votes, error):
 
 @_inlined
 def _texture(raw, floor, smooth, m, mu, b, d_mu, d_b):
-    """Location and scale (5, m) from raw outputs (m, 10), and their slopes with respect to the raw outputs."""
+    """Location and scale (5, m) from raw outputs (m, 10), and their derivatives with respect to the raw outputs."""
     x = np.empty(TILE, raw.dtype)
     one = np.float32(1)
     for c in range(5):
@@ -250,35 +331,16 @@ def _texture(raw, floor, smooth, m, mu, b, d_mu, d_b):
 
 
 @_sums
-def _tile(
-    pool,
-    pixels,
-    share,
-    raw,
-    affine,
-    alpha,
-    log_alpha,
-    which,
-    network,
-    length,
-    temperature,
-    floor,
-    data_weight,
-    smooth,
-    median_gradient,
-    inward,
-    bits,
-    v,
-    u,
-    distance,
-    planes,
-    d_raw,
-    d_affine,
-    d_alpha,
-    votes,
-    error,
-):
-    """Loss and gradients of one tile: (data, label), both weighted by `share`."""
+def _tile(pool, pixels, share, raw, of_segment, settings, scratch, out):
+    """Loss and gradients of one tile: (data, label), both weighted by `share`.
+
+    `of_segment`: (affine, alpha, log alpha, usable predictions, comparators, their number) of the tile's segment; `out`:
+    the tile's rows of the `Gradients` without `sums`.
+    """
+    affine, alpha, log_alpha, which, network, length = of_segment
+    temperature, floor, data_weight = settings.temperature, settings.floor, settings.data_weight
+    bits, v, u, distance, planes = scratch
+    d_raw, d_affine, d_alpha, votes, error = out
     m, n_used = len(pixels), len(which)
     one = np.float32(1)
     mu, b, d_mu, d_b = planes[0], planes[1], planes[2], planes[3]
@@ -287,7 +349,7 @@ def _tile(
     zero = share[0] * 0
     _fetch(pool, pixels, which, bits, v)
     _correct(v, affine, which, m, u)
-    _texture(raw, floor, smooth, m, mu, b, d_mu, d_b)
+    _texture(raw, floor, settings.smooth, m, mu, b, d_mu, d_b)
     label = _labels(u, mu, share, which, log_alpha, temperature, m, distance, votes, error)
     data = np.float64(0)
     middle = (n_used - 1) // 2
@@ -315,14 +377,14 @@ def _tile(
             inverse = one / b_p
             w = share[i] * data_weight / np.float32(5)
             total += share[i] * (math.log(b_p / b_r) + (d + b_r * decay[i]) * inverse - one)
-            pull = (one - decay[i]) * inverse * w
-            slope[i] = pull if difference > 0 else (-pull if difference < 0 else zero)
+            force = (one - decay[i]) * inverse * w
+            slope[i] = force if difference > 0 else (-force if difference < 0 else zero)
             d_raw[i, LOCATION[c]] = -slope[i] * d_mu[c, i]
             d_raw[i, SCALE[c]] = (one - (d + b_r * decay[i]) * inverse) * inverse * w * d_b[c, i]
             clamped = spread[i] < floor
             extra[i] = zero if clamped else w * ((one + d / b_r) * decay[i] * inverse - one / b_r)
         data += total / 5
-        if median_gradient:  # of b_ref, to the first prediction that is the median
+        if settings.median_gradient:  # of b_ref, to the first prediction that is the median
             for i in range(m):
                 found = False
                 sign = zero
@@ -343,7 +405,7 @@ def _tile(
                 of_alpha += slope[i] * _clamp(u[c, j, i], low)
             d_alpha[k, p] += of_alpha
             g_r = g_g = g_b = g_1 = zero
-            if median_gradient:
+            if settings.median_gradient:
                 for i in range(m):
                     decay[i] = a * slope[i] + distance[j, i]
             else:
@@ -351,7 +413,7 @@ def _tile(
                     decay[i] = a * slope[i]
             for i in range(m):
                 off = u[c, j, i] - _clamp(u[c, j, i], low)
-                passes = off == 0 or (inward and off * decay[i] > 0)
+                passes = off == 0 or (settings.inward and off * decay[i] > 0)
                 decay[i] = decay[i] if passes else zero
             if c < 3:
                 for i in range(m):
@@ -374,7 +436,7 @@ def _tile(
 
 @_inlined
 def _regulariser(t, weight, gradient):
-    """Identity regulariser of one correction (CROSS layout, METHOD 2.3.7); adds weight x its gradient."""
+    """Identity regulariser of one map in the CROSS layout (Eq. F.14); adds weight times its gradient."""
     one, two, four = np.float32(1), np.float32(2), np.float32(4)
     total = t[0] * 0
     for i in range(3):
@@ -400,89 +462,38 @@ def _regulariser(t, weight, gradient):
 
 
 @_kernel
-def batch_loss(
-    first: int,
-    last: int,
-    start: NDArray,
-    segment: NDArray,
-    pool: NDArray,
-    pixels: NDArray,
-    share: NDArray,
-    raw: NDArray,
-    affine: NDArray,
-    alpha: NDArray,
-    log_alpha: NDArray,
-    usable: NDArray,
-    networks: NDArray,
-    lengths: NDArray,
-    numbers: NDArray,
-    flags: NDArray,
-    d_raw: NDArray,
-    d_affine: NDArray,
-    d_alpha: NDArray,
-    votes: NDArray,
-    error: NDArray,
-    sums: NDArray,
-) -> None:
-    """Loss and gradients of the runs first ... last - 1 of a batch; run r is pixels start[r] ... start[r + 1] - 1.
+def batch_loss(first: int, last: int, batch: Batch, tables: SegmentTables, settings: LossSettings, out: Gradients) -> None:
+    """Compute loss and gradients of the runs first ... last - 1 of a batch.
+
+    The derivative of the label loss with respect to the logits is (alpha sum(votes) - votes) / (3 temperature); it follows
+    from `out.votes` (Eq. F.54).
 
     Args:
-        segment: (R,) segment of each run. pool: (P, K, 5) values, words (kernels.as_words) or real.
-        pixels: (N,) rows of the pool. share: (N,) real, sum 1: how much a pixel counts. raw: (N, 10) real.
-        affine: (S, K, CROSS) real. alpha, log_alpha: (S, K, 3) real. usable: (S, K) bool.
-        networks, lengths: of `selection_networks`.
-        numbers: (4,) real: temperature of the errors, scale floor, weight of the data, of the regulariser.
-        flags: (3,) bool: smooth floor of the texture's scale, gradient through b_ref, gradients of clamped values
-            that lead back inside pass.
-
-    Writes:
-        d_raw (N, 10) and adds to, per segment, d_affine (S, K, CROSS), d_alpha (S, K, 3) (data term alone), votes
-        (S, K, 3) sums of share x q, error (S, K, 3) float64 sums of share x L1 error; sums (R, SUMS) float64.
-        The slope of the label loss is alpha sum(votes) - votes, over 3 temperature, with respect to the logits.
+        first, last: range of runs, which no other call may contain.
+        batch: pixels; tables: maps and selection; settings: numbers and choices of the loss.
+        out: arrays that are written.
     """
+    start, segment, pool, pixels, share, raw = batch
+    affine, alpha, log_alpha, usable, networks, lengths = tables
+    d_raw, d_affine, d_alpha, votes, error, sums = out
     n_k = pool.shape[1]
     bits, v = _planes(pool, n_k)
     u = np.empty((5, n_k, TILE), raw.dtype)
     distance = np.empty((n_k, TILE), raw.dtype)
     planes = np.empty((5, 5, TILE), raw.dtype)
+    scratch = _Scratch(bits, v, u, distance, planes)
     real = np.empty(1, raw.dtype)
-    temperature, floor, data_weight, regulariser_weight = numbers[0], numbers[1], numbers[2], numbers[3]
     for r in range(first, last):
         s = segment[r]
         which = np.flatnonzero(usable[s])
         if len(which) == 0:
             continue
+        of_segment = (affine[s], alpha[s], log_alpha[s], which, networks[len(which)], lengths[len(which)])
         of_run = np.float64(0)
         for low in range(start[r], start[r + 1], TILE):
             high = min(low + TILE, start[r + 1])
-            data, label = _tile(
-                pool,
-                pixels[low:high],
-                share[low:high],
-                raw[low:high],
-                affine[s],
-                alpha[s],
-                log_alpha[s],
-                which,
-                networks[len(which)],
-                lengths[len(which)],
-                temperature,
-                floor,
-                data_weight,
-                flags[0],
-                flags[1],
-                flags[2],
-                bits,
-                v,
-                u,
-                distance,
-                planes,
-                d_raw[low:high],
-                d_affine[s],
-                d_alpha[s],
-                votes[s],
-                error[s],
-            )
+            rows = (d_raw[low:high], d_affine[s], d_alpha[s], votes[s], error[s])
+            data, label = _tile(pool, pixels[low:high], share[low:high], raw[low:high], of_segment, settings, scratch, rows)
             sums[r, 0] += data
             sums[r, 1] += label
             for i in range(low, high):
@@ -493,7 +504,7 @@ def batch_loss(
         for j in range(len(which)):
             k = which[j]
             t = affine[s, k]
-            sums[r, 2] += of_run / len(which) * _regulariser(t, weight * regulariser_weight, d_affine[s, k])
+            sums[r, 2] += of_run / len(which) * _regulariser(t, weight * settings.regulariser, d_affine[s, k])
             for p in range(3):
                 if alpha[s, k, p] > 0:
                     entropy -= alpha[s, k, p] * log_alpha[s, k, p]
@@ -504,7 +515,7 @@ def batch_loss(
 
 @_kernel
 def add_rows(out: NDArray, rows: NDArray, values: NDArray) -> None:
-    """out[rows[i]] += values[i], in order."""
+    """Add values[i] (m, c) to out[rows[i]] in order."""
     for i in range(len(rows)):
         for c in range(values.shape[1]):
             out[rows[i], c] += values[i, c]

@@ -1,11 +1,10 @@
-"""The optimiser's step on the CPU: loss and gradient as closed forms in one compiled pass (kernels.py)."""
+"""The optimiser's step on the CPU, with loss and gradient as closed forms in one compiled pass (kernels.py)."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +13,16 @@ from iif_core.fusion.hashgrid.texture import HashGridTexture
 from iif_core.fusion.kernels import IDENTITY
 from iif_core.fusion.sgd.options import SgdOptions
 from iif_core.fusion.sgd.pool import Pool, Step, runs, shares, softmax, start_values
+from iif_core.numerics.adam import adam_factors
 
-_CHUNK = 4096  # pixels of a task; fixed, though results do not depend on it
+if TYPE_CHECKING:
+    from iif_core.fusion.sgd.kernels import LossSettings
+
+_CHUNK_PIXELS = 4096  # of a task; results do not depend on it
 
 
 class Adam:
-    """Adam of a float32 array (torch.optim.Adam's defaults, dense), in the kernel of the hash grid."""
+    """Dense Adam of a float32 array with the constants of Kingma and Ba, by the kernel of the hash grid (Eq. F.55)."""
 
     def __init__(self, parameter: NDArray):
         from iif_core.fusion.hashgrid.kernels import SPAN
@@ -31,27 +34,22 @@ class Adam:
         self.steps = 0
 
     def step(self, lr: float, run: Callable = lambda task, arguments: [task(a) for a in arguments]) -> None:
-        """One update; zeroes the gradient. `run` shares pieces out: elements are independent."""
+        """Update the array once and zero the gradient; `run` may spread pieces over threads."""
         from iif_core.fusion.hashgrid.kernels import adam
 
         self.steps += 1
-        beta1, beta2 = 0.9, 0.999
-        rate, root = lr / (1 - beta1**self.steps), 1 / math.sqrt(1 - beta2**self.steps)
-        numbers = [np.float32(x) for x in (beta1, beta2, rate, root, 1e-8)]
+        factors = adam_factors(lr, self.steps)
         piece = 4096
 
         def update(low: int) -> None:
             rows, spans = slice(low * self.span, (low + piece) * self.span), slice(low, low + piece)
-            adam(self.parameter[rows], self.first[rows], self.second[rows], self.gradient[rows], self.live[spans], *numbers)
+            adam(self.parameter[rows], self.first[rows], self.second[rows], self.gradient[rows], self.live[spans], factors)
 
         run(update, range(0, len(self.live), piece))
 
 
-# ------------------------------------------------------------------------------------------------------------- engines
-
-
 class NumbaEngine:
-    """CPU engine: closed-form gradients. `alpha` fixed once `fix` was called."""
+    """Engine for the CPU with closed-form gradients; the selection is fixed from a call of `fix` on."""
 
     def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int):
         from iif_core.fusion.sgd import kernels
@@ -82,31 +80,39 @@ class NumbaEngine:
             list(self.threads.map(task, arguments))
 
     def weights(self, temperature: float) -> tuple[NDArray, NDArray]:
-        """alpha, log alpha (S, K, 3) float32."""
+        """Return alpha and log alpha (S, K, 3) float32."""
         if self.fixed is not None:
             return self.fixed, np.log(self.fixed, out=np.zeros_like(self.fixed), where=self.fixed > 0)
         divisor = temperature if self.options.logits == "scaled" else 1.0
         return softmax(self.z, divisor, self.pool.usable)
 
     def losses(self, step: Step, raw: NDArray, share: NDArray, error: NDArray) -> tuple[NDArray, NDArray]:
-        """Gradients into the Adams and d_alpha, votes; returns d_raw and the sums (SUMS,)."""
+        """Add gradients to the optimisers' arrays, `d_alpha` and `votes`; return d_raw (N, 10) and the sums (SUMS,).
+
+        Args:
+            step: pixels and temperature; raw: (N, 10) float32 raw outputs at the pixels.
+            share: (N,) float32 weights of the pixels; error: (S, K, 3) float64, is added to.
+
+        Returns:
+            (N, 10) float32 derivatives with respect to the raw outputs, and (SUMS,) float64 sums of the loss.
+        """
         pool, options = self.pool, self.options
         start, segment = runs(pool.segment[step.pixels])
         alpha, log_alpha = self.weights(step.temperature)
         self.d_alpha[segment], self.votes[segment] = 0, 0
         d_raw = np.empty_like(raw)
         sums = np.zeros((len(segment), self.kernels.SUMS))
-        numbers = np.array([step.temperature, options.scale_floor, options.data_weight, options.regulariser], np.float32)
-        flags = np.array([options.scale_floor_kind == "smooth", options.median_gradient, options.clamp_gradient == "inward"])
         gradient = self.adam_affine.gradient.reshape(self.affine.shape)
-        edges = np.unique(np.searchsorted(start, np.arange(0, len(step.pixels) + _CHUNK, _CHUNK)).clip(0, len(segment)))
+        batch = self.kernels.Batch(start, segment, pool.values, step.pixels, share, raw)
+        tables = self.kernels.SegmentTables(self.affine, alpha, log_alpha, pool.usable, *self.networks)
+        settings = loss_settings(options, step.temperature, np.float32)
+        out = self.kernels.Gradients(d_raw, gradient, self.d_alpha, self.votes, error, sums)
+        edges = np.unique(
+            np.searchsorted(start, np.arange(0, len(step.pixels) + _CHUNK_PIXELS, _CHUNK_PIXELS)).clip(0, len(segment))
+        )
 
         def work(piece: tuple[int, int]) -> None:
-            self.kernels.batch_loss(
-                *(*piece, start, segment, pool.values, step.pixels, share, raw, self.affine, alpha, log_alpha),
-                *(pool.usable, *self.networks, numbers, flags),
-                *(d_raw, gradient, self.d_alpha, self.votes, error, sums),
-            )
+            self.kernels.batch_loss(*piece, batch, tables, settings, out)
 
         self.run(work, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)))
         if self.fixed is None and pool.usable.shape[1] > 1:
@@ -114,11 +120,11 @@ class NumbaEngine:
             slope = logit_slope(alpha[segment], self.d_alpha[segment], self.votes[segment], options.label_weight, divisor)
             self.adam_z.gradient.reshape(self.z.shape)[segment] = slope
         else:
-            sums[:, 1] = 0  # a kept selection has no label loss
+            sums[:, 1] = 0  # a fixed selection has no label loss
         return d_raw, sums.sum(0)
 
     def step(self, step: Step) -> NDArray:
-        """One update of everything; returns the sums (SUMS,)."""
+        """Update texture, maps and logits once; return the sums (SUMS,)."""
         share = shares(self.pool, step.pixels, self.options)
         error = np.zeros((*self.pool.usable.shape, 3))
         rows, graph = self.pool.cell[step.pixels], None
@@ -145,7 +151,7 @@ class NumbaEngine:
         return sums
 
     def errors(self, temperature: float) -> NDArray:
-        """(S, K, 3) mean L1 error of every corrected prediction against the texture, over all pixels."""
+        """Return the L1 error of every corrected prediction against the texture, summed over all pixels, (S, K, 3)."""
         total = np.zeros((*self.pool.usable.shape, 3))
         for low in range(0, len(self.pool), self.options.batch):
             pixels = np.arange(low, min(low + self.options.batch, len(self.pool)), dtype=np.int32)
@@ -156,13 +162,13 @@ class NumbaEngine:
         return total
 
     def raw(self, pixels: NDArray) -> NDArray:
-        """Raw outputs at pixels of the pool, without jitter."""
+        """Return the raw outputs at pixels of the pool, without jitter."""
         if self.grid is None:
             return self.table[self.pool.cell[pixels]]
         return self.at(self.pool.coordinates[pixels])
 
     def at(self, coordinates: NDArray) -> NDArray:
-        """Raw outputs of the hash grid."""
+        """Return the raw outputs of the hash grid at coordinates (N, 3)."""
         import torch
 
         return self.grid.evaluate(torch.from_numpy(coordinates)).numpy()
@@ -177,10 +183,24 @@ class NumbaEngine:
         return self.affine
 
 
-def logit_slope(alpha: NDArray, d_alpha: NDArray, votes: NDArray, label_weight: float, divisor: float) -> NDArray:
-    """Slope of the loss with respect to z, (S, K, 3), of alpha = softmax_k(z / divisor).
+def loss_settings(options: SgdOptions, temperature: float, real: type[np.floating]) -> LossSettings:
+    """Return the numbers and choices of the loss for the compiled kernel, the numbers of type `real`."""
+    from iif_core.fusion.sgd.kernels import LossSettings
 
-    The data term comes through alpha, d_alpha its slope; the label loss -(label_weight / 3) sum votes log alpha directly.
+    numbers = (real(x) for x in (temperature, options.scale_floor, options.data_weight, options.regulariser))
+    smooth, inward = options.scale_floor_kind == "smooth", options.clamp_gradient == "inward"
+    return LossSettings(*numbers, smooth, options.median_gradient, inward)
+
+
+def logit_slope(alpha: NDArray, d_alpha: NDArray, votes: NDArray, label_weight: float, divisor: float) -> NDArray:
+    """Return the derivative of the loss with respect to the logits of alpha = softmax_k(z / divisor) (Eq. F.54).
+
+    Args:
+        alpha: (S, K, 3) selection weights; d_alpha: (S, K, 3) derivative of the data term with respect to them.
+        votes: (S, K, 3) summed votes of the label loss; label_weight: its weight; divisor: of the logits.
+
+    Returns:
+        (S, K, 3).
     """
     slope = alpha * (d_alpha - (alpha * d_alpha).sum(1, keepdims=True))
     slope += (alpha * votes.sum(1, keepdims=True) - votes) * alpha.dtype.type(label_weight / 3)

@@ -1,4 +1,4 @@
-"""Options of the paper's optimiser: every fragile choice of the published behaviour has its own (METHOD 5)."""
+"""Options of the paper's optimiser: one for every choice of the published behaviour that is numerically fragile."""
 
 from __future__ import annotations
 
@@ -24,37 +24,39 @@ _CHOICES: dict[str, tuple] = {
 
 @dataclass(frozen=True)
 class SgdOptions:
-    """How to solve; defaults are the safe choices, in brackets the published ones.
+    """How to solve. The defaults are the safe choices; the published ones follow in brackets where they differ.
 
     Attributes:
-        texture: `cells` = one row of ten raw outputs a cell; `hashgrid` = iif_core.fusion.hashgrid at the surface points (needs
-            problem.point) [hashgrid].
+        texture: `cells` = one row of ten raw outputs per cell; `hashgrid` = a function of the surface points (needs
+            `FusionProblem.point`) [hashgrid].
         grid: shape of the hash grid; None = the paper's.
-        batch: pixels a step (fewer when the problem has fewer).
-        iterations: steps; None = `epochs` passes over the pixels, as many as whole batches fit [None]. A number of
-            epochs means little on small scenes (10 epochs of 24 views of 256 x 256 are 240 steps); fix the steps.
-        learning_rate: of texture, T and z. lr_schedule: halved at 20, 40, 60, 80 % of the steps (`fraction`) or after
-            2, 4, 6, 8 epochs (`epochs`) [epochs].
-        temperature: at the start, of z and of the errors. anneal: its factor, applied 81 times evenly over the steps
-            (`fraction`, what the paper's largest scene gets) or after step 1, 101, 201, ... (`steps`: then the last
-            temperature depends on the size of the scene) [steps].
-        temperature_floor: smallest temperature, H4 [0].
-        label_weight, regulariser, data_weight: weights of the terms.
-        scale_floor, scale_floor_kind: the texture's scale s becomes max(s, floor) (`hard`: no gradient below) or
-            sqrt(s^2 + floor^2) (`smooth`, H1) [hard]. b_ref is max(., floor) always.
-        median_gradient: gradient through b_ref, which reaches one arbitrary prediction, H3 [True].
-        clamp_gradient: of corrected values outside [low, 1]: none (`dead`), or what leads back inside (`inward`, H13)
-            [dead]. The loss is the same.
-        logits: alpha = softmax(z / tau) (`scaled`), or softmax(z) with tau in the errors alone (`direct`, H5) [scaled].
-        choice: `argmin` = the prediction with the least mean L1 error over the segment is chosen, per property, after
-            `choose_at` of the steps, and the rest of them fits texture and T to that; `soft` = alpha to the end [soft].
-        init: of `cells`: mean and spread of all predictions of the cell (`mean`), or raw outputs 0, that is 0.5
-            (`paper`) [paper].
-        jitter: points are drawn within the pixel, where the problem has tangents; `hashgrid` alone, H11 [True].
-        weighted: pixels count by problem.weight instead of 1 each [False].
-        seed: of the order of pixels, the jitter, and the network.
-        memory: bytes the predictions may take.
-        records: entries of the history.
+        batch: pixels per step, fewer if the problem has fewer.
+        epochs: passes over the pixels if `iterations` is None.
+        iterations: steps; None = as many as whole batches fit into `epochs` passes [None].
+        learning_rate: of texture, affine maps and logits. lr_schedule: halved at 20, 40, 60, 80 % of the steps
+            (`fraction`) or after 2, 4, 6, 8 epochs (`epochs`) [epochs].
+        temperature: of logits and errors at the start. anneal: factor on it, applied 81 times evenly over the steps
+            (`fraction`, Eq. F.61) or every 100 steps (`steps`, Eq. F.17, whose last temperature depends on the size of the
+            scene) [steps].
+        temperature_floor: smallest temperature (docs/method/numerics.md#cold-temperatures) [0].
+        data_weight, label_weight, regulariser: weights of the terms (Eq. F.16).
+        scale_floor, scale_floor_kind: the texture's scale s becomes max(s, floor) (`hard`, no gradient below) or
+            sqrt(s^2 + floor^2) (`smooth`, docs/method/numerics.md#laplace-scale-at-zero) [hard]. b_ref is always
+            max(b_ref, floor).
+        median_gradient: follow the derivative of b_ref, which reaches one arbitrary prediction
+            (docs/method/numerics.md#median-subgradient) [True].
+        clamp_gradient: gradient of corrected values outside [low, 1]: none (`dead`), or that which leads back inside
+            (`inward`, docs/method/numerics.md#gradients-at-clamps) [dead]. The loss is the same.
+        logits: alpha = softmax(z / tau) (`scaled`), or softmax(z) with tau in the errors alone (`direct`,
+            docs/method/numerics.md#logits-divided-by-a-temperature).
+        choice: `argmin` = after `choose_at` of the steps the prediction with the smallest mean L1 error over the segment is
+            chosen per property, and the other steps fit texture and maps to it; `soft` = softmax to the end [soft].
+        init: start of `cells`: mean and spread of all predictions of the cell (`mean`), or raw outputs 0, which are values
+            of 0.5 (`paper`) [paper].
+        jitter: draw points within the pixel if the problem has tangents, for `hashgrid` alone (Eq. F.60) [True].
+        weighted: pixels count by `FusionProblem.weight` instead of 1 each.
+        seed: of the order of the pixels, the jitter and the network.
+        memory: bytes that the predictions may take; records: entries of the history.
     """
 
     texture: str = "cells"
@@ -123,10 +125,24 @@ _PAPER: dict[str, Any] = {
 }
 
 
-def sgd_options(preset: str = "safe", **changes: Any) -> SgdOptions:
-    """Options of a preset, `safe` or `paper` (the published behaviour), with changes.
+_SAFE_GRID = {"levels": 16, "log2_entries": 17}
 
-    Not reproduced of the paper: rays that miss the mesh (there are no such pixels), coordinates in [-1, 1], half precision.
+
+def preset_grid(preset: str, levels: int | None = None, log2_entries: int | None = None) -> HashGridOptions:
+    """Return the hash grid of a preset, 16 levels of 2^17 entries with `safe` and the published size with `paper`; sizes
+    that are given replace the preset's."""
+    sizes = {} if preset == "paper" else dict(_SAFE_GRID)
+    sizes |= {name: x for name, x in (("levels", levels), ("log2_entries", log2_entries)) if x is not None}
+    return HashGridOptions(**sizes)
+
+
+def sgd_options(preset: str = "safe", **changes: Any) -> SgdOptions:
+    """Return the options of a preset, `safe` or `paper` (the published behaviour), with changes.
+
+    Preset `paper` does not reproduce rays that miss the mesh, coordinates in [-1, 1] and half precision.
+
+    Raises:
+        InputError: an unknown preset or a value that is not allowed.
     """
     presets: dict[str, dict[str, Any]] = {"safe": {}, "paper": _PAPER}
     if preset not in presets:

@@ -1,4 +1,4 @@
-"""What the optimiser draws from: all usable pixels in memory, batches of them, and the schedules of a run."""
+"""All usable pixels in memory, batches of them, the schedules of a run, and start and range of the texture."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion.kernels import as_floats, as_words
-from iif_core.fusion.problem import LOWEST, BaseProblem, Dropped, usable_pixels
+from iif_core.fusion.problem import LOWEST, Dropped, FusionProblem, usable_pixels
 from iif_core.fusion.sgd.kernels import LOCATION, SCALE
 from iif_core.fusion.sgd.options import SgdOptions
 
-_FULL_ANNEALS = 81  # multiplications of the paper's largest scene, 8080 steps
-_HALVINGS = 4
-_COLDEST = 1e-30  # of the temperature, so that 1 / tau is a float32
-_CHUNK = 65536  # pixels read at a time
+_FULL_ANNEALS = 81  # multiplications of the temperature in the 8080 steps of the paper's kitchen
+_HALVINGS = 4  # of the learning rate
+_MIN_TEMPERATURE = 1e-30  # 1 / tau is still a float32
+_CHUNK_PIXELS = 65536  # read at a time
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,11 @@ class Pool:
     segment: NDArray  # (P,) int32
     weight: NDArray  # (P,) float32
     coordinates: NDArray | None  # (P, 3) float32 in [0, 1]
-    tangent: NDArray | None  # (P, 2, 3) float32, of the coordinates
-    box: tuple[float, float]
+    tangent: NDArray | None  # (P, 2, 3) float32, in units of the coordinates
+    box: tuple[float, float]  # world coordinates that are mapped to 0 and 1, for all axes, m
     usable: NDArray  # (S, K) bool
-    observations: NDArray
-    views: NDArray
+    observations: NDArray  # (n_cells,) int32 pixels
+    views: NDArray  # (n_cells,) int32
     dropped: list[Dropped]
 
     def __len__(self) -> int:
@@ -42,15 +42,21 @@ class Pool:
 
 
 def of_view(source: Any, view: int) -> NDArray:
+    """Read a view of a sequence or of a callable as float32."""
     return np.asarray(source(view) if callable(source) else source[view], np.float32)
 
 
-def gather(problem: BaseProblem, options: SgdOptions) -> Pool:
-    """Reads every view once. Raises InputError on shapes, ids, memory, missing points."""
+def gather(problem: FusionProblem, options: SgdOptions) -> Pool:
+    """Read every view once.
+
+    Raises:
+        InputError: shapes or ids that do not match, a segment in two views, too much memory, surface points that are
+            missing or not finite.
+    """
     spatial = options.texture == "hashgrid"
     jitter = spatial and options.jitter and problem.tangent is not None
     if spatial and problem.point is None:
-        raise InputError("base sgd: the hash grid needs the surface points of the pixels (BaseProblem.point), there are none")
+        raise InputError("base sgd: the hash grid needs the surface points of the pixels (FusionProblem.point), there are none")
     observations, views = (np.zeros(problem.n_cells, np.int32) for _ in range(2))
     parts: dict[str, list[NDArray]] = {name: [] for name in ("values", "cell", "segment", "weight", "point", "tangent")}
     dropped: list[Dropped] = []
@@ -100,7 +106,7 @@ def gather(problem: BaseProblem, options: SgdOptions) -> Pool:
         if not np.isfinite(point).all():
             raise InputError("base sgd: some surface points of used pixels are not finite; set their cell to -1")
         low, high = float(point.min()), float(point.max())
-        pad = max(0.01 * (high - low), 1e-6)  # METHOD 2.0: a cube, padded by 1 %
+        pad = max(0.01 * (high - low), 1e-6)  # Eq. F.56
         box = (low - pad, high + pad)
         coordinates = unit_coordinates(point, box)
         tangent = pool["tangent"] / np.float32(box[1] - box[0]) if jitter else None
@@ -120,7 +126,7 @@ def gather(problem: BaseProblem, options: SgdOptions) -> Pool:
 
 
 def _half_in_range(values: NDArray) -> NDArray:
-    """Half bits as they are if all are in [0, 1] (what the kernel reads), else float32."""
+    """Half bits as they are if all values are in [0, 1], where the kernel can read them, else float32."""
     if values.dtype == np.uint16:
         values[values == 0x8000] = 0  # minus zero
     if values.dtype == np.uint16 and values.max(initial=0) > 0x3C00:
@@ -129,11 +135,12 @@ def _half_in_range(values: NDArray) -> NDArray:
 
 
 def unit_coordinates(point: NDArray, box: tuple[float, float]) -> NDArray:
+    """Map world coordinates (..., 3) to the unit cube (Eq. F.56), float32."""
     return ((point - np.float32(box[0])) / np.float32(box[1] - box[0])).astype(np.float32)
 
 
 def batches(n: int, batch: int, rng: np.random.Generator) -> Iterator[NDArray]:
-    """Batches of a fresh permutation an epoch, the last partial one left out; sorted, which sorts them by segment."""
+    """Yield batches of a new permutation per epoch without the last partial one; sorted, and so in segment order."""
     while True:
         order = rng.permutation(n).astype(np.int32)
         for start in range(0, n - batch + 1, batch):
@@ -141,13 +148,13 @@ def batches(n: int, batch: int, rng: np.random.Generator) -> Iterator[NDArray]:
 
 
 def runs(segment: NDArray) -> tuple[NDArray, NDArray]:
-    """(start (R + 1,), segment (R,)) of the runs of equal segments."""
+    """Return start (R + 1,) and segment (R,) of the runs of equal segments."""
     start = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
     return np.append(start, len(segment)), segment[start]
 
 
 def shares(pool: Pool, pixels: NDArray, options: SgdOptions) -> NDArray:
-    """How much each pixel of a batch counts, sum 1."""
+    """Return the weights (N,) float32 of the pixels of a batch, which sum to 1."""
     if not options.weighted:
         return np.full(len(pixels), 1 / len(pixels), np.float32)
     weight = pool.weight[pixels]
@@ -158,14 +165,23 @@ def shares(pool: Pool, pixels: NDArray, options: SgdOptions) -> NDArray:
 
 
 def temperature_at(options: SgdOptions, step: int, steps: int) -> float:
+    """Return the temperature of step number `step` (from 0) of `steps` (Eq. F.17 or F.61)."""
     if options.anneal_schedule == "steps":
         times = -(-step // 100)
     else:
         times = step * _FULL_ANNEALS // steps
-    return max(options.temperature * options.anneal**times, options.temperature_floor, _COLDEST)
+    return max(options.temperature * options.anneal**times, options.temperature_floor, _MIN_TEMPERATURE)
 
 
 def learning_rate_at(options: SgdOptions, step: int, steps: int, steps_per_epoch: int) -> float:
+    """Return the learning rate of a step.
+
+    Args:
+        options: schedule; step: number of the step, from 0; steps: their number; steps_per_epoch: for schedule `epochs`.
+
+    Returns:
+        Rate, halved up to four times.
+    """
     if options.lr_schedule == "epochs":
         times = step // (2 * steps_per_epoch)
     else:
@@ -177,7 +193,7 @@ def learning_rate_at(options: SgdOptions, step: int, steps: int, steps_per_epoch
 
 
 def activated(raw: NDArray, options: SgdOptions) -> tuple[NDArray, NDArray]:
-    """Location and Laplace scale (N, 5) float32 of raw outputs (N, 10) (METHOD 2.3.5)."""
+    """Return location and Laplace scale (N, 5) float32 of raw outputs (N, 10) (Eqs. F.50, F.51)."""
     sigmoid = 0.5 + 0.5 * np.tanh(0.5 * np.asarray(raw, np.float64))
     value = LOWEST + (1 - LOWEST) * sigmoid[:, LOCATION]
     scale = sigmoid[:, SCALE]
@@ -189,13 +205,13 @@ def activated(raw: NDArray, options: SgdOptions) -> tuple[NDArray, NDArray]:
 
 
 def start_values(pool: Pool, n_cells: int, options: SgdOptions) -> NDArray:
-    """Raw outputs (n_cells, 10) float32 to start from."""
+    """Return the raw outputs (n_cells, 10) float32 of the texture `cells` to start from."""
     raw = np.zeros((n_cells, 10), np.float32)
     if options.init == "paper":
         return raw
     total, square = np.zeros((n_cells, 5)), np.zeros((n_cells, 5))
-    for low in range(0, len(pool), _CHUNK):
-        rows = slice(low, low + _CHUNK)
+    for low in range(0, len(pool), _CHUNK_PIXELS):
+        rows = slice(low, low + _CHUNK_PIXELS)
         v = np.clip(as_floats(pool.values[rows]), LOWEST, 1)
         use = pool.usable[pool.segment[rows]]
         v, count = v * use[..., None], use.sum(1)[:, None]
@@ -218,7 +234,7 @@ def start_values(pool: Pool, n_cells: int, options: SgdOptions) -> NDArray:
 
 @dataclass(frozen=True)
 class Step:
-    """What a step needs besides the parameters."""
+    """Inputs of a step besides the parameters."""
 
     pixels: NDArray  # (N,) sorted rows of the pool
     coordinates: NDArray | None  # (N, 3)
@@ -230,7 +246,7 @@ TERMS = ("data", "label", "regulariser", "entropy", "gain")
 
 
 def softmax(z: NDArray, divisor: float, usable: NDArray) -> tuple[NDArray, NDArray]:
-    """Softmax of z / divisor over the usable k and its logarithm, (S, K, 3) float32; 0 and 0 where not usable."""
+    """Return the softmax of z / divisor over the usable k and its logarithm, (S, K, 3) float32, 0 where not usable."""
     use = usable[..., None]
     lowest = np.where(use, z, -np.inf).max(1, keepdims=True)
     exponent = np.where(use, z - np.where(np.isfinite(lowest), lowest, 0), 0).astype(np.float64) / divisor

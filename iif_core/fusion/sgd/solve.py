@@ -1,22 +1,15 @@
-"""The paper's optimiser: stochastic gradient descent on texture, corrections and selection together (METHOD 2.3).
+"""The paper's optimiser: stochastic gradient descent on texture, affine maps and selection together.
 
-The twin of the direct solver: it reads the same problem, its result is described the same way, and
-`reference_loss.reference_loss` judges both. The loss of a batch of pixels is
+It reads the same problem as the direct solver, its result is described in the same way (`direct.describe_fit`), and
+`reference_loss.reference_loss` judges both. The loss of a batch of pixels is Eq. F.16, minimised by one Adam over the
+texture, the maps and the logits. On the CPU, loss and gradient are closed forms in one compiled pass (kernels.py); the torch
+engine uses automatic differentiation, runs on any device and checks the former. Every choice of the published behaviour that
+is numerically fragile is an option: docs/method/fusion.md#schedules compares the presets `safe` and `paper`.
 
-    L = mean KL(Laplace(mu_ref, b_ref) || Laplace(mu, b)) + label loss + 100 identity regulariser     (2.3.4 - 2.3.8)
-
-with mu_ref = sum_k softmax_k(z / tau) clamp(T_k v_k), b_ref the lower median over k of |mu_ref - clamp(T_k v_k)|, and one
-Adam over texture, T and z. On the CPU, loss and gradient are closed forms in one compiled pass (kernels.py); the
-torch backend leaves them to automatic differentiation, runs on any device and is the check of the former.
-
-Every choice where the published behaviour is fragile is an option of its own (METHOD 5); `sgd_options("paper")` are the
-published ones, `sgd_options("safe")` = `SgdOptions()` the others.
-
-Reproducible: same problem, options and seed give the same bytes on the CPU, for any number of threads (numba backend)
-or for a fixed number of torch threads (torch backend); on CUDA gradients of the texture are added in no fixed order.
-The order of the predictions matters to rounding alone.
-
-Memory: all predictions (in half precision if they come so), since a batch draws from every view; four textures.
+The same problem, options and seed give the same bytes on the CPU, for any number of threads with the compiled engine and for
+a fixed number of torch threads with the torch engine; on CUDA the gradients of the texture are added in no fixed order. The
+order of the predictions changes the result by rounding only. All predictions stay in memory (in half precision if they come
+so), since a batch draws from every view.
 """
 
 from __future__ import annotations
@@ -28,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
-from iif_core.fusion.problem import BaseProblem, Dropped, object_means
+from iif_core.fusion.problem import Dropped, FusionProblem, object_means
 from iif_core.fusion.selection import selection_weights
 from iif_core.fusion.sgd.numba_engine import NumbaEngine
 from iif_core.fusion.sgd.options import SgdOptions
@@ -52,18 +45,18 @@ class SgdFit:
     """What the optimiser found.
 
     Attributes:
-        value, scale: (n_cells, 5) float32 location and Laplace scale (the learnt one); a hash grid is read at the mean
-            point of each cell. Cells nobody saw: their object's mean, and a scale as of the least sure tenth.
-        corrections: (S, K, 16) float32, packed: albedo 3 x 4 (row = output), roughness 2, metallic 2 (gain, bias).
+        value, scale: (n_cells, 5) float32 location and learnt Laplace scale; a hash grid is read at the mean point of each
+            cell. Cells without observations take the mean of their object and the 0.9 quantile of the scales.
+        corrections: (S, K, 16) float32 affine maps: albedo 3 x 4 (row = output), roughness 2, metallic 2 (gain, bias).
         alpha: (S, K, 3) float32 selection weights; 0 where the segment has no usable pixel.
-        log_alpha, temperature: (S, K, 3) float32 log softmax and the temperature of the last step, for the label loss.
-        error: (S, K, 3) float32 mean L1 error of each corrected prediction against the texture, at the end.
+        log_alpha, temperature: (S, K, 3) float32 log softmax and temperature of the last step, for the label loss.
+        error: (S, K, 3) float32 mean L1 error of each corrected prediction against the texture at the end.
         observations, views: (n_cells,) int32 pixels and views that saw the cell.
         dropped: predictions that were not used.
-        history: step; data, label, regulariser (without weights), label_part (with its weight), total: means over the
-            steps since the last entry; label is 0 once the selection is kept, and for K = 1; temperature,
-            learning_rate, entropy (nats), gain (mean of trace A / 3, METHOD H14).
-        at_pixels: view -> (location, scale) of the texture at its pixels, (N, 5) float32 each; without meaning where a
+        history: step; data, label, regulariser (without weights), label_part (with its weight) and total, as means over the
+            steps since the last entry; temperature, learning_rate, entropy (nats), gain (mean of tr(A) / 3). The label
+            loss is 0 once the selection is fixed, and for K = 1.
+        at_pixels: view -> (location, scale) of the texture at its pixels, (N, 5) float32 each, with any value where a
             pixel is not used.
     """
 
@@ -96,25 +89,17 @@ class SgdFit:
         return self.corrections[..., 14:]
 
     @property
-    def affine(self) -> NDArray:
-        """(S, K, 6, 5): [albedo, roughness, metallic, 1] @ affine = corrected values."""
-        out = np.zeros((*self.corrections.shape[:2], 6, 5), np.float32)
-        out[..., [0, 1, 2, 5], :3] = self.affine_albedo.swapaxes(-1, -2)
-        out[..., [3, 5], 3] = self.affine_roughness
-        out[..., [4, 5], 4] = self.affine_metallic
-        return out
-
-    @property
     def weight(self) -> NDArray:
-        """Selection weights by the name that BaseResult gives them."""
+        """Selection weights, by the name of `FusionResult`."""
         return self.alpha
 
 
 def converged(history: list[dict[str, float]], tolerance: float = 0.01) -> bool:
-    """Whether the loss is flat: over the last fifth of the history it changes by less than `tolerance`, relatively.
+    """Return whether the loss changes by less than the share `tolerance` over the last fifth of the history.
 
-    Compares the means of the first and the last third of that fifth, of data + 100 regulariser: the label loss goes with
-    1 / temperature and never settles while that falls. Fewer than 15 entries do not tell: False.
+    Compares the means of data + 100 regulariser over the first and the last third of that fifth. The label loss is left
+    out, because it grows with 1 / temperature and does not settle while the temperature falls. False for fewer than 15
+    entries.
     """
     if len(history) < 15:
         return False
@@ -124,8 +109,8 @@ def converged(history: list[dict[str, float]], tolerance: float = 0.01) -> bool:
     return bool(abs(after - before) <= tolerance * max(abs(before), 1e-12))
 
 
-def solve_base_sgd(
-    problem: BaseProblem,
+def solve_sgd(
+    problem: FusionProblem,
     options: SgdOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
@@ -133,10 +118,18 @@ def solve_base_sgd(
     weight: NDArray | None = None,
     backend: str | None = None,
 ) -> SgdFit:
-    """Texture, corrections and selection of a problem by the paper's optimiser.
+    """Solve a problem by the paper's optimiser.
 
-    `progress(done, total)` counts steps. `weight` (S, K, 3): selection weights to keep instead of learning them, for
-    comparing solvers at the same selection. `backend`: "numba" (CPU), "torch", or None: numba on the CPU, else torch.
+    Args:
+        problem: predictions on cells, with surface points for a hash grid.
+        options: how to solve; None = the safe preset.
+        progress: called as progress(done, total) with numbers of steps.
+        threads: threads of the compiled engine or of the hash grid; device: torch device.
+        weight: (S, K, 3) selection weights to keep instead of learning them, for comparing solvers at one selection.
+        backend: "numba" (CPU), "torch", or None = numba on the CPU and torch elsewhere.
+
+    Returns:
+        Texture, affine maps, selection and history.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views, no usable pixel, too much memory,
@@ -153,30 +146,27 @@ def solve_base_sgd(
     n_segments, k = pool.usable.shape
     if weight is not None and np.shape(weight) != (n_segments, k, 3):
         raise InputError(f"base sgd: weight has shape {np.shape(weight)}; needed is {(n_segments, k, 3)}")
-    batch = min(options.batch, len(pool))
-    per_epoch = max(1, len(pool) // batch)
-    steps = options.iterations or options.epochs * per_epoch
     if backend == "numba":
         engine: NumbaEngine | TorchEngine = NumbaEngine(pool, options, problem.n_cells, threads)
     else:
         engine = TorchEngine(pool, options, problem.n_cells, threads, device)
     try:
-        return _solve(problem, options, pool, engine, steps, batch, per_epoch, weight, progress)
+        return _solve(problem, options, pool, engine, weight, progress)
     finally:
         engine.close()
 
 
 def _solve(
-    problem: BaseProblem,
+    problem: FusionProblem,
     options: SgdOptions,
     pool: Pool,
     engine: NumbaEngine | TorchEngine,
-    steps: int,
-    batch: int,
-    per_epoch: int,
     weight: NDArray | None,
     progress: Callable[[int, int], None] | None,
 ) -> SgdFit:
+    batch = min(options.batch, len(pool))
+    per_epoch = max(1, len(pool) // batch)
+    steps = options.iterations or options.epochs * per_epoch
     rng = np.random.default_rng(options.seed)
     stream = batches(len(pool), batch, rng)
     single = pool.usable.shape[1] == 1
@@ -217,7 +207,7 @@ def _solve(
 
 
 def _chosen(error: NDArray, pool: Pool) -> NDArray:
-    """(S, K, 3) weights of the least error; equal ones share, so that the order of the predictions does not matter."""
+    """(S, K, 3) weights that choose the smallest error; equal ones share, so the order of predictions does not matter."""
     use = np.broadcast_to(pool.usable[:, None, :], (len(error), 3, error.shape[1]))
     count = np.maximum(np.bincount(pool.segment, minlength=len(error)), 1)
     return selection_weights((error / count[:, None, None]).swapaxes(1, 2), 0.0, use).swapaxes(1, 2)
@@ -241,7 +231,7 @@ def _entry(step: int, means: NDArray, options: SgdOptions, temperature: float, l
 
 
 def _fit(
-    problem: BaseProblem,
+    problem: FusionProblem,
     options: SgdOptions,
     pool: Pool,
     engine: NumbaEngine | TorchEngine,

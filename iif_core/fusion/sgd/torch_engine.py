@@ -1,8 +1,8 @@
-"""The optimiser's step on any device, its gradient left to automatic differentiation: the check of the compiled one."""
+"""The optimiser's step on any device with automatic differentiation, which checks the closed forms of the compiled engine."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,34 @@ if TYPE_CHECKING:
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 
 
+class TorchBatch(NamedTuple):
+    """Pixels of a batch."""
+
+    raw: torch.Tensor
+    """(N, 10) raw outputs of the texture, any real type."""
+    values: torch.Tensor
+    """(N, K, 5) predictions."""
+    segment: torch.Tensor
+    """(N,) int64."""
+    share: torch.Tensor
+    """(N,) weights of the pixels, sum 1."""
+
+
+class TorchTables(NamedTuple):
+    """Maps and selection of every segment and prediction."""
+
+    affine: torch.Tensor
+    """(S, K, 16)."""
+    z: torch.Tensor
+    """(S, K, 3) logits."""
+    usable: torch.Tensor
+    """(S, K) bool."""
+    fixed: torch.Tensor | None = None
+    """(S, K, 3) selection weights in place of the logits."""
+
+
 class TorchEngine:
-    """Any device: the same loss left to automatic differentiation."""
+    """Engine for any device; the methods are those of numba_engine.NumbaEngine."""
 
     def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int, device: str):
         import torch
@@ -54,21 +80,11 @@ class TorchEngine:
         segment = self.segment[pixels]
         share = self.weight[pixels] if self.options.weighted else self.torch.ones_like(self.weight[pixels])
         divisor = temperature if self.options.logits == "scaled" else 1.0
-        found = torch_losses(
-            raw,
-            self.values[pixels].to(self.torch.float32),
-            self.affine,
-            self.z,
-            segment,
-            self.usable,
-            share / share.sum(),
-            temperature,
-            divisor,
-            self.options,
-            self.fixed,
-        )
+        batch = TorchBatch(raw, self.values[pixels].to(self.torch.float32), segment, share / share.sum())
+        tables = TorchTables(self.affine, self.z, self.usable, self.fixed)
+        found = torch_losses(batch, tables, temperature, divisor, self.options)
         if self.fixed is not None:
-            found["label"] = self.torch.zeros_like(found["label"])  # a kept selection has no label loss
+            found["label"] = self.torch.zeros_like(found["label"])  # a fixed selection has no label loss
         return found
 
     def step(self, step: Step) -> NDArray:
@@ -122,65 +138,29 @@ class TorchEngine:
 
 
 def torch_losses(
-    raw: torch.Tensor,
-    values: torch.Tensor,
-    affine: torch.Tensor,
-    z: torch.Tensor,
-    segment: torch.Tensor,
-    usable: torch.Tensor,
-    share: torch.Tensor,
-    temperature: float,
-    divisor: float,
-    options: SgdOptions,
-    fixed: torch.Tensor | None = None,
+    batch: TorchBatch, tables: TorchTables, temperature: float, divisor: float, options: SgdOptions
 ) -> dict[str, torch.Tensor]:
-    """The terms of the loss of a batch in torch operations, any real type and device; differentiable.
+    """Compute the terms of the loss of a batch in differentiable torch operations (Eqs. F.1 to F.15).
 
     Args:
-        raw: (N, 10) raw outputs of the texture. values: (N, K, 5). affine: (S, K, 16). z: (S, K, 3).
-        segment: (N,) int64. usable: (S, K) bool. share: (N,), sum 1. divisor: of z. fixed: (S, K, 3) alpha, no logits.
+        batch: pixels; tables: maps and selection, of the same real type and device.
+        temperature: of the errors; divisor: of the logits; options: choices of the loss.
 
     Returns:
-        data, label, regulariser (without its weight), entropy, gain: scalars; error (N, K, 3) L1, without a graph.
+        data, label, regulariser (without its weight), entropy and gain: scalars; error: (N, K, 3) L1 errors without graph.
     """
     import torch
 
+    raw, values, segment, share = batch
     low = torch.as_tensor(LOWEST, device=raw.device).to(raw.dtype)
-    floor = options.scale_floor
-    use, t = usable[segment], affine[segment]
+    use, t = tables.usable[segment], tables.affine[segment]
     n_used = use.sum(1)
-    sigmoid = raw.sigmoid()
-    mu = low + (1 - low) * sigmoid[:, LOCATION]
-    b = sigmoid[:, SCALE]
-    b = (b * b + floor**2).sqrt() if options.scale_floor_kind == "smooth" else b.clamp_min(floor)
-
-    albedo = t[..., :12].unflatten(-1, (3, 4))
-    corrected = torch.cat(
-        [
-            (albedo[..., :3] * values[..., None, :3]).sum(-1) + albedo[..., 3],
-            t[..., 12:13] * values[..., 3:4] + t[..., 13:14],
-            t[..., 14:15] * values[..., 4:] + t[..., 15:],
-        ],
-        -1,
-    )
-    corrected = _clamped(corrected, low, options.clamp_gradient)
-
-    if fixed is None:
-        y = (z - z.masked_fill(~usable[..., None], -torch.inf).amax(1, keepdim=True).clamp_min(-1e30).detach()) / divisor
-        log_alpha = y.masked_fill(~usable[..., None], -torch.inf).log_softmax(1).masked_fill(~usable[..., None], 0)
-        alpha = log_alpha.exp() * usable[..., None]
-    else:
-        alpha = fixed.to(raw.dtype)
-        log_alpha = torch.where(alpha > 0, alpha, 1.0).log()
+    mu, b = _texture(raw, low, options)
+    corrected = _clamped(_corrected(values, t), low, options.clamp_gradient)
+    alpha, log_alpha = _selection(tables, divisor, raw.dtype)
     alpha_n = alpha[segment]
     mixed = (alpha_n[..., _PROPERTY_OF_CHANNEL] * corrected).sum(1)
-    spread = (mixed[:, None] - corrected).abs()
-    ranked = torch.where(use[..., None], spread.detach(), torch.inf).sort(dim=1).values
-    median = ranked.gather(1, ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5))
-    index = torch.arange(usable.shape[1], device=raw.device)[None, :, None]
-    is_median = (spread.detach() == median) & use[..., None]
-    first = torch.where(is_median, index, usable.shape[1] - 1).amin(1, keepdim=True)  # of those that are equal
-    b_ref = spread.gather(1, first)[:, 0].clamp_min(floor)
+    b_ref = _reference_scale((mixed[:, None] - corrected).abs(), use, n_used).clamp_min(options.scale_floor)
     if not options.median_gradient:
         b_ref = b_ref.detach()
     d = (mixed - mu).abs()
@@ -193,12 +173,7 @@ def torch_losses(
         nearest = torch.where(use[..., None], error, torch.inf).amin(1, keepdim=True)
         q = ((nearest - error) / temperature).masked_fill(~use[..., None], -torch.inf).softmax(1)
     label = -(share[:, None, None] * q * torch.where(q > 0, log_alpha[segment], 0)).sum() / 3
-
-    a, identity = albedo[..., :3], torch.eye(3, dtype=raw.dtype, device=raw.device)
-    penalty = ((a - identity) ** 2).sum((-1, -2)) + (albedo[..., 3] ** 2).sum(-1)
-    penalty = penalty + ((a @ a.mT - identity) ** 2).sum((-1, -2))
-    penalty = penalty + ((t[..., 12:] - torch.tensor([1.0, 0.0, 1.0, 0.0], device=raw.device)) ** 2).sum(-1)
-    regulariser = (share * (penalty * use).sum(1) / n_used).sum()
+    regulariser = (share * (_distance_from_identity(t) * use).sum(1) / n_used).sum()
 
     with torch.no_grad():
         entropy = -(share * (alpha * log_alpha).sum((1, 2))[segment]).sum() / 3
@@ -207,8 +182,68 @@ def torch_losses(
     return {"data": data, "label": label, "regulariser": regulariser, "entropy": entropy, "gain": gain, "error": error}
 
 
+def _texture(raw: torch.Tensor, low: torch.Tensor, options: SgdOptions) -> tuple[torch.Tensor, torch.Tensor]:
+    """Location and Laplace scale (N, 5) of raw outputs (Eqs. F.50, F.51)."""
+    floor = options.scale_floor
+    sigmoid = raw.sigmoid()
+    mu = low + (1 - low) * sigmoid[:, LOCATION]
+    b = sigmoid[:, SCALE]
+    return mu, (b * b + floor**2).sqrt() if options.scale_floor_kind == "smooth" else b.clamp_min(floor)
+
+
+def _corrected(values: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """Predictions (N, K, 5) under the maps of their segments (N, K, 16), before the clamp."""
+    import torch
+
+    albedo = t[..., :12].unflatten(-1, (3, 4))
+    return torch.cat(
+        [
+            (albedo[..., :3] * values[..., None, :3]).sum(-1) + albedo[..., 3],
+            t[..., 12:13] * values[..., 3:4] + t[..., 13:14],
+            t[..., 14:15] * values[..., 4:] + t[..., 15:],
+        ],
+        -1,
+    )
+
+
+def _selection(tables: TorchTables, divisor: float, real: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+    """alpha and log alpha (S, K, 3), 0 where a prediction is not usable (Eq. F.2)."""
+    import torch
+
+    if tables.fixed is not None:
+        alpha = tables.fixed.to(real)
+        return alpha, torch.where(alpha > 0, alpha, 1.0).log()
+    z, off = tables.z, ~tables.usable[..., None]
+    y = (z - z.masked_fill(off, -torch.inf).amax(1, keepdim=True).clamp_min(-1e30).detach()) / divisor
+    log_alpha = y.masked_fill(off, -torch.inf).log_softmax(1).masked_fill(off, 0)
+    return log_alpha.exp() * tables.usable[..., None], log_alpha
+
+
+def _reference_scale(spread: torch.Tensor, use: torch.Tensor, n_used: torch.Tensor) -> torch.Tensor:
+    """Lower median (N, 5) of the deviations (N, K, 5) of usable predictions; its gradient reaches the first that equals it."""
+    import torch
+
+    ranked = torch.where(use[..., None], spread.detach(), torch.inf).sort(dim=1).values
+    median = ranked.gather(1, ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5))
+    index = torch.arange(use.shape[1], device=spread.device)[None, :, None]
+    is_median = (spread.detach() == median) & use[..., None]
+    first = torch.where(is_median, index, use.shape[1] - 1).amin(1, keepdim=True)
+    return spread.gather(1, first)[:, 0]
+
+
+def _distance_from_identity(t: torch.Tensor) -> torch.Tensor:
+    """Identity regulariser (N, K) of maps (N, K, 16) (Eq. F.14)."""
+    import torch
+
+    albedo = t[..., :12].unflatten(-1, (3, 4))
+    a, identity = albedo[..., :3], torch.eye(3, dtype=t.dtype, device=t.device)
+    penalty = ((a - identity) ** 2).sum((-1, -2)) + (albedo[..., 3] ** 2).sum(-1)
+    penalty = penalty + ((a @ a.mT - identity) ** 2).sum((-1, -2))
+    return penalty + ((t[..., 12:] - torch.tensor([1.0, 0.0, 1.0, 0.0], device=t.device)) ** 2).sum(-1)
+
+
 def _clamped(x: torch.Tensor, low: torch.Tensor, gradient: str) -> torch.Tensor:
-    """x within [low, 1]; `gradient`: as in SgdOptions.clamp_gradient."""
+    """x clamped to [low, 1], with the gradient that SgdOptions.clamp_gradient names."""
     import torch
 
     clamped = torch.maximum(torch.minimum(x, torch.ones_like(x)), low.expand_as(x))

@@ -1,4 +1,5 @@
-"""The radiance cache: mean outgoing radiance per voxel of everything that does not shine (METHOD 2.0)."""
+"""The radiance cache: mean outgoing radiance per voxel of everything that does not shine
+(docs/method/light.md#radiance-cache)."""
 
 from __future__ import annotations
 
@@ -15,9 +16,10 @@ class RadianceVoxels:
 
     Attributes:
         edge: m; origin: (3,) corner of voxel (0, 0, 0).
-        ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black (METHOD H27).
-        radiance: (n, 3) float32 mean of the uncensored observations; where there are none the largest censored
-            one, a lower bound (H60).
+        ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black
+            (docs/method/numerics.md#empty-voxels-of-the-radiance-cache).
+        radiance: (n, 3) float32 mean of the unsaturated observations; where there are none the largest saturated one, a lower
+            bound (Eq. L.5).
         samples: (n,) int32 observations behind `radiance`.
         censored: (n,) bool, `radiance` is a lower bound.
     """
@@ -31,7 +33,7 @@ class RadianceVoxels:
 
 
 class RadianceSums:
-    """Running sums per voxel: `add` the pixels of one view after another, then `finish` (METHOD 2.0).
+    """Running sums per voxel: `add` the pixels of one view after another, then `finish`.
 
     Args:
         edge: voxel edge in m.
@@ -47,7 +49,7 @@ class RadianceSums:
     def add(self, points: np.ndarray, radiance: np.ndarray, censored: np.ndarray) -> None:
         """Add pixels: points (n, 3) in m, radiance (n, 3) linear, censored (n,) bool; non-finite rows are left out.
 
-        The caller leaves out pixels on emitters (METHOD H28).
+        The caller leaves out pixels on emitters (docs/method/numerics.md#emitters-in-the-radiance-cache).
 
         Raises:
             InputError: edge not positive, or a point outside the 65536 voxels an axis from the origin.
@@ -76,7 +78,7 @@ class RadianceSums:
         self._value = sums
 
     def finish(self) -> RadianceVoxels:
-        """The cache of what was added so far."""
+        """Return the cache of what was added so far."""
         count, clipped = self._value[:, 3], self._value[:, 7]
         bound = count == 0
         mean = self._value[:, :3] / np.maximum(count, 1)[:, None]

@@ -1,7 +1,7 @@
-"""Which faces may shine by themselves.
+"""Faces that may shine by themselves (docs/method/light.md#emitter-candidates).
 
-A face is a candidate when nearly all of its pixels in all views are far brighter than the room, or saturated whatever
-the exposure. That is generous on purpose: a surface that merely reflects is recognised by the solve that follows
+A face is a candidate when nearly all of its pixels in all views are far brighter than the room, or saturated at every
+exposure. The test accepts too many faces on purpose: surfaces that merely reflect are recognised by the solve that follows
 (`pruning`).
 """
 
@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
+from iif_core.numerics.graph import component_labels
 
 SMALL_AREA = 0.25
 """Surface (m^2) of a lamp that may be one group whatever its shape."""
@@ -46,11 +48,11 @@ def face_statistics(
     bound: np.ndarray | None = None,
     quantile: float = 0.05,
 ) -> FaceStatistics:
-    """Statistics of the pixels that see each face (METHOD 2.4, quantile form, in radiance).
+    """Summarise the pixels that see each face.
 
-    A saturated pixel at exposure e says only L >= f^-1(saturation) / e, and at a long exposure that is next to
-    nothing. The lower quantile is therefore Kaplan and Meier's (1958) estimate from right-censored data: bounds below
-    a value do not count against it. Without saturation it is the observation of rank floor(quantile * count).
+    A saturated pixel gives a lower bound only. The lower quantile is therefore Kaplan and Meier's (1958) estimate from
+    right-censored data (Eq. L.2): bounds below a value do not count against it. Without saturation it is the observation of
+    rank floor(quantile * count).
 
     Args:
         face: (n,) int, -1 = no face.
@@ -59,6 +61,9 @@ def face_statistics(
         n_faces: F.
         bound: (n, 3) bool, `value` is a lower bound; None = nowhere.
         quantile: lower quantile; the minimum below 1 / quantile pixels.
+
+    Returns:
+        Statistics of F faces.
     """
     value = np.asarray(value)
     good = (face >= 0) & np.isfinite(value).all(-1)
@@ -79,13 +84,13 @@ def face_statistics(
 def _censored_quantile(
     face: np.ndarray, value: np.ndarray, bounded: np.ndarray, count: np.ndarray, quantile: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Kaplan-Meier quantile per face, and whether it lies beyond the last value; the largest value then."""
+    """Kaplan-Meier quantile per face, and whether it lies beyond the last value; it is the largest value then."""
     low, hidden = np.zeros(len(count), np.float32), np.zeros(len(count), bool)
-    order = np.lexsort((bounded, value, face))  # at equal values those that are known come first
+    order = np.lexsort((bounded, value, face))  # of equal values, bounds come last
     owner, ordered, known = face[order], value[order], ~bounded[order]
     first = np.cumsum(count) - count
     at_risk = count[owner] - (np.arange(len(owner)) - first[owner])
-    # The last one of a face, if it is known, ends the curve: log 0.
+    # The last observation of a face, if it is not a bound, ends the curve: log 0.
     with np.errstate(divide="ignore"):
         step = np.where(known, np.log1p(-1.0 / np.maximum(at_risk, 1)), 0.0)
     last = at_risk == 1
@@ -114,16 +119,19 @@ def with_thin_objects(
     inside: np.ndarray,
     min_observations: int,
 ) -> FaceStatistics:
-    """Statistics of interior pixels, and of all pixels for objects too thin to have interior ones.
+    """Take the statistics of interior pixels, and those of all pixels for objects too thin to have interior ones.
 
-    Pixels at the border of an object mix with what is beside it, so interior ones count. An object without any (a
-    filament) is judged by all of its pixels, if nine tenths of them are bright: the frame of a window is not.
+    Pixels at the border of an object mix with what is beside it. An object without interior pixels (a filament) is judged by
+    all of its pixels if nine tenths of them are bright, which excludes the frame of a window.
 
     Args:
-        interior, every: statistics of the interior pixels and of all.
+        interior, every: statistics of the interior pixels, and of all.
         object_id: (F,) of the faces, -1 = none.
-        face, bright, inside: (n,) of all pixels.
+        face, bright, inside: (n,) of all pixels: face; reaches the threshold or is saturated; interior.
         min_observations: interior pixels from which an object is not thin.
+
+    Returns:
+        Statistics of F faces.
     """
     owner, size = object_id[face] + 1, int(object_id.max(initial=-1)) + 2
     share = np.bincount(owner, bright, size) / np.maximum(np.bincount(owner, minlength=size), 1)
@@ -137,16 +145,15 @@ def with_thin_objects(
     return FaceStatistics(**{name: pick(name) for name in FaceStatistics.__dataclass_fields__})
 
 
-BRIGHT = 5.0
-"""Radiance of a candidate relative to the median."""
+CANDIDATE_RATIO = 5.0
+"""Radiance of a candidate relative to the median of the room."""
 
 
-def radiance_threshold(statistics: FaceStatistics, ratio: float = BRIGHT) -> float:
-    """Radiance above which a face may be an emitter: `ratio` times the median over pixels.
+def radiance_threshold(statistics: FaceStatistics, ratio: float = CANDIDATE_RATIO) -> float:
+    """Find the radiance above which a face may be an emitter: `ratio` times the median over pixels (Eq. L.3).
 
-    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may
-    fill up to half of the pixels. A white diffuse surface in a room reflects at most a few times the median; lamps
-    and windows exceed it by 10 to 50. Infinite when nothing was seen.
+    The median is of the low quantile of the face that each pixel sees, so highlights do not count and emitters may fill up to
+    half of the pixels. Infinite when nothing was seen.
     """
     seen = statistics.count > 0
     if not seen.any():
@@ -163,14 +170,22 @@ def radiance_threshold(statistics: FaceStatistics, ratio: float = BRIGHT) -> flo
 def emitter_candidates(
     statistics: FaceStatistics, adjacency: np.ndarray, areas: np.ndarray, threshold: float, min_observations: int = 8
 ) -> np.ndarray:
-    """Faces that may shine by themselves: (F,) bool (METHOD 2.4).
+    """Find the faces that may shine by themselves.
 
-    A face counts when its low quantile reaches `threshold`, or saturation hides how bright it is, over at least
-    `min_observations` pixels. Faces seen by fewer
-    pixels are pooled: neighbours (also across a few unseen faces) that all reach the threshold count when together
-    they were seen often enough: finely tessellated lamps. Unseen surface whose seen neighbours are candidates to
-        90 % joins
-    them, up to four times their area or `SMALL_AREA`: the gaps between them, and the far side of a lamp.
+    A face counts when its low quantile reaches `threshold` or is hidden by saturation. Neighbours that count, also across a few
+    unseen faces, are pooled, and the pool must have been seen by `min_observations` pixels: finely tessellated lamps. Unseen
+    surface joins when 90 % of its border are candidates, up to four times their area or `SMALL_AREA`: gaps, and the far side
+    of a lamp.
+
+    Args:
+        statistics: of F faces.
+        adjacency: (E, 2) pairs of neighbouring faces.
+        areas: (F,) m^2.
+        threshold: radiance, see `radiance_threshold`.
+        min_observations: pixels that must have seen a pool.
+
+    Returns:
+        (F,) bool.
     """
     solid, unseen = areas > 1e-12, statistics.count == 0
     bright = ~unseen & ((statistics.low >= threshold) | statistics.bounded) & solid
@@ -191,19 +206,14 @@ def emitter_candidates(
 
 def components(adjacency: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Label of the connected component of every face; faces outside `mask` are alone."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    n = len(mask)
-    pair = adjacency[mask[adjacency[:, 0]] & mask[adjacency[:, 1]]]
-    graph = coo_matrix((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), (n, n))
-    return connected_components(graph, directed=False)[1]
+    inside = mask[adjacency[:, 0]] & mask[adjacency[:, 1]]
+    return component_labels(len(mask), *adjacency[inside].T)
 
 
 def _enclosed(
     adjacency: np.ndarray, areas: np.ndarray, unseen: np.ndarray, candidate: np.ndarray, pool: np.ndarray
 ) -> np.ndarray:
-    """Unseen faces in regions that border on candidates (almost) alone and are not much larger than their pools."""
+    """Unseen faces in regions that border almost only on candidates and are not much larger than their pools."""
     region = components(adjacency, unseen)
     size = int(region.max(initial=-1)) + 1
     pair = np.concatenate([adjacency, adjacency[:, ::-1]])

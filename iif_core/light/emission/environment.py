@@ -1,4 +1,5 @@
-"""Light from outside: where rays go that leave the mesh, and which texels share one unknown radiance (METHOD 2.6, 8)."""
+"""Light from outside the mesh: what escaping camera rays see, and which texels share one unknown radiance
+(docs/method/light.md#environment-map)."""
 
 from __future__ import annotations
 
@@ -9,10 +10,10 @@ import numpy as np
 from iif_core.light.environment import direction_in, texel_of
 from iif_core.numerics.xp import NUMPY
 
-HEIGHT, WIDTH = 16, 32
+HEIGHT, WIDTH = 16, 32  # texels of the map
 MAX_GROUPS = 12
 MIN_PIXELS = 50
-"""Escaping camera pixels from which a texel is known by itself (METHOD 8)."""
+"""Escaping camera pixels from which a texel is known by itself."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +36,12 @@ class Sky:
 
     @property
     def is_unseen(self) -> bool:
-        """No group is taken for what a camera sees of it (`SkySums.directions`)."""
+        """No camera sees any of the groups, as for those of `SkySums.directions`."""
         return not self.pixels.any()
 
 
 class SkySums:
-    """What the camera rays see that leave the mesh: `add` one view after another, then `groups`."""
+    """Sums of what camera rays see that leave the mesh: `add` one view after another, then `groups`."""
 
     def __init__(self, height: int = HEIGHT, width: int = WIDTH):
         self.shape = (height, width)
@@ -58,16 +59,15 @@ class SkySums:
         return int(self._sums[:, 3].sum())
 
     def mean(self) -> np.ndarray:
-        """(3,) mean radiance of all escaping pixels; 0 without any."""
+        """Return the mean radiance (3,) of all escaping pixels, 0 without any."""
         return self._sums[:, :3].sum(0) / max(self.pixels, 1)
 
     def groups(self, max_ratio: float = 1.5, max_groups: int = MAX_GROUPS, min_pixels: int = MIN_PIXELS) -> Sky:
-        """Texels that share an unknown radiance: those of similar brightness, saturated ones by themselves, and as the
-        last group all that too few pixels have seen: nothing tells them apart.
+        """Group texels that share an unknown radiance: those of similar brightness, saturated ones apart from the others; all
+        texels that too few pixels have seen are the last group, since nothing tells them apart.
 
-        Args:
-            max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice.
-            min_pixels: of a texel that counts as seen.
+        max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice; min_pixels: of a texel that
+        counts as seen.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
         mean = self._sums[:, :3] / np.maximum(count, 1)[:, None]
@@ -93,11 +93,10 @@ class SkySums:
         return Sky(number.reshape(self.shape).astype(np.int32), pixels.astype(np.int64), radiance, bounded)
 
     def directions(self) -> Sky:
-        """Twelve directions for the outside of a mesh with large openings, all unknown.
+        """Divide the outside of a mesh with large openings into twelve directions, all unknown
+        (docs/method/light.md#open-meshes).
 
-        What lies outside is near then - a ceiling with its lamps, the rest of the room - and lights surfaces from where no camera
-        looks; what a camera sees through an opening says nothing about that. A texel belongs to the nearest of the twelve
-        vertices of an icosahedron; all start at the mean of what was seen.
+        A texel belongs to the nearest of the twelve vertices of an icosahedron; all start at the mean of what was seen.
         """
         golden = (1 + 5**0.5) / 2
         corners = [np.roll([0.0, a, b * golden], i) for i in range(3) for a in (-1, 1) for b in (-1, 1)]
@@ -108,14 +107,14 @@ class SkySums:
 
 
 def texels(directions: np.ndarray, height: int, width: int) -> np.ndarray:
-    """(n,) int index of the texel that each direction (n, 3), of any length > 0, points to."""
+    """Return (n,) int, the texel that each direction (n, 3), of any length > 0, points to."""
     unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
     row, column = texel_of(NUMPY, tuple(unit.astype(np.float64).T), height, width)
     return row.astype(np.int64) * width + column.astype(np.int64)
 
 
 def cosine_directions(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One unit vector (n, 3) a normal (n, 3), with density cos / pi around it."""
+    """Draw one unit vector for each normal (n, 3), with density cos / pi around it."""
     sphere = rng.normal(size=normals.shape)
     sphere /= np.maximum(np.linalg.norm(sphere, axis=1, keepdims=True), 1e-12)
     # A uniform point on the sphere that touches the surface from above is cosine-distributed.

@@ -11,7 +11,7 @@ from iif_core.light.emission.rows import EmissionRows, GlossRows, scale_rows
 
 LEVEL_OF_PRIOR = 0.35
 """Standard deviation of the logarithm of the level that the mean albedo of the base texture gives the light: it is off by
-factors of 1.22, 1.36 and 1.41 on the three scenes with truth (docs/affines.md)."""
+factors of 1.22, 1.36 and 1.41 on the three scenes with truth (docs/method/fitting.md)."""
 SHARED_ERROR = 0.1
 """Error of the logarithm of the level that no object tells from another's: light that geometry, cache and materials lose
 everywhere. The built-in kitchen's light comes out 10 % too dim, 2 % with the true materials."""
@@ -21,7 +21,7 @@ _BOUNDS = (0.1, 10.0)
 _GLOSS_BOUNDS = (0.0, 3.0)
 GLOSS_ROWS = 30.0
 """The predicted strength of an object's gloss is off by 100 %, say, and that is held against this many rows: so many of an object
-may err together (design effects, docs/emission.md)."""
+may err together (design effects, docs/method/light.md)."""
 WHITE_SHARE = 0.03
 """Share of the rows whose objects may come out brighter than white: gloss, and lamps that nobody found."""
 

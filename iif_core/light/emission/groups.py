@@ -1,4 +1,4 @@
-"""Candidate faces in groups that share one unknown radiance (METHOD 8)."""
+"""Candidate faces merged into groups that share one unknown radiance (docs/method/light.md#emitter-groups)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class EmitterGroups:
         of_face: (F,) int32 group of every face, -1 = none.
         side: (F,) int32: +1 shines to the side of the normal, -1 to the other, 0 to both; 0 where `of_face` is -1.
         faces: (G,) int32; area: (G,) m^2; observed: (G, 3) mean observed value, weighted by pixels; count: (G,) pixels.
-        dropped: [(faces, area, reason)] candidates that were left out.
+        dropped: [(faces, area, reason)] groups that were left out.
     """
 
     of_face: np.ndarray
@@ -41,95 +41,112 @@ class EmitterGroups:
         return EmitterGroups(of_face, side, *rows, self.dropped)
 
 
+@dataclass(frozen=True)
+class GroupingOptions:
+    """Which candidates are merged (Eq. L.4), and which groups are kept.
+
+    Attributes:
+        max_angle: degrees between the normals of two groups that are merged.
+        max_ratio: of any channel between the colours of two groups that are merged.
+        small_area: m^2; a connected piece below it is one group whatever its normals (bulbs, shades).
+        min_faces, min_area (m^2): a group needs one of the two.
+        min_observations: pixels that must have seen a group; nothing bounds the radiance of a highlight on one face.
+        max_groups: the strongest groups (area x radiance) are kept.
+    """
+
+    max_angle: float = 15.0
+    max_ratio: float = 1.5
+    small_area: float = SMALL_AREA
+    min_faces: int = 3
+    min_area: float = 1e-4
+    max_groups: int = 64
+    min_observations: int = 8
+
+
 def group_emitters(
     candidate: np.ndarray,
     statistics: FaceStatistics,
     adjacency: np.ndarray,
     normals: np.ndarray,
     areas: np.ndarray,
-    max_angle: float = 15.0,
-    max_ratio: float = 1.5,
-    small_area: float = SMALL_AREA,
-    min_faces: int = 3,
-    min_area: float = 1e-4,
-    max_groups: int = 64,
-    min_observations: int = 8,
+    options: GroupingOptions | None = None,
 ) -> EmitterGroups:
-    """Candidates in groups that share one radiance (METHOD 8): connected, normals within `max_angle`, colours within
-    `max_ratio`, same side. A connected piece below `small_area` is one group whatever its normals (bulbs, shades).
+    """Merge candidates into groups that share one radiance (docs/method/light.md#emitter-groups).
 
-    Merging is greedy from the most similar neighbours on and compares the means of the groups, so that a gradient
-    is cut into steps instead of being chained into one group.
+    Faces of a group are connected, shine to the same side, and have similar normals and colours. Merging is greedy from the
+    most similar neighbours on and compares the means of whole groups, so that a gradient is cut into steps instead of being
+    chained into one group.
 
     Args:
-        candidate: (F,) bool; statistics, adjacency, normals (F, 3), areas (F,): of the same mesh.
-        max_angle: degrees; max_ratio: of any channel between two groups; small_area, min_area: m^2.
-        min_faces, min_area: a group needs one of the two.
-        min_observations: pixels that must have seen a group; a highlight on one face has fewer, and nothing bounds
-            its radiance.
-        max_groups: the strongest (area x radiance) are kept.
-    """
-    n_faces = len(candidate)
-    ids = np.flatnonzero(candidate)
-    side = np.zeros(n_faces, np.int32)
-    front = statistics.front[ids]
-    side[ids] = np.where(front > 0.9, 1, np.where(front < 0.1, -1, 0))
-    # Unseen faces (far sides) follow the majority of what was seen; the normal's side when nothing was.
-    unseen = statistics.count[ids] == 0
-    seen_sides = side[ids[~unseen]]
-    side[ids[unseen]] = (1 if (seen_sides >= 0).mean() >= 0.5 else -1) if len(seen_sides) else 1
+        candidate: (F,) bool.
+        statistics: of the faces of the same mesh.
+        adjacency: (E, 2) pairs of neighbouring faces.
+        normals, areas: (F, 3) unit vectors, and (F,) m^2.
+        options: None = defaults.
 
+    Returns:
+        The groups, strongest first.
+    """
+    options = options or GroupingOptions()
+    ids = np.flatnonzero(candidate)
+    side = _sides(candidate, statistics)
     pair = adjacency[candidate[adjacency[:, 0]] & candidate[adjacency[:, 1]]]
     pair = pair[side[pair[:, 0]] == side[pair[:, 1]]]
-    local = np.full(n_faces, -1, np.int64)
+    local = np.full(len(candidate), -1, np.int64)
     local[ids] = np.arange(len(ids))
     label = components(local[pair], np.ones(len(ids), bool)) if len(ids) else np.zeros(0, np.int64)
     piece_area = np.bincount(label, areas[ids])[label] if len(ids) else np.zeros(0)
     # A face that is always saturated has no colour to compare.
     weight = statistics.clear[ids].astype(np.float64)
     colour = statistics.mean[ids] * weight[:, None]
-    parent = _merge(
-        local[pair],
-        normals[ids],
-        areas[ids],
-        colour,
-        weight,
-        piece_area < small_area,
-        np.cos(np.radians(max_angle)),
-        max_ratio,
-    )
+    small, min_cosine = piece_area < options.small_area, np.cos(np.radians(options.max_angle))
+    parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, min_cosine, options.max_ratio)
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
+    return _strongest(ids, label, side, statistics, areas, options)
+
+
+def _sides(candidate: np.ndarray, statistics: FaceStatistics) -> np.ndarray:
+    """(F,) int32 side to which each candidate shines; unseen ones (far sides) follow the majority of what was seen, or the
+    normal where nothing was."""
+    side, ids = np.zeros(len(candidate), np.int32), np.flatnonzero(candidate)
+    front = statistics.front[ids]
+    side[ids] = np.where(front > 0.9, 1, np.where(front < 0.1, -1, 0))
+    unseen = statistics.count[ids] == 0
+    seen_sides = side[ids[~unseen]]
+    side[ids[unseen]] = (1 if (seen_sides >= 0).mean() >= 0.5 else -1) if len(seen_sides) else 1
+    return side
+
+
+def _strongest(
+    ids: np.ndarray,
+    label: np.ndarray,
+    side: np.ndarray,
+    statistics: FaceStatistics,
+    areas: np.ndarray,
+    options: GroupingOptions,
+) -> EmitterGroups:
+    """The groups that are large enough, seen often enough and strong enough; `label` is the group of each face `ids`."""
     count = np.bincount(label)
     area = np.bincount(label, areas[ids])
     pixels = np.bincount(label, statistics.count[ids])
     observed = np.stack([np.bincount(label, statistics.mean[ids, c] * statistics.count[ids]) for c in range(3)], -1)
     observed = observed / np.maximum(pixels, 1)[:, None]
-    solid = ((count >= min_faces) | (area >= min_area)) & (pixels >= min_observations)
-    power = area * observed.sum(-1)
-    order = np.lexsort((np.arange(len(count)), -power))
-    kept = [g for g in order if solid[g]][:max_groups]
-    dropped = [
-        (
-            int(count[g]),
-            float(area[g]),
-            "too small or hardly seen" if not solid[g] else f"not among the {max_groups} strongest",
-        )
-        for g in order
-        if g not in set(kept)
-    ]
+    solid = ((count >= options.min_faces) | (area >= options.min_area)) & (pixels >= options.min_observations)
+    order = np.lexsort((np.arange(len(count)), -area * observed.sum(-1)))
+    kept = np.array([g for g in order if solid[g]][: options.max_groups], np.int64)
+    reasons = np.where(solid, f"not among the {options.max_groups} strongest", "too small or hardly seen")
+    dropped = [(int(count[g]), float(area[g]), str(reasons[g])) for g in order if g not in set(kept)]
     number = np.full(len(count), -1, np.int64)
     number[kept] = np.arange(len(kept))
-    of_face = np.full(n_faces, -1, np.int32)
+    of_face = np.full(len(side), -1, np.int32)
     of_face[ids] = number[label]
-    side[of_face < 0] = 0
-    kept_index = np.array(kept, np.int64)
     return EmitterGroups(
         of_face,
-        side,
-        count[kept_index].astype(np.int32),
-        area[kept_index],
-        observed[kept_index].astype(np.float64),
-        pixels[kept_index].astype(np.int64),
+        np.where(of_face < 0, 0, side).astype(np.int32),
+        count[kept].astype(np.int32),
+        area[kept],
+        observed[kept].astype(np.float64),
+        pixels[kept].astype(np.int64),
         dropped,
     )
 
@@ -144,7 +161,7 @@ def _merge(
     min_cosine: float,
     max_ratio: float,
 ) -> np.ndarray:
-    """Union-find over neighbouring faces; returns the root of each."""
+    """Union-find over neighbouring faces (Eq. L.4); returns the root of each."""
     n = len(areas)
     parent = np.arange(n)
     normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()

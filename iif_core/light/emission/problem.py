@@ -8,6 +8,7 @@ import numpy as np
 
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.gains import object_gains
+from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import EmissionRows, GlossRows, block_rows, scale_rows
 
@@ -18,24 +19,6 @@ looked at says what it emits; light it sends elsewhere also depends on albedos t
 
 Halves = list[tuple[np.ndarray, np.ndarray]]
 """Two independent estimates of (A (n, G, 3), h (n, 3))."""
-
-
-@dataclass(frozen=True)
-class PixelRows:
-    """The pixels whose transport is traced, n rows.
-
-    Attributes:
-        radiance: (n, 3) linear; bound: (n, 3) bool, `radiance` is a lower bound.
-        object_id, view, tile: (n,) int; pixels that agree in all three are averaged.
-        group: (n,) emitter group that the pixel looks at, -1 = none.
-    """
-
-    radiance: np.ndarray
-    bound: np.ndarray
-    object_id: np.ndarray
-    view: np.ndarray
-    tile: np.ndarray
-    group: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -90,7 +73,7 @@ class EmissionProblem:
 
 
 def assemble(
-    pixels: PixelRows,
+    pixels: EmissionPixels,
     halves: Halves,
     n_groups: int,
     white: Halves | None = None,
@@ -217,7 +200,7 @@ def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
     return replace(rows, weight=weight)
 
 
-def initial_radiance(pixels: PixelRows, observed: np.ndarray, is_hdr: bool) -> np.ndarray:
+def initial_radiance(pixels: EmissionPixels, observed: np.ndarray, is_hdr: bool) -> np.ndarray:
     """(G, 3) mean radiance seen on each group, a high quantile of the bounds where saturated.
 
     Args:
@@ -234,7 +217,7 @@ def initial_radiance(pixels: PixelRows, observed: np.ndarray, is_hdr: bool) -> n
     return out
 
 
-def white_surface(pixels: PixelRows, seen: np.ndarray, white: Halves) -> WhiteSurface:
+def white_surface(pixels: EmissionPixels, seen: np.ndarray, white: Halves) -> WhiteSurface:
     """Means over the pixels of each group of what they would show if they were white.
 
     Args:

@@ -1,4 +1,4 @@
-"""From photographs to radiance, with what saturation leaves unknown."""
+"""Radiance of photographs, and where it is only a lower bound (docs/method/light.md#radiance-and-bounds)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Sensor:
     saturation: float
 
     def radiance(self, value: np.ndarray, exposure: float) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 3) linear radiance f^-1(I) / e and (n, 3) bool: only a lower bound (METHOD H30)."""
+        """Return (n, 3) linear radiance f^-1(I) / exposure, and (n, 3) bool where it is only a lower bound (Eq. L.1)."""
         if self.is_hdr:
             return np.maximum(value, 0.0), np.zeros(value.shape, bool)
         bound = value >= self.saturation

@@ -1,8 +1,8 @@
-"""Moving arrays between NumPy and the device, and cutting work into lanes with a random stream each.
+"""Arrays between NumPy and the device, checks of their shapes, and work cut into lanes with a random stream each.
 
-A lane owns a few samples of one point and adds them up itself; the lanes of a point are added in a fixed
-order. How a point is cut depends on the number of samples alone, so its result does not depend on its
-neighbours, on the chunks or on the threads.
+A lane computes a few samples of one point and adds them up itself; the lanes of a point are added in a fixed order. How a
+point is cut depends on the number of samples alone, so its result does not depend on its neighbours, on the chunks or on the
+threads.
 """
 
 from __future__ import annotations
@@ -46,7 +46,20 @@ def to_numpy(value: Any) -> Array:
 
 
 def rows_of(value: ArrayLike, count: int, width: int | None, name: str) -> Array:
-    """`value` as float32 of shape (count, width) (or (count,) for width None), checked to be finite."""
+    """Convert to float32 and check the shape.
+
+    Args:
+        value: array of any type.
+        count: rows that are expected.
+        width: columns that are expected; None = a plain vector.
+        name: what a message calls it.
+
+    Returns:
+        (count, width) or (count,) float32, finite.
+
+    Raises:
+        InputError: another shape, or non-finite numbers.
+    """
     shape = (count,) if width is None else (count, width)
     value = np.asarray(value, np.float32)
     if value.shape != shape:
@@ -56,9 +69,26 @@ def rows_of(value: ArrayLike, count: int, width: int | None, name: str) -> Array
     return value
 
 
+def _unit_rows(rows: Array, name: str) -> Array:
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    if not (length > 0).all():
+        raise InputError(f"{name} contains a zero vector")
+    return rows / length
+
+
+def checked_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tuple[Array, Array, Array]:
+    """Check points and directions; return points, unit normals on the viewer's side and unit `wo`, each (n, 3) float32."""
+    points = np.asarray(points, np.float32)
+    count = len(points)
+    points = rows_of(points, count, 3, "points")
+    normals = _unit_rows(rows_of(normals, count, 3, "normals"), "normals")
+    wo = _unit_rows(rows_of(wo, count, 3, "wo"), "wo")
+    away = np.einsum("ij,ij->i", normals, wo) < 0
+    return points, np.where(away[:, None], -normals, normals), wo
+
+
 SAMPLES_PER_LANE = 8
-"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough that the start-up is
-paid off."""
+"""Few enough that one view fills many cores (Dr.Jit gives a thread 16384 lanes), enough to outweigh the start of a lane."""
 
 LANES = 1 << 18
 """Lanes on the device at once, unless their results would need more than DEVICE_FLOATS."""
@@ -69,8 +99,7 @@ DEVICE_FLOATS = 1 << 26
 
 @dataclass(frozen=True)
 class Batch:
-    """Points `part` of the caller's arrays, each worked on by `split` neighbouring lanes, numbered from
-    `first_lane`."""
+    """Points `part` of the caller's arrays; `split` neighbouring lanes work on each, numbered from `first_lane`."""
 
     part: slice
     split: int
@@ -81,8 +110,7 @@ class Batch:
         return (self.part.stop - self.part.start) * self.split
 
     def spread(self, kind: Any, rows: Array) -> Any:
-        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes
-        of a point."""
+        """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes of a point."""
         rows = rows[self.part]
         columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
         parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
@@ -100,7 +128,8 @@ class Batch:
         return to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums)
 
     def streams(self, seed: int) -> Any:
-        """One PCG32 stream a lane, a function of (seed, lane number) alone. The seed is any integer >= 0."""
+        """One PCG32 stream per lane, hashed from seed (any integer >= 0) and lane number
+        (docs/method/numerics.md#correlated-random-streams)."""
         words = np.random.SeedSequence(seed).generate_state(4)
         lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
         a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
@@ -109,7 +138,20 @@ class Batch:
 
 
 def batches(points: int, samples: int, floats_per_lane: int, lanes: int | None = None) -> Iterator[Batch]:
-    """Cuts `points` x `samples` into batches of at most `lanes` lanes (at least one point)."""
+    """Cut work into batches that fit on the device.
+
+    Args:
+        points: number of points.
+        samples: paths for each.
+        floats_per_lane: entries of the result of a lane.
+        lanes: lanes at once; None = `LANES`, fewer where results would exceed `DEVICE_FLOATS`.
+
+    Yields:
+        Batches of consecutive points, at least one point each.
+
+    Raises:
+        InputError: 2^32 lanes or more (docs/method/numerics.md#more-samples-than-a-launch-can-number).
+    """
     split = -(-samples // SAMPLES_PER_LANE)
     if points * split >= 1 << 32:
         raise InputError(f"{points} points with {samples} samples are too many for one call; call with fewer points")

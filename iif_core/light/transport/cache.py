@@ -1,5 +1,4 @@
-"""Voxel tables on the device: the hash lookup shared by cell materials and the radiance cache, and that
-cache."""
+"""Voxel tables on the device: the hash lookup that cell materials and the radiance cache share, and that cache."""
 
 from __future__ import annotations
 
@@ -18,8 +17,7 @@ Array = np.ndarray
 
 
 class VoxelRows:
-    """Device copy of a `CellTable` with its grid: from a point (and an object id) to a row of the caller's
-    table."""
+    """Device copy of a `CellTable` with its grid: maps a point (and an object id) to a row of the caller's table."""
 
     def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, object_id: ArrayLike):
         self.table = CellTable.build(pack_keys(ijk, object_id))
@@ -49,11 +47,20 @@ class VoxelRows:
 
 
 class RadianceCache:
-    """Diffuse outgoing radiance on a voxel grid: what a path takes over instead of bouncing on.
+    """Diffuse outgoing radiance on a voxel grid, with which a path ends instead of bouncing on
+    (docs/method/light.md#radiance-cache).
 
-    `ijk` (n, 3) voxel indices from `cells.voxel_indices(points, edge, origin)`, `radiance` (n, 3) linear, >=
-    0. A voxel in the table with radiance 0 is a black surface; a voxel not in the table is a miss and the
-    path goes on (METHOD H27).
+    A voxel in the table with radiance 0 is a black surface; a voxel that is not in the table is unknown, and the path goes on
+    (docs/method/numerics.md#empty-voxels-of-the-radiance-cache).
+
+    Args:
+        edge: of a voxel, metres.
+        origin: (3,) corner of voxel (0, 0, 0).
+        ijk: (n, 3) from `cells.voxel_indices(points, edge, origin)`.
+        radiance: (n, 3) linear, >= 0.
+
+    Raises:
+        InputError: wrong shapes, non-finite or negative radiance.
     """
 
     def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, radiance: ArrayLike):

@@ -1,4 +1,5 @@
-"""Emitters: radiance per face and of the environment, and drawing points or directions with an exactly known density."""
+"""Emitters: radiance of faces and of the environment, and points or directions drawn with an exactly known density
+(docs/method/light.md#drawing-emitters)."""
 
 from __future__ import annotations
 
@@ -17,23 +18,30 @@ from iif_core.numerics.xp import DRJIT
 
 Array = np.ndarray
 
-MIN_SLOTS = 4096
+MIN_SLOTS = 4096  # entries of the table from which emitters are drawn, at least
 
 SHARE_LIMITS = (0.1, 0.5)
-"""Bounds of the environment's share of the draws beside emitting faces: neither is starved by a bad guess of its
-power."""
+"""Bounds of the environment's share of the draws beside emitting faces, so that a wrong guess of its power starves neither."""
 
 
 class Emitters:
-    """Emitting faces of one geometry and the light around it.
+    """Emitting faces of one geometry and the light around it. Emitting faces reflect too, with whatever the material says.
 
-    radiance (m, 3) per face, linear, >= 0; side (m,) int8: +1 the side of the right-hand normal emits, -1 the
-    other, 0 both (default 0); environment (3,) or (H, W, 3): radiance of escaping rays, a map as in
-    `iif_core.light.environment`; sampling_weight (m,) >= 0: how often a face is drawn (default area x mean radiance);
-    environment_weight (H, W) >= 0 likewise (default solid angle x mean radiance; a map of one texel is never drawn, since
-    directions of the BRDF find it as well); environment_share: of all draws, where both are drawn (default by power). A face
-    or texel with weight 0 is still found by directions that hit it; those with a positive weight and unknown radiance 0 may
-    be candidates. Emitting faces reflect too, with whatever the material says.
+    A face or texel of weight 0 is never drawn and still found by directions that hit it; one of positive weight and radiance 0
+    is drawn as well, for a radiance that is not known yet.
+
+    Args:
+        geometry: mesh of m faces.
+        radiance: (m, 3) linear, >= 0.
+        side: (m,) int8: +1 the side of the right-hand normal emits, -1 the other, 0 both; None = 0.
+        environment: radiance of escaping rays, (3,) or a map (H, W, 3) as in `iif_core.light.environment`.
+        sampling_weight: (m,) >= 0, how often a face is drawn; None = area x mean radiance.
+        environment_weight: (H, W) >= 0, how often a texel is drawn; None = solid angle x mean radiance. A map of one texel is
+            never drawn, since directions of the BRDF find it as well.
+        environment_share: of all draws, where faces and texels are drawn; None = by power (Eq. L.9).
+
+    Raises:
+        InputError: wrong shapes, negative radiance or weights, unknown sides.
     """
 
     def __init__(
@@ -85,14 +93,14 @@ class Emitters:
         self._texels = table(np.concatenate([self.environment, self.pdf_sky[..., None]], -1))
 
     def texel(self, texel: Any, active: Any) -> tuple[Any, Any]:
-        """(radiance, density per steradian) of a texel, row x W + column; density 0 where it is never drawn."""
+        """Return (radiance, density per steradian) of a texel, row x W + column; density 0 where it is never drawn."""
         if self.environment.shape[:2] == (1, 1):
             return mi.Color3f(*self._constant), mi.Float(0)
         record = dr.gather(mi.Vector4f, self._texels, texel, active)
         return mi.Color3f(record.x, record.y, record.z), record.w
 
     def texel_along(self, direction: Any) -> Any:
-        """Texel that a unit direction escapes into."""
+        """Return the texel that a unit direction escapes into."""
         height, width = self.environment.shape[:2]
         if height * width == 1:
             return mi.UInt32(0)
@@ -100,15 +108,14 @@ class Emitters:
         return mi.UInt32(row) * width + mi.UInt32(column)
 
     def direction_to(self, texel: Any, u1: Any, u2: Any) -> Any:
-        """Unit direction drawn in a texel with the density that `texel` reports."""
+        """Draw a unit direction in a texel with the density that `texel` reports."""
         height, width = self.environment.shape[:2]
         return mi.Vector3f(*direction_in(DRJIT, mi.Float(texel // width), mi.Float(texel % width), u1, u2, height, width))
 
     def surface(self, face: Any, cos_front: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """(radiance, area density, emits, is_emitter) of a face seen under the cosine `cos_front` to its
-        right-hand normal.
+        """Return (radiance, area density, emits, is_emitter) of a face seen under `cos_front`, the cosine to its normal.
 
-        `emits`: the side that is seen is a radiating one; `is_emitter`: the face is one at all.
+        `emits`: the side that is seen radiates; `is_emitter`: some side does.
         """
         record = dr.gather(mi.Vector4f, self._radiance_pdf, face, active)
         is_emitter = active & ((record.w > 0) | (dr.maximum(dr.maximum(record.x, record.y), record.z) > 0))
@@ -119,7 +126,7 @@ class Emitters:
         return mi.Color3f(record.x, record.y, record.z), record.w, emits, is_emitter
 
     def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(face, on_sky, texel) drawn with the densities that `surface` and `texel` report, from a uniform u in [0, 1)."""
+        """Draw (face, on_sky, texel) with the densities that `surface` and `texel` report, from a uniform u in [0, 1)."""
         count = len(self.slots)
         slot = dr.minimum(mi.UInt32(u * count), count - 1)
         drawn = dr.gather(mi.UInt32, self._slots, slot, active)
@@ -130,11 +137,9 @@ class Emitters:
 
 
 def share_of_environment(geometry: Geometry, power: float, sky: float) -> float:
-    """Share of the draws that the environment deserves beside emitting faces, by the light that each gives to surfaces.
+    """Choose the share of draws for the environment beside emitting faces, by the light that each gives to surfaces (Eq. L.9).
 
-    power: sum of area x mean radiance of the faces; sky: mean radiance over all directions. By reciprocity the
-    environment gives surfaces of area A, from which a share s of cosine-distributed rays escapes, A s x sky, in the same
-    units. Clipped to SHARE_LIMITS.
+    power: sum of area x mean radiance of the faces; sky: mean radiance over all directions. Clipped to SHARE_LIMITS.
     """
     outside = geometry.areas.sum() * _escape_share(geometry) * sky
     total = outside + power
@@ -194,8 +199,7 @@ def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
     """(slots uint32, pdf (m,) float32): item of every slot and count / slots / measure, the density of one draw.
 
     Each item of positive weight owns at least one slot; the rest follow the weights by largest remainder,
-    ties to the lower id. A table replaces the search in a cumulative sum: one read, no rounding at its
-    ends (METHOD H22).
+    ties to the lower id (Eq. L.8; docs/method/numerics.md#searching-a-cumulative-sum).
     """
     pdf = np.zeros(len(weight), np.float32)
     items = np.flatnonzero(weight > 0)

@@ -16,18 +16,19 @@ from iif_core.light.transport.arrays import chunks, table, to_numpy, vectors
 Array = np.ndarray
 
 MIN_AREA = 1e-12
-"""Faces below this area (m^2) count as degenerate: never hit, never sampled, given a unit normal (METHOD
-H48)."""
+"""Faces below this area (m^2) are degenerate: never hit, never drawn, with an arbitrary unit normal
+(docs/method/numerics.md#degenerate-faces)."""
 
 NO_FACE = -1
 
 
 class Geometry:
-    """One merged mesh ready for ray tracing. Made by `build_geometry`; not a Dr.Jit struct, so kernels leave
-    it alone.
+    """One merged mesh, ready for ray tracing; made by `build_geometry`. Not a Dr.Jit struct, so kernels do not carry it as state.
 
-    vertices (n, 3) float32, faces (m, 3) int32, object_id (m,) int32, normals (m, 3) float32 unit right-hand
-    normals (finite for degenerate faces too), areas (m,) float64 in m^2 with 0 for degenerate faces.
+    Attributes:
+        vertices: (n, 3) float32 metres; faces: (m, 3) int32; object_id: (m,) int32.
+        normals: (m, 3) float32 unit right-hand normals, finite for degenerate faces too.
+        areas: (m,) float64 m^2, 0 for degenerate faces.
     """
 
     def __init__(self, vertices: Array, faces: Array, object_id: Array):
@@ -62,7 +63,15 @@ class Geometry:
         return mi.Vector3f(record.x, record.y, record.z), dr.reinterpret_array(mi.Int32, record.w)
 
     def point_on_face(self, face: Any, b1: Any, b2: Any, active: Any) -> Any:
-        """v0 + b1 (v1 - v0) + b2 (v2 - v0)."""
+        """Return v0 + b1 (v1 - v0) + b2 (v2 - v0).
+
+        Args:
+            face, active: ids, and lanes that need a point.
+            b1, b2: barycentric coordinates of the second and the third corner.
+
+        Returns:
+            Point3f, metres.
+        """
         v0 = dr.gather(mi.Vector4f, self._corner, face, active)
         e1 = dr.gather(mi.Vector4f, self._edge1, face, active)
         e2 = dr.gather(mi.Vector4f, self._edge2, face, active)
@@ -79,7 +88,15 @@ class Geometry:
         return hit, face, found.t
 
     def occluded(self, origin: Any, direction: Any, distance: Any, active: Any) -> Any:
-        """Whether something lies on origin + t direction for 0 < t < distance (direction of unit length)."""
+        """Test for anything between two points.
+
+        Args:
+            origin, direction: start of the ray and unit direction.
+            distance, active: metres up to which something counts, and lanes that need the answer.
+
+        Returns:
+            Bool, true where something lies on origin + t direction with 0 < t < distance.
+        """
         return self.scene.ray_test(mi.Ray3f(origin, direction, distance, 0.0, mi.Color0f()), coherent=False, active=active)
 
 
@@ -88,10 +105,10 @@ def _padded(rows: Array) -> Array:
 
 
 def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) -> Geometry:
-    """Merged mesh from vertices (n, 3) metres, faces (m, 3) vertex ids and object_id (m,) (-1 = none).
+    """Build a mesh from vertices (n, 3) metres, faces (m, 3) vertex ids and object_id (m,) (-1 = none).
 
-    Degenerate faces keep their id and are never hit. Raises InputError for wrong shapes, ids out of range,
-    non-finite vertices or a mesh without surface.
+    Degenerate faces keep their id and are never hit. Raises InputError for wrong shapes, ids out of range, non-finite vertices
+    or a mesh without surface.
     """
     vertices = np.ascontiguousarray(vertices, np.float32)
     faces = np.ascontiguousarray(faces, np.int32)
@@ -110,16 +127,15 @@ def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) 
 
 
 def offset_from(point: Any, normal: Any) -> Any:
-    """Point moved off the surface along the viewer's normal by max(1e-4, 3e-6 |x|_inf) metres (METHOD
-    H24)."""
+    """Move a point off the surface along the viewer's normal by max(1e-4, 3e-6 |x|_inf) metres (Eq. S.12,
+    docs/method/numerics.md#self-intersection)."""
     reach = dr.maximum(dr.maximum(dr.abs(point.x), dr.abs(point.y)), dr.abs(point.z))
     return mi.Point3f(dr.fma(normal, dr.maximum(1e-4, 3e-6 * reach), point))
 
 
 @dataclass
 class Hit:
-    """One nearest intersection on the device: `normal` is the right-hand normal, `t` in units of the
-    direction."""
+    """A nearest intersection on the device: `normal` is the right-hand normal, `t` counts lengths of the direction."""
 
     valid: Any
     face: Any
@@ -130,14 +146,23 @@ class Hit:
 
 
 def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any) -> Hit:
-    """Nearest intersection with everything a path vertex needs to know about it."""
+    """Intersect rays with the mesh.
+
+    Args:
+        geometry: the mesh.
+        origin, direction: Point3f in metres, and Vector3f of any length above 0.
+        active: lanes that have a ray.
+
+    Returns:
+        Everything that a path needs to know about the nearest intersection.
+    """
     valid, face, t = geometry.intersect(origin, direction, active)
     normal, object_id = geometry.normal_and_object(face, valid)
     return Hit(valid, face, object_id, mi.Point3f(dr.fma(direction, t, origin)), normal, t)
 
 
 def cosine_directions(normals: ArrayLike, rng: np.random.Generator) -> Array:
-    """(n, 3) float64 directions around unit normals (n, 3), density cos / pi per steradian; not of unit length."""
+    """Draw one direction (n, 3) float64 around each unit normal (n, 3), of density cos / pi per steradian; not of unit length."""
     normals = np.asarray(normals, np.float64)
     ball = rng.normal(size=normals.shape)
     # A uniform point on the sphere that touches the surface from above is cosine-distributed.
@@ -145,11 +170,16 @@ def cosine_directions(normals: ArrayLike, rng: np.random.Generator) -> Array:
 
 
 def trace(geometry: Geometry, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20) -> tuple[Array, Array]:
-    """(face_id int32 with -1 = miss, t float32 with inf = miss) of the nearest face along origin + t
-    direction.
+    """Find the nearest face along rays; both sides of a face are hit.
 
-    origins (n, 3) or (3,), directions (n, 3), not necessarily of unit length: t counts directions, so with
-    `camera.pixel_directions` it is the z-depth. Both sides of a face are hit.
+    Args:
+        geometry: the mesh.
+        origins, directions: (n, 3) or (3,) metres, and (n, 3) of any length above 0.
+        chunk: rays on the device at once.
+
+    Returns:
+        Face (n,) int32, -1 = miss, and distance (n,) float32 in lengths of the direction, inf = miss. With
+        `pinhole.pixel_directions` the distance is the z-depth.
     """
     directions = np.asarray(directions, np.float32).reshape(-1, 3)
     origins = np.broadcast_to(np.asarray(origins, np.float32), directions.shape)

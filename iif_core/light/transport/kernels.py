@@ -1,9 +1,9 @@
-"""The path tracer itself: one vertex, one loop. Everything here works on device types inside a kernel.
+"""One path: its vertices, the light that is drawn at them, and the loop that follows it (docs/method/shading.md#paths).
 
-Directions are of unit length, `wo` points to where the light goes, `wi` to where it comes from. Surfaces are
-double-sided. A vertex is lit twice, by a point drawn on an emitter and by the direction in which the path
-goes on, and the two are weighted with the power heuristic, both densities per solid angle (METHOD 2.5; the
-measure mix-up named there is avoided).
+Everything here works on device types inside a kernel. Directions have unit length; `wo` points to where the light goes, `wi`
+to where it comes from. Surfaces reflect on both sides. Every vertex is lit twice, by a point drawn on an emitter and by the
+direction in which the path continues; the two are weighted with the power heuristic (Eq. S.6), both densities per solid angle
+(docs/method/numerics.md#densities-in-two-measures).
 """
 
 from __future__ import annotations
@@ -14,81 +14,107 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from iif_core.light.transport.cache import RadianceCache
-from iif_core.light.transport.emitters import Emitters
-from iif_core.light.transport.geometry import Geometry, nearest_hit, offset_from
+from iif_core.light.transport.geometry import nearest_hit, offset_from
+from iif_core.light.transport.scene import Scene
 from iif_core.numerics.xp import DRJIT
 from iif_core.reflectance import brdf
 
-ROULETTE_START = 4
-ROULETTE_LIMIT = 0.95
+ROULETTE_START = 4  # interactions after which a path may end by chance
+ROULETTE_LIMIT = 0.95  # highest probability of survival
 
 
 class World:
-    """What a path meets: not a Dr.Jit struct on purpose, so that loops do not carry its tables as state."""
+    """A scene and a collector for kernels; not a Dr.Jit struct on purpose, so that loops do not carry its tables as state."""
 
-    def __init__(
-        self,
-        geometry: Geometry,
-        material: Any,
-        emitters: Emitters,
-        cache: RadianceCache | None,
-        collector: Any,
-    ):
-        self.geometry, self.material, self.emitters = geometry, material, emitters
-        self.cache, self.collector = cache, collector
+    def __init__(self, scene: Scene, collector: Any):
+        self.geometry, self.material, self.emitters, self.cache = scene
+        self.collector = collector
 
 
 class RadianceCollector:
-    """Adds up radiance. A collector says what a path gains by reaching an emitter; kernels are otherwise the
-    same."""
+    """Adds up radiance. A collector says what a path gains by reaching an emitter; kernels are otherwise the same."""
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
-        """Gain of reaching `face` of the given radiance with path weight `weight` (Color3f)."""
+        """Return what a path gains on reaching an emitting face.
+
+        Args:
+            face: id of the face.
+            radiance: its radiance towards the path.
+            weight: Color3f, throughput of the path times the weight of multiple importance sampling.
+            active: where the face is reached.
+
+        Returns:
+            Color3f, 0 where not active.
+        """
         return dr.select(active, weight * radiance, 0)
 
     def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
-        """Gain of leaving the scene through `texel` of the environment."""
+        """Return what a path gains on leaving the scene through `texel` (row x W + column).
+
+        Args:
+            texel, radiance, weight, active: as in `emitter`.
+
+        Returns:
+            Color3f, 0 where not active.
+        """
         return dr.select(active, weight * radiance, 0)
 
 
+@dataclass
+class Vertex:
+    """A shaded point of a path: `point` already lies off the surface (`offset_from`), `normal` is on the side of `wo`."""
+
+    point: Any
+    normal: Any
+    wo: Any
+    kd: Any
+    ks: Any
+    roughness: Any
+
+
 def power_weight(p: Any, q: Any) -> Any:
-    """p^2 / (p^2 + q^2) as 1 / (1 + (q/p)^2): no overflow of the squares, p = inf gives 1, p = 0 gives 0
-    (METHOD H16, H56)."""
+    """Return p^2 / (p^2 + q^2) as 1 / (1 + (q/p)^2), Eq. S.6; p = inf gives 1, p = 0 gives 0
+    (docs/method/numerics.md#squared-densities)."""
     ratio = q / p
     return dr.select(p > 0, 1 / dr.fma(ratio, ratio, 1), 0)
 
 
 def uniform(rng: Any) -> Any:
-    """Uniform in [0, 1 - 2^-24] (METHOD H55)."""
+    """Draw uniformly from [0, 1 - 2^-24] (docs/method/numerics.md#random-numbers-equal-to-one)."""
     return dr.minimum(rng.next_float32(), 1 - 2**-24)
 
 
 def to_world(local: tuple[Any, Any, Any], normal: Any) -> Any:
-    """Local vector (z = normal) in world axes; the frame is Duff et al.'s branch-free one."""
+    """Turn a local vector (z = normal) into world axes, with the branch-free frame of Duff et al. (2017)."""
     tangent, bitangent = mi.coordinate_system(normal)
     return mi.Vector3f(tangent * local[0] + bitangent * local[1] + normal * local[2])
 
 
-def specular_chance(kd: Any, ks: Any, normal: Any, wo: Any) -> Any:
-    """Probability with which a path at this vertex goes on in the GGX lobe."""
-    return brdf.specular_chance(DRJIT, dr.max(kd), dr.max(ks), dr.dot(normal, wo))
+def _specular_chance(vertex: Vertex) -> Any:
+    """Probability with which a path continues in the GGX lobe (Eq. R.12)."""
+    return brdf.specular_chance(DRJIT, dr.max(vertex.kd), dr.max(vertex.ks), dr.dot(vertex.normal, vertex.wo))
 
 
-def evaluate(wi: Any, wo: Any, normal: Any, roughness: Any, chance: Any) -> tuple[Any, Any, Any, Any]:
-    """(diffuse, spec, fc, mixture density) of one pair of directions."""
-    NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, normal, wi, wo)
-    diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, roughness)
-    return diffuse, spec, fc, brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, roughness, chance)
-
-
-def reflectance(kd: Any, ks: Any, diffuse: Any, spec: Any, fc: Any) -> Any:
-    """f cos (Color3f) from the lobes of one direction."""
-    return brdf.compose(kd, ks, diffuse, spec * (1 - fc), spec * fc)
+def _evaluate(vertex: Vertex, wi: Any, chance: Any) -> tuple[Any, Any, Any]:
+    """(diffuse f cos, specular f cos, mixture density) of light from `wi`."""
+    NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, vertex.normal, wi, vertex.wo)
+    diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, vertex.roughness)
+    pdf = brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, vertex.roughness, chance)
+    return vertex.kd * diffuse, brdf.compose(0, vertex.ks, 0, spec * (1 - fc), spec * fc), pdf
 
 
 def sample_lobe(choose_specular: Any, u1: Any, u2: Any, wo: Any, normal: Any, roughness: Any) -> Any:
-    """Direction from the GGX lobe where asked, else from the cosine lobe; it may lie below the surface."""
+    """Draw a direction from the GGX lobe or from the cosine lobe.
+
+    Args:
+        choose_specular: where the GGX lobe is wanted.
+        u1, u2: uniform in [0, 1).
+        wo, normal: unit direction to the viewer, unit normal on its side.
+        roughness: of the GGX lobe.
+
+    Returns:
+        Unit direction, possibly below the surface.
+    """
     half = to_world(brdf.sample_ggx_half(DRJIT, u1, u2, roughness), normal)
     mirrored = dr.normalize(mi.Vector3f(*brdf.reflect(wo, half)))
     return dr.select(choose_specular, mirrored, to_world(brdf.sample_cosine(DRJIT, u1, u2), normal))
@@ -96,8 +122,10 @@ def sample_lobe(choose_specular: Any, u1: Any, u2: Any, wo: Any, normal: Any, ro
 
 @dataclass
 class LightSample:
-    """A point drawn on an emitter, or a direction to the environment (`on_sky`): `valid` = visible and radiating this
-    way; `pdf` per solid angle at the receiver."""
+    """A point drawn on an emitter, or a direction to the environment (`on_sky`).
+
+    `valid`: it is visible and radiates this way; `pdf`: density per solid angle at the receiver (Eq. S.5).
+    """
 
     valid: Any
     face: Any
@@ -108,7 +136,7 @@ class LightSample:
     pdf: Any
 
     def gain(self, world: World, weight: Any) -> Any:
-        """What the collector makes of it, for a path of the given weight (Color3f)."""
+        """Return what a path of the given weight (Color3f) gains by it."""
         if not world.emitters.sky_is_sampled:
             return world.collector.emitter(self.face, self.radiance, weight, self.valid)
         gain = world.collector.emitter(self.face, self.radiance, weight, self.valid & ~self.on_sky)
@@ -116,7 +144,17 @@ class LightSample:
 
 
 def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -> LightSample:
-    """Next-event estimation from `point`, which already lies off the surface (see `offset_from`)."""
+    """Draw a point on an emitter or a direction to the environment and test whether it is visible.
+
+    Args:
+        world: what the shadow ray can meet.
+        rng: random stream of the lane.
+        point, normal: receiver, already off the surface (`offset_from`), and its unit normal on the side of the viewer.
+        active: lanes that need a sample.
+
+    Returns:
+        The sample.
+    """
     emitters, geometry = world.emitters, world.geometry
     u0, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
     face, on_sky, texel = emitters.sample(u0, active)
@@ -131,7 +169,7 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     radiance, pdf_area, emits, _ = emitters.surface(face, cos_front, active)
     pdf = pdf_area * distance2 / dr.abs(cos_front)
     valid = emits & (dr.abs(cos_front) > 1e-7)
-    # Up to 1e-3 of the distance in front of the emitter counts as the emitter (METHOD H23).
+    # Up to 1e-3 of the distance in front of the emitter counts as the emitter: numerics.md#visibility-of-a-light.
     reach = distance * (1 - 1e-3)
     if emitters.sky_is_sampled:
         sky, sky_pdf = emitters.texel(texel, active & on_sky)
@@ -143,63 +181,51 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
     return LightSample(valid, face, on_sky, texel, radiance, wi, pdf)
 
 
-def light_by_lobe(
-    world: World, rng: Any, point: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
-) -> tuple[LightSample, Any, Any]:
-    """(sample, diffuse weight, specular weight) of next-event estimation at a vertex."""
-    light = sample_light(world, rng, point, normal, active)
-    diffuse, spec, fc, pdf = evaluate(light.wi, wo, normal, roughness, specular_chance(kd, ks, normal, wo))
+def light_by_lobe(world: World, rng: Any, vertex: Vertex, active: Any) -> tuple[LightSample, Any, Any]:
+    """Estimate direct light by drawing a point on an emitter.
+
+    Args:
+        world: what the shadow ray can meet.
+        rng: random stream of the lane.
+        vertex: the shaded point.
+        active: lanes that need a sample.
+
+    Returns:
+        The sample and its weights f cos w / pdf (Color3f) in the diffuse and in the specular lobe.
+    """
+    light = sample_light(world, rng, vertex.point, vertex.normal, active)
+    diffuse, specular, pdf = _evaluate(vertex, light.wi, _specular_chance(vertex))
     share = dr.select(light.valid, power_weight(light.pdf, pdf) / light.pdf, 0)
-    return light, kd * diffuse * share, reflectance(0, ks, 0, spec, fc) * share
+    return light, diffuse * share, specular * share
 
 
-def direct_light(
-    world: World,
-    rng: Any,
-    point: Any,
-    normal: Any,
-    wo: Any,
-    kd: Any,
-    ks: Any,
-    roughness: Any,
-    weight: Any,
-    active: Any,
-) -> Any:
-    """Gain of next-event estimation at a vertex whose path weight so far is `weight`."""
+def _direct_light(world: World, rng: Any, vertex: Vertex, weight: Any, active: Any) -> Any:
+    """Gain of a point drawn on an emitter, at a vertex of a path with throughput `weight`."""
     if not world.emitters.can_be_sampled:
         return mi.Color3f(0)
-    light, diffuse, specular = light_by_lobe(world, rng, point, normal, wo, kd, ks, roughness, active)
+    light, diffuse, specular = light_by_lobe(world, rng, vertex, active)
     return light.gain(world, weight * (diffuse + specular))
 
 
-def scatter_by_lobe(
-    rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any
-) -> tuple[Any, Any, Any, Any, Any]:
-    """(goes_on, wi, diffuse f cos / pdf, specular f cos / pdf, pdf): the direction in which a path continues."""
+def scatter_by_lobe(rng: Any, vertex: Vertex, active: Any) -> tuple[Any, Any, Any, Any, Any]:
+    """Draw the direction in which a path continues: (goes_on, wi, diffuse f cos / pdf, specular f cos / pdf, pdf)."""
     choice, u1, u2 = uniform(rng), uniform(rng), uniform(rng)
-    chance = specular_chance(kd, ks, normal, wo)
-    wi = sample_lobe(choice < chance, u1, u2, wo, normal, roughness)
-    diffuse, spec, fc, pdf = evaluate(wi, wo, normal, roughness, chance)
-    goes_on = active & (dr.dot(normal, wi) > 0) & (pdf > 0)
-    lobes = kd * diffuse / pdf, reflectance(0, ks, 0, spec, fc) / pdf
-    return goes_on, wi, *(dr.select(goes_on, lobe, 0) for lobe in lobes), pdf
+    chance = _specular_chance(vertex)
+    wi = sample_lobe(choice < chance, u1, u2, vertex.wo, vertex.normal, vertex.roughness)
+    diffuse, specular, pdf = _evaluate(vertex, wi, chance)
+    goes_on = active & (dr.dot(vertex.normal, wi) > 0) & (pdf > 0)
+    return goes_on, wi, *(dr.select(goes_on, lobe / pdf, 0) for lobe in (diffuse, specular)), pdf
 
 
-def scatter(rng: Any, normal: Any, wo: Any, kd: Any, ks: Any, roughness: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-    """(goes_on, wi, f cos / pdf, pdf): the direction in which a path continues."""
-    goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, normal, wo, kd, ks, roughness, active)
-    return goes_on, wi, diffuse + specular, pdf
-
-
-def roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
-    """(survives, 1 / survival probability) from the fourth bounce on; before that everyone survives."""
+def _roulette(rng: Any, bounce: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
+    """Russian roulette (Eq. S.11): (survives, 1 / survival probability); before `ROULETTE_START` every path survives."""
     chance = dr.minimum(dr.max(throughput), ROULETTE_LIMIT)
     chance = dr.select(bounce >= ROULETTE_START, chance, 1)
     survives = active & (uniform(rng) < chance) & (dr.max(throughput) > 0)
     return survives, dr.select(survives, 1 / chance, 0)
 
 
-def take_from_cache(world: World, point: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
+def _take_from_cache(world: World, point: Any, throughput: Any, active: Any) -> tuple[Any, Any]:
     """(found, gain) of ending the path with the cached radiance."""
     if world.cache is None or world.cache.count == 0:
         return mi.Bool(False), mi.Color3f(0)
@@ -219,13 +245,22 @@ def incoming(
     active: Any,
     throughput: Any = 1.0,
 ) -> tuple[Any, Any]:
-    """(gain, rng) along `direction` from `origin`: radiance times `throughput`, when the collector collects
-    radiance.
+    """Follow a path and return what it gains (Eq. S.10): radiance times throughput where radiance is collected.
 
-    `pdf` is the density with which the direction was drawn where emitters were sampled as well, inf where
-    they were not; `bounce` counts the surface interactions so far. The path ends at the environment, in the
-    radiance cache (only for bounce >= 1 and never on an emitting face), after `max_bounces` interactions, or
+    The path ends at the environment, in the radiance cache (never on an emitting face), after `max_bounces` interactions, or
     by Russian roulette.
+
+    Args:
+        world: what the path can meet.
+        rng: random stream of the lane.
+        origin, direction: start, off the surface, and unit direction.
+        pdf: density per solid angle with which the direction was drawn where emitters are drawn as well, inf elsewhere.
+        bounce, max_bounces: surface interactions so far (at 0 the cache is not asked), and the most.
+        active: lanes that have a path.
+        throughput: of the path so far.
+
+    Returns:
+        Gain (Color3f) and the random stream.
     """
     gain = mi.Color3f(0)
     throughput = mi.Color3f(throughput)
@@ -244,19 +279,19 @@ def incoming(
         radiance, pdf_area, emits, is_emitter = world.emitters.surface(hit.face, cos_front, hit.valid)
         weight = power_weight(pdf, pdf_area * hit.t * hit.t / dr.abs(cos_front))
         gain += world.collector.emitter(hit.face, radiance, throughput * weight, emits)
-        found, cached = take_from_cache(world, hit.point, throughput, hit.valid & ~is_emitter & (bounce >= 1))
+        found, cached = _take_from_cache(world, hit.point, throughput, hit.valid & ~is_emitter & (bounce >= 1))
         gain += cached
 
         active &= hit.valid & ~found & (bounce < max_bounces) & (cos_front != 0)
         normal = dr.select(cos_front < 0, -hit.normal, hit.normal)
         wo = -direction
         base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, active)
-        kd, ks = brdf.kd_ks(base_color, metallic)
         origin = offset_from(hit.point, normal)
-        gain += direct_light(world, rng, origin, normal, wo, kd, ks, roughness, throughput, active)
-        active, direction, factor, pdf = scatter(rng, normal, wo, kd, ks, roughness, active)
-        throughput *= factor
+        vertex = Vertex(origin, normal, wo, *brdf.kd_ks(base_color, metallic), roughness)
+        gain += _direct_light(world, rng, vertex, throughput, active)
+        active, direction, diffuse, specular, pdf = scatter_by_lobe(rng, vertex, active)
+        throughput *= diffuse + specular
         bounce += 1
-        active, boost = roulette(rng, bounce, throughput, active)
+        active, boost = _roulette(rng, bounce, throughput, active)
         throughput *= boost
     return gain, rng

@@ -1,8 +1,6 @@
-"""Materials: callables `material(point, face, object_id, active) -> (base_color, roughness, metallic)` on
-device types.
+"""Materials: callables (point, face, object id, active) -> (base colour, roughness, metallic) on device types.
 
-Table rows are (base colour R, G, B, roughness, metallic), linear; roughness is clamped to [0.02, 1], the
-others to [0, 1].
+Rows of tables are (base colour R, G, B, roughness, metallic), linear; roughness is clamped to [0.02, 1], the others to [0, 1].
 """
 
 from __future__ import annotations
@@ -18,18 +16,19 @@ from iif_core.errors import InputError
 from iif_core.light.transport.arrays import rows_of, table
 from iif_core.light.transport.cache import VoxelRows
 from iif_core.reflectance.brdf import R_MIN
+from iif_core.reflectance.material import LOWEST
 from iif_core.surface.cells import COARSE, coarse_cells
 
 Array = np.ndarray
 
 
 class _Rows:
-    """Device table of material rows, padded to 8 floats so that one row is two aligned reads."""
+    """Device table of material rows, padded to 8 floats so that two aligned reads fetch a row."""
 
     def __init__(self, values: ArrayLike, name: str):
         values = np.asarray(values, np.float32)
         values = rows_of(values, len(values), 5, name)
-        clamped = np.clip(values, [0, 0, 0, R_MIN, 0], 1)
+        clamped = np.clip(values, LOWEST, 1)
         self.count = len(values)
         self._table = table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
 
@@ -51,12 +50,20 @@ class FaceMaterials:
 
 
 class CellMaterials:
-    """One material for each surface cell (voxel x object); the mean of the coarse cell around where the cell was not
-    observed, the object's mean where that is empty too.
+    """One material for each surface cell (voxel x object). Where the cell was not observed it is the mean of the coarse cell
+    around, and where that is empty too the mean of the object; without an object, the mean over all objects
+    (docs/method/numerics.md#surface-that-nobody-saw).
 
-    `ijk` (n, 3) from `cells.voxel_indices(points, edge, origin)`, `object_id` (n,), values (n, 5),
-    object_values (n_objects, 5). Faces without an object (-1) and without a cell get the mean over all
-    objects.
+    Args:
+        edge: of a voxel, metres.
+        origin: (3,) corner of voxel (0, 0, 0).
+        ijk: (n, 3) from `cells.voxel_indices(points, edge, origin)`.
+        object_id: (n,), -1 = none.
+        values: (n, 5) rows of the cells.
+        object_values: (n_objects, 5), at least one.
+
+    Raises:
+        InputError: wrong shapes, non-finite numbers, no object.
     """
 
     def __init__(
@@ -79,7 +86,7 @@ class CellMaterials:
         coarse_ijk, coarse_object, coarse = coarse_cells(ijk, object_id, values)
         self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
         self._first_coarse, self._first_object = len(ijk), len(ijk) + len(coarse)
-        # One table: cells, coarse cells, objects, the overall mean; a miss only changes which row is read.
+        # One table of cells, coarse cells, objects and the overall mean: a miss only changes which row is read.
         parts = [values, coarse, object_values, object_values.mean(axis=0, keepdims=True)]
         self._rows = _Rows(np.concatenate(parts), "values")
 

@@ -1,5 +1,5 @@
-"""The transport matrix: reflected radiance per unit radiance of every emitter group, from one path set, by the lobe of the
-point that reflects it."""
+"""The transport matrix: radiance that points reflect per unit radiance of every emitter group, by lobe, from one set of paths
+(docs/method/light.md#transport-matrix)."""
 
 from __future__ import annotations
 
@@ -12,24 +12,22 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import solid_angles
-from iif_core.light.transport.arrays import batches, rows_of, to_numpy
-from iif_core.light.transport.cache import RadianceCache
+from iif_core.light.transport.arrays import batches, checked_points, rows_of, to_numpy
 from iif_core.light.transport.emitters import Emitters, share_of_environment
 from iif_core.light.transport.geometry import Geometry, offset_from
-from iif_core.light.transport.kernels import World, incoming, light_by_lobe, scatter_by_lobe
-from iif_core.light.transport.render import check_counts
-from iif_core.light.transport.shading import surface_points
+from iif_core.light.transport.kernels import Vertex, World, incoming, light_by_lobe, scatter_by_lobe
+from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
 from iif_core.reflectance import brdf
 
 Array = np.ndarray
 
 
 class _ColumnCollector:
-    """Deposits path weights in the row of the lane and the column of the emitter's group: first all diffuse columns of the
-    lane, then all specular ones. `specular` (Color3f) is the share of the specular lobe at the first vertex of the path.
+    """Adds path weights to the row of the lane and the column of the emitter's group: all diffuse columns of the lane come
+    first, then all specular ones. `specular` (Color3f) is the share of the specular lobe at the first vertex of the path.
 
-    Only cached light is returned. A lane writes to its own row alone, so plain (non-atomic) additions are
-    safe and their order is fixed.
+    Only cached light is returned. A lane writes to its own row alone, so plain (non-atomic) additions are safe and their order
+    is fixed.
     """
 
     def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, group_of_texel: Any):
@@ -63,32 +61,19 @@ class _ColumnCollector:
 
 
 @dr.syntax
-def _deposit_paths(
-    world: World,
-    rng: Any,
-    point: Any,
-    normal: Any,
-    wo: Any,
-    kd: Any,
-    ks: Any,
-    roughness: Any,
-    sample: Any,
-    end: Any,
-    max_bounces: Any,
-) -> Any:
+def _deposit_paths(world: World, rng: Any, vertex: Vertex, sample: Any, end: Any, max_bounces: Any) -> Any:
     diffuse_cached = mi.Color3f(0)
     specular_cached = mi.Color3f(0)
-    origin = offset_from(point, normal)
-    visible = dr.dot(normal, wo) > 0
+    visible = dr.dot(vertex.normal, vertex.wo) > 0
     while sample < end:
         if world.emitters.can_be_sampled:
-            light, diffuse, specular = light_by_lobe(world, rng, origin, normal, wo, kd, ks, roughness, visible)
+            light, diffuse, specular = light_by_lobe(world, rng, vertex, visible)
             world.collector.specular = _share(specular, diffuse)
             light.gain(world, diffuse + specular)
-        goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, normal, wo, kd, ks, roughness, visible)
+        goes_on, wi, diffuse, specular, pdf = scatter_by_lobe(rng, vertex, visible)
         share = _share(specular, diffuse)
         world.collector.specular = share
-        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, goes_on, diffuse + specular)
+        gain, rng = incoming(world, rng, vertex.point, wi, pdf, 1, max_bounces, goes_on, diffuse + specular)
         diffuse_cached += gain * (1 - share)
         specular_cached += gain * share
         sample += 1
@@ -96,100 +81,85 @@ def _deposit_paths(
 
 
 def _share(part: Any, rest: Any) -> Any:
-    """part / (part + rest) a channel, 0 where both are 0."""
+    """part / (part + rest) for each channel, 0 where both are 0."""
     whole = part + rest
     return dr.select(whole > 0, part / whole, 0)
 
 
-def transport_matrix(
-    geometry: Geometry,
-    material: Any,
-    points: ArrayLike,
-    normals: ArrayLike,
-    wo: ArrayLike,
-    base_color: ArrayLike,
-    roughness: ArrayLike,
-    metallic: ArrayLike,
-    emitter_of_face: ArrayLike,
-    n_groups: int,
-    side: ArrayLike | None,
-    samples: int,
-    max_bounces: int,
-    seed: int,
-    cache: RadianceCache | None = None,
-    environment_columns: ArrayLike | None = None,
-    sampling_weight: ArrayLike | None = None,
-    chunk: int | None = None,
-) -> tuple[Array, Array]:
-    """(A (n, 2, G, 3), h (n, 2, 3)) float32: radiance that each point reflects by its diffuse lobe (0) and by its specular lobe
-    (1) is A @ E + h for emitter radiances E (G, 3). A.sum(1), h.sum(1): all that it reflects.
+def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumns, paths: PathOptions) -> tuple[Array, Array]:
+    """Trace the transport matrix (Eq. L.12): a point reflects A @ E + h by each lobe, for emitter radiances E (G, 3).
 
-    points, normals, wo (n, 3), base_color (n, 3), roughness (n,), metallic (n,): the points and their own
-    materials; `material` shades everything further on. emitter_of_face (m,) int32 in [-1, G); side (m,) as in
-    `Emitters`; faces of a group emit its unknown radiance. h is what paths take from `cache` (0 without).
-    environment_columns (H, W) int32: the column in which paths that escape into a texel of the environment
-    (`iif_core.light.environment`) are deposited, -1 = dark; texels of a column share its unknown radiance. The point's
-    own, directly visible emission is not included. sampling_weight (m,) overrides the default, half by area and
-    half the same for every group; texels are drawn by solid angle, a map of one texel by directions of the BRDF
-    alone. max_bounces counts surface interactions including the point. chunk: lanes on the device at once, a lane
-    being up to 8 samples of a point and a row of A (default: 2^18, fewer when their rows would take more than 256
-    MiB). Source: METHOD 7a (multi-bounce, or one bounce and the cache), 2.6; COMPUTE 4.
+    Emission that a point sees directly is not included.
+
+    Args:
+        scene: geometry, materials of everything that paths meet after the points, and cache; its emitters are not used.
+        points: the points, n of them, with their own materials.
+        columns: which faces and texels share an unknown radiance. Texels are drawn by solid angle; a map of one texel is found
+            by directions of the BRDF alone.
+        paths: bounces include the point.
+
+    Returns:
+        A (n, 2, G, 3) float32 by the diffuse (0) and the specular (1) lobe, and h (n, 2, 3) float32, the radiance that paths
+        take from the cache (0 without one).
+
+    Raises:
+        InputError: wrong shapes, non-finite numbers, column numbers out of range.
     """
-    check_counts(samples, max_bounces)
-    points, normals, wo = surface_points(points, normals, wo)
-    count = len(points)
-    base_color = np.clip(rows_of(base_color, count, 3, "base_color"), 0, 1)
-    roughness = np.clip(rows_of(roughness, count, None, "roughness"), brdf.R_MIN, 1)
-    metallic = np.clip(rows_of(metallic, count, None, "metallic"), 0, 1)
-    groups = np.ascontiguousarray(emitter_of_face, np.int32)
-    if groups.shape != (len(geometry.faces),) or groups.min() < -1 or groups.max() >= n_groups:
-        raise InputError(
-            f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
-            f"({len(geometry.faces)},) in -1 ... {n_groups - 1}"
-        )
-    columns = None if environment_columns is None else np.ascontiguousarray(environment_columns, np.int32)
-    if columns is not None and (columns.ndim != 2 or not columns.size or columns.min() < -1 or columns.max() >= n_groups):
-        raise InputError(
-            f"environment_columns has shape {columns.shape} and values up to {columns.max(initial=-1)}; expected "
-            f"(height, width) in -1 ... {n_groups - 1}"
-        )
+    position, normals, wo = checked_points(points.points, points.normals, points.wo)
+    count, n_groups = len(position), columns.count
+    base_color = np.clip(rows_of(points.base_color, count, 3, "base_color"), 0, 1)
+    roughness = np.clip(rows_of(points.roughness, count, None, "roughness"), brdf.R_MIN, 1)
+    metallic = np.clip(rows_of(points.metallic, count, None, "metallic"), 0, 1)
+    groups, texels = _checked_columns(columns, len(scene.geometry.faces))
     matrix, cached = np.zeros((count, 2, n_groups, 3), np.float32), np.zeros((count, 2, 3), np.float32)
-    if max_bounces == 0 or n_groups == 0 and cache is None:
+    if paths.max_bounces == 0 or n_groups == 0 and scene.cache is None:
         return matrix, cached
-    if sampling_weight is None:
-        sampling_weight = _group_weights(geometry.areas, groups, n_groups)
-    emitters = _unit_emitters(geometry, groups, side, sampling_weight, columns)
-    group_of_face = mi.Int32(groups)
-    group_of_texel = None if columns is None else mi.Int32(columns.ravel())
+    weight = columns.sampling_weight
+    if weight is None:
+        weight = _group_weights(scene.geometry.areas, groups, n_groups)
+    scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns.side, weight, texels))
+    group_of_face, group_of_texel = mi.Int32(groups), None if texels is None else mi.Int32(texels.ravel())
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
     width = 6 * n_groups
-    for batch in batches(count, samples, width, chunk):
+    for batch in batches(count, paths.samples, width, paths.chunk):
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
-        collector = _ColumnCollector(rows, dr.arange(mi.UInt32, batch.lanes), n_groups, group_of_face, group_of_texel)
-        gains = _deposit_paths(
-            World(geometry, material, emitters, cache, collector),
-            batch.streams(seed),
-            batch.spread(mi.Point3f, points),
-            batch.spread(mi.Vector3f, normals),
-            batch.spread(mi.Vector3f, wo),
-            batch.spread(mi.Color3f, kd),
-            batch.spread(mi.Color3f, ks),
-            batch.spread(mi.Float, roughness),
-            *batch.samples(samples),
-            dr.opaque(mi.UInt32, max_bounces),
-        )
+        lane = dr.arange(mi.UInt32, batch.lanes)
+        world = World(scene, _ColumnCollector(rows, lane, n_groups, group_of_face, group_of_texel))
+        random, start = batch.streams(paths.seed), batch.spread(mi.Point3f, position)
+        normal, towards = batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo)
+        material = batch.spread(mi.Color3f, kd), batch.spread(mi.Color3f, ks), batch.spread(mi.Float, roughness)
+        vertex = Vertex(offset_from(start, normal), normal, towards, *material)
+        gains = _deposit_paths(world, random, vertex, *batch.samples(paths.samples), dr.opaque(mi.UInt32, paths.max_bounces))
         dr.eval(gains, rows)
         for lobe, gain in enumerate(gains):
-            cached[batch.part, lobe] = batch.collect(gain) / samples
+            cached[batch.part, lobe] = batch.collect(gain) / paths.samples
         if n_groups:
-            matrix[batch.part] = to_numpy(rows).reshape(-1, batch.split, 2, n_groups, 3).sum(axis=1) / samples
+            summed = to_numpy(rows).reshape(-1, batch.split, 2, n_groups, 3).sum(axis=1)
+            matrix[batch.part] = summed / paths.samples
     return matrix, cached
+
+
+def _checked_columns(columns: EmitterColumns, faces: int) -> tuple[Array, Array | None]:
+    """Column of every face and of every texel as int32."""
+    groups = np.ascontiguousarray(columns.of_face, np.int32)
+    if groups.shape != (faces,) or groups.min() < -1 or groups.max() >= columns.count:
+        raise InputError(
+            f"emitter_of_face has shape {groups.shape} and values up to {groups.max(initial=-1)}; expected "
+            f"({faces},) in -1 ... {columns.count - 1}"
+        )
+    texels = None if columns.of_texel is None else np.ascontiguousarray(columns.of_texel, np.int32)
+    if texels is not None and (texels.ndim != 2 or not texels.size or texels.min() < -1 or texels.max() >= columns.count):
+        raise InputError(
+            f"environment_columns has shape {texels.shape} and values up to {texels.max(initial=-1)}; expected "
+            f"(height, width) in -1 ... {columns.count - 1}"
+        )
+    return groups, texels
 
 
 def _unit_emitters(
     geometry: Geometry, groups: Array, side: ArrayLike | None, weight: ArrayLike, columns: Array | None
 ) -> Emitters:
-    """Emitters that are drawn as if all groups had the same radiance; what they radiate is the unknown."""
+    """Emitters of radiance 0, drawn as if all groups had the same radiance."""
     dark = np.zeros((len(groups), 3))
     if columns is None or columns.size == 1:
         return Emitters(geometry, dark, side, sampling_weight=weight)
@@ -199,7 +169,7 @@ def _unit_emitters(
 
 
 def _group_weights(areas: Array, groups: Array, n_groups: int) -> Array:
-    """Half by area, half the same for every group with area: small emitters are not starved by large ones."""
+    """How often faces are drawn: half by area, half the same for every group with area, so that small emitters get samples."""
     member = groups >= 0
     area = np.where(member, areas, 0.0)
     total = np.bincount(groups[member], area[member], minlength=n_groups)

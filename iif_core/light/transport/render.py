@@ -11,18 +11,11 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.transport.arrays import batches, chunks, rows_of, to_numpy, vectors
-from iif_core.light.transport.cache import RadianceCache
-from iif_core.light.transport.emitters import Emitters
 from iif_core.light.transport.geometry import Geometry, nearest_hit
 from iif_core.light.transport.kernels import RadianceCollector, World, incoming, uniform
+from iif_core.light.transport.scene import Material, PathOptions, Scene
 
 Array = np.ndarray
-
-
-def check_counts(samples: int, max_bounces: int) -> None:
-    """Raises InputError for sample and bounce counts that make no path."""
-    if samples < 1 or max_bounces < 0:
-        raise InputError(f"samples={samples}, max_bounces={max_bounces}: at least 1 sample and 0 bounces")
 
 
 @dr.syntax
@@ -49,29 +42,31 @@ def _radiance_sum(
 
 
 def render(
-    geometry: Geometry,
-    material: Any,
-    emitters: Emitters,
+    scene: Scene,
     origins: ArrayLike,
     directions: ArrayLike,
-    samples: int,
-    max_bounces: int,
-    seed: int,
-    cache: RadianceCache | None = None,
+    paths: PathOptions,
     jitter: tuple[ArrayLike, ArrayLike] | None = None,
-    chunk: int | None = None,
 ) -> Array:
-    """Mean radiance (n, 3) float32, linear, of `samples` paths along each ray.
+    """Estimate the radiance that arrives along rays, the mean over `paths.samples` paths.
 
-    origins (n, 3) or (3,) metres; directions (n, 3), any length. max_bounces counts surface interactions: 0 =
-    visible emission only, 1 = direct light. jitter = (d_du, d_dv), (n, 3) or (3,) each: the direction becomes
-    d + xi_1 d_du + xi_2 d_dv with xi uniform in [-1/2, 1/2) BEFORE it is normalised, a box filter over the
-    pixel (METHOD 1.4). The first hit is always shaded with its material; from the second on a path ends in
-    `cache` where it has a voxel. chunk: lanes on the device at once, a lane being up to 8 samples of a ray
-    (default 2^18). Unbiased but for the offset along the normal, the bounce limit and the cache. Source:
-    METHOD 2.5, 3.
+    Unbiased except for the offset of new rays along the normal, the limit of bounces and the radiance cache
+    (docs/method/shading.md#paths).
+
+    Args:
+        scene: what paths meet. The first hit is always shaded with its material and never taken from the cache.
+        origins: (n, 3) or (3,) metres.
+        directions: (n, 3) of any length above 0.
+        paths: 0 bounces = visible emission, 1 = direct light.
+        jitter: (d_du, d_dv), each (n, 3) or (3,): the direction becomes d + xi_1 d_du + xi_2 d_dv with xi uniform in
+            [-1/2, 1/2) before it is normalised, a box filter over the pixel. None = none.
+
+    Returns:
+        (n, 3) float32 radiance, linear.
+
+    Raises:
+        InputError: wrong shapes, non-finite numbers, a zero direction.
     """
-    check_counts(samples, max_bounces)
     directions = np.asarray(directions, np.float32)
     directions = rows_of(directions, len(directions), 3, "directions")
     if not (np.abs(directions).max(axis=1, initial=0) > 0).all():
@@ -81,30 +76,37 @@ def render(
     d_du, d_dv = (
         rows_of(np.broadcast_to(np.asarray(step, np.float32), directions.shape), len(directions), 3, "jitter") for step in steps
     )
-    world = World(geometry, material, emitters, cache, RadianceCollector())
+    world = World(scene, RadianceCollector())
     result = np.zeros(directions.shape, np.float32)
-    for batch in batches(len(directions), samples, 3, chunk):
+    for batch in batches(len(directions), paths.samples, 3, paths.chunk):
         total = _radiance_sum(
             world,
-            batch.streams(seed),
+            batch.streams(paths.seed),
             batch.spread(mi.Point3f, origins),
             batch.spread(mi.Vector3f, directions),
             batch.spread(mi.Vector3f, d_du),
             batch.spread(mi.Vector3f, d_dv),
-            *batch.samples(samples),
-            dr.opaque(mi.UInt32, max_bounces),
+            *batch.samples(paths.samples),
+            dr.opaque(mi.UInt32, paths.max_bounces),
         )
         dr.eval(total)
-        result[batch.part] = batch.collect(total) / samples
+        result[batch.part] = batch.collect(total) / paths.samples
     return result
 
 
 def first_hits(
-    geometry: Geometry, material: Any, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20
+    geometry: Geometry, material: Material, origins: ArrayLike, directions: ArrayLike, chunk: int = 1 << 20
 ) -> tuple[Array, Array, Array]:
-    """(base colour (n, 3), normal (n, 3) towards the viewer, face (n,) int32) of what rays meet first; 0, 0, -1 for a miss.
+    """Look up base colour, normal and face where rays first meet the mesh: the noise-free guides of a denoiser.
 
-    The noise-free guides of a denoiser. origins (n, 3) or (3,), directions (n, 3), any length.
+    Args:
+        geometry, material: as in `Scene`.
+        origins, directions: as in `render`.
+        chunk: rays on the device at once.
+
+    Returns:
+        Base colour (n, 3) float32 linear, unit normal towards the viewer (n, 3) float32, face (n,) int32. A ray that meets
+        nothing gives 0, 0 and -1.
     """
     directions = np.asarray(directions, np.float32).reshape(-1, 3)
     origins = np.broadcast_to(np.asarray(origins, np.float32), directions.shape)

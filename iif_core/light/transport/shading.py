@@ -1,4 +1,5 @@
-"""Cached shading: diffuse and split specular lobes of points, all from ONE set of paths."""
+"""Cached shading: the diffuse integral and the split specular integrals of points, all from one set of paths
+(docs/method/shading.md#shared-paths)."""
 
 from __future__ import annotations
 
@@ -10,12 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import batches, rows_of
-from iif_core.light.transport.cache import RadianceCache
-from iif_core.light.transport.emitters import Emitters
-from iif_core.light.transport.geometry import Geometry, offset_from
+from iif_core.light.transport.arrays import batches, checked_points
+from iif_core.light.transport.geometry import offset_from
 from iif_core.light.transport.kernels import RadianceCollector, World, incoming, power_weight, sample_light, sample_lobe, uniform
-from iif_core.light.transport.render import check_counts
+from iif_core.light.transport.scene import PathOptions, Scene
 from iif_core.numerics.xp import DRJIT
 from iif_core.reflectance import brdf
 from iif_core.reflectance.brdf import R_MIN
@@ -24,8 +23,8 @@ Array = np.ndarray
 
 
 class _Levels:
-    """Roughness levels and the sampling lobes: the cosine twice, and GGX lobes from the sharpest level up to
-    0.5."""
+    """Roughness levels, and the lobes from which directions are drawn: the cosine twice, and GGX lobes from the sharpest level
+    up to 0.5."""
 
     def __init__(self, levels: Array):
         self.levels = [float(level) for level in levels]
@@ -42,7 +41,7 @@ class _Levels:
         return roughness
 
     def pdf(self, angles: tuple[Any, ...]) -> Any:
-        """Density of the mixture of all lobes, each chosen equally often."""
+        """Density of the mixture of all lobes, each chosen equally often (Eq. S.8)."""
         NoL, _, NoH, VoH, sin2_h = angles
         total = self.cosine_lobes * NoL * dr.inv_pi
         for level in self.lobes:
@@ -88,7 +87,7 @@ def _lobe_sums(
     origin = offset_from(point, normal)
     while sample < end:
         sums = levels.light(world, rng, origin, normal, wo, sums)
-        # Stratified choice: over all samples every lobe is drawn equally often in expectation.
+        # Stratified choice: every lobe is drawn equally often in expectation over all samples.
         position = (mi.Float(sample) + uniform(rng)) / mi.Float(samples)
         lobe = dr.minimum(mi.UInt32(position * levels.count), levels.count - 1)
         u1 = uniform(rng)
@@ -103,73 +102,46 @@ def _lobe_sums(
     return sums
 
 
-def unit_rows(vectors_: Array, name: str) -> Array:
-    """Rows scaled to unit length; raises InputError for zero rows."""
-    length = np.linalg.norm(vectors_, axis=1, keepdims=True)
-    if not (length > 0).all():
-        raise InputError(f"{name} contains a zero vector")
-    return vectors_ / length
-
-
-def surface_points(points: ArrayLike, normals: ArrayLike, wo: ArrayLike) -> tuple[Array, Array, Array]:
-    """Checked (points, unit normals on the viewer's side, unit wo), each (n, 3) float32."""
-    points = np.asarray(points, np.float32)
-    count = len(points)
-    points = rows_of(points, count, 3, "points")
-    normals = unit_rows(rows_of(normals, count, 3, "normals"), "normals")
-    wo = unit_rows(rows_of(wo, count, 3, "wo"), "wo")
-    away = np.einsum("ij,ij->i", normals, wo) < 0
-    return points, np.where(away[:, None], -normals, normals), wo
-
-
 def shading_caches(
-    geometry: Geometry,
-    material: Any,
-    emitters: Emitters,
-    points: ArrayLike,
-    normals: ArrayLike,
-    wo: ArrayLike,
-    levels: ArrayLike,
-    samples: int,
-    max_bounces: int,
-    seed: int,
-    cache: RadianceCache | None = None,
-    chunk: int | None = None,
+    scene: Scene, points: ArrayLike, normals: ArrayLike, wo: ArrayLike, levels: ArrayLike, paths: PathOptions
 ) -> tuple[Array, Array, Array]:
-    """(diffuse (n, 3), s0 (n, J, 3), s1 (n, J, 3)) float32 of points (n, 3) seen along wo (n, 3).
+    """Integrate the light that arrives at points over the lobes of the BRDF (Eq. S.3).
 
-        diffuse = 1/pi int L cos,  s0(r) = int spec_r (1 - F_c) L,  s1(r) = int spec_r F_c L,
+    `brdf.compose(k_d, k_s, diffuse, s0(r), s1(r))` is then the radiance that the point reflects for any material of roughness r
+    there. All lobes share one path per sample; its first direction is drawn from a mixture of the cosine and a few GGX lobes
+    and weighted with the density of that mixture (balance heuristic, Eq. S.9).
 
-    with L the incident radiance under the given materials elsewhere, so that `brdf.compose(k_d, k_s, diffuse,
-    s0(r), s1(r))` is the radiance reflected at the point for ANY material of roughness r there. normals are
-    flipped to the viewer. levels (J,) roughness in [0.02, 1], increasing (may be empty). max_bounces counts
-    surface interactions including the point itself. All lobes share one path per sample, drawn from a mixture
-    of the cosine and a few GGX lobes and weighted with that mixture's density (balance heuristic). chunk:
-    lanes on the device at once, a lane being up to 8 samples of a point (default: 2^18, fewer when the lobes
-    would take more than 256 MiB). Source: METHOD 2.7; COMPUTE 5.
+    Args:
+        scene: what paths meet; its materials apply everywhere but at the points.
+        points, normals, wo: (n, 3) metres; normals, flipped to the viewer; towards the viewer.
+        levels: (J,) roughness in [0.02, 1], increasing; may be empty.
+        paths: bounces include the point.
+
+    Returns:
+        diffuse (n, 3), s0 (n, J, 3), s1 (n, J, 3), float32 radiance, linear.
+
+    Raises:
+        InputError: wrong shapes, non-finite numbers, levels that do not increase or lie outside the range.
     """
-    check_counts(samples, max_bounces)
     levels = np.asarray(levels, np.float64).reshape(-1)
     if levels.size and not (levels.min() >= R_MIN - 1e-6 and levels.max() <= 1 + 1e-6 and (np.diff(levels) > 0).all()):
         raise InputError(f"roughness levels {levels.tolist()}: must increase within [{R_MIN}, 1]")
-    points, normals, wo = surface_points(points, normals, wo)
+    points, normals, wo = checked_points(points, normals, wo)
     count = len(levels)
     diffuse = np.zeros((len(points), 3), np.float32)
     s0, s1 = np.zeros((len(points), count, 3), np.float32), np.zeros((len(points), count, 3), np.float32)
-    if max_bounces == 0:
+    if paths.max_bounces == 0:
         return diffuse, s0, s1
-    world, lobes = World(geometry, material, emitters, cache, RadianceCollector()), _Levels(levels)
-    for batch in batches(len(points), samples, 3 * (1 + 2 * count), chunk):
+    world, lobes = World(scene, RadianceCollector()), _Levels(levels)
+    for batch in batches(len(points), paths.samples, 3 * (1 + 2 * count), paths.chunk):
         sums = _lobe_sums(
             world,
             lobes,
-            batch.streams(seed),
-            batch.spread(mi.Point3f, points),
-            batch.spread(mi.Vector3f, normals),
-            batch.spread(mi.Vector3f, wo),
-            dr.opaque(mi.UInt32, samples),
-            *batch.samples(samples),
-            dr.opaque(mi.UInt32, max_bounces),
+            batch.streams(paths.seed),
+            *(batch.spread(kind, rows) for kind, rows in ((mi.Point3f, points), (mi.Vector3f, normals), (mi.Vector3f, wo))),
+            dr.opaque(mi.UInt32, paths.samples),
+            *batch.samples(paths.samples),
+            dr.opaque(mi.UInt32, paths.max_bounces),
         )
         dr.eval(sums)
         diffuse[batch.part] = batch.collect(sums[0])
@@ -177,5 +149,5 @@ def shading_caches(
             s0[batch.part, number] = batch.collect(sums[1 + number])
             s1[batch.part, number] = batch.collect(sums[1 + count + number])
     for result in (diffuse, s0, s1):
-        result /= samples
+        result /= paths.samples
     return diffuse, s0, s1

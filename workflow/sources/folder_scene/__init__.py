@@ -1,2 +1,5 @@
-"""Parts of the `folder` source: `inputs` (which files), `transforms` and `colmap` (cameras), `images`, `mesh`, `alignment`,
-`registration`, `exposure`."""
+"""Parts that all sources of photographs share.
+
+`inputs` lists the files, `transforms` and `colmap` read cameras, `images` and `mesh` read what their names say; `alignment`,
+`registration` and `exposure` compare the photographs with the mesh and with each other.
+"""

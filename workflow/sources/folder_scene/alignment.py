@@ -1,7 +1,7 @@
-"""Do photographs, poses and mesh belong together? Measured, not believed.
+"""Measures whether photographs, poses and mesh belong together.
 
-With depth images: the mesh's depth in the photograph's camera against the depth image, moved into that camera. Without:
-how well edges of the photograph lie on edges of the mesh, against the same picture shifted by a few pixels.
+With depth images or sparse points, the mesh's depth in the camera of the photograph is compared with the measured depth. In any
+case, edges of the photograph are correlated with edges of the mesh, also after shifts by a few pixels.
 """
 
 from __future__ import annotations
@@ -18,28 +18,26 @@ from iif_core.errors import InputError
 from workflow.sources.folder_scene import images
 from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 
-DEPTH_SAMPLES = 20_000
-"""Depth pixels compared a view."""
-MIN_COMPARED = 0.2
-MIN_POINTS = 20
-"""Sparse points that a photograph must see to be compared by them."""
-TRIAL_POINTS = 300
-TRIAL_VIEWS = 6
-TRIAL_WIDTH = 96
-EDGE_WIDTH = 160
-"""Edges are compared in pictures of at most this width, so that shifts mean the same for any capture size."""
-SHIFT = 4
-"""Pixels (of such a picture) that the photograph is shifted to either side."""
+DEPTH_SAMPLES = 20_000  # depth pixels compared per view
+MIN_COMPARED = 0.2  # share of the measured depths that must meet the mesh
+MIN_POINTS = 20  # sparse points that a photograph must see to be compared by them
+TRIAL_POINTS, TRIAL_VIEWS, TRIAL_WIDTH = 300, 6, 96  # points per view, views and pixels across for trials of other conventions
+EDGE_WIDTH = 160  # pixels; edges are compared at this width at most, so that shifts do not depend on the size of the capture
+SHIFT = 4  # pixels of such a picture by which the photograph is shifted to either side
 WEAK_CORRELATION = 0.05
 CLEAR_CORRELATION = 0.12
-"""Of another reading of the poses, and three times as much as of theirs: then theirs is wrong."""
+"""Another convention is proposed if it reaches this correlation and three times that of the convention in use."""
 
 
 @dataclass(frozen=True)
 class Conventions:
-    """How `transform_matrix` is read: `axes`, `metres`, and a change of the matrix before that (None = as written).
+    """How `transform_matrix` is interpreted.
 
-    A change of the world (`of_world`) holds for the depth images' own poses too.
+    Attributes:
+        axes: of the camera, `opengl` or `opencv`.
+        metres: per unit.
+        change: applied to the matrix before; None = identity.
+        of_world: whether `change` concerns the world, and thus also the depth images' own poses and the sparse points.
     """
 
     axes: str
@@ -48,19 +46,19 @@ class Conventions:
     of_world: bool = False
 
     def pose(self, frame: Frame) -> np.ndarray:
-        """`world_from_camera` of the photograph."""
+        """Return `world_from_camera` of the photograph."""
         matrix = self.change(frame.matrix) if self.change else frame.matrix
         return opencv_pose(matrix, self.axes, self.metres)
 
     def depth_pose(self, frame: Frame) -> np.ndarray:
-        """`world_from_camera` of the depth image, where the file gives it its own."""
+        """Return `world_from_camera` of the depth image, which may have a pose of its own."""
         if frame.depth_matrix is None:
             return self.pose(frame)
         matrix = self.change(frame.depth_matrix) if self.change and self.of_world else frame.depth_matrix
         return opencv_pose(matrix, "opencv", self.metres)
 
     def points(self, frame: Frame) -> np.ndarray:
-        """(n, 3) sparse points of the photograph in metres."""
+        """Return the sparse points (n, 3) of the photograph in metres."""
         if not (self.change and self.of_world):
             return frame.seen * self.metres
         at = np.tile(np.eye(4), (len(frame.seen), 1, 1))
@@ -69,10 +67,20 @@ class Conventions:
 
 
 def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Mesh depth / measured depth (n,) float64 in the photograph's (pinhole) camera `view`, one entry a measured pixel.
+    """Compare the depth of the mesh with a depth image.
 
-    The depth image (H, W, metres, 0 = unknown) is turned into points, and these are looked up in `mesh_depth`, so a
-    depth camera beside the colour camera is compared correctly (but for what only one of the two sees: use a median).
+    The depth image is converted to points that are looked up in `mesh_depth`, so that a depth camera beside the colour camera is
+    compared correctly, except at surface that only one of the two sees.
+
+    Args:
+        frame: the photograph and its depth camera.
+        conventions: of its poses.
+        view: pinhole camera of the photograph.
+        mesh_depth: (h, w) z-depth of the mesh in `view`, metres, 0 = miss.
+        depth: (H, W) z-depth of the depth image, metres, 0 = unknown.
+
+    Returns:
+        (n,) float64 mesh depth / measured depth, one entry per measured pixel; NaN where there is no mesh.
     """
     height, width = depth.shape
     step = max(1, int(np.sqrt(depth.size / DEPTH_SAMPLES)))
@@ -93,7 +101,17 @@ def depth_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_dept
 
 
 def point_ratio(frame: Frame, conventions: Conventions, view: Pinhole, mesh_depth: np.ndarray) -> np.ndarray:
-    """Mesh depth / depth of the sparse points that the photograph sees (n,), NaN where no mesh is."""
+    """Compare the depth of the mesh with that of the sparse points that the photograph sees.
+
+    Args:
+        frame: the photograph and its points.
+        conventions: of its poses.
+        view: pinhole camera of the photograph.
+        mesh_depth: (h, w) z-depth of the mesh in `view`, metres, 0 = miss.
+
+    Returns:
+        (n,) float64 mesh depth / depth of the points; NaN where there is no mesh.
+    """
     return _ratio_at(conventions.points(frame), view, conventions.pose(frame), mesh_depth)
 
 
@@ -108,9 +126,9 @@ def _ratio_at(points: np.ndarray, view: Pinhole, pose: np.ndarray, mesh_depth: n
 
 
 def disagreement(ratio: np.ndarray) -> float:
-    """Median |mesh depth / measured depth - 1| where both exist; inf when that is less than MIN_COMPARED of the pixels.
+    """Return the median of |mesh depth / measured depth - 1| where both exist; inf if these are less than MIN_COMPARED of all.
 
-    A camera that looks elsewhere, or from very far away, may agree in the few pixels that land on the mesh by chance.
+    The limit is needed because a camera with a wrong pose may agree in the few pixels that meet the mesh by chance.
     """
     both = ratio[np.isfinite(ratio)]
     return float(np.median(np.abs(both - 1))) if len(both) and len(both) >= MIN_COMPARED * len(ratio) else float("inf")
@@ -128,28 +146,17 @@ Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 
 
 
 def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Conventions]]:
-    """Other readings of the poses, each with the advice that makes it true. known: the file's format tells the axes."""
+    """Return other conventions, each with the advice that applies it; `known`: the format of the file determines the axes."""
     other = "opencv" if axes == "opengl" else "opengl"
     inverse = "the matrices are world-to-camera: write their inverses into transforms.json"
     of_camera = [
         (f"`source.axes: {other}` fits", Conventions(other, metres)),
         (f"{inverse} (axes {axes}) fits", Conventions(axes, metres, np.linalg.inv)),
-        (
-            f"{inverse} with `source.axes: {other}` fits",
-            Conventions(other, metres, np.linalg.inv),
-        ),
+        (f"{inverse} with `source.axes: {other}` fits", Conventions(other, metres, np.linalg.inv)),
     ]
-    out = [
-        *([] if known else of_camera),
-        (
-            "turning the mesh from y-up to z-up (x, -z, y) fits",
-            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP), of_world=True),
-        ),
-        (
-            "turning the mesh from z-up to y-up (x, z, -y) fits",
-            Conventions(axes, metres, _turned(Z_UP_TO_Y_UP.T), of_world=True),
-        ),
-    ]
+    out = [] if known else of_camera
+    for text, world in (("y-up to z-up (x, -z, y)", Z_UP_TO_Y_UP), ("z-up to y-up (x, z, -y)", Z_UP_TO_Y_UP.T)):
+        out.append((f"turning the mesh from {text} fits", Conventions(axes, metres, _turned(world), of_world=True)))
     for factor in (1000.0, 100.0, 0.01, 0.001):
         text = f"camera positions times {factor:g} fits (mesh and poses are in different units)"
         out.append((text, Conventions(axes, metres, _moved(factor), of_world=True)))
@@ -165,9 +172,18 @@ def explain(
     depth_unit: float | None,
     tolerance: float,
 ) -> str:
-    """What would fit the depth images (or sparse points) better, in words; empty when nothing does.
+    """Find a convention that fits the depth images (or sparse points) better.
 
-    frames: with either, and their pinhole cameras. trace: (origin, directions (h, w, 3)) -> z-depth (h, w).
+    Args:
+        frames: photographs with either, and their pinhole cameras.
+        trace: (origin, directions (h, w, 3)) -> z-depth (h, w), 0 = miss.
+        axes, metres: the convention in use.
+        known: whether the format of the file determines the axes.
+        depth_unit: metres per value of the depth images; None = by their format.
+        tolerance: largest acceptable disagreement.
+
+    Returns:
+        Advice in words; empty if no convention fits.
     """
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, TRIAL_VIEWS).astype(int))]
     depths = [images.load_depth(frame.depth, depth_unit) if frame.depth else None for frame, _ in chosen]
@@ -189,7 +205,7 @@ def explain(
 
     as_is = ratios(Conventions(axes, metres))
     scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres, known)]
-    if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no metres of their own
+    if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no scale of their own
         factor = float(np.nanmedian(as_is))
         scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
     best, text = min(scores)
@@ -204,10 +220,17 @@ def explain_edges(
     known: bool,
     now: float,
 ) -> str:
-    """Which other reading of the poses brings the mesh's edges onto those of the photographs, in words; empty: none does.
+    """Find a convention that aligns the mesh's edges with those of the photographs.
 
-    trials: (frame, pinhole camera, its photograph (h, w, 3), valid (h, w)). trace: (origin, directions (h, w, 3)) ->
-    z-depth (h, w) with 0 = miss, unit normals (h, w, 3). now: correlation of the poses as they are read.
+    Args:
+        trials: frame, pinhole camera, its photograph (h, w, 3) and valid (h, w).
+        trace: (origin, directions (h, w, 3)) -> z-depth (h, w) with 0 = miss, and unit normals (h, w, 3).
+        axes, metres: the convention in use.
+        known: whether the format of the file determines the axes.
+        now: correlation with the convention in use.
+
+    Returns:
+        Advice in words; empty if no convention is clearly better.
     """
 
     def correlation(conventions: Conventions) -> float:
@@ -230,29 +253,33 @@ def _unit_advice(metres: float, factor: float) -> str:
 
 
 def shrunk(camera: Pinhole, width: int) -> Pinhole:
-    """The same camera with fewer pixels."""
-    scale = min(1.0, width / camera.width)
-    w, h = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    return scaled(camera, w, h)
+    """Return the same camera with at most `width` pixels across."""
+    return scaled(camera, *images.fitted_size(camera.width, camera.height, width, np.inf))
 
 
 def scaled(camera: Pinhole, width: int, height: int) -> Pinhole:
-    """The same camera with width x height pixels; (u + 0.5) coordinates scale about the picture's corner."""
+    """Return the same camera with width x height pixels; (u + 0.5) coordinates scale about the corner of the picture."""
     a, b = width / camera.width, height / camera.height
     return Pinhole(camera.fx * a, camera.fy * b, camera.cx * a, camera.cy * b, width, height)
 
 
 def directions(camera: Pinhole, pose: np.ndarray) -> np.ndarray:
-    """(h, w, 3) float32 with camera z 1: distances along them are z-depths."""
+    """Return (h, w, 3) float32 world directions with camera z = 1, so that distances along them are z-depths."""
     return pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose)
 
 
 def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Correlation of photograph edges with mesh edges for shifts of the photograph, (2 SHIFT + 1, 2 SHIFT + 1) float64.
+    """Correlate photograph edges with mesh edges for shifts of the photograph; all pictures are reduced to EDGE_WIDTH first.
 
-    Entry [SHIFT + dy, SHIFT + dx]: mesh pixel (u, v) against photograph pixel (u + dx, v + dy). photo (H, W, 3), valid
-    (H, W), depth (H, W) with 0 = miss, normal (H, W, 3) unit. All are reduced to EDGE_WIDTH first. Zeros when the
-    picture is too small or has no edges.
+    Args:
+        photo: (H, W, 3).
+        valid: (H, W) bool.
+        depth: (H, W) z-depth of the mesh, 0 = miss.
+        normal: (H, W, 3) unit normals of the mesh.
+
+    Returns:
+        (2 SHIFT + 1, 2 SHIFT + 1) float64; entry [SHIFT + dy, SHIFT + dx] compares mesh pixel (u, v) with photograph pixel
+        (u + dx, v + dy). Zeros if the picture is too small or has no edges.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -287,7 +314,7 @@ def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, no
 
 @dataclass
 class Alignment:
-    """Collects what the views say; `report` for capture.json, `verdict` refuses."""
+    """Collects the comparisons of all views: `report` for capture.json, `notes` and `edge_warning` in words, `refuse`."""
 
     ratios: dict[str, np.ndarray]
     edges: dict[str, np.ndarray]
@@ -299,11 +326,11 @@ class Alignment:
 
     @property
     def depth_disagreement(self) -> float:
-        """Median over all compared pixels of all views; inf when depth images are absent or too few pixels meet."""
+        """Median over all compared pixels of all views; inf without depth images or if too few pixels meet the mesh."""
         return disagreement(np.concatenate(list(self.ratios.values()))) if self.ratios else float("inf")
 
     def report(self) -> dict[str, Any]:
-        """Measured numbers, for capture.json and the notes."""
+        """Return the measured numbers, for capture.json and the notes."""
         out: dict[str, Any] = {}
         if np.isfinite(self.depth_disagreement):
             joined = np.concatenate(list(self.ratios.values()))
@@ -320,16 +347,16 @@ class Alignment:
             out["edge_best_shift"] = [int(dx) - SHIFT, int(dy) - SHIFT]
         return out
 
-    def doubtful(self, tolerance: float) -> list[str]:
-        """Views whose own disagreement is above tolerance: one bad pose does not move the median of all."""
+    def disagreeing_views(self, tolerance: float) -> list[str]:
+        """Return the views whose own disagreement exceeds `tolerance`; one bad pose does not move the median of all views."""
         return [name for name, ratio in self.ratios.items() if disagreement(ratio) > tolerance]
 
     def notes(self, tolerance: float) -> list[str]:
-        """The numbers in words."""
+        """Return the numbers in words."""
         r, out = self.report(), []
-        doubtful = self.doubtful(tolerance) if "depth_median_disagreement" in r else []
-        if doubtful:
-            out.append(f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(doubtful)}: is the pose right?")
+        wrong = self.disagreeing_views(tolerance) if "depth_median_disagreement" in r else []
+        if wrong:
+            out.append(f"WARNING alignment: mesh and depth disagree in view(s) {', '.join(wrong)}: is the pose right?")
         if "depth_median_disagreement" in r:
             out.append(
                 f"alignment: mesh depth differs from the {self.what} by {r['depth_median_disagreement']:.2%} (median"
@@ -345,7 +372,7 @@ class Alignment:
         return out
 
     def edge_warning(self) -> str:
-        """Words when edges do not lie on edges; empty otherwise."""
+        """Return a warning if edges do not lie on edges, else an empty text."""
         r = self.report()
         if "edge_correlation" not in r:
             return ""
@@ -361,7 +388,7 @@ class Alignment:
         return ""
 
     def refuse(self, path: Any, tolerance: float, advice: Callable[[], str]) -> str:
-        """The message when depth images contradict the mesh; empty when they agree or there are none."""
+        """Return an error message if the measured depth contradicts the mesh, else an empty text."""
         if not self.ratios or self.depth_disagreement <= tolerance:
             return ""
         number = self.depth_disagreement
@@ -375,7 +402,7 @@ class Alignment:
 
 
 def raise_or_note(message: str, mode: str, notes: list[str]) -> None:
-    """`check` raises, `warn` records."""
+    """Raise a message that is not empty if `mode` is `check`, else append it to the notes."""
     if message and mode == "check":
         raise InputError(message)
     if message:

@@ -1,6 +1,6 @@
-"""COLMAP models (text or binary) -> entries as in transforms.json. https://colmap.github.io/format.html
+"""Reads COLMAP models (text or binary) as entries like those of transforms.json (https://colmap.github.io/format.html).
 
-COLMAP's conventions are the project's own: OpenCV camera axes, pixel centres at +0.5; poses are world-to-camera.
+COLMAP's conventions are the project's own, OpenCV camera axes and pixel centres at +0.5, except that poses are world-to-camera.
 """
 
 from __future__ import annotations
@@ -22,10 +22,8 @@ from workflow.sources.folder_scene.transforms import Transforms
 
 PARTS = ("cameras", "images", "points3D")
 PLACES = ("sparse/0", "sparse", "colmap/sparse/0", "colmap")
-SEEN_POINTS = 2000
-"""Sparse points of a photograph that are kept: enough for medians."""
-REPROJECTION = 0.01
-"""Largest median distance of a point from its keypoint, as a share of the longer side; good models have 0.001."""
+MAX_SEEN_POINTS = 2000  # sparse points kept of a photograph; enough for medians
+MAX_REPROJECTION = 0.01  # median distance of points from their keypoints, as a share of the longer side; good models have 0.001
 
 MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "SIMPLE_PINHOLE": (0, "PINHOLE", ("f", "cx", "cy")),
@@ -40,14 +38,13 @@ MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "RADIAL_FISHEYE": (9, "OPENCV_FISHEYE", ("f", "cx", "cy", "k1", "k2")),
     "THIN_PRISM_FISHEYE": (10, "", ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1")),
 }
-"""Model -> id in binary files, the lens it is here ("" = none), its parameters in COLMAP's order."""
+"""Model -> id in binary files, corresponding `camera_model` ("" = none), parameters in COLMAP's order."""
 _NAME_OF = {number: name for name, (number, _, _) in MODELS.items()}
 
 
 @dataclass(frozen=True)
 class Image:
-    """One registered image: its camera's id, world-from-camera (4, 4) OpenCV, keypoints (n, 2) that have a point, and
-    the points' ids (n,)."""
+    """One registered image: id of its camera, `world_from_camera` (4, 4), keypoints (n, 2) with their points' ids (n,)."""
 
     name: str
     camera: int
@@ -58,7 +55,15 @@ class Image:
 
 @dataclass(frozen=True)
 class Model:
-    """cameras: id -> keys of transforms.json. points: ids ascending and positions (n, 3), empty without points3D."""
+    """A reconstruction.
+
+    Attributes:
+        path: file of the images, for messages.
+        cameras: id -> keys of transforms.json.
+        images: sorted by name.
+        point_ids, points: ascending ids (n,) and positions (n, 3), empty without points3D.
+        files: that were read.
+    """
 
     path: Path
     cameras: dict[int, dict[str, Any]]
@@ -68,17 +73,17 @@ class Model:
     files: tuple[Path, ...]
 
     def seen(self, image: Image) -> tuple[np.ndarray, np.ndarray]:
-        """Positions (n, 3) of the sparse points that an image sees, and their keypoints (n, 2)."""
+        """Return the positions (n, 3) of sparse points that an image sees, and their keypoints (n, 2)."""
         if len(self.points) == 0 or len(image.point_ids) == 0:
             return np.zeros((0, 3)), np.zeros((0, 2))
         at = np.minimum(np.searchsorted(self.point_ids, image.point_ids), len(self.point_ids) - 1)
         known = np.flatnonzero(self.point_ids[at] == image.point_ids)
-        known = known[:: max(1, len(known) // SEEN_POINTS)]
+        known = known[:: max(1, len(known) // MAX_SEEN_POINTS)]
         return self.points[at[known]], image.keypoints[known]
 
 
 def find(folder: Path, stated: str | None) -> Path | None:
-    """The folder of a model: `source.cameras`, or the first of the usual places that holds one; None = there is none."""
+    """Return the folder of a model: `source.cameras`, or the first of the usual places that holds one, or None."""
     if stated is not None:
         path = folder / stated
         path = path.parent if path.is_file() and path.stem in PARTS else path
@@ -92,15 +97,15 @@ def find(folder: Path, stated: str | None) -> Path | None:
 
 
 def is_model(path: Path) -> bool:
-    """Whether a folder holds cameras and images."""
+    """Return whether a folder holds cameras and images."""
     return any(all((path / f"{part}{suffix}").is_file() for part in PARTS[:2]) for suffix in (".bin", ".txt"))
 
 
 def read(path: Path, with_points: bool = True) -> Model:
-    """A model, binary if both forms exist (COLMAP writes the text beside it). Without points no keypoints either: quick.
+    """Read a model, the binary form if both exist; without points, keypoints are not read either, which is fast.
 
     Raises:
-        InputError: damaged files, a lens that is not known here, images without camera.
+        InputError: damaged files, an unsupported lens, images without camera.
     """
     suffix = ".bin" if all((path / f"{part}.bin").is_file() for part in PARTS[:2]) else ".txt"
     files = [path / f"{part}{suffix}" for part in PARTS]
@@ -126,7 +131,7 @@ def _guarded(path: Path, reader: Any) -> Any:
 
 
 def entry_of(model: Model, image: Image) -> dict[str, Any]:
-    """Entry as in transforms.json, with camera-to-world of OpenCV axes."""
+    """Return an entry like those of transforms.json, but with camera-to-world of OpenCV axes."""
     where = f"image {image.name}"
     return {
         **model.cameras[image.camera],
@@ -138,9 +143,16 @@ def entry_of(model: Model, image: Image) -> dict[str, Any]:
 
 
 def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[str, Any], points: bool) -> Transforms:
-    """Frames of a folder whose cameras are a COLMAP model, checked like those of transforms.json.
+    """Read the frames of a folder whose cameras are a COLMAP model, with the same checks as for transforms.json.
 
-    points: read the sparse points too, check the cameras by them, and keep them for the check of the mesh.
+    Args:
+        folder: of the scene.
+        place: folder of the model.
+        source, capture: the dumped settings sections.
+        points: also read the sparse points, check the cameras by them, and keep them for the check of the mesh.
+
+    Returns:
+        The checked frames.
 
     Raises:
         InputError: what is missing or does not fit, by name.
@@ -152,7 +164,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
     entries = [entry_of(model, image) for image in model.images]
     masks = folder / "masks"
     for entry in entries if masks.is_dir() else []:
-        # COLMAP's own form of the name; 0001.png would be a segmentation's masks (docs/segmentation.md).
+        # COLMAP's own form of the name; 0001.png would be a mask of objects (docs/guide/segmentation.md).
         name = masks / (entry["file_path"] + ".png")
         entry["_mask"] = name if name.is_file() else None
     listed = transforms.frames_of(model.path, {}, entries, root, source, capture)
@@ -168,7 +180,7 @@ def frames_of(folder: Path, place: Path, source: dict[str, Any], capture: dict[s
 
 
 def _check_reprojection(model: Model, listed: Transforms) -> None:
-    """Refuse cameras that do not send the sparse points to their keypoints: an edited or foreign cameras file."""
+    """Refuse cameras that do not project the sparse points to their keypoints, as after an edit or with another model's file."""
     found = {image.name: image for image in model.images}
     errors = {}
     for frame in listed.frames:
@@ -182,10 +194,10 @@ def _check_reprojection(model: Model, listed: Transforms) -> None:
         if len(off):
             errors[frame.name] = float(np.median(off)) / max(camera.width, camera.height)
     median = float(np.median(list(errors.values()))) if errors else 0.0
-    if median > REPROJECTION:
+    if median > MAX_REPROJECTION:
         raise InputError(
             f"{model.path}: its sparse points miss their keypoints by {median:.1%} of the picture (median of"
-            f" {len(errors)} images, allowed {REPROJECTION:.1%}): cameras and images are of different runs, or the intrinsics"
+            f" {len(errors)} images, allowed {MAX_REPROJECTION:.1%}): cameras and images are of different runs, or the intrinsics"
             " were changed (fx with fy, cx with cy?); take all files of one model"
         )
 
@@ -206,7 +218,7 @@ def _camera(path: Path, number: int, model: str, width: int, height: int, values
 
 
 def _pose(quaternion: Any, translation: Any) -> np.ndarray:
-    """World-from-camera of COLMAP's world-to-camera quaternion (w, x, y, z) and translation."""
+    """Return `world_from_camera` of COLMAP's world-to-camera quaternion (w, x, y, z) and translation."""
     q = np.asarray(quaternion, np.float64)
     norm = np.linalg.norm(q)
     if not (np.isfinite(q).all() and norm > 1e-6):
@@ -234,7 +246,7 @@ def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray)
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Lines without comments, one at a time: these files hold every keypoint of every image."""
+    """Yield the lines without comments, one at a time because these files hold every keypoint of every image."""
     with open(path) as file:
         for line in file:
             if not line.startswith("#"):
@@ -250,7 +262,7 @@ def _cameras(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def _images(path: Path, keypoints: bool) -> list[Image]:
-    """Two lines an image; the second (keypoints) may be empty."""
+    """Read two lines per image, of which the second (keypoints) may be empty."""
     out, lines = [], _lines(path)
     for first in lines:
         if not first:

@@ -1,4 +1,4 @@
-"""`capture.exposure`: exposures.json, or gains estimated from surface that views share."""
+"""`capture.exposure`: exposures from exposures.json, or estimated from surface that several views show."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from iif_core.camera.response import response
 from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 
-SAMPLES = 2_000_000
-"""Pixels of all views together that the estimate uses."""
-MIN_EDGE = 0.02
-"""Metres; finer cells would hold single pixels."""
-DARK, BRIGHT = 0.03, 0.97
-"""Sensor values outside say little about exposure: noise, saturation."""
+MAX_PIXELS = 2_000_000  # of all views together
+MIN_CELL_EDGE = 0.02  # metres; finer cells would hold single pixels
+DARK, BRIGHT = 0.03, 0.97  # sensor values outside of this range are dominated by noise or saturated
 
 
 def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
-    """Exposure of every frame (name, file_path) from exposures.json: {file_path or name: factor on radiance}."""
+    """Read the exposure of every frame (name, file_path) from exposures.json: {file_path or name: factor on radiance}.
+
+    Raises:
+        InputError: unreadable, an entry missing, or not a positive number.
+    """
     try:
         table = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
@@ -43,16 +44,23 @@ def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
 
 
 class SharedSurface:
-    """Collects thinned pixels of the views, then estimates one gain a view."""
+    """Collects some pixels of every view, then estimates one gain per view."""
 
     def __init__(self, views: int, encoded: bool):
-        self.limit, self.encoded = max(1, SAMPLES // max(views, 1)), encoded
+        self.limit, self.encoded = max(1, MAX_PIXELS // max(views, 1)), encoded
         self.points: list[np.ndarray] = []
         self.values: list[np.ndarray] = []
         self.footprints: list[float] = []
 
     def add(self, photo: np.ndarray, usable: np.ndarray, points: np.ndarray, footprint: float) -> None:
-        """One view: photo (H, W, 3), usable (H, W) bool hit and valid, points (H, W, 3) and footprint in metres."""
+        """Add a view.
+
+        Args:
+            photo: (H, W, 3) sensor values or radiance.
+            usable: (H, W) bool, valid pixels that hit the mesh.
+            points: (H, W, 3) surface points, metres.
+            footprint: median size of a pixel on the surface, metres.
+        """
         if self.encoded:
             usable = usable & (photo > DARK).all(-1) & (photo < BRIGHT).all(-1)
         else:
@@ -64,12 +72,12 @@ class SharedSurface:
         self.footprints.append(footprint)
 
     def gains(self) -> ExposureGains:
-        """Gains of the views in the order in which they were added; sensor values are linearised by x^0.449."""
+        """Estimate the gains of the views in the order in which they were added; the inverse of x^0.449 makes values linear."""
         points, values = np.concatenate(self.points), np.concatenate(self.values)
         view = np.repeat(np.arange(len(self.points)), [len(p) for p in self.points])
         if len(points) == 0:
             return estimate_gains(np.zeros(0, int), view, values, len(self.points))
-        edge = max(3 * float(np.median(self.footprints)), MIN_EDGE)
+        edge = max(3 * float(np.median(self.footprints)), MIN_CELL_EDGE)
         keys = pack_keys(voxel_indices(points, edge, grid_origin(points, edge)))
         cell = np.unique(keys, return_inverse=True)[1].ravel()
         linear = response("ggcm").inverse(values) if self.encoded else values

@@ -1,4 +1,4 @@
-"""Image files of a `folder` scene: headers for the checks, pixels as float, masks for what cannot be used."""
+"""Reads image files: headers for the checks, pixels as floats, and masks of pixels that cannot be used."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda a: a[::-1, ::-1].swapaxes(0, 1),
     8: lambda a: a.swapaxes(0, 1)[::-1],
 }
-"""Stored pixels -> upright, by EXIF orientation."""
+"""EXIF orientation -> function that turns stored pixels upright."""
 
 
 @dataclass(frozen=True)
 class Header:
-    """(width, height) as stored, and EXIF orientation 1 ... 8 (1 = upright)."""
+    """Size (width, height) as stored, and EXIF orientation 1 ... 8 (1 = upright)."""
 
     size: tuple[int, int]
     orientation: int = 1
@@ -39,9 +39,13 @@ class Header:
 
 @dataclass
 class Photo:
-    """(H, W, 3) float32 sensor values in [0, 1] or radiance; (H, W) bool; counts of what was wrong with pixels.
+    """A decoded photograph.
 
-    form: what the file held beyond 8-bit colour (`grey`, `16-bit`, `16-bit grey`).
+    Attributes:
+        pixels: (H, W, 3) float32 sensor values in [0, 1], or radiance.
+        valid: (H, W) bool.
+        non_finite, transparent, negative, masked: counts of such pixels.
+        form: format of the file other than 8-bit colour (`grey`, `16-bit`, `16-bit grey`), else empty.
     """
 
     pixels: np.ndarray
@@ -88,7 +92,7 @@ def header(path: Path) -> Header:
 
 
 def _complete(path: Path) -> bool:
-    """Whether a png or jpg has its end mark; a jpg's must come after its picture began (thumbnails have their own)."""
+    """Return whether a png or jpg has its end mark; in a jpg it must follow the start of the scan, as thumbnails have one too."""
     if path.stat().st_size == 0:
         return False
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
@@ -97,7 +101,7 @@ def _complete(path: Path) -> bool:
         if data[:2] != b"\xff\xd8":
             return True
         at = 2
-        while data[at : at + 2] != b"\xff\xda":  # segments up to the start of the scan, which hold their own length
+        while data[at : at + 2] != b"\xff\xda":  # segments before the start of the scan state their length
             if at + 4 > len(data) or data[at] != 0xFF:
                 return data.rfind(b"\xff\xd9") > 0
             at += 1 if data[at + 1] == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
@@ -111,9 +115,9 @@ def _is_16_bit_png(path: Path) -> bool:
 
 
 def _stored(path: Path) -> np.ndarray:
-    """Pixels of a png or jpg, (H, W) or (H, W, C), integer; palettes resolved."""
+    """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer; palettes are resolved."""
     try:
-        if _is_16_bit_png(path):  # Pillow cuts 16-bit colour to 8 bits
+        if _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
             import mitsuba as mi
 
             return np.array(mi.Bitmap(str(path)))
@@ -139,7 +143,7 @@ def _exr(path: Path) -> dict[str, np.ndarray]:
 
 
 def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
-    """(H, W, 3) or (H, W, 4) float32 of R G B [A], or of one grey channel [and A]."""
+    """Return (H, W, 3) or (H, W, 4) float32 of R G B [A], or of one grey channel [and A]."""
     if all(c in channels for c in "RGB"):
         names = list("RGB")
     else:
@@ -151,10 +155,10 @@ def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def load_photo(path: Path, turn: int = 1) -> Photo:
-    """A photograph: 8/16-bit to [0, 1], EXR as it is; grey becomes RGB.
+    """Read a photograph: 8 or 16 bits become [0, 1], EXR values stay, grey becomes RGB.
 
-    Pixels with alpha < 0.5, and NaN or infinite ones, are not valid and become 0. EXR colour is divided by its alpha
-    (EXR stores it multiplied). Negative EXR values become 0.
+    Pixels with alpha < 0.5 and those that are NaN or infinite are not valid and become 0. EXR stores colour multiplied by alpha,
+    so it is divided by alpha. Negative EXR values become 0.
     """
     form = ""
     if path.suffix.lower() == ".exr":
@@ -187,8 +191,11 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
 
 
 def load_mask(path: Path, turn: int = 1, full: bool = False) -> np.ndarray:
-    """(H, W) bool: which pixels count. Those that are not 0 (nerfstudio, COLMAP), or with `full` only those at the
-    largest value of the type (ScanNet++: 255; interpolation leaves less at the border of what is hidden)."""
+    """Read which pixels may be used, (H, W) bool: those that are not 0 (nerfstudio, COLMAP).
+
+    With `full` only the largest value of the type counts (ScanNet++: 255), because interpolation leaves smaller values at the
+    borders of hidden regions.
+    """
     stored = _stored(path)
     stored = stored[..., 0] if stored.ndim == 3 else stored
     kept = stored == np.iinfo(stored.dtype).max if full else stored > 0
@@ -196,7 +203,7 @@ def load_mask(path: Path, turn: int = 1, full: bool = False) -> np.ndarray:
 
 
 def load_map(path: Path, channels: int) -> np.ndarray:
-    """(H, W, 3) or (H, W) float32 of an EXR map; not-finite values are kept for the caller to mask."""
+    """Read an EXR map, (H, W, 3) or (H, W) float32; values that are not finite are kept for the caller to mask."""
     values = _exr_colour(path, found) if "R" in (found := _exr(path)) else _one_channel(path, found)[..., None]
     if channels == 3:
         return np.repeat(values, 3, -1) if values.shape[-1] == 1 else values[..., :3]
@@ -210,10 +217,13 @@ def _one_channel(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def load_ids(path: Path, turn: int = 1) -> np.ndarray:
-    """(H, W) int32 ids of a one-channel png (8 or 16 bit) or EXR, -1 = none.
+    """Read object ids (H, W) int32 from a one-channel png (8 or 16 bit) or EXR, -1 = none.
 
-    None is written as a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0 is an id.
-    Raises InputError for colour pictures and for ids between integers (anti-aliased, METHOD H44).
+    Files mark pixels without an id by a negative number or NaN (float EXR), 4294967295 (UINT EXR) or 65535 (16-bit png). 0 is an
+    id.
+
+    Raises:
+        InputError: a colour picture, or ids between integers (docs/method/numerics.md#ids-between-integers).
     """
     if path.suffix.lower() == ".exr":
         stored = _one_channel(path, _exr(path))
@@ -244,7 +254,7 @@ def load_ids(path: Path, turn: int = 1) -> np.ndarray:
 
 
 def load_depth(path: Path, unit: float | None) -> np.ndarray:
-    """(H, W) float32 z-depth in metres, 0 = unknown. unit: metres per value; default 0.001 (png), 1 (EXR)."""
+    """Read z-depth (H, W) float32 in metres, 0 = unknown; `unit` is metres per value, by default 0.001 (png) or 1 (EXR)."""
     if path.suffix.lower() == ".exr":
         found = _exr(path)
         named = next((found[name] for name in ("Z", "depth.Z", "Y", "R") if name in found), None)
@@ -263,14 +273,25 @@ def load_depth(path: Path, unit: float | None) -> np.ndarray:
     return np.where(known, depth * np.float32(scale), 0).astype(np.float32)
 
 
-def fitted_size(width: int, height: int, max_width: int, max_height: int) -> tuple[int, int]:
-    """Size within max_width x max_height, aspect kept, never enlarged."""
+def fitted_size(width: int, height: int, max_width: float, max_height: float) -> tuple[int, int]:
+    """Return the largest size within a limit that keeps the aspect ratio and does not enlarge.
+
+    Args:
+        width, height: pixels.
+        max_width, max_height: the limit, pixels.
+
+    Returns:
+        Width and height, at least 1.
+
+    >>> fitted_size(640, 480, 320, 320)
+    (320, 240)
+    """
     scale = min(max_width / width, max_height / height, 1.0)
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _overlap(size: int, wanted: int) -> Any:
-    """(wanted, size) sparse: share of target pixel i that source pixel j covers; rows sum to 1."""
+    """Return a sparse (wanted, size) matrix: the share of target pixel i that source pixel j covers; rows sum to 1."""
     from scipy.sparse import csr_matrix
 
     step = size / wanted
@@ -286,9 +307,15 @@ def _overlap(size: int, wanted: int) -> Any:
 
 
 def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean of the valid part of every target pixel's area; valid where at least half of that area is.
+    """Reduce an image: every target pixel is the mean of the valid part of its area.
 
-    image (H, W, C) float32 with finite values, valid (H, W) bool -> (height, width, C) float32, (height, width) bool.
+    Args:
+        image: (H, W, C) float32, finite.
+        valid: (H, W) bool.
+        width, height: of the result, pixels.
+
+    Returns:
+        (height, width, C) float32, and (height, width) bool: where at least half of the area is valid.
     """
     if image.shape[:2] == (height, width):
         return np.where(valid[..., None], image, 0), valid
@@ -305,7 +332,7 @@ def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -
 
 
 def reduce_nearest(ids: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The value at every target pixel's centre."""
+    """Return the values at the centres of the target pixels, (height, width)."""
     row = np.minimum(((np.arange(height) + 0.5) * ids.shape[0] / height).astype(int), ids.shape[0] - 1)
     column = np.minimum(((np.arange(width) + 0.5) * ids.shape[1] / width).astype(int), ids.shape[1] - 1)
     return ids[np.ix_(row, column)]

@@ -1,4 +1,4 @@
-"""Which files make a scene: what every photographed source fills in, and how the source `folder` finds its own."""
+"""The files of a scene: the record that every source of photographs fills, and the search of the source `folder`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,21 @@ TRUTH = ("albedo", "roughness", "metallic", "emission")
 
 @dataclass(frozen=True)
 class Inputs:
-    """Every file that the capture of this scene reads."""
+    """Every file that the capture of a scene reads.
+
+    Attributes:
+        transforms: the checked cameras.
+        mesh: the mesh file.
+        exposures: exposures.json.
+        instances: name of a view -> its map of object ids.
+        truth: name of a view -> kind -> file.
+        metres: per unit of the poses and of the mesh.
+        gains: exposures of the frames that the source itself knows.
+        of_vertices: reads the object ids of the mesh's vertices.
+        load_ids: reads a map of object ids, given its path and the EXIF turn.
+        response: (3, 101) true camera response.
+        also: further files that are read.
+    """
 
     transforms: transforms.Transforms
     mesh: Path
@@ -27,16 +41,13 @@ class Inputs:
     truth: dict[str, dict[str, Path]] = field(default_factory=dict)
     metres: float = 1.0
     gains: tuple[float, ...] | None = None
-    """Exposures of the frames that the source itself knows."""
     of_vertices: Callable[[], mesh.VertexIds] | None = None
-    """Object ids of the mesh's vertices."""
     load_ids: Callable[[Path, int], np.ndarray] = images.load_ids
     response: np.ndarray | None = None
-    """True camera response, (3, 101)."""
     also: tuple[Path, ...] = ()
-    """Further files that are read."""
 
     def files(self) -> list[Path]:
+        """List all files."""
         out = [self.transforms.path, self.mesh, *([self.exposures] if self.exposures else []), *self.instances.values()]
         for frame in self.transforms.frames:
             out += [path for path in (frame.image, frame.depth, frame.mask) if path]
@@ -45,7 +56,18 @@ class Inputs:
 
 
 def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
-    """The checked scene: cameras, and the files that belong to them. points: read a model's sparse points too (slow)."""
+    """Find and check the cameras of a scene and the files that belong to them.
+
+    Args:
+        source, capture: the dumped settings sections.
+        points: also read the sparse points of a COLMAP model, which is slow.
+
+    Returns:
+        The checked scene.
+
+    Raises:
+        InputError: missing or unusable files, by name.
+    """
     metres = transforms.metres_per_unit(source["unit"])
     folder = transforms.folder_at(source, "transforms.json or a COLMAP model")
     stated = source["cameras"]

@@ -1,4 +1,4 @@
-"""The mesh file of a `folder` scene: read, brought to metres, cleaned, checked for its size."""
+"""Reads the mesh file of a scene, scales it to metres, removes degenerate faces and checks its size."""
 
 from __future__ import annotations
 
@@ -9,24 +9,28 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.surface.triangles import face_geometry
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene.transforms import METRES
 
 NAMES = ("mesh.ply", "mesh.obj", "mesh.glb")
 SUFFIXES = (".ply", ".obj", ".glb")
-MIN_AREA = 1e-12
-"""m^2; smaller triangles are removed (METHOD H48)."""
-DIAGONAL = (0.5, 200.0)
-"""Metres; a room outside of this is in another unit (METHOD H57)."""
-TYPICAL = 7.0
-"""Metres across a room: the unit that comes nearest is proposed."""
+MIN_AREA = 1e-12  # m^2; smaller triangles are removed (docs/method/numerics.md#degenerate-faces)
+DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another unit (docs/method/numerics.md#unit-of-the-mesh)
+TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
 @dataclass
 class Mesh:
-    """vertices (n, 3) float64 in metres, faces (m, 3) int32, instance (m,) int32 with -1 = none or None, and their
-    names.
+    """A triangle mesh.
 
-    `from_nodes`: the instances are the file's nodes, not ids that somebody gave.
+    Attributes:
+        vertices: (n, 3) float64, metres.
+        faces: (m, 3) int32.
+        instance: (m,) int32 object of each face with -1 = none, or None.
+        names: of the objects.
+        from_nodes: whether the objects are the nodes of the file rather than given ids.
+        notes: what was removed, in words.
     """
 
     vertices: np.ndarray
@@ -38,7 +42,7 @@ class Mesh:
 
     @property
     def bounds(self) -> np.ndarray:
-        """(2, 3): lowest and highest corner."""
+        """(2, 3), the lowest and the highest corner."""
         return np.stack([self.vertices.min(0), self.vertices.max(0)])
 
     @property
@@ -48,13 +52,17 @@ class Mesh:
 
 
 def find(folder: Path, name: str | None) -> Path:
-    """The mesh file: `source.mesh`, or the only one of mesh.ply, mesh.obj, mesh.glb."""
+    """Return the mesh file: `source.mesh`, or the only one of mesh.ply, mesh.obj, mesh.glb.
+
+    Raises:
+        InputError: no such file, several, or one of another kind.
+    """
     if name is not None:
         path = folder / name
         if path.suffix.lower() not in SUFFIXES:
             raise InputError(f"`source.mesh: {name}`: allowed are {', '.join(SUFFIXES)} files")
         if not path.is_file():
-            raise InputError(f"{path}: not found (`source.mesh: {name}`)")
+            raise InputError(f"{path}: not found (`source.mesh: {name}`).{did_you_mean_path(path)}")
         return path
     found = [folder / n for n in NAMES if (folder / n).is_file()]
     if len(found) > 1:
@@ -62,13 +70,13 @@ def find(folder: Path, name: str | None) -> Path:
     if not found:
         meshes = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
         hint = f" Found {', '.join(meshes[:3])}: name it with `source.mesh`." if meshes else ""
-        raise InputError(f"{folder}: no {', '.join(NAMES)}; a mesh of the scene is needed (docs/own-data.md).{hint}")
+        raise InputError(f"{folder}: no {', '.join(NAMES)}; a mesh of the scene is needed (docs/guide/own-data.md).{hint}")
     return found[0]
 
 
 @dataclass(frozen=True)
 class VertexIds:
-    """Object of every vertex of the file (n,) with -1 = none, the objects' names, and where they come from."""
+    """The object of every vertex of a mesh file (n,) with -1 = none, the names of the objects, and the file of the ids."""
 
     ids: np.ndarray
     names: dict[int, str]
@@ -76,12 +84,18 @@ class VertexIds:
 
 
 def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mesh:
-    """Read a mesh, merge its nodes, scale it to metres, remove what has no area, keep `instance` of the faces.
+    """Read a mesh, merge its nodes, scale it to metres, remove faces without area, keep `instance` of the faces.
 
-    of_vertices: ids from another file; they replace those of the mesh.
+    Args:
+        path: PLY, OBJ or GLB.
+        metres: per unit of the file.
+        of_vertices: ids from another file, which replace those of the mesh.
+
+    Returns:
+        The mesh.
 
     Raises:
-        InputError: unreadable, no triangles, nothing left, or instance ids that do not fit.
+        InputError: unreadable, no triangles, none with an area, or instance ids that do not fit.
     """
     vertices, faces, ids, names = _read(path)
     if len(faces) == 0:
@@ -94,7 +108,7 @@ def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mes
                 f"{of_vertices.path}: ids of {len(of_vertices.ids)} vertices, {path.name} has {len(vertices)}; both must come"
                 " from the same release"
             )
-        ids, names = majority(of_vertices.ids[faces]), None
+        ids, names = majority_id(of_vertices.ids[faces]), None
     mesh = _cleaned(path, vertices * metres, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True
@@ -105,8 +119,12 @@ def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mes
     return mesh
 
 
-def majority(ids: np.ndarray) -> np.ndarray:
-    """(m,) the id that at least two of a face's three vertices share, -1 where all differ. ids (m, 3)."""
+def majority_id(ids: np.ndarray) -> np.ndarray:
+    """Return the id (m,) that at least two of the three vertices of a face share, -1 where all differ; ids (m, 3).
+
+    >>> majority_id(np.array([[4, 7, 4], [1, 2, 3]])).tolist()
+    [4, -1]
+    """
     a, b, c = ids.T
     return np.where((a == b) | (a == c), a, np.where(b == c, b, -1)).astype(np.int64)
 
@@ -126,7 +144,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[s
             continue
         v = np.asarray(part.vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
         f = np.asarray(part.faces, np.int64)
-        if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node would turn its front inwards
+        if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node would have its front inside
             f = f[:, ::-1]
         vertices.append(v)
         faces.append(f + offset)
@@ -145,7 +163,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[s
 
 
 def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
-    """The `instance` property of the faces of a PLY."""
+    """Return the `instance` property of the faces of a PLY, or None."""
     data = part.metadata.get("_ply_raw", {}).get("face", {}).get("data")
     names = data.dtype.names if isinstance(data, np.ndarray) else data.keys() if isinstance(data, dict) else ()
     if "instance" not in (names or ()):
@@ -163,9 +181,7 @@ def _face_property(path: Path, part: Any, count: int) -> np.ndarray | None:
 
 def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarray | None) -> Mesh:
     finite = np.isfinite(vertices).all(1)[faces].all(1)
-    corners = np.where(np.isfinite(vertices), vertices, 0)[faces]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    kept = finite & (area >= MIN_AREA)
+    kept = finite & (face_geometry(np.where(np.isfinite(vertices), vertices, 0), faces)[1] >= MIN_AREA)
     notes = []
     if (~finite).any():
         notes.append(f"mesh: {int((~finite).sum())} faces with NaN vertices removed")
@@ -181,13 +197,24 @@ def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarra
 
 
 def _renumbered(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ids that occur, ascending, and ids counted from 0 in that order; -1 stays."""
+    """Return the ids that occur, ascending, and the ids renumbered from 0 in that order; -1 stays."""
     given = np.unique(ids[ids >= 0])
     return given, np.where(ids < 0, -1, np.searchsorted(given, ids)).astype(np.int32)
 
 
 def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres: np.ndarray) -> None:
-    """Refuse a scene that cannot be in metres, and cameras that are not near it. centres: (v, 3) camera positions."""
+    """Refuse a scene that cannot be in metres, and cameras that are not near it.
+
+    Args:
+        path: file that messages name.
+        mesh: in metres.
+        unit: `source.unit`, for messages.
+        metres: per unit.
+        centres: (v, 3) camera positions, metres.
+
+    Raises:
+        InputError: the size is implausible, or most cameras are far from the mesh.
+    """
     low, high = DIAGONAL
     diagonal = mesh.diagonal
     if not low <= diagonal <= high:
@@ -200,7 +227,7 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
                 " into the unit of transforms.json (is it in millimetres? then scale its vertices by 0.001)"
             )
         across = {name: diagonal / metres * factor for name, factor in METRES.items()}
-        name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL)))
+        name, size = min(across.items(), key=lambda item: abs(np.log(item[1] / TYPICAL_DIAGONAL)))
         if low <= size <= high:
             raise InputError(f"{found}; `source: {{unit: {name}}}` makes it {size:.3g} m")
         raise InputError(f"{found}; give its unit as a number: `source: {{unit: <metres per unit>}}`")
@@ -211,5 +238,5 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
         raise InputError(
             f"{path}: {int(far.sum())} of {len(centres)} cameras are more than the scene's size ({diagonal:.3g} m) away"
             f" from the mesh (median {np.median(outside):.3g} m); mesh and poses are in different units or frames:"
-            " export both from the same tool (docs/own-data.md, mesh and poses in one frame)"
+            " export both from the same tool (docs/guide/own-data.md, mesh and poses in one frame)"
         )

@@ -1,4 +1,4 @@
-"""`source.registration`: small corrections of poses and intrinsics that bring photographs onto the mesh; views left out."""
+"""`source.registration`: small corrections of poses and intrinsics that align photographs with the mesh, and views left out."""
 
 from __future__ import annotations
 
@@ -12,39 +12,57 @@ from iif_core.camera.registration import MIN_VIEWS, Photo, Registration, registe
 from workflow import decisions
 from workflow.sources.folder_scene.transforms import Frame
 
-WIDTH = 200
-"""Pictures are compared at most this wide."""
-ROWS = 300_000
-"""Points times views, to keep the work of a capture within a minute."""
-BLURRED, ASTRAY = 0.4, 0.2
+WIDTH = 200  # pixels; photographs are reduced to at most this width before they are compared
+MAX_ROWS = 300_000  # points times views; keeps the registration of a capture within about a minute
+MIN_SHARPNESS, MIN_AGREEMENT = 0.4, 0.2
 """Sharpness, and agreement with the other views, below which a photograph is left out."""
-LEFT_OUT = 1 / 3
-"""More views than this share are never left out: then it is not they that are wrong. Nor is any of fewer than MIN_VIEWS."""
+MAX_SHARE_LEFT_OUT = 1 / 3
+"""If more views than this share fail, or there are fewer than MIN_VIEWS, none is left out: the fault lies elsewhere."""
 
 
 @dataclass(frozen=True)
 class Registered:
-    """Frames with corrected cameras, their poses, why some are better left out (by name), numbers, and what plan.yaml says."""
+    """The result of a registration.
+
+    Attributes:
+        frames: with corrected cameras.
+        poses: (4, 4) `world_from_camera` of each frame.
+        left_out: name of a frame -> why it should not be used.
+        facts: numbers for capture.json.
+        notes: the same in words.
+        plan: entries of plan.yaml.
+    """
 
     frames: list[Frame]
     poses: list[np.ndarray]
     left_out: dict[str, str]
     facts: dict[str, Any]
     notes: list[str]
-    decisions: list[decisions.Decision]
+    plan: list[decisions.Decision]
 
 
-def registered(
+def register_frames(
     frames: Sequence[Frame], poses: Sequence[np.ndarray], photos: Sequence[Photo | None], axes: str, metres: float
 ) -> Registered:
-    """Photographs (None: sees nothing) registered with the mesh and with each other."""
+    """Register photographs with the mesh and with each other.
+
+    Args:
+        frames: all frames of the scene.
+        poses: (4, 4) `world_from_camera` of each frame.
+        photos: reduced photograph of each frame with depth and normals of the mesh; None where it sees no surface.
+        axes: `opengl` or `opencv`, camera axes of the frames' matrices.
+        metres: per unit of the frames' matrices.
+
+    Returns:
+        The corrected frames; those given where the correction does not pay.
+    """
     seen = [i for i, photo in enumerate(photos) if photo is not None]
     if len(seen) < 2:
         return Registered(list(frames), list(poses), {}, {}, [], [])
     plain = all(frames[i].lens.is_identity for i in seen)
-    found = register([photos[i] for i in seen], points=max(2000, ROWS // len(seen)), intrinsics=plain)
+    found = register([photos[i] for i in seen], points=max(2000, MAX_ROWS // len(seen)), intrinsics=plain)
     scale = frames[seen[0]].camera.width / photos[seen[0]].image.shape[1]
-    left_out = _hopeless([frames[i].name for i in seen], found)
+    left_out = _unusable([frames[i].name for i in seen], found)
     new_frames, new_poses = list(frames), list(poses)
     if found.accepted:
         for pose, i in zip(found.pose, seen, strict=True):
@@ -64,20 +82,20 @@ def _camera(frame: Frame, found: Registration) -> Any:
 
 
 def _matrix(pose: np.ndarray, axes: str, metres: float) -> np.ndarray:
-    """The matrix that `transforms.opencv_pose` reads as `pose`."""
+    """Return the matrix that `transforms.opencv_pose` converts to `pose`."""
     out = pose.copy()
     out[:3, 3] /= metres
     return out @ np.diag([1.0, -1.0, -1.0, 1.0]) if axes == "opengl" else out
 
 
-def _hopeless(names: list[str], found: Registration) -> dict[str, str]:
+def _unusable(names: list[str], found: Registration) -> dict[str, str]:
     out = {}
     for name, sharp, agreement in zip(names, found.sharpness, found.agreement, strict=True):
-        if agreement != 0 and agreement < ASTRAY:
+        if agreement != 0 and agreement < MIN_AGREEMENT:
             out[name] = f"badly posed? It correlates {agreement:.2f} with what the others show of the same surface"
-        elif sharp > 0 and sharp < BLURRED:
+        elif sharp > 0 and sharp < MIN_SHARPNESS:
             out[name] = f"blurred: {sharp:.2f} of the texture's contrast that the others show"
-    return out if len(names) >= MIN_VIEWS and len(out) <= LEFT_OUT * len(names) else {}
+    return out if len(names) >= MIN_VIEWS and len(out) <= MAX_SHARE_LEFT_OUT * len(names) else {}
 
 
 def _facts(frames: Sequence[Frame], seen: list[int], found: Registration, scale: float) -> dict[str, Any]:
@@ -100,7 +118,7 @@ def _facts(frames: Sequence[Frame], seen: list[int], found: Registration, scale:
         "edge_gain": [found.edge_gain, found.edge_error],
     }
     rounded = {k: np.round(v, 5).tolist() if not isinstance(v, bool) else v for k, v in numbers.items()}
-    # A standard error that is not known is infinite, which JSON has no word for.
+    # An unknown standard error is infinite, which JSON cannot represent.
     finite = {k: v if isinstance(v, bool) else np.nan_to_num(v, posinf=0.0).tolist() for k, v in rounded.items()}
     return {**finite, "views": views}
 

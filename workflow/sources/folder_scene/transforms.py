@@ -1,8 +1,8 @@
-"""`transforms.json` of nerfstudio and instant-ngp -> cameras in the project's conventions, checked before any work.
+"""Reads and checks cameras in the form of `transforms.json` of nerfstudio and instant-ngp.
 
-Reads JSON and image headers only, because it runs while Snakemake plans. Every message names the file, the frame,
-what was found, what is allowed and what to do. Other camera files (COLMAP, ScanNet++, FIPT) are brought into the same
-entries and pass the same checks (`frames_of`).
+The checks read JSON and image headers only, because they run while Snakemake plans. Every message names the file, the frame, the
+value found, the values allowed and the remedy. Other camera files (COLMAP, ScanNet++, FIPT) are converted to the same entries and
+pass the same checks (`frames_of`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 
 from iif_core.camera.distortion import Distortion, Pinhole
 from iif_core.errors import InputError
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import images
 
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "in": 0.0254}
@@ -28,38 +29,35 @@ INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "camera_angle_x", "camera_an
 KEYS = (
     *INTRINSICS,
     *("k1", "k2", "k3", "k4", "p1", "p2", "camera_model", "is_fisheye", "pixel_centres_at"),
-    *(
-        "frames",
-        "file_path",
-        "transform_matrix",
-        "mask_path",
-        "depth_file_path",
-        "applied_transform",
-        "applied_scale",
-        "train_filenames",
-        "val_filenames",
-        "test_filenames",
-    ),
+    *("frames", "file_path", "transform_matrix", "mask_path", "depth_file_path", "applied_transform", "applied_scale"),
+    *("train_filenames", "val_filenames", "test_filenames"),
 )
-"""What is read of a transforms.json; other keys are other tools' and are ignored."""
-NEAR = 0.85
-"""Similarity (difflib) from which a key that is not read is a misspelt one that is."""
+"""Keys of a transforms.json that are read; keys of other tools are ignored."""
+MISSPELT = 0.85
+"""Similarity (difflib) from which an unknown key counts as a misspelt known one."""
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-RIGID_TOLERANCE = 5e-3
-"""Largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not."""
-SWAPPED = 0.08
-"""Share of the picture by which a principal point must be off before x and y can be said to be swapped."""
+RIGID_TOLERANCE = 5e-3  # largest entry of R^T R - I: rounding to three decimals passes, a scale of 1 % does not
+MIN_OFFSET_IF_SWAPPED = 0.08
+"""Offset of the principal point from the middle, as a share of the picture, above which x and y may have been swapped."""
 
 
 @dataclass(frozen=True)
 class Frame:
     """One photograph, as the file describes it.
 
-    camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5. matrix: `transform_matrix` as written.
-    depth_camera, depth_matrix: of the depth image where they differ from the photograph's (matrix: OpenCV axes).
-    mask: picture of which pixels count: those that are not 0, with `mask_full` only the brightest value.
-    split: `train` or `test` where lists say so. seen: (n, 3) points of a sparse reconstruction that this photograph
-    sees, in the unit of the poses.
+    Attributes:
+        name: of the view.
+        file_path: as written.
+        image: the file.
+        turn: EXIF orientation that makes the stored pixels upright.
+        camera: of the stored (or EXIF-turned) picture, pixel centres at +0.5.
+        lens: its distortion.
+        matrix: (4, 4) `transform_matrix` as written.
+        depth: depth image.
+        depth_camera, depth_matrix: of the depth image where they differ from the photograph's; the matrix has OpenCV axes.
+        mask: picture of the pixels that may be used: those that are not 0, or with `mask_full` only those of the largest value.
+        split: `train` or `test` where lists say so.
+        seen: (n, 3) points of a sparse reconstruction that this photograph sees, in the unit of the poses.
     """
 
     name: str
@@ -80,10 +78,16 @@ class Frame:
 
 @dataclass(frozen=True)
 class Transforms:
-    """The checked file: its frames in order, and metres per value of the depth images where it says so.
+    """A checked camera file.
 
-    axes: camera axes of the frames' matrices; `known`: by the file's format, so no setting can be wrong. notes: what was left
-    out, in words. also: further files that were read.
+    Attributes:
+        path: the file.
+        frames: in order.
+        depth_unit: metres per value of the depth images, where the file states it.
+        axes: camera axes of the frames' matrices, `opengl` or `opencv`.
+        known: whether the format of the file determines the axes, so that no setting can be wrong.
+        notes: what was left out, in words.
+        also: further files that were read.
     """
 
     path: Path
@@ -96,7 +100,11 @@ class Transforms:
 
 
 def metres_per_unit(unit: str | float) -> float:
-    """Factor of `source.unit`."""
+    """Return the metres per unit of `source.unit`.
+
+    >>> metres_per_unit("cm"), metres_per_unit(0.5)
+    (0.01, 0.5)
+    """
     factor = METRES.get(unit, unit) if isinstance(unit, str) else unit
     try:
         factor = float(factor)
@@ -108,7 +116,7 @@ def metres_per_unit(unit: str | float) -> float:
 
 
 def opencv_pose(matrix: np.ndarray, axes: str, metres: float) -> np.ndarray:
-    """`world_from_camera` (4, 4) float64, OpenCV axes, metres; its rotation made exactly orthonormal."""
+    """Return `world_from_camera` (4, 4) float64 with OpenCV axes, in metres and with an exactly orthonormal rotation."""
     pose = matrix @ OPENGL_TO_OPENCV if axes == "opengl" else matrix.copy()
     u, _, vt = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = u @ vt
@@ -116,42 +124,49 @@ def opencv_pose(matrix: np.ndarray, axes: str, metres: float) -> np.ndarray:
     return pose
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """`wanted` of `count` indices, evenly spread, all of them when there are fewer."""
+def evenly_spread(count: int, wanted: int) -> list[int]:
+    """Return `wanted` of `count` indices, evenly spread, or all of them if there are fewer.
+
+    >>> evenly_spread(10, 3)
+    [1, 5, 8]
+    """
     if count <= wanted:
         return list(range(count))
     return [int((i + 0.5) * count / wanted) for i in range(wanted)]
 
 
-def chosen(entries: list[dict[str, Any]], views: int) -> list[dict[str, Any]]:
-    """At most `views` entries, evenly spread; of those that lists keep for testing (`_split`) at most one in eight."""
+def choose_entries(entries: list[dict[str, Any]], views: int) -> list[dict[str, Any]]:
+    """Return at most `views` entries, evenly spread; at most one in eight is a test photograph (`_split`)."""
     tests = [e for e in entries if e.get("_split") == "test"]
     others = [e for e in entries if e.get("_split") != "test"]
     if len(entries) > views:
         kept = min(len(tests), max(1, views // 8)) if views > 1 else 0
-        tests = [tests[i] for i in spread(len(tests), kept)]
-        others = [others[i] for i in spread(len(others), views - kept)]
+        tests = [tests[i] for i in evenly_spread(len(tests), kept)]
+        others = [others[i] for i in evenly_spread(len(others), views - kept)]
     taken = {id(e) for e in (*others, *tests)}
     return [e for e in entries if id(e) in taken]
 
 
 def folder_at(source: dict[str, Any], holds: str) -> Path:
-    """`source.path`, which must be a folder."""
+    """Return `source.path`, which must be a folder; `holds` says in messages what it contains."""
     folder = Path(source["path"])
     if not folder.is_dir():
-        found = "is a file" if folder.exists() else "not found"
-        raise InputError(f"{folder}: {found}; `source.path` must be a folder with {holds} (docs/own-data.md)")
+        found, hint = ("is a file", "") if folder.exists() else ("not found", did_you_mean_path(folder))
+        raise InputError(f"{folder}: {found}; `source.path` must be a folder with {holds} (docs/guide/own-data.md).{hint}")
     return folder
 
 
 def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
-    """Frames of a folder after `frames` glob and `capture.views`, everything about them checked.
+    """Read the frames of a folder that `source.frames` and `capture.views` choose, and check everything about them.
 
     Args:
         source, capture: the dumped settings sections.
 
+    Returns:
+        The checked frames.
+
     Raises:
-        InputError: on the first thing that cannot be used; lists of files name the first few.
+        InputError: at the first fault; of a list of faulty files the message names the first few.
     """
     path = folder_at(source, "transforms.json") / (source["cameras"] or "transforms.json")
     document = load(path)
@@ -173,18 +188,24 @@ def frames_of(
     capture: dict[str, Any],
     world: np.ndarray | None = None,
 ) -> Transforms:
-    """The frames that `capture.views` and `source.frames` leave of `entries`, everything about them checked.
+    """Return the frames that `source.frames` and `capture.views` choose of `entries`, after checking everything about them.
 
     Args:
         path: the file that messages name.
         document: keys that all frames share (intrinsics), and those of the whole file.
-        entries: one a photograph, keys as in transforms.json; `_name`, `_mask`, `_mask_full`, `_split`, `_seen` fill the
-            fields of Frame.
-        root: what `file_path` counts from.
+        entries: one per photograph, with keys as in transforms.json; `_where` names it in messages, and `_name`, `_mask`,
+            `_mask_full`, `_split`, `_seen` fill the fields of Frame.
+        root: folder that `file_path` counts from.
         source, capture: the dumped settings sections.
-        world: (4, 4) rotation, translation and uniform scale that brings the poses into the mesh's frame; None = is so.
+        world: (4, 4) rotation, translation and uniform scale from the world of the poses to that of the mesh; None = identity.
+
+    Returns:
+        The checked frames.
+
+    Raises:
+        InputError: at the first fault.
     """
-    raw = chosen(_matching(path, entries, source.get("frames")), capture["views"])
+    raw = choose_entries(_matching(path, entries, source.get("frames")), capture["views"])
     if all(entry.get("_split") == "test" for entry in raw):
         raise InputError(f"{path}: lists keep all {len(raw)} photographs for testing; at least one must be there to use")
     _unique_names(path, raw)
@@ -195,6 +216,7 @@ def frames_of(
     offset = _pixel_offset(path, document, source.get("pixel_centre", "auto"))
     headers = {image: images.header(image) for _, image in located}
     _same_sizes(path, document, located, headers)
+    _refuse_bad_poses(path, raw)
     strict = source["alignment"] != "off"
     frames = [_frame(path, document, entry, image, headers[image], offset, strict) for entry, image in located]
     absent = [f.depth for f in frames if f.depth is not None and not f.depth.is_file()]
@@ -212,16 +234,16 @@ def frames_of(
 
 
 def _in_world(world: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """The pose after a similarity of the world: its scale moves the camera and does not stretch its axes."""
+    """Return the pose after a similarity of the world, whose scale moves the camera but does not stretch its axes."""
     scale = float(np.cbrt(np.linalg.det(world[:3, :3])))
     out = world @ matrix
-    if abs(scale - 1) > 1e-12:  # axes that only change places stay exact
+    if abs(scale - 1) > 1e-12:  # permutations of the axes stay exact
         out[:3, :3] /= scale
     return out
 
 
 def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
-    """What takes nerfstudio's `applied_transform` (3 or 4 rows of 4) and `applied_scale` back."""
+    """Return the inverse of nerfstudio's `applied_transform` (3 or 4 rows of 4) and `applied_scale`."""
     stated = document.get("applied_transform")
     try:
         rows = np.array(stated, np.float64)
@@ -244,7 +266,7 @@ def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
 
 
 def _listed_splits(path: Path, document: dict[str, Any], entries: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """`_split` of every entry where nerfstudio's lists of file names decide it (validation counts as test)."""
+    """Add `_split` to every entry that nerfstudio's lists of file names contain; validation counts as test."""
     lists = {key: document[key] for key in ("train_filenames", "val_filenames", "test_filenames") if key in document}
     if not lists:
         return entries
@@ -267,13 +289,19 @@ def _listed_splits(path: Path, document: dict[str, Any], entries: list[dict[str,
 
 
 def entries_of(path: Path, document: dict[str, Any], key: str = "frames") -> list[dict[str, Any]]:
-    """The checked list of frames of a document."""
+    """Return the checked list of frames of a document."""
     return [_entry(path, i, entry, key) for i, entry in enumerate(_frames(path, document, key))]
 
 
 def load(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        InputError: missing, not JSON, or not an object.
+    """
     if not path.is_file():
-        raise InputError(f"{path}: not found; a `folder` scene needs it (docs/own-data.md shows how to make one)")
+        hint = did_you_mean_path(path)
+        raise InputError(f"{path}: not found; a `folder` scene needs it (docs/guide/own-data.md shows how to make one){hint}")
     try:
         document = json.loads(path.read_text())
     except (ValueError, UnicodeDecodeError) as error:
@@ -284,13 +312,13 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def _refuse_misspelt(path: Path, document: dict[str, Any]) -> None:
-    """Keys that are all but one that is read and that is missing beside them: a mask or a focal length would be lost silently."""
+    """Refuse an unknown key that is similar to a known, absent one, because a mask or focal length would be ignored silently."""
     frames = document.get("frames")
     places = [("", document)]
     places += [(f"frames[{i}]: ", f) for i, f in enumerate(frames if isinstance(frames, list) else []) if isinstance(f, dict)]
     for where, place in places:
         for key in place:
-            near = difflib.get_close_matches(key, KEYS, 1, NEAR) if key not in KEYS and key != "pixel_centers_at" else []
+            near = difflib.get_close_matches(key, KEYS, 1, MISSPELT) if key not in KEYS and key != "pixel_centers_at" else []
             if near and near[0] not in place:
                 raise InputError(f"{path}: {where}`{key}`: unknown key. Did you mean `{near[0]}`? Rename or remove it")
 
@@ -307,7 +335,8 @@ def _entry(path: Path, index: int, entry: Any, key: str) -> dict[str, Any]:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
         raise InputError(f"{path}: {key}[{index}]: needs a `file_path` (text) and a `transform_matrix`")
     file_path = entry["file_path"].removeprefix("./")
-    return {**entry, "file_path": file_path, "_where": f"{key}[{index}] ({file_path})"}
+    stated = {name: value for name, value in entry.items() if not name.startswith("_")}  # reserved for the readers
+    return {**stated, "file_path": file_path, "_where": f"{key}[{index}] ({file_path})"}
 
 
 def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) -> list[dict[str, Any]]:
@@ -383,7 +412,7 @@ def _one_range(path: Path, files: list[Path], dynamic_range: str) -> None:
 
 
 def _pixel_offset(path: Path, document: dict[str, Any], setting: str) -> float:
-    """What is added to cx, cy so that pixel centres lie at +0.5."""
+    """Return the offset on cx and cy that puts pixel centres at +0.5."""
     stated = document.get("pixel_centres_at", document.get("pixel_centers_at"))
     if setting != "auto":
         return 0.5 if setting == "integer" else 0.0
@@ -406,7 +435,7 @@ def _same_sizes(
     located: list[tuple[dict[str, Any], Path]],
     headers: dict[Path, images.Header],
 ) -> None:
-    """Images that share the top-level intrinsics must have one size."""
+    """Refuse images of different sizes that share the top-level intrinsics."""
     sizes: dict[tuple[int, int], list[Path]] = {}
     for entry, image in located:
         if not any(key in entry for key in INTRINSICS):
@@ -475,7 +504,7 @@ def _frame(
 
 
 def _size(path: Path, where: str, values: dict[str, Any], image: Path, header: images.Header) -> tuple[int, int, int]:
-    """Width and height of the picture that the intrinsics speak of, and the EXIF turn that makes it."""
+    """Return width and height of the picture that the intrinsics describe, and the EXIF turn that produces it."""
     stored = header.size
     width, height = (_number(path, where, values, key, size) for key, size in zip("wh", stored, strict=True))
     stated = (int(round(width)), int(round(height)))
@@ -526,7 +555,7 @@ def _camera(
         raise InputError(f"{path}: {where}: focal lengths fl_x = {fx:g}, fl_y = {fy:g}; must be positive pixels")
     cx = _number(path, where, values, "cx", width / 2 - offset) + offset
     cy = _number(path, where, values, "cy", height / 2 - offset) + offset
-    reach = 0.25 if strict else 1.0  # without w, h the principal point is the only sign of another resolution
+    reach = 0.25 if strict else 1.0  # without w and h, only the principal point can reveal another resolution
     if abs(cx - width / 2) > reach * width or abs(cy - height / 2) > reach * height:
         raise InputError(
             f"{path}: {where}: the principal point ({cx:g}, {cy:g}) is not near the middle of the {width}x{height}"
@@ -537,13 +566,13 @@ def _camera(
 
 
 def _not_swapped(path: Path, where: str, camera: Pinhole) -> None:
-    """Refuse a principal point that would be in the middle if x and y changed places, and is far from it as it is."""
+    """Refuse a principal point that is far from the middle as given and near it with x and y exchanged."""
 
-    def off(cx: float, cy: float) -> float:
+    def offset(cx: float, cy: float) -> float:
         return max(abs(cx / camera.width - 0.5), abs(cy / camera.height - 0.5))
 
-    given, other = off(camera.cx, camera.cy), off(camera.cy, camera.cx)
-    if given > SWAPPED and other < 0.25 * given:
+    given, other = offset(camera.cx, camera.cy), offset(camera.cy, camera.cx)
+    if given > MIN_OFFSET_IF_SWAPPED and other < 0.25 * given:
         raise InputError(
             f"{path}: {where}: the principal point ({camera.cx:g}, {camera.cy:g}) of a {camera.width}x{camera.height} image:"
             f" cx and cy seem swapped (then {other:.1%} from the middle instead of {given:.1%}); swap cx, cy, and fl_x, fl_y"
@@ -575,26 +604,43 @@ def _lens(path: Path, where: str, values: dict[str, Any]) -> Distortion:
 
 
 def _matrix(path: Path, where: str, entry: dict[str, Any], key: str) -> np.ndarray:
+    if fault := _fault_of_pose(entry, key):
+        raise InputError(f"{path}: {where}: `{key}` {fault}")
+    return np.array(entry[key], np.float64)
+
+
+def _fault_of_pose(entry: dict[str, Any], key: str) -> str:
+    """Return why `entry[key]` is not a rigid camera-to-world matrix, or an empty text if it is."""
     try:
         matrix = np.array(entry.get(key), np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
         found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
-        raise InputError(f"{path}: {where}: `{key}` {found}; expected 4 rows of 4 numbers, camera-to-world")
+        return f"{found}; expected 4 rows of 4 numbers, camera-to-world"
     if not np.isfinite(matrix).all():
-        raise InputError(f"{path}: {where}: `{key}` holds NaN or infinity: this image has no pose; remove the frame")
+        return "holds NaN or infinity: this image has no pose; remove the frame"
     rotation, last = matrix[:3, :3], matrix[3]
     determinant = float(np.linalg.det(rotation))
     if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(f"{path}: {where}: last row of `{key}` is {last.tolist()}; expected 0 0 0 1 (row-major matrix)")
+        return f"has the last row {last.tolist()}; expected 0 0 0 1 (row-major matrix)"
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > RIGID_TOLERANCE or determinant < 0:
         kind = "a reflection" if determinant < 0 else "a scale or shear"
-        raise InputError(
-            f"{path}: {where}: `{key}` holds {kind} (determinant {determinant:.4g}, expected 1); poses must be rotation"
-            " and translation only: keep scale in the translation and use `source.unit`"
+        return (
+            f"holds {kind} (determinant {determinant:.4g}, expected 1); poses must be rotation and translation only: keep scale"
+            " in the translation and use `source.unit`"
         )
-    return matrix
+    return ""
+
+
+def _refuse_bad_poses(path: Path, entries: list[dict[str, Any]]) -> None:
+    """Refuse poses that are not rigid; the message names the photographs that share the first fault."""
+    photographs: dict[str, list[str]] = {}
+    for entry in entries:
+        if fault := _fault_of_pose(entry, "transform_matrix"):
+            photographs.setdefault(fault, []).append(entry["_where"])
+    for fault, where in photographs.items():
+        raise InputError(f"{path}: {_some(where, 20)}: `transform_matrix` {fault}")
 
 
 def _depth_unit(path: Path, document: dict[str, Any]) -> float | None:

@@ -1,5 +1,5 @@
-"""A Mitsuba 3 scene as a source: XML -> merged mesh, material truth, camera path, rendered photographs.
+"""Parts of the `mitsuba` source, in the order in which they are used.
 
-`document` (which files belong to a scene) -> `scene` (load, list shapes) -> `flatten` (one mesh) -> `materials`
-(albedo, roughness, metallic of a BSDF) -> `path` (where a camera can stand) -> `render` (photographs).
+`document` lists the files of a scene, `scene` loads it and lists its shapes, `flatten` merges them into one mesh, `materials`
+converts BSDFs to albedo, roughness and metallic, `path` chooses cameras, and `render` makes the photographs.
 """

@@ -1,4 +1,4 @@
-"""The files that a Mitsuba XML refers to, found without Mitsuba: what to hash, and what is missing."""
+"""The files that a Mitsuba XML refers to, found without Mitsuba, so that they can be hashed and missing ones named."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from xml.parsers import expat
 
 from iif_core.errors import InputError
+from workflow.settings.names import did_you_mean_path
 
 WHERE_FROM = (
     "Scenes from outside lie under data/ (a symbolic link is fine); the shipped ones are Benedikt Bitterli's rendering"
@@ -18,16 +19,16 @@ _DEEPEST = 16  # <include> levels
 
 
 def referenced_files(xml: Path) -> list[Path]:
-    """The scene's XML, the XML files that it includes and every file that they name; sorted, without repetition.
+    """List the scene's XML, the XML files that it includes and every file that they name; sorted, without repetition.
 
-    `<default>` values are substituted in file names, `<path>` folders are searched. Checks that the scene has a sensor
-    and a shape. Standard library only.
+    `<default>` values are substituted in file names, and `<path>` folders are searched. The scene must have a sensor and a
+    shape. This function runs while Snakemake plans and uses the standard library only.
 
     Raises:
         InputError: XML absent, not well-formed (with line and column) or not a scene; named files absent.
     """
     if not xml.is_file():
-        raise InputError(f"{xml}: scene not found. {WHERE_FROM}")
+        raise InputError(f"{xml}: scene not found.{did_you_mean_path(xml)} {WHERE_FROM}")
     found: dict[Path, None] = {}
     missing: dict[str, None] = {}
     tags: set[str] = set()
@@ -39,10 +40,7 @@ def referenced_files(xml: Path) -> list[Path]:
             f"{xml}: names {len(names)} file(s) that are not there: {', '.join(names[:_SHOWN])}{more}."
             f" Looked in {xml.parent}. Put them beside the XML under these names. {WHERE_FROM}"
         )
-    remedies = {
-        "sensor": "add a <sensor> inside the room: the camera path starts there",
-        "shape": "add surface",
-    }
+    remedies = {"sensor": "add a <sensor> inside the room: the camera path starts there", "shape": "add surface"}
     for tag, remedy in remedies.items():
         if tag not in tags:
             raise InputError(f"{xml}: has no <{tag}>; {remedy}")
@@ -97,7 +95,7 @@ def _collect(
 
 
 def _substitute(text: str, defaults: dict[str, str]) -> str:
-    """Replace $name by its default, longest name first, as Mitsuba does."""
+    """Replace every $name by its default, longest name first, as Mitsuba does."""
     for name in sorted(defaults, key=len, reverse=True):
         text = re.sub(re.escape("$" + name), lambda _, value=defaults[name]: value, text)
     return text

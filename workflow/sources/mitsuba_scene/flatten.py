@@ -1,7 +1,8 @@
-"""All shapes of a scene as one welded triangle mesh that still knows which shape and primitive a face came from."""
+"""Merges all shapes of a scene into one welded triangle mesh that records the shape and primitive of every face."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,30 +15,25 @@ from workflow.sources.mitsuba_scene.scene import LoadedScene, Shape, children
 
 Array = np.ndarray
 
-SEGMENTS = 64  # around a sphere, cylinder or disk: the chord leaves the circle by 0.12 % of the radius
-SUPPORTED = (
-    "ply",
-    "obj",
-    "serialized",
-    "cube",
-    "merge",
-    "rectangle",
-    "disk",
-    "sphere",
-    "cylinder",
-    "instance",
-)
-_FLAT = 1e-7
-"""A face whose doubled area is below this share of its longest edge squared has no normal in float32."""
+SEGMENTS = 64  # around a sphere, cylinder or disk; chords leave the circle by 0.12 % of the radius
+SUPPORTED = ("ply", "obj", "serialized", "cube", "merge", "rectangle", "disk", "sphere", "cylinder", "instance")
+MIN_RELATIVE_AREA = 1e-7
+"""Twice the area of a face over its longest edge squared; below this a face has no normal in float32."""
 
 
 @dataclass
 class FlatMesh:
     """The merged mesh.
 
-    vertices (n, 3) float32 metres, welded; faces (m, 3) int32, right-hand normal = Mitsuba's side `front`;
-    uv (m, 3, 2) float32 of the face corners; shape (m,) int32 index into `shapes`; primitive (m,) int32 of the shape's
-    own mesh (-1 where tessellated here); emission (m, 3) float32 radiance of the front side.
+    Attributes:
+        vertices: (n, 3) float32 metres, welded.
+        faces: (m, 3) int32; the right-hand normal points to Mitsuba's front side.
+        uv: (m, 3, 2) float32, texture coordinates of the corners.
+        shape: (m,) int32, index into `shapes`.
+        primitive: (m,) int32, face of the shape's own mesh; -1 where it was tessellated here.
+        emission: (m, 3) float32 radiance of the front side.
+        shapes: all shapes of the scene.
+        notes: what was left out, in words.
     """
 
     vertices: Array
@@ -53,22 +49,22 @@ class FlatMesh:
 def flatten(loaded: LoadedScene) -> FlatMesh:
     """Merge and weld every shape that can become triangles.
 
-    Vertices are welded where all three float32 coordinates are equal. Zero-area faces are dropped; of faces over the
-    same three vertices one stays (a light before other surface, else the first). Everything dropped is a note.
+    Vertices are welded where all three float32 coordinates are equal. Faces without area are dropped. Of several faces over the
+    same three vertices one is kept: a light rather than other surface, else the first. The notes name everything dropped.
 
     Raises:
-        InputError: nothing is left.
+        InputError: no face is left.
     """
     parts: list[tuple[Array, Array, Array, Array, Array, Array]] = []
-    unsupported: dict[str, int] = {}
+    unsupported: Counter[str] = Counter()
+    skipped_lights: Counter[str] = Counter()
     tessellated = 0
-    skipped_lights: dict[str, int] = {}
     offset = 0
     for index, shape in enumerate(loaded.shapes):
         light = shape.object.emitter()
         surface = _triangles(shape, textured_light=light is not None and _varies(light))
         if surface is None:
-            unsupported[shape.plugin] = unsupported.get(shape.plugin, 0) + 1
+            unsupported[shape.plugin] += 1
             continue
         vertices, faces, uv, primitive = surface
         tessellated += shape.plugin in ("disk", "sphere", "cylinder")
@@ -81,7 +77,7 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
             if light.class_name() == "AreaLight":
                 emission = _emission(shape, light, uv, primitive)
             else:
-                skipped_lights[light.class_name()] = skipped_lights.get(light.class_name(), 0) + 1
+                skipped_lights[light.class_name()] += 1
         ids = np.full(len(faces), index, np.int32)
         parts.append((vertices.astype(np.float32), faces.astype(np.int64) + offset, uv, ids, primitive, emission))
         offset += len(vertices)
@@ -110,7 +106,7 @@ def flatten(loaded: LoadedScene) -> FlatMesh:
 
 
 def compact(mesh: FlatMesh, keep: Array | None = None) -> FlatMesh:
-    """The mesh with only the faces `keep` (m,) bool, and only the vertices that they use (in the same order)."""
+    """Return the mesh with only the faces `keep` (m,) bool and the vertices that they use, in the same order."""
     chosen = slice(None) if keep is None else keep
     faces = mesh.faces[chosen]
     used = np.zeros(len(mesh.vertices), bool)
@@ -132,7 +128,7 @@ def compact(mesh: FlatMesh, keep: Array | None = None) -> FlatMesh:
 
 
 def _triangles(shape: Shape, textured_light: bool) -> tuple[Array, Array, Array, Array] | None:
-    """Vertices (n, 3) float64, faces (m, 3), corner uv (m, 3, 2), primitive (m,); None if it has no triangles."""
+    """Return vertices (n, 3) float64, faces (m, 3), corner uv (m, 3, 2) and primitive (m,), or None without triangles."""
     if shape.plugin == "rectangle":
         local, faces, uv = _grid_rectangle(16 if textured_light else 1)
     elif shape.plugin == "disk":
@@ -159,13 +155,13 @@ def _mesh_triangles(shape: Shape) -> tuple[Array, Array, Array, Array]:
     primitive = np.arange(len(faces), dtype=np.int32)
     if mesh.has_vertex_texcoords():
         uv = np.array(mesh.vertex_texcoords_buffer(), np.float32).reshape(-1, 2)[faces]
-    else:  # Mitsuba's uv is then the barycentric position
+    else:  # Mitsuba then uses the barycentric position as uv
         uv = np.broadcast_to(np.array([[0, 0], [1, 0], [0, 1]], np.float32), (len(faces), 3, 2)).copy()
     if not np.isfinite(vertices).all():
         wrong = np.count_nonzero(~np.isfinite(vertices).all(1))
         raise InputError(f"shape {shape.name}: {wrong} vertices are not finite; mend the mesh")
     flip = np.full(len(faces), mesh.has_flipped_normals())
-    if mesh.emitter() is not None and len(faces):  # a light shines on the side of its shading normal
+    if mesh.emitter() is not None and len(faces):  # a light emits to the side of its shading normal
         si = interaction_at_centres(mesh, primitive)
         corners = vertices[faces]
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -176,7 +172,7 @@ def _mesh_triangles(shape: Shape) -> tuple[Array, Array, Array, Array]:
 
 
 def interaction_at_centres(mesh: Any, primitive: Array) -> Any:
-    """Mitsuba's surface interaction at the centre of triangles of one mesh."""
+    """Return Mitsuba's surface interaction at the centres of triangles of one mesh."""
     hit = dr.zeros(mi.PreliminaryIntersection3f, len(primitive))
     hit.t = dr.full(mi.Float, 1, len(primitive))
     hit.prim_index = mi.UInt32(primitive.astype(np.uint32))
@@ -186,7 +182,7 @@ def interaction_at_centres(mesh: Any, primitive: Array) -> Any:
 
 
 def _faces_front(shape: Any, local: Array, corners: Array) -> bool:
-    """Whether a triangle's right-hand normal is on Mitsuba's front side; corners (3, 3) local and in the world."""
+    """Return whether the right-hand normal of a triangle, (3, 3) local and in the world, points to Mitsuba's front side."""
     normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     length = np.linalg.norm(normal)
     reach = np.sqrt(length)
@@ -237,13 +233,13 @@ def _grid_cylinder() -> tuple[Array, Array, Array]:
 
 
 def _around(turn: Array) -> Array:
-    """Points of the unit circle; a whole turn is the same point as none, to the last bit, so that seams weld."""
+    """Return points of the unit circle; a full turn gives exactly the same point as none, so that seams can be welded."""
     angle = 2 * np.pi * (turn % 1)
     return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def _quads(rows: int, columns: int, stride: int) -> Array:
-    """Two triangles for each cell of a (rows + 1) x (columns + 1) grid of vertices."""
+    """Return two triangles for each cell of a (rows + 1) x (columns + 1) grid of vertices."""
     i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     a = (i * stride + j).ravel()
     b, c, d = a + stride, a + stride + 1, a + 1
@@ -251,7 +247,7 @@ def _quads(rows: int, columns: int, stride: int) -> Array:
 
 
 def _without_poles(local: Array, faces: Array, uv: Array) -> tuple[Array, Array]:
-    """Faces and corner uv without the triangles that collapse at a pole."""
+    """Return faces and corner uv without the triangles that collapse at a pole."""
     corners = local[faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     whole = edges.min(1) > 1e-9
@@ -267,11 +263,11 @@ def _varies(light: Any) -> bool:
 
 
 _BARYCENTRIC = np.array([[(i + 1 / 3) / 4, (j + 1 / 3) / 4] for i in range(4) for j in range(4 - i)])
-"""Ten points of a triangle, one in each upright sub-triangle of side 1/4."""
+"""Barycentric coordinates of ten points, one in each upright sub-triangle of side 1/4."""
 
 
 def _emission(shape: Shape, light: Any, uv: Array, primitive: Array) -> Array:
-    """Radiance (m, 3) of the front side, averaged over each face when it is textured."""
+    """Return the radiance (m, 3) of the front sides, averaged over each face where it is textured."""
     if not len(uv):
         return np.zeros((0, 3), np.float32)
     texture = children(light)["radiance"]
@@ -284,7 +280,7 @@ def _emission(shape: Shape, light: Any, uv: Array, primitive: Array) -> Array:
 
 
 def texture_at(texture: Any, uv: Array) -> Array:
-    """Linear RGB (n, 3) float32 of a Mitsuba texture at uv (n, 2), transformation, wrapping and filter included."""
+    """Evaluate a Mitsuba texture at uv (n, 2) with its transformation, wrapping and filter: linear RGB (n, 3) float32."""
     si = dr.zeros(mi.SurfaceInteraction3f, len(uv))
     si.uv = mi.Point2f(*(mi.Float(np.ascontiguousarray(uv[:, axis], np.float32)) for axis in range(2)))
     value = np.array(mi.Color3f(texture.eval(si)), np.float32).T
@@ -295,7 +291,7 @@ def texture_at(texture: Any, uv: Array) -> Array:
 
 
 def first_of_equal(rows: Array) -> Array:
-    """For each row of a (n, 3) array of 4-byte items the smallest index of a row with the same bits; int64 (n,)."""
+    """Return, for each row of an (n, 3) array of 4-byte items, the smallest index of a row with the same bits, (n,) int64."""
     words = np.ascontiguousarray(rows).view(np.uint32).astype(np.uint64)
     key = np.zeros(len(words), np.uint64)
     for column, odd in enumerate((0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)):
@@ -305,7 +301,7 @@ def first_of_equal(rows: Array) -> Array:
     starts = np.ones(len(order), bool)
     starts[1:] = key[order[1:]] != key[order[:-1]]
     same = (words[order[1:]] == words[order[:-1]]).all(1)
-    if not (same | starts[1:]).all():  # two different rows share a hash: sort by the rows themselves
+    if not (same | starts[1:]).all():  # where two different rows share a hash, the rows themselves are sorted
         order = np.lexsort(words.T[::-1])
         starts[1:] = (words[order[1:]] != words[order[:-1]]).any(1)
     first = np.empty(len(order), np.int64)
@@ -322,14 +318,14 @@ def _weld(vertices: Array, faces: Array) -> tuple[Array, Array]:
 
 
 def _proper(vertices: Array, faces: Array, emissive: Array) -> tuple[Array, int, int]:
-    """Which faces (m,) bool have area and are not over the vertices of another; counts of the two kinds left out."""
+    """Return which faces (m,) bool have area and do not repeat the vertices of another, and the counts of both kinds left out."""
     area, longest = np.empty(len(faces)), np.empty(len(faces))
     for start in range(0, len(faces), 1 << 20):
         part = slice(start, start + (1 << 20))
         a, b, c = (vertices[faces[part, i]].astype(np.float64) for i in range(3))
         area[part] = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         longest[part] = np.max([((b - a) ** 2).sum(1), ((c - b) ** 2).sum(1), ((a - c) ** 2).sum(1)], axis=0)
-    keep = area > _FLAT * longest
+    keep = area > MIN_RELATIVE_AREA * longest
     degenerate = int(np.count_nonzero(~keep))
     order = np.argsort(~emissive, kind="stable")  # lights first
     order = order[keep[order]]

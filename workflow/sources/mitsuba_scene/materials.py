@@ -1,14 +1,13 @@
-"""What a Mitsuba BSDF is in terms of base colour, perceptual roughness and metallic; every approximation is said.
+"""Converts Mitsuba BSDFs to base colour a, perceptual roughness r and metallic m; the notes state every approximation.
 
     diffuse                    a = reflectance, r = 1, m = 0
-    plastic, roughplastic      a = what leaves the coat diffusely (`under_coat`), r = sqrt(alpha) (smooth: alpha = 0), m = 0
+    plastic, roughplastic      a = albedo of base and coat (`albedo_under_coat`), r = sqrt(alpha) (smooth: alpha = 0), m = 0
     conductor, roughconductor  a = F0 specular_reflectance, F0 = ((eta - 1)^2 + k^2) / ((eta + 1)^2 + k^2), m = 1
     principled                 a = base_color, r = roughness (Mitsuba's alpha = roughness^2), m = metallic
     blendbsdf                  linear in its weight; twosided, bumpmap, normalmap, mask: the BSDF inside
     dielectric, ...            transparent: no truth;  anything else: neutral grey, no truth
 
-Textures are evaluated by Mitsuba itself (linear values; `to_uv`, `raw`, wrapping, filter). The target model
-is METHOD 3.
+Mitsuba itself evaluates the textures (linear values; `to_uv`, `raw`, wrapping, filter). The target model is Eq. R.1.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from workflow.sources.mitsuba_scene.scene import Shape, children, parameter
 Array = np.ndarray
 
 MIN_ROUGHNESS = 0.02
-OPAQUE = 0.5
-"""Faces of a mask with less opacity than this are left out."""
+OPAQUE = 0.5  # faces with less opacity are left out of the mesh
 
 _TRANSPARENT = {"SmoothDielectric", "RoughDielectric", "ThinDielectric"}
 _PLASTIC = {"SmoothPlastic", "RoughPlastic", "PolarizedPlastic"}
@@ -39,27 +37,27 @@ _WRAPPER = {
     "NormalMap": "nested_bsdf",
 }
 _PRINCIPLED_EXTRAS = ("anisotropic", "spec_tint", "sheen", "clearcoat", "flatness", "diff_trans")
-_CHUNK = 1 << 22
+_POINTS_AT_ONCE = 1 << 22
 
 
-def under_coat(reflectance: Array, eta: float, nonlinear: bool) -> Array:
-    """Albedo of a diffuse base under a dielectric coat: (1 - F_ext)^2 / eta^2 * rho / (1 - s F_int), float32.
+def albedo_under_coat(reflectance: Array, eta: float, nonlinear: bool) -> Array:
+    """Compute the albedo of a diffuse base under a dielectric coat: (1 - F_ext)^2 / eta^2 * rho / (1 - s F_int), float32.
 
-    F_ext, F_int are the diffuse Fresnel reflectances from outside and inside, s = rho for `nonlinear` plastics, else 1. Light
-    enters and leaves through the coat and is partly thrown back inside: 0.34 reflects 0.16. Averaged over directions; the
-    target model has no such loss, so this, not the reflectance below, is its base colour.
+    F_ext and F_int are the diffuse Fresnel reflectances from outside and inside; s = rho for `nonlinear` plastics, else 1. Light
+    is lost on its way in and out and reflected back inside the coat. The target model has no such loss, and so this average over
+    directions, rather than the reflectance of the base, is its base colour.
     """
     outside = float(np.ravel(mi.fresnel_diffuse_reflectance(1.0 / eta))[0])
     inside = float(np.ravel(mi.fresnel_diffuse_reflectance(eta))[0])
-    if eta > 1:  # the larger one is total reflection inside
+    if eta > 1:  # total reflection makes the inner one larger
         outside, inside = min(outside, inside), max(outside, inside)
-    thrown_back = inside * (reflectance if nonlinear else 1.0)
-    return ((1 - outside) ** 2 / eta**2 * reflectance / (1 - thrown_back)).astype(np.float32)
+    returned = inside * (reflectance if nonlinear else 1.0)
+    return ((1 - outside) ** 2 / eta**2 * reflectance / (1 - returned)).astype(np.float32)
 
 
 @dataclass
 class Surface:
-    """Materials of n points: albedo (n, 3) linear, roughness (n,) perceptual, metallic (n,), truth (n,) bool."""
+    """Materials of n points: albedo (n, 3) linear, roughness (n,) perceptual, metallic (n,), truth (n,) bool = is exact."""
 
     albedo: Array
     roughness: Array
@@ -68,13 +66,13 @@ class Surface:
 
     @staticmethod
     def neutral(n: int) -> Surface:
-        """Grey of middle roughness that is no truth."""
+        """Return a grey of medium roughness that is no truth."""
         half = np.full(n, 0.5, np.float32)
         return Surface(np.full((n, 3), 0.5, np.float32), half, np.zeros(n, np.float32), np.zeros(n, bool))
 
 
 class Points:
-    """Where textures are evaluated: uv (n, 2), positions (n, 3), and which primitive of which shape."""
+    """Points at which textures are evaluated: uv (n, 2), positions (n, 3), primitives and shapes (n,)."""
 
     def __init__(self, uv: Array, position: Array, primitive: Array, shape: Array, shapes: list[Shape]):
         self.count = len(uv)
@@ -90,14 +88,14 @@ class Points:
         self.si = si
 
     def colour(self, texture: Any, default: float) -> Array:
-        """Linear RGB (n, 3) float32 of a texture; `default` where the BSDF has none."""
+        """Return the linear RGB (n, 3) float32 of a texture; `default` where the BSDF has none."""
         if texture is None:
             return np.full((self.count, 3), default, np.float32)
         value = np.array(mi.Color3f(texture.eval(self.si)), np.float32).T
         return np.ascontiguousarray(np.broadcast_to(value, (self.count, 3)))
 
     def scalar(self, value: Any, default: float) -> Array:
-        """(n,) float32 of a texture, a number or None."""
+        """Return the (n,) float32 values of a texture or a number; `default` for None."""
         if value is None:
             return np.full(self.count, default, np.float32)
         if not isinstance(value, mi.Texture):
@@ -112,8 +110,11 @@ class Points:
 class Material:
     """One BSDF, read once.
 
-    transparent: light goes through (glass).  two_sided: reflects on both sides.  masked: has an opacity.
-    notes: what the mapping leaves out, in words.
+    Attributes:
+        transparent: transmits light (glass).
+        two_sided: reflects on both sides.
+        masked: has an opacity.
+        notes: approximations of the conversion, in words.
     """
 
     def __init__(self, bsdf: Any):
@@ -175,18 +176,18 @@ class Material:
             note(f"{self.bsdf.class_name()}: unknown BSDF, grey in its place and no material truth")
 
     def _eta(self) -> float:
-        """Index of refraction of a plastic's coat; one number stands for a textured one."""
+        """Return the index of refraction of a plastic's coat; a textured one is represented by one of its values."""
         eta = parameter(self.bsdf, "eta")
         if eta is None and "eta" in self.textures:
             eta = self._points_zero().scalar(self.textures["eta"], 1.5)
         return float(np.asarray(eta).ravel()[0]) if eta is not None else 1.5
 
     def _points_zero(self) -> Points:
-        """One point in the middle of the texture, for what is asked once per BSDF."""
+        """Return one point in the middle of the texture, for quantities that are needed once per BSDF."""
         return Points(np.full((1, 2), 0.5), np.zeros((1, 3)), np.zeros(1, np.int32), np.zeros(0, np.int32), [])
 
     def opacity(self, points: Points) -> Array:
-        """(n,) in [0, 1]: product of the masks above the surface; 0 for `null`."""
+        """Return the opacity (n,) in [0, 1]: the product of all nested masks, 0 for `null`."""
         if self.kind == "Null":
             return np.zeros(points.count, np.float32)
         own = points.scalar(self.textures.get("opacity"), 1)  # only a mask has one
@@ -194,7 +195,7 @@ class Material:
         return own * self.inner[name].opacity(points) if name in self.inner else own
 
     def evaluate(self, points: Points) -> Surface:
-        """Albedo, roughness and metallic at points; roughness in [0.02, 1], the others clipped to [0, 1]."""
+        """Return albedo, roughness and metallic at points; roughness in [0.02, 1], the others clipped to [0, 1]."""
         surface = self._evaluate(points)
         surface.albedo = np.clip(np.nan_to_num(surface.albedo), 0, 1).astype(np.float32)
         surface.roughness = np.clip(np.nan_to_num(surface.roughness, nan=1.0), MIN_ROUGHNESS, 1).astype(np.float32)
@@ -210,9 +211,9 @@ class Material:
         if self.kind == "SmoothDiffuse":
             return Surface(colour("reflectance", 0.5), np.ones(n, np.float32), zero, sure)
         if self.kind in _PLASTIC:
-            # Mitsuba tells the flag nowhere but in the description.
+            # Mitsuba reports the flag only in the description.
             nonlinear = "nonlinear = 1" in str(self.bsdf)
-            albedo = under_coat(colour("diffuse_reflectance", 0.5), self._eta(), nonlinear)
+            albedo = albedo_under_coat(colour("diffuse_reflectance", 0.5), self._eta(), nonlinear)
             return Surface(albedo, np.sqrt(self._alpha(points)), zero, sure)
         if self.kind in _CONDUCTOR:
             eta, k = colour("eta", 0), colour("k", 1)
@@ -235,7 +236,7 @@ class Material:
         return surface
 
     def _alpha(self, points: Points) -> Array:
-        """Microfacet alpha (n,) >= 0; geometric mean of an anisotropic pair, 0 for the smooth kinds."""
+        """Return the microfacet alpha (n,) >= 0: the geometric mean of an anisotropic pair, 0 for the smooth kinds."""
         if self.kind in ("SmoothPlastic", "SmoothConductor", "SmoothDielectric", "ThinDielectric"):
             return np.zeros(points.count, np.float32)
         pair = []
@@ -265,12 +266,12 @@ class MaterialTable:
         self.of_shape = np.array(of_shape, np.int32)
 
     def of_faces(self, mesh: FlatMesh, name: str) -> Array:
-        """A flag (`transparent`, `two_sided`, `known`, `masked`) of every face's material, (m,) bool."""
+        """Return a flag (`transparent`, `two_sided`, `known`, `masked`) of the material of every face, (m,) bool."""
         flags = np.array([getattr(material, name) for material in self.materials], bool)
         return flags[self.of_shape[mesh.shape]]
 
     def face_opacity(self, mesh: FlatMesh) -> Array:
-        """Mean opacity of every face, (m,) float32; 1 without a mask."""
+        """Return the mean opacity of every face, (m,) float32; 1 without a mask."""
         out = np.ones(len(mesh.faces), np.float32)
         kinds = np.array([m.masked or m.kind == "Null" for m in self.materials], bool)
         faces = np.flatnonzero(kinds[self.of_shape[mesh.shape]])
@@ -283,9 +284,8 @@ class MaterialTable:
         return out
 
     def evaluate(self, mesh: FlatMesh, face: Array, barycentric: Array) -> Surface:
-        """Materials at points of faces (n,) with weights (n, 2) of their second and third corners."""
+        """Return the materials at points of faces (n,) with weights (n, 2) of their second and third corners."""
         out = Surface.neutral(len(face))
-
         for rows, part in self._groups(mesh, face, barycentric, Material.evaluate):
             out.albedo[rows], out.roughness[rows] = part.albedo, part.roughness
             out.metallic[rows], out.truth[rows] = part.metallic, part.truth
@@ -296,8 +296,8 @@ class MaterialTable:
         order = np.argsort(material, kind="stable")
         bounds = np.searchsorted(material[order], np.arange(len(self.materials) + 1))
         for index in range(len(self.materials)):
-            for start in range(bounds[index], bounds[index + 1], _CHUNK):
-                rows = order[start : min(start + _CHUNK, bounds[index + 1])]
+            for start in range(bounds[index], bounds[index + 1], _POINTS_AT_ONCE):
+                rows = order[start : min(start + _POINTS_AT_ONCE, bounds[index + 1])]
                 f, b = face[rows], barycentric[rows]
                 weights = np.column_stack([1 - b.sum(1), b])[:, :, None]
                 uv = (weights * mesh.uv[f]).sum(1)
@@ -306,7 +306,7 @@ class MaterialTable:
                 yield rows, function(self.materials[index], points)
 
     def notes(self, mesh: FlatMesh) -> list[str]:
-        """Every approximation of the mapping, with the BSDFs and faces that it concerns."""
+        """Return every approximation of the conversion, with the numbers of BSDFs and faces that it concerns."""
         faces = np.bincount(self.of_shape[mesh.shape], minlength=len(self.materials))
         lines: dict[str, list[int]] = {}
         for material, count in zip(self.materials, faces.tolist(), strict=True):
@@ -318,7 +318,7 @@ class MaterialTable:
 
 
 def barycentric_of(mesh: FlatMesh, face: Array, position: Array) -> Array:
-    """Weights (n, 2) of the second and third corner of points (n, 3) on faces (n,), clipped into the triangle."""
+    """Return the weights (n, 2) of the second and third corner at points (n, 3) on faces (n,), clipped into the triangle."""
     a, b, c = (mesh.vertices[mesh.faces[face, i]].astype(np.float64) for i in range(3))
     u, v, w = b - a, c - a, position.astype(np.float64) - a
     uu, uv, vv = (u * u).sum(1), (u * v).sum(1), (v * v).sum(1)

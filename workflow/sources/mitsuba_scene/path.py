@@ -1,12 +1,11 @@
-"""Where a camera can stand in a room and which views of it together see the most: found from the mesh and one pose.
+"""Chooses camera positions and views of a room that together see as much of it as possible, from the mesh and one pose.
 
-    free space    positions that see each other, from the starting pose on, at eye height and with clearance all around
-    surface       points drawn evenly over the area; reachable = seen from some free position
-    selection     greedy: the (position, direction) that adds most; a point counts 1, 0.6, 0.4 for its first, second and
-                  third view and next to nothing after (so a gain only ever shrinks, and a lazy queue makes the exact
-                  greedy choice)
+    free space    positions at eye height with clearance all around that are connected to the starting pose by lines of sight
+    surface       points drawn uniformly over the area; a point is reachable if some free position sees it
+    selection     greedy: the view of the largest gain; a point counts 1, 0.6, 0.4 for its first, second and third view and
+                  nearly nothing afterwards (gains can only shrink, so that a lazy queue makes the exact greedy choice)
 
-Lengths are scene units (metres); limits shrink with the room where it is too small for them. Deterministic in `seed`.
+Lengths are scene units (metres); limits shrink with rooms that are too small for them. The result is a function of the seed.
 """
 
 from __future__ import annotations
@@ -24,22 +23,20 @@ Array = np.ndarray
 Trace = Callable[[Array, Array], tuple[Array, Array]]
 """(origins (n, 3), directions (n, 3)) -> (face (n,) int32, -1 = miss; t (n,) float32, inf = miss)."""
 
-CLEARANCE = 0.35
-EYE_HEIGHTS = (1.0, 1.9)
-NEAR = 1.0
-"""A view whose median distance is below this looks at a wall."""
+CLEARANCE = 0.35  # metres
+EYE_HEIGHTS = (1.0, 1.9)  # metres
+MIN_MEDIAN_DISTANCE = 1.0  # metres; a view below this looks at a wall
 YAWS = 16
-PITCHES = (-30.0, -8.0, 14.0)
-CANDIDATES = 768
-POSITIONS = 128
-SPHERE = 384
-POINTS = 16000
-GRAZING = 0.15
-"""Cosine below which a surface is not counted as seen."""
-PLAUSIBLE = (0.3, 30.0)
-"""Median distance seen from the sensor in a scene whose unit is the metre; else all lengths scale with it."""
-_GAIN = (1.0, 0.6, 0.4)
-_LATER = 0.02
+PITCHES = (-30.0, -8.0, 14.0)  # degrees
+CANDIDATE_POSITIONS = 768
+FREE_POSITIONS = 128
+SPHERE_DIRECTIONS = 384
+SURFACE_POINTS = 16000
+GRAZING_COSINE = 0.15  # below this a surface point does not count as seen
+PLAUSIBLE_DISTANCES = (0.3, 30.0)
+"""Median distance seen from the sensor in a scene whose unit is the metre; outside of it all lengths scale with the distance."""
+_GAIN_OF_VIEW = (1.0, 0.6, 0.4)  # of the first, second and third view of a point
+_GAIN_LATER = 0.02
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Path:
-    """Chosen poses (v, 4, 4) OpenCV world_from_camera, whether each is one of the given ones, and what they see."""
+    """Chosen poses (v, 4, 4) `world_from_camera` of OpenCV axes, whether each was given (v,), facts and notes about coverage."""
 
     poses: Array
     given: Array
@@ -60,7 +57,7 @@ class Path:
     notes: list[str]
 
 
-def plan(
+def plan_views(
     solid: Trace,
     visible: Trace,
     vertices: Array,
@@ -74,28 +71,31 @@ def plan(
     """Choose `count` views of the room that the first given pose stands in; the given poses come first.
 
     Args:
-        solid: traces everything that a camera cannot pass, glass included.
-        visible: traces what a camera sees.
+        solid: traces everything that a camera cannot pass through, glass included.
+        visible: traces the surface that a camera sees.
         vertices, faces: the visible mesh.
         given: poses of the scene's own sensors with their lenses, at least one.
         lens: of the chosen views.
         up: (3,) unit vector.
         count: views >= 1; surplus given poses are left out.
         seed: of the positions and surface points.
+
+    Returns:
+        At most `count` poses.
     """
     given = given[:count]
     rng = np.random.default_rng([seed, 0x9A7])
     start = given[0][0][:3, 3]
-    sphere = fibonacci_sphere(SPHERE)
+    sphere = fibonacci_sphere(SPHERE_DIRECTIONS)
     notes: list[str] = []
 
-    directions = fibonacci_sphere(4 * SPHERE)
+    directions = fibonacci_sphere(4 * SPHERE_DIRECTIONS)
     _, around = solid(np.broadcast_to(start, directions.shape), directions)
     seen = np.isfinite(around)
     reach = float(np.median(around[seen])) if seen.any() else 1.0
     escape = float(1 - seen.mean())
     unit = 1.0
-    if not PLAUSIBLE[0] <= reach <= PLAUSIBLE[1]:
+    if not PLAUSIBLE_DISTANCES[0] <= reach <= PLAUSIBLE_DISTANCES[1]:
         unit = reach / 2.5
         notes.append(f"the median distance seen from the sensor is {reach:.3g} m: is the scene's unit the metre?")
     room = _Room(start, up, directions, around, reach, escape, unit)
@@ -113,7 +113,8 @@ def plan(
     counts = np.zeros(len(points), np.int64)
     for (pose, own_lens), row in zip(given, own, strict=True):
         counts += row & _in_frustum(pose, own_lens, points)
-    views, poses = _views(positions, distances, sphere, sees, points, lens, up, min(NEAR * unit, 0.5 * reach), escape)
+    near = min(MIN_MEDIAN_DISTANCE * unit, 0.5 * reach)
+    views, poses = _views(positions, distances, sphere, sees, points, lens, up, near, escape)
     chosen = _greedy(views, counts, count - len(given))
     if len(given) + len(chosen) < count:
         notes.append(f"only {len(given) + len(chosen)} of {count} views: the free space allows no more")
@@ -133,7 +134,7 @@ def plan(
 
 
 def fibonacci_sphere(n: int) -> Array:
-    """n directions spread evenly over the sphere, (n, 3) float32."""
+    """Return n directions spread evenly over the sphere, (n, 3) float32."""
     z = 1 - (2 * np.arange(n) + 1) / n
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n)
     r = np.sqrt(1 - z * z)
@@ -141,13 +142,13 @@ def fibonacci_sphere(n: int) -> Array:
 
 
 def upright(direction: Array) -> Array:
-    """The coordinate axis nearest to a direction, with its sign: which way a scene's sensor calls up."""
+    """Return the signed coordinate axis nearest to a direction, such as the upward axis of a scene from that of its sensor."""
     axis = int(np.argmax(np.abs(direction)))
     return np.eye(3)[axis] * np.sign(direction[axis])
 
 
 def _basis(up: Array) -> tuple[Array, Array]:
-    """Two unit vectors across `up`."""
+    """Return two unit vectors that span the plane square to `up`."""
     e1 = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     e1 /= np.linalg.norm(e1)
     return e1, np.cross(up, e1)
@@ -155,9 +156,14 @@ def _basis(up: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Room:
-    """What the starting pose sees around it: distances along directions, their median, the share that escapes.
+    """The surroundings of the starting pose.
 
-    unit: metres as the scene seems to mean them (1 where its size is plausible).
+    Attributes:
+        start, up: (3,) position and upward direction.
+        directions, around: (n, 3) directions and the distances along them, (n,).
+        reach: median distance.
+        escape: share of the directions that meet no surface.
+        unit: metres per unit as far as the size of the scene suggests; 1 where its size is plausible.
     """
 
     start: Array
@@ -170,18 +176,18 @@ class _Room:
 
     @property
     def seen(self) -> Array:
-        """Points (n, 3) of the surface around; the unit sphere where there is none."""
+        """Points (n, 3) of the surrounding surface; the unit sphere where there is none."""
         hit = np.isfinite(self.around)
         return self.start + (self.directions[hit] * self.around[hit, None] if hit.any() else self.directions)
 
     def box(self) -> tuple[Array, Array]:
-        """Corners of a box about what is seen, without the farthest half per cent on each side."""
+        """Return the corners of a box around the seen points without the outermost half per cent on each side."""
         low, high = np.percentile(self.seen, [0.5, 99.5], axis=0)
         return low - 0.05 * self.reach, high + 0.05 * self.reach
 
 
 def _free_positions(solid: Trace, room: _Room, sphere: Array, count: int, rng: Any) -> tuple[Array, Array, dict[str, Any]]:
-    """Positions (n, 3) where a camera can stand, distances (n, SPHERE) of what surrounds each, and facts."""
+    """Return positions (n, 3) where a camera can stand, distances (n, SPHERE_DIRECTIONS) around each, and facts."""
     start, up = room.start, room.up
     e1, e2 = _basis(up)
     across = np.column_stack([room.seen @ e1, room.seen @ e2])
@@ -191,9 +197,9 @@ def _free_positions(solid: Trace, room: _Room, sphere: Array, count: int, rng: A
         drop = 1.5 * room.unit
     eye = _eye_heights(drop, _distance(solid, start[None], up)[0], room.unit)
 
-    # Low-discrepancy across the room (Roberts' R3), the third coordinate over the eye heights.
+    # A low-discrepancy sequence (Roberts' R3): two coordinates across the room, the third over the eye heights.
     ratio = 1.2207440846057596
-    sequence = (rng.random(3) + np.arange(1, CANDIDATES + 1)[:, None] * ratio ** -np.arange(1.0, 4.0)) % 1
+    sequence = (rng.random(3) + np.arange(1, CANDIDATE_POSITIONS + 1)[:, None] * ratio ** -np.arange(1.0, 4.0)) % 1
     flat = low + (high - low) * sequence[:, :2]
     columns = flat[:, :1] * e1 + flat[:, 1:] * e2 + (start @ up) * up
     below = _distance(solid, columns, -up)
@@ -206,14 +212,14 @@ def _free_positions(solid: Trace, room: _Room, sphere: Array, count: int, rng: A
     nearest = distances.min(1)
     inside = np.isinf(distances).mean(1) <= room.escape + 0.15
     clearance = min(CLEARANCE * room.unit, 0.25 * room.reach)
-    enough = min(max(8, count), POSITIONS)
+    enough = min(max(8, count), FREE_POSITIONS)
     for _ in range(8):
         roomy = np.flatnonzero(inside & (nearest >= clearance))
         kept = roomy[_connected(solid, start, positions[roomy])]
         if len(kept) >= enough:
             break
         clearance *= 0.75
-    kept = kept[:POSITIONS]
+    kept = kept[:FREE_POSITIONS]
     facts = {
         "clearance_m": round(float(min(clearance, nearest[kept].min())) if len(kept) else 0.0, 6),
         "floor_m": round(floor, 6),
@@ -223,7 +229,7 @@ def _free_positions(solid: Trace, room: _Room, sphere: Array, count: int, rng: A
 
 
 def _eye_heights(below: float, above: float, unit: float) -> tuple[float, float]:
-    """Eye heights above the floor: 1.0 ... 1.9 m and the sensor's own, no higher than 0.85 of the room."""
+    """Return the lowest and highest eye height above the floor: 1.0 to 1.9 m and the sensor's own, at most 0.85 of the room."""
     low, high = EYE_HEIGHTS[0] * unit, EYE_HEIGHTS[1] * unit
     if not 0.5 * unit <= below <= 4 * unit:
         low, high = 0.6 * below, 1.15 * below
@@ -238,19 +244,19 @@ def _distance(trace: Trace, origins: Array, direction: Array) -> Array:
 
 
 def _sees(trace: Trace, origins: Array, targets: Array) -> Array:
-    """Whether nothing lies between origins and targets (n, 3), up to 0.1 % before the target."""
+    """Return whether the lines from origins to targets (n, 3) are free, up to 0.1 % before the targets."""
     origins = np.broadcast_to(origins, targets.shape)
     return trace(origins, targets - origins)[1] > 0.999
 
 
 def _spheres(trace: Trace, positions: Array, sphere: Array) -> Array:
-    """Distances (n, directions) from positions along the directions of a sphere."""
+    """Return the distances (n, directions) from positions along the directions of a sphere."""
     _, t = trace(np.repeat(positions, len(sphere), 0), np.tile(sphere, (len(positions), 1)))
     return t.reshape(len(positions), len(sphere))
 
 
 def _connected(trace: Trace, start: Array, positions: Array) -> Array:
-    """Indices of the positions that can be reached from `start` along unobstructed straight lines, in their order."""
+    """Return the indices of the positions that can be reached from `start` along free straight lines, in ascending order."""
     reached = np.zeros(len(positions), bool)
     front = start[None]
     while len(front) and not reached.all():
@@ -263,35 +269,35 @@ def _connected(trace: Trace, start: Array, positions: Array) -> Array:
 
 
 def _surface_points(vertices: Array, faces: Array, low: Array, high: Array, rng: Any) -> tuple[Array, Array]:
-    """POINTS points drawn evenly over the area within a box, and unit normals (either side)."""
+    """Return SURFACE_POINTS points drawn uniformly over the area within a box, and unit normals of either sign."""
     a, b, c = (vertices[faces[:, i]].astype(np.float32) for i in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1).astype(np.float64)
     cumulative = np.cumsum(area)
     points = np.zeros((0, 3))
     normals = np.zeros((0, 3))
-    for _ in range(8):  # faces may be larger than the box: draw, keep what lies within, draw again
-        face = np.searchsorted(cumulative, rng.random(POINTS) * cumulative[-1])
+    for _ in range(8):  # faces may be larger than the box, so that only some of the points drawn lie within
+        face = np.searchsorted(cumulative, rng.random(SURFACE_POINTS) * cumulative[-1])
         face = np.minimum(face, len(faces) - 1)
-        u, v = rng.random((2, POINTS))
+        u, v = rng.random((2, SURFACE_POINTS))
         outside = u + v > 1
         u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
         p = a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
         inside = ((p >= low) & (p <= high)).all(1) & (area[face] > 0)
         points = np.concatenate([points, p[inside]])
         normals = np.concatenate([normals, normal[face[inside]] / area[face[inside], None]])
-        if len(points) >= POINTS:
+        if len(points) >= SURFACE_POINTS:
             break
-    return points[:POINTS], normals[:POINTS]
+    return points[:SURFACE_POINTS], normals[:SURFACE_POINTS]
 
 
 def _visibility(trace: Trace, positions: Array, points: Array, normals: Array) -> Array:
-    """(positions, points) bool: seen at less than a grazing angle with nothing in between."""
+    """Return (positions, points) bool: which points each position sees at more than a grazing angle."""
     out = np.zeros((len(positions), len(points)), bool)
     for row, position in enumerate(positions):
         toward = points - position
         distance = np.linalg.norm(toward, axis=1)
-        facing = np.abs((toward * normals).sum(1)) > GRAZING * distance
+        facing = np.abs((toward * normals).sum(1)) > GRAZING_COSINE * distance
         index = np.flatnonzero(facing)
         out[row, index] = _sees(trace, position, points[index])
     return out
@@ -302,8 +308,8 @@ def _in_frustum(pose: Array, lens: Lens, points: Array) -> Array:
 
 
 def _in_frusta(rotations: Array, lens: Lens, rays: Array) -> Array:
-    """(rotations, rays) bool: rays (n, 3) from the camera that fall into the picture of each rotation (k, 3, 3)."""
-    # einsum: matrices this thin are slower through a threaded BLAS.
+    """Return (rotations, rays) bool: which rays (n, 3) from the camera fall into the picture of each rotation (k, 3, 3)."""
+    # einsum is faster than a threaded BLAS for matrices this thin.
     columns, rays = rotations.astype(np.float32), np.ascontiguousarray(rays.T, np.float32)
     x, y, z = (np.einsum("ka,an->kn", columns[:, :, axis], rays) for axis in range(3))
     return (z > 0) & (np.abs(x) <= lens.x * z) & (np.abs(y) <= lens.y * z)
@@ -320,11 +326,11 @@ def _views(
     near: float,
     escape: float,
 ) -> tuple[Array, Array]:
-    """Candidate views: seen points (packed bits) and pose; views of a near wall or of nothing are left out."""
+    """Return candidate views, the points that each sees (packed bits) and its pose, without views of near walls or of nothing."""
     e1, e2 = _basis(up)
     packed, poses = [], []
     for index, position in enumerate(positions):
-        turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # so that not all positions share their yaws
+        turn = 2 * np.pi * (0.6180339887498949 * index % 1) / YAWS  # gives every position yaws of its own
         yaw, pitch = np.meshgrid(turn + 2 * np.pi * np.arange(YAWS) / YAWS, np.radians(PITCHES), indexing="ij")
         across = np.cos(yaw).reshape(-1, 1) * e1 + np.sin(yaw).reshape(-1, 1) * e2
         forward = np.cos(pitch).reshape(-1, 1) * across + np.sin(pitch).reshape(-1, 1) * up
@@ -348,17 +354,17 @@ def _views(
 
 
 def _greedy(views: Array, counts: Array, wanted: int) -> Array:
-    """Indices of `wanted` views, best first; `counts` is brought up to date in place."""
+    """Return the indices of `wanted` views, best first; `counts`, the views of each point, is updated in place."""
     n = len(counts)
 
-    def worth() -> Array:
-        first = np.array(_GAIN)[np.minimum(counts, len(_GAIN) - 1)]
-        return np.where(counts < len(_GAIN), first, _LATER / np.maximum(counts, 1))
+    def gain_of_points() -> Array:
+        first = np.array(_GAIN_OF_VIEW)[np.minimum(counts, len(_GAIN_OF_VIEW) - 1)]
+        return np.where(counts < len(_GAIN_OF_VIEW), first, _GAIN_LATER / np.maximum(counts, 1))
 
     def gain(view: int) -> float:
         return float(weight[np.unpackbits(views[view], count=n).view(bool)].sum())
 
-    weight = worth()
+    weight = gain_of_points()
     queue = [(-gain(view), view) for view in range(len(views))]
     heapq.heapify(queue)
     chosen: list[int] = []
@@ -370,5 +376,5 @@ def _greedy(views: Array, counts: Array, wanted: int) -> Array:
             continue
         chosen.append(view)
         counts += np.unpackbits(views[view], count=n)
-        weight = worth()
+        weight = gain_of_points()
     return np.array(chosen, int)

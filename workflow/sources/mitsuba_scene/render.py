@@ -1,8 +1,7 @@
-"""Photographs of the original scene by Mitsuba's own path tracer, along the capture's own rays.
+"""Photographs of the original scene by Mitsuba's own path tracer, along the rays of the capture's cameras.
 
-Every pixel is the mean of paths through uniformly jittered points of its square (a box filter). A launch holds several
-samples of some pixels side by side; each pixel's are summed in order, so the image is the same to the last bit whatever
-the number of threads.
+Every pixel is the mean of paths through uniformly jittered points of its square (a box filter). A launch holds several samples of
+some pixels side by side; the samples of a pixel are summed in order, so that the image does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -13,26 +12,25 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from iif_core.camera.pinhole import direction_derivatives, pixel_directions
+from iif_core.camera.pinhole import direction_derivatives
 from workflow.scene.normal_form import View
 from workflow.sources.mitsuba_scene.flatten import texture_at
 from workflow.sources.mitsuba_scene.scene import children
 
 Array = np.ndarray
 
-LANES = 1 << 19
-"""Paths in flight at once; bounds the memory."""
+PATHS_AT_ONCE = 1 << 19  # bounds the memory
 
 
 def path_integrator(max_bounces: int) -> Any:
-    """Mitsuba's `path` with that many surface interactions (its `max_depth` counts the camera's segment too)."""
+    """Return Mitsuba's `path` with that many surface interactions; its `max_depth` also counts the camera's segment."""
     return mi.load_dict({"type": "path", "max_depth": max_bounces + 1})
 
 
 def balance_lights(scene: Any, shapes: list[Any]) -> None:
-    """Let the path tracer pick area lights by their power (nine parts in ten; one part evenly). Changes noise alone.
+    """Make the path tracer choose area lights by power (nine parts in ten) and uniformly (one part), which only affects noise.
 
-    Lights that have no area keep their share.
+    Lights without area keep their share.
     """
     lights = [(shape, shape.emitter()) for shape in shapes if shape.emitter() is not None]
     power = np.array([_power(shape, light) for shape, light in lights])
@@ -48,7 +46,7 @@ def balance_lights(scene: Any, shapes: list[Any]) -> None:
 
 
 def _power(shape: Any, light: Any) -> float:
-    """Area times mean radiance over a coarse grid of the texture (a weight, so coarse is enough)."""
+    """Return area times mean radiance over a coarse grid of the texture, which is accurate enough for a sampling weight."""
     texture = children(light).get("radiance")
     if texture is None:
         return 0.0
@@ -58,23 +56,31 @@ def _power(shape: Any, light: Any) -> float:
 
 
 def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int) -> tuple[Array, Array, int]:
-    """Radiance (H, W, 3) float32, valid (H, W) bool, number of samples that were not finite (left out of the mean).
+    """Render a view; the result depends on the arguments alone.
 
-    A function of scene, view, samples and seed alone. Where no sample was finite: radiance 0, not valid.
+    Args:
+        scene: Mitsuba scene.
+        integrator: of `path_integrator`.
+        view: the camera.
+        samples: paths per pixel.
+        seed: of the random numbers.
+
+    Returns:
+        Radiance (H, W, 3) float32, valid (H, W) bool, and the number of samples that were not finite. Those are left out of the
+        means; a pixel without finite samples has radiance 0 and is not valid.
     """
-    directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, view.world_from_camera)
-    directions = directions.reshape(-1, 3)
+    directions = view.directions().reshape(-1, 3)
     d_du, d_dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
     origin = mi.Point3f(*view.world_from_camera[:3, 3].astype(np.float32).tolist())
     radiance = np.zeros((len(directions), 3), np.float64)
     finite = np.zeros(len(directions), np.int64)
-    for first in range(0, len(directions), LANES):
-        rows = slice(first, min(first + LANES, len(directions)))
+    for first in range(0, len(directions), PATHS_AT_ONCE):
+        rows = slice(first, min(first + PATHS_AT_ONCE, len(directions)))
         count = rows.stop - rows.start
         device = [mi.Float(np.ascontiguousarray(directions[rows, axis])) for axis in range(3)]
         done = 0
         while done < samples:
-            repeat = min(max(1, LANES // count), samples - done)
+            repeat = min(max(1, PATHS_AT_ONCE // count), samples - done)
             sampler = mi.load_dict({"type": "independent"})
             key = np.random.SeedSequence([seed, view.view_id, first, done]).generate_state(1)[0]
             sampler.seed(int(key), count * repeat)
@@ -97,7 +103,7 @@ def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int
 
 
 def original_distance(scene: Any, origin: Array, directions: Array) -> Array:
-    """t (n,) of the first surface of the original scene along rays, inf = none: the mesh may have left it out."""
+    """Return t (n,) of the first surface of the original scene along rays, inf = none; the mesh may lack that surface."""
     if not len(directions):  # an empty launch aborts the process
         return np.zeros(0, np.float32)
     d = [mi.Float(np.ascontiguousarray(directions[:, axis], np.float32)) for axis in range(3)]

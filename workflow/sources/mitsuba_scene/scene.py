@@ -1,7 +1,8 @@
-"""Loading a scene so that every shape keeps its identity, and listing what is in it."""
+"""Loads a scene such that every shape keeps its identity, and lists its shapes."""
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,14 +16,14 @@ VARIANT = "llvm_ad_rgb"
 
 
 def choose_variant() -> None:
-    """Select Mitsuba's backend unless the process has one already that works on RGB arrays."""
+    """Select Mitsuba's backend, unless the process already has one that works on RGB arrays."""
     current = mi.variant()
     if not current or "rgb" not in current or not current.startswith(("llvm", "cuda")):
         mi.set_variant(VARIANT)
 
 
 def children(thing: Any) -> dict[str, Any]:
-    """Mitsuba objects directly below an object (BSDFs, textures, emitters), by parameter name."""
+    """Return the Mitsuba objects directly below an object (BSDFs, textures, emitters) by parameter name."""
 
     class Callback(mi.TraversalCallback):  # the base class exists only once a variant is chosen
         def __init__(self) -> None:
@@ -39,17 +40,20 @@ def children(thing: Any) -> dict[str, Any]:
 
 
 def parameter(thing: Any, name: str, default: Any = None) -> Any:
-    """Value of a numeric parameter as an array, or `default`."""
+    """Return the value of a numeric parameter as an array, or `default`."""
     parameters = mi.traverse(thing)
     return np.array(parameters[name]) if name in parameters else default
 
 
 @dataclass(frozen=True)
 class Shape:
-    """One shape as it stands in the world.
+    """One shape in the world.
 
-    plugin: Mitsuba's name (`ply`).  name: for people, unique.  placement: (4, 4) on top of the shape's own
-    transformation (members of a shape group), or None.
+    Attributes:
+        plugin: Mitsuba's name of its kind, such as `ply`.
+        name: unique, for people.
+        object: Mitsuba's shape.
+        placement: (4, 4) applied after the shape's own transformation (members of a shape group), or None.
     """
 
     plugin: str
@@ -60,7 +64,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """The scene that is rendered, its shapes, and notes on what the XML says that the mesh cannot."""
+    """The scene that is rendered, its shapes, and notes about parts of the XML that the mesh cannot represent."""
 
     scene: Any
     shapes: list[Shape]
@@ -71,11 +75,11 @@ def load(xml: Path) -> LoadedScene:
     """Load a scene without merging meshes or materials; a shape of a group appears once for each of its instances.
 
     Raises:
-        InputError: whatever Mitsuba refuses, with its words.
+        InputError: Mitsuba cannot load the scene; the message repeats Mitsuba's.
     """
     parser = mi.parser
     config = parser.ParserConfig(mi.variant())
-    config.merge_meshes = config.merge_equivalent = False  # one object per shape is what the ids stand for
+    config.merge_meshes = config.merge_equivalent = False  # every shape stays an object of its own, as the ids require
     resolver = mi.file_resolver()
     before = [str(resolver[i]) for i in range(len(resolver))]
     resolver.prepend(str(xml.parent.resolve()))
@@ -103,7 +107,7 @@ def _references(node: Any) -> list[int]:
 
 
 def _bsdf_name(state: Any, index: int) -> str:
-    """Id of a BSDF, or of the first one nested in it that has one, or its plugin's name."""
+    """Return the id of a BSDF, or of the first nested one that has an id, or the name of its plugin."""
     node = state.nodes[index]
     if node.props.id():
         return node.props.id()
@@ -116,11 +120,11 @@ def _bsdf_name(state: Any, index: int) -> str:
 class _Entry:
     plugin: str
     name: str
-    members: tuple[tuple[str, str, dict[str, Any]], ...]  # of an instance: plugin, name, dictionary of each shape
+    members: tuple[tuple[str, str, dict[str, Any]], ...]  # plugin, name and dictionary of each shape of an instance
 
 
 def _name_shapes(state: Any) -> dict[str, _Entry]:
-    """Give every shape node the id '@<index>', so that its object can be found again; what it is, by that id."""
+    """Give every shape node the id '@<index>', by which its object can be found later; return plugin and name by that id."""
     shapes = [i for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.Shape]
     names = {}
     for index in shapes:
@@ -144,16 +148,16 @@ def _name_shapes(state: Any) -> dict[str, _Entry]:
 
 def _shapes(scene: Any, entries: dict[str, _Entry]) -> list[Shape]:
     out: list[Shape] = []
-    taken: dict[str, int] = {}
+    taken: Counter[str] = Counter()
 
     def add(plugin: str, name: str, thing: Any, placement: np.ndarray | None) -> None:
-        taken[name] = taken.get(name, 0) + 1
+        taken[name] += 1
         unique = name if taken[name] == 1 else f"{name}#{taken[name]}"
         out.append(Shape(plugin, unique, thing, placement))
 
     for thing in scene.shapes():
         name = thing.class_name().lower()
-        # A `merge` shape has been replaced by its result, which no node stands for.
+        # A `merge` shape has been replaced by its result, which has no node.
         entry = entries.get(thing.id(), _Entry(name, thing.id() or name, ()))
         if entry.plugin != "instance":
             add(entry.plugin, entry.name, thing, None)
@@ -165,7 +169,7 @@ def _shapes(scene: Any, entries: dict[str, _Entry]) -> list[Shape]:
 
 
 def _as_dict(state: Any, index: int) -> dict[str, Any]:
-    """A parsed node as the dictionary that `mi.load_dict` takes."""
+    """Return a parsed node as a dictionary for `mi.load_dict`."""
     props = state.nodes[index].props
     out: dict[str, Any] = {"type": props.plugin_name()}
     for key in props.keys():
@@ -175,17 +179,15 @@ def _as_dict(state: Any, index: int) -> dict[str, Any]:
 
 
 def _notes(state: Any) -> list[str]:
-    plugins: dict[str, int] = {}
-    beckmann = 0
+    media = beckmann = 0
     for node in state.nodes:
-        if node.type == mi.ObjectType.Medium:
-            plugins["medium"] = plugins.get("medium", 0) + 1
+        media += node.type == mi.ObjectType.Medium
         if node.type == mi.ObjectType.BSDF and node.props.plugin_name().startswith("rough"):
             props = node.props
             beckmann += "distribution" not in props or str(props["distribution"]) != "ggx"
     out = []
     if beckmann:
         out.append(f"{beckmann} rough BSDFs have the Beckmann distribution: their alpha is taken for GGX's")
-    if plugins:
-        out.append(f"{plugins['medium']} participating media: not rendered, the photographs show surfaces alone")
+    if media:
+        out.append(f"{media} participating media: not rendered, the photographs show surfaces alone")
     return out

@@ -12,7 +12,7 @@ ROOMS: dict[str, Callable[[], Room]] = {"kitchen": kitchen.build, "tiny": tiny.b
 
 
 def build(name: str) -> Room:
-    """The room of that name.
+    """Build the room of that name.
 
     Raises:
         InputError: unknown name.

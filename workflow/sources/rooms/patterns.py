@@ -1,12 +1,12 @@
 """Solid textures, written once for NumPy (truth maps) and Dr.Jit (renderer) on `iif_core.numerics.xp`.
 
-An object's material is a row of numbers. A pattern makes two blends (t, s) of a point in the object's frame:
+The material of an object is a row of numbers. A pattern computes two blend weights (t, s) at a point in the object's frame:
 
     albedo = mix(mix(first, second, t), third, s)      roughness = r0 + r_t t + r_s s      metallic = m
 
-Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 holds exactly,
-so that both libraries see the same texture. Finest features are about 1.5 cm (seams and grout 0.8 cm): above
-the footprint of a pixel at reading distance, so that photographs do not alias.
+Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 represents exactly, so that both
+libraries see the same texture. The finest features measure about 1.5 cm (seams and grout 0.8 cm), more than the footprint of a
+pixel at the distances of the cameras, so that photographs do not alias.
 """
 
 from __future__ import annotations
@@ -20,38 +20,26 @@ import numpy as np
 from iif_core.numerics.xp import Namespace
 
 Colour = tuple[float, float, float]
-KINDS = (
-    "plain",
-    "wood",
-    "cells",
-    "checks",
-    "marble",
-    "terrazzo",
-    "stripes",
-    "rug",
-    "painting",
-    "rings",
-    "spines",
-)
+KINDS = ("plain", "wood", "cells", "checks", "marble", "terrazzo", "stripes", "rug", "painting", "rings", "spines")
 
 _SQUARE = {"z": ((1, 0, 0), (0, 1, 0)), "y": ((1, 0, 0), (0, 0, 1)), "x": ((0, 1, 0), (0, 0, 1))}
 
 
 @dataclass(frozen=True)
 class Material:
-    """One object's material.
+    """The material of one object.
 
     Attributes:
-        first, second, third: linear base colours that the pattern mixes.
-        roughness: (r0, r_t, r_s), perceptual; must stay in [0.02, 1].
+        first, second, third: linear base colours that the pattern mixes; None repeats the colour before.
+        roughness: (r0, r_t, r_s), perceptual; the sum must stay in [0.02, 1].
         metallic: in [0, 1].
         kind: one of KINDS.
-        size: pattern sizes in metres along the frame's u and v (what they mean depends on the kind).
+        size: sizes of the pattern in metres along u and v of the frame; their meaning depends on the kind.
         axes: directions of u and v in the world (orthonormal); w = u x v.
         origin: where (u, v, w) = 0.
-        grain: cycles a metre of the coarse noise along u, v, w; the fine noise has `fine` times as many.
-        fine: see `grain`.
-        amount: how much of the noise shows in `plain` and `cells`, 0 to 1.
+        grain: cycles per metre of the coarse noise along u, v, w.
+        fine: frequency of the fine noise as a multiple of `grain`.
+        amount: contribution of the noise to `plain` and `cells`, 0 to 1.
     """
 
     first: Colour
@@ -69,7 +57,7 @@ class Material:
 
 
 def facing(axis: str) -> tuple[Sequence[float], Sequence[float]]:
-    """(u, v) axes for a surface across `axis`: v is up for walls, and y for floors."""
+    """Return the (u, v) axes of a surface square to the world axis `axis`: v points up on walls and along y on floors."""
     return _SQUARE[axis]
 
 
@@ -105,11 +93,7 @@ def _row(material: Material) -> list[float]:
 
 @dataclass(frozen=True)
 class MaterialTable:
-    """The materials of all objects; position = object id.
-
-    Called as `table.numpy(points (n, 3), object_id (n,))` for truth, and `table.drjit()` gives the
-    renderer's callable `material(point, face, object_id, active) -> (base_color, roughness, metallic)`.
-    """
+    """The materials of all objects, in order of their ids: `numpy` evaluates them for truth maps, `drjit` for the renderer."""
 
     materials: tuple[Material, ...]
     _columns: dict[str, np.ndarray] = field(init=False, repr=False)
@@ -119,7 +103,7 @@ class MaterialTable:
         object.__setattr__(self, "_columns", {name: rows[:, k].copy() for k, name in enumerate(_COLUMNS)})
 
     def numpy(self, points: np.ndarray, object_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Albedo (n, 3) linear, roughness (n,), metallic (n,) float32 at points (n, 3) of objects (n,)."""
+        """Return albedo (n, 3) linear, perceptual roughness (n,) and metallic (n,), float32, at points (n, 3) of objects (n,)."""
         from iif_core.numerics.xp import NUMPY
 
         points = np.asarray(points, np.float32).reshape(-1, 3)
@@ -127,13 +111,16 @@ class MaterialTable:
         return np.stack(albedo, 1), roughness, metallic
 
     def drjit(self) -> Callable[..., tuple[Any, Any, Any]]:
-        """The same for the renderer, on the active Mitsuba variant."""
+        """Return the renderer's `material(point, face, object_id, active) -> (base_color, roughness, metallic)`.
+
+        It works on the active Mitsuba variant.
+        """
         import drjit as dr
         import mitsuba as mi
 
         from iif_core.numerics.xp import DRJIT
 
-        # Rows padded to whole groups of four: one aligned read fetches four entries.
+        # Rows are padded to whole groups of four, because one aligned read fetches four entries.
         width = -(-len(_COLUMNS) // 4)
         rows = np.zeros((len(self.materials), 4 * width), np.float32)
         rows[:, : len(_COLUMNS)] = np.stack([self._columns[name] for name in _COLUMNS], 1)
@@ -154,7 +141,7 @@ class MaterialTable:
 
 
 def evaluate(xp: Namespace, point: Sequence[Any], column: Callable[[str], Any]) -> tuple[tuple[Any, Any, Any], Any, Any]:
-    """(albedo, roughness, metallic) at world points (x, y, z); `column(name)`: their table entries."""
+    """Return (albedo, roughness, metallic) at world points (x, y, z); `column(name)` gives the entries of their objects."""
     x, y, z = point
     u, v, w = (column(f"{a}_x") * x + column(f"{a}_y") * y + column(f"{a}_z") * z + column(f"{a}_1") for a in "uvw")
     frequency = [column(f"grain_{a}") for a in "uvw"]
@@ -181,7 +168,7 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     grain = xp.abs(2 * (rings - xp.floor(rings)) - 1)
     grain = 0.45 * grain * grain * (3 - 2 * grain) + 0.3 * coarse + 0.25 * detail
 
-    # cells of su x sv: boards (rows shifted at random, seams 5 mm), tiles (odd rows by half, grout 8 mm)
+    # cells of su x sv: boards (rows shifted at random, seams of 5 mm) or tiles (odd rows shifted by half, grout of 8 mm)
     row = xp.floor(v / sv)
     odd = row - 2 * xp.floor(row * 0.5)
     boards = su > 4 * sv
@@ -192,7 +179,7 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     seam = xp.where(edge < xp.where(boards, 0.0025, 0.004), 1.0 + zero, zero)
     cells = xp.where(boards, 0.45 * tone + 0.55 * grain, tone * (1 - amount) + amount * cloud)
 
-    # checks: gingham; odd column and odd row each half of the second colour
+    # checks: gingham; an odd column and an odd row each add half of the second colour
     column_index = xp.floor(u / su)
     checks = 0.5 * (_parity(xp, column_index) + odd)
 
@@ -201,7 +188,7 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     vein = xp.maximum(1 - xp.abs(warped - 0.5) * 18, 0.0)
     chips = _step(xp, 0.68, 0.72, detail)
 
-    # stripes along u of width sv; every fourth band in the third colour
+    # stripes along u of width sv; every fourth band shows the third colour
     quarter = row - 4 * xp.floor(row * 0.25)
     stripe_s = xp.where(quarter == 2, 1.0 + zero, zero)
 
@@ -221,11 +208,11 @@ def _blends(xp: Namespace, local: Sequence[Any], coarse: Any, detail: Any, colum
     paint_t = xp.where(pv < near, 1.0 + zero, xp.where(pv < far, 0.62 + 0.2 * detail, 0.25 - 0.25 * pv + 0.1 * coarse))
     paint_s = xp.where(pv < near, 0.18 * detail, xp.where(pv < far, zero, xp.where(sun < 0.05, 1.0 + zero, zero)))
 
-    # rings about w: disc of radius su plain, then a band to sv in the second colour, twelve ticks outside it
+    # rings about w: a band from radius su to sv in the second colour
     radius = xp.sqrt(u * u + v * v)
     band = xp.where((radius > su) & (radius < sv), 1.0 + zero, zero)
 
-    # spines: books side by side along u, each with its own colour and two bands across
+    # spines: books side by side along u, each with its own colour and a band across
     book = _hash(xp, column_index, 5 + zero, zero)
     second = _hash(xp, column_index, 9 + zero, zero)
     title = xp.where(xp.abs(v - sv) < 0.012, 0.8 + zero, zero)
@@ -264,7 +251,7 @@ def _step(xp: Namespace, low: float, high: float, x: Any) -> Any:
 
 
 def _permute(xp: Namespace, x: Any) -> Any:
-    """(34 x + 1) x mod 289 of integers 0 <= x < 578; exact in float32, which needs the first reduction."""
+    """(34 x + 1) x mod 289 of integers 0 <= x < 578, exact in float32 thanks to the first reduction."""
     x = xp.where(x >= 289, x - 289, x)
     x = (34 * x + 1) * x
     return x - 289 * xp.floor((x + 0.5) * (1 / 289))
@@ -275,14 +262,14 @@ def _modulo(xp: Namespace, i: Any) -> Any:
 
 
 def _hash(xp: Namespace, i: Any, j: Any, k: Any) -> Any:
-    """A number in [0, 1] for three integers."""
+    """Return a number in [0, 1] for three integers."""
     h = _permute(xp, _modulo(xp, i))
     h = _permute(xp, h + _modulo(xp, j))
     return _permute(xp, h + _modulo(xp, k)) * (1 / 288)
 
 
 def noise(xp: Namespace, x: Any, y: Any, z: Any) -> Any:
-    """Value noise in [0, 1], mean 1/2: smooth between random values at the integers, stretched."""
+    """Return value noise in [0, 1] of mean 1/2: random values at the integers, smoothly interpolated, with stretched contrast."""
     i, j, k = xp.floor(x), xp.floor(y), xp.floor(z)
     fx, fy, fz = (f * f * (3 - 2 * f) for f in (x - i, y - j, z - k))
     i0, j0, k0 = (_modulo(xp, c) for c in (i, j, k))

@@ -1,4 +1,4 @@
-"""Light transport: two roads to one number (caches, matrix, paths, radiance cache)."""
+"""Light transport: different estimators of one number agree (cached shading, matrix, paths, radiance cache)."""
 
 import numpy as np
 import pytest
@@ -20,16 +20,12 @@ def test_shading_caches_compose_to_the_rendered_radiance(T, room):
         rendered.append(room.render(T, 128, seed=100 + seed))
         for levels, kept in ((exact, composed), (grid, interpolated)):
             diffuse, s0, s1 = T.shading_caches(
-                room.geometry,
-                room.material,
-                room.emitters,
+                T.Scene(room.geometry, room.material, room.emitters),
                 room.points,
                 room.normals,
                 room.wo,
                 levels,
-                128,
-                5,
-                seed=seed,
+                T.PathOptions(128, 5, seed),
             )
             lower = np.clip(np.searchsorted(levels, room.roughness) - 1, 0, len(levels) - 2)
             t = ((room.roughness - levels[lower]) / (levels[lower + 1] - levels[lower]))[:, None]
@@ -45,20 +41,10 @@ def test_transport_matrix_reproduces_reflected_radiance(T, room):
     seeds, products, rendered = 4, [], []
     for seed in range(seeds):
         matrix, cached = T.transport_matrix(
-            room.geometry,
-            room.material,
-            room.points,
-            room.normals,
-            room.wo,
-            room.base_color,
-            room.roughness,
-            room.metallic,
-            room.group,
-            2,
-            room.side,
-            128,
-            5,
-            seed=seed,
+            T.Scene(room.geometry, room.material, None),
+            T.ShadingPoints(room.points, room.normals, room.wo, room.base_color, room.roughness, room.metallic),
+            T.EmitterColumns(room.group, 2, room.side),
+            T.PathOptions(128, 5, seed),
         )
         matrix, cached = matrix.sum(1), cached.sum(1)
         assert matrix.shape == (len(room.points), 2, 3) and not cached.any() and (matrix >= 0).all()
@@ -74,37 +60,23 @@ def test_constant_cache_in_a_closed_room_is_a_furnace(T, room):
     levels = [0.1, 0.9]
     cache = constant_cache(T, (2, 1, 0))
     diffuse, s0, s1 = T.shading_caches(
-        room.geometry,
-        room.material,
-        dark,
+        T.Scene(room.geometry, room.material, dark, cache),
         room.points[pick],
         room.normals[pick],
         room.wo[pick],
         levels,
-        64,
-        1,
-        0,
-        cache=cache,
+        T.PathOptions(64, 1, 0),
     )
     assert_mean(diffuse[:, 0], 2)
     assert_mean(diffuse[:, 1], 1)
     assert not diffuse[:, 2].any()  # in the table with radiance 0: black, not a miss
     matrix, h = T.transport_matrix(
-        room.geometry,
-        room.material,
-        room.points[pick],
-        room.normals[pick],
-        room.wo[pick],
-        room.base_color[pick],
-        room.roughness[pick],
-        room.metallic[pick],
-        np.full(len(room.faces), -1),
-        0,
-        None,
-        64,
-        1,
-        0,
-        cache=cache,
+        T.Scene(room.geometry, room.material, None, cache),
+        T.ShadingPoints(
+            room.points[pick], room.normals[pick], room.wo[pick], room.base_color[pick], room.roughness[pick], room.metallic[pick]
+        ),
+        T.EmitterColumns(np.full(len(room.faces), -1), 0),
+        T.PathOptions(64, 1, 0),
     )
     assert matrix.shape == (len(diffuse), 2, 0, 3)
     walls = room.object[pick] == 0
@@ -113,7 +85,9 @@ def test_constant_cache_in_a_closed_room_is_a_furnace(T, room):
     for lobe, expected in enumerate(lobes):
         assert_mean((h[:, lobe] - expected)[walls, 0], 0)
     h = h.sum(1)
-    seen = T.render(room.geometry, room.material, dark, room.origin, room.directions[pick], 64, 1, 0, cache=cache)
+    seen = T.render(
+        T.Scene(room.geometry, room.material, dark, cache), room.origin, room.directions[pick], T.PathOptions(64, 1, 0)
+    )
     assert_mean(seen[:, 0] - h[:, 0], 0)  # the primary hit is shaded with its material, never cached
     assert_mean(seen[:, 1] - h[:, 1], 0)
     assert seen[:, 0].mean() < 1.7 and not seen[:, 2].any()
@@ -163,7 +137,7 @@ def test_true_radiance_cache_replaces_the_tail_of_the_paths(T):
             inward.append(n)
     points, inward = np.concatenate(points), np.concatenate(inward)
     tilted = inward + np.array([0.31, 0.17, 0.23]) * (inward == 0)
-    radiance = T.render(geometry, material, emitters, points + 1e-3 * tilted, -tilted, 128, 9, seed=2)
+    radiance = T.render(T.Scene(geometry, material, emitters), points + 1e-3 * tilted, -tilted, T.PathOptions(128, 9, 2))
     keys = cells.pack_keys(cells.voxel_indices(points, edge, origin))
     unique, row = np.unique(keys, return_inverse=True)
     mean = np.stack([np.bincount(row, radiance[:, c]) for c in range(3)], -1) / np.bincount(row)[:, None]
@@ -173,8 +147,8 @@ def test_true_radiance_cache_replaces_the_tail_of_the_paths(T):
     d = rng.normal(size=(4000, 3))
     d[:, 2] = -np.abs(d[:, 2])
     start = np.array([1.03, 0.96, 1.2])
-    full = T.render(geometry, material, emitters, start, d, 64, 9, seed=3)
-    short = T.render(geometry, material, emitters, start, d, 64, 1, seed=4, cache=cache)
-    without = T.render(geometry, material, emitters, start, d, 64, 1, seed=4)
+    full = T.render(T.Scene(geometry, material, emitters), start, d, T.PathOptions(64, 9, 3))
+    short = T.render(T.Scene(geometry, material, emitters, cache), start, d, T.PathOptions(64, 1, 4))
+    without = T.render(T.Scene(geometry, material, emitters), start, d, T.PathOptions(64, 1, 4))
     assert short.mean() == pytest.approx(full.mean(), rel=0.01)
     assert without.mean() < 0.8 * full.mean()

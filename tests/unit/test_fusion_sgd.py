@@ -1,4 +1,4 @@
-"""The paper's optimiser: gradients against automatic differentiation, what it finds, its edge cases."""
+"""The paper's optimiser: gradients against automatic differentiation, fits of planted scenes, edge cases."""
 
 from dataclasses import replace
 
@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.fusion.direct import solve_base
+from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.hashgrid.levels import HashGridOptions
 from iif_core.fusion.kernels import IDENTITY, as_words
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import LOWEST, NEUTRAL, BaseProblem
+from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
 from iif_core.fusion.reference_loss import loss_of_result, reference_loss
 from iif_core.fusion.sgd import kernels, numba_engine, torch_engine
 from iif_core.fusion.sgd import pool as sgd_pool
 from iif_core.fusion.sgd.options import SgdOptions, sgd_options
-from iif_core.fusion.sgd.solve import converged, solve_base_sgd
-from tests.unit.test_base import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
+from iif_core.fusion.sgd.solve import converged, solve_sgd
+from iif_core.reflectance.material import unclamped_material
+from tests.unit.test_fusion_direct import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
 torch = pytest.importorskip("torch")
 TERMS = ("data", "label", "regulariser", "entropy", "gain")
@@ -51,14 +52,14 @@ def compiled(p, options, temperature=0.3, divisor=0.7, real=np.float64):
     start, segment = sgd_pool.runs(p["segment"])
     d_affine, d_alpha, votes = (np.zeros((*p["usable"].shape, m), real) for m in (16, 3, 3))
     d_raw, error, sums = np.empty(p["raw"].shape, real), np.zeros(alpha.shape), np.zeros((len(segment), 5))
-    numbers = np.array([temperature, options.scale_floor, options.data_weight, options.regulariser], real)
-    flags = np.array([options.scale_floor_kind == "smooth", options.median_gradient, options.clamp_gradient == "inward"])
-    kernels.batch_loss(
-        *(0, len(segment), start, segment, p["values"].astype(real), np.arange(len(p["raw"]), dtype=np.int32)),
-        *(a.astype(real) for a in (p["share"], p["raw"], p["affine"], alpha, log_alpha)),
-        *(p["usable"], *kernels.selection_networks(alpha.shape[1]), numbers, flags),
-        *(d_raw, d_affine, d_alpha, votes, error, sums),
-    )
+    pixels = np.arange(len(p["raw"]), dtype=np.int32)
+    values, share, raw = (p[name].astype(real) for name in ("values", "share", "raw"))
+    batch = kernels.Batch(start, segment, values, pixels, share, raw)
+    maps = (a.astype(real) for a in (p["affine"], alpha, log_alpha))
+    tables = kernels.SegmentTables(*maps, p["usable"], *kernels.selection_networks(alpha.shape[1]))
+    settings = numba_engine.loss_settings(options, temperature, real)
+    out = kernels.Gradients(d_raw, d_affine, d_alpha, votes, error, sums)
+    kernels.batch_loss(0, len(segment), batch, tables, settings, out)
     d_z = numba_engine.logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
     return dict(zip(TERMS, sums.sum(0), strict=True)), {"raw": d_raw, "affine": d_affine, "z": d_z}, error
 
@@ -72,12 +73,12 @@ def softmax(y, usable):
 
 
 def automatic(p, options, temperature=0.3, divisor=0.7):
-    """The same left to torch."""
+    """Terms of the loss and gradients by torch."""
     t = {name: torch.from_numpy(a) for name, a in p.items()}
     wanted = [t[name].requires_grad_() for name in ("raw", "affine", "z")]
-    found = torch_engine.torch_losses(
-        *(t[name] for name in ("raw", "values", "affine", "z", "segment", "usable", "share")), temperature, divisor, options
-    )
+    batch = torch_engine.TorchBatch(*(t[name] for name in ("raw", "values", "segment", "share")))
+    tables = torch_engine.TorchTables(*(t[name] for name in ("affine", "z", "usable")))
+    found = torch_engine.torch_losses(batch, tables, temperature, divisor, options)
     o = options
     loss = o.data_weight * found["data"] + o.label_weight * found["label"] + o.regulariser * found["regulariser"]
     slopes = dict(zip(("raw", "affine", "z"), (g.numpy() for g in torch.autograd.grad(loss, wanted)), strict=True))
@@ -110,7 +111,7 @@ def test_closed_form_gradients_equal_automatic_ones(k, options):
 @pytest.mark.parametrize("options", [sgd_options("paper"), sgd_options("paper", scale_floor_kind="smooth", data_weight=2.0)])
 @pytest.mark.parametrize("name", ["raw", "affine", "z"])
 def test_gradients_equal_finite_differences(options, name):
-    """All but q, which is a constant: the label loss is compared in z alone, on which q does not depend."""
+    """q is a constant for the gradient, so the label loss is compared only in z, on which q does not depend."""
     options = replace(options, label_weight=1.0 if name == "z" else 0.0)
     p = state(5, low=0.3, spread=0.03)
     _, slopes, _ = compiled(p, options)
@@ -129,7 +130,7 @@ def test_gradients_equal_finite_differences(options, name):
         assert slopes[name][at] == pytest.approx(numeric, rel=2e-5, abs=2e-9)
 
 
-def test_label_loss_trains_the_logits_alone():
+def test_label_loss_trains_only_the_logits():
     p = state(5)
     options = sgd_options(data_weight=0.0, regulariser=0.0)
     for _, slopes, _ in (compiled(p, options), automatic(p, options)):
@@ -138,13 +139,13 @@ def test_label_loss_trains_the_logits_alone():
         np.testing.assert_allclose(slopes["z"].sum(1), 0, atol=1e-15)
 
 
-def test_clamped_values_pull_back_inside_or_not_at_all():
-    """One pixel whose corrected albedo is far too bright: only `inward` moves the correction, and towards less."""
+def test_clamped_values_have_an_inward_gradient_or_none():
+    """For a pixel whose corrected albedo is far too bright, only `inward` changes the map, and it darkens it."""
     p = state(1, n=1, segments=1, spread=0.0)
     p["values"][:], p["raw"][:], p["affine"][0, 0, 3] = 0.9, -1.0, 0.5
     dead, inward = (compiled(p, sgd_options(regulariser=0.0, clamp_gradient=g))[1]["affine"][0, 0] for g in ("dead", "inward"))
     assert dead[3] == 0 and inward[3] > 0 and dead[7] == inward[7] > 0
-    p["raw"][:] = 9.0  # the texture is brighter still: outwards is no way
+    p["raw"][:] = 9.0  # the texture is brighter still, so a step leads outwards
     assert compiled(p, sgd_options(regulariser=0.0, scale_floor=0.5))[1]["affine"][0, 0, 3] >= 0
 
 
@@ -167,14 +168,12 @@ def test_half_precision_pools_are_read_as_they_are():
         start, segment = sgd_pool.runs(p["segment"])
         alpha, log_alpha = (a.astype(np.float32) for a in softmax(p["z"], p["usable"]))
         rest = [np.zeros((4, 6, m), np.float32) for m in (16, 3, 3)]
-        kernels.batch_loss(
-            *(0, 4, start, segment, pool, np.arange(100, dtype=np.int32)),
-            *(a.astype(np.float32) for a in (p["share"], p["raw"], p["affine"])),
-            *(alpha, log_alpha, p["usable"], *kernels.selection_networks(6), np.float32([0.3, 0.01, 1, 100])),
-            *(np.array([True, False, True]), d_raw, *rest, np.zeros((4, 6, 3)), sums),
-        )
+        share, raw, affine = (p[name].astype(np.float32) for name in ("share", "raw", "affine"))
+        batch = kernels.Batch(start, segment, pool, np.arange(100, dtype=np.int32), share, raw)
+        tables = kernels.SegmentTables(affine, alpha, log_alpha, p["usable"], *kernels.selection_networks(6))
+        gradients = kernels.Gradients(d_raw, *rest, np.zeros((4, 6, 3)), sums)
+        kernels.batch_loss(0, 4, batch, tables, numba_engine.loss_settings(options, 0.3, np.float32), gradients)
         out.append((sums, d_raw))
-    assert options.scale_floor == 0.01
     np.testing.assert_array_equal(out[0][0], out[1][0])
     np.testing.assert_array_equal(out[0][1], out[1][1])
 
@@ -218,7 +217,7 @@ def test_adam_is_that_of_torch():
 
 
 def test_published_schedules():
-    """METHOD 2.3.8: 81 multiplications on 8080 steps, the first after the first step; halved after 2, 4, 6, 8 epochs."""
+    """81 multiplications in 8080 steps, the first after the first step (Eq. F.17); rate halved after 2, 4, 6, 8 epochs."""
     paper = sgd_options("paper")
     temperature = [sgd_pool.temperature_at(paper, step, 8080) for step in (0, 1, 100, 101, 8079)]
     np.testing.assert_allclose(temperature, 0.85 ** np.array([0, 1, 1, 2, 81]))
@@ -248,10 +247,10 @@ def test_batches_are_permutations():
 # -------------------------------------------------------------------------------------------------------------- solver
 
 
-def test_loss_falls_and_the_history_says_so():
+def test_loss_falls_in_the_history():
     problem, truth = simulated()
     calls = []
-    fit = solve_base_sgd(problem, sgd_options(iterations=800), lambda done, total: calls.append((done, total)))
+    fit = solve_sgd(problem, sgd_options(iterations=800), lambda done, total: calls.append((done, total)))
     before, after = fit.history[0], fit.history[-1]
     assert after["data"] < 0.7 * before["data"] and calls[-1] == (800, 800)
     assert converged(fit.history) and not converged(fit.history[:40])
@@ -261,7 +260,7 @@ def test_loss_falls_and_the_history_says_so():
     assert found.total == pytest.approx(after["total"], rel=0.02)
     regulariser = found.regulariser_albedo + found.regulariser_roughness + found.regulariser_metallic
     assert regulariser == pytest.approx(after["regulariser"], rel=0.02)
-    mean = solve_base(problem, BaseOptions("texel_mean"))
+    mean = solve_direct(problem, FusionOptions("texel_mean"))
     assert oracle_psnr(problem, fit.value, truth) > oracle_psnr(problem, mean.value, truth) + 0.3
     assert fit.value.shape == fit.scale.shape == (problem.n_cells, 5) and fit.scale.min() >= 0.01
     assert (fit.value >= LOWEST).all() and (fit.value <= 1).all()
@@ -278,7 +277,7 @@ def test_flat_and_falling_histories():
 
 
 def test_good_predictions_are_selected_and_the_texture_found():
-    """One clean sample among patterns of noise, at another k in every view (clean: an affine map of the truth)."""
+    """One affine map of the truth among patterns of noise, at a different k in every view."""
     problem, truth = planted(views=8, samples=5, spread=0.03)
     rng = np.random.default_rng(1)
     good = rng.integers(0, 5, 8)
@@ -288,7 +287,7 @@ def test_good_predictions_are_selected_and_the_texture_found():
             if k != good[v]:
                 p[k] = np.clip(p[k] + 0.12 * rng.standard_normal(p[k].shape), 0, 1)
     problem = replace(problem, predictions=predictions)
-    fit = solve_base_sgd(problem, sgd_options(iterations=1200))
+    fit = solve_sgd(problem, sgd_options(iterations=1200))
     view_of_segment = np.array(
         [next(v for v, m in enumerate(problem.segment_of_pixel) if (m == s).any()) for s in range(problem.n_segments)]
     )
@@ -299,11 +298,11 @@ def test_good_predictions_are_selected_and_the_texture_found():
 
 @pytest.mark.parametrize("preset", ["safe", "paper"])
 def test_loss_of_the_solver_is_the_reference_loss(preset):
-    """All pixels in one batch and a step of size 0: the first history entry is the loss of what is returned."""
+    """With all pixels in one batch and steps of size 0, the first history entry is the loss of the result."""
     problem, _ = simulated()
     options = sgd_options(preset, texture="cells", init="mean", iterations=1, batch=1 << 20, learning_rate=1e-30)
     for backend in ("numba", "torch"):
-        fit = solve_base_sgd(problem, replace(options, choice="soft"), backend=backend)
+        fit = solve_sgd(problem, replace(options, choice="soft"), backend=backend)
         expected = reference_loss(
             problem,
             *(fit.value, fit.scale, (fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
@@ -313,29 +312,28 @@ def test_loss_of_the_solver_is_the_reference_loss(preset):
         assert fit.history[0]["total"] == pytest.approx(expected.total, rel=1e-5)
         assert fit.history[0]["data"] == pytest.approx(expected.data, rel=1e-5)
         assert fit.history[0]["label"] == pytest.approx(expected.label, rel=1e-5)
-    weighted = solve_base_sgd(problem, replace(options, weighted=True))
+    weighted = solve_sgd(problem, replace(options, weighted=True))
     assert weighted.history[0]["data"] == pytest.approx(loss_of_result(problem, weighted, weighted=True).data, rel=1e-5)
 
 
 def test_loss_with_moved_corrections_is_the_reference_loss():
     problem, _ = simulated()
-    fit = solve_base_sgd(problem, sgd_options(iterations=120, batch=1 << 20, learning_rate=0.02))
+    fit = solve_sgd(problem, sgd_options(iterations=120, batch=1 << 20, learning_rate=0.02))
     assert np.abs(fit.corrections - IDENTITY).max() > 1e-3
     assert loss_of_result(problem, fit).total == pytest.approx(fit.history[-1]["total"], rel=2e-3)  # one step later
-    packed = np.random.default_rng(0).random((7, 5)).astype(np.float32)
-    packed = np.c_[packed, np.ones(7, np.float32)]
-    rows = packed @ fit.affine[3, 2]
-    expected = packed[:, :3] @ fit.affine_albedo[3, 2, :, :3].T + fit.affine_albedo[3, 2, :, 3]
-    np.testing.assert_allclose(rows[:, :3], expected, rtol=1e-5)
-    gain, bias = fit.affine_metallic[3, 2]
-    np.testing.assert_allclose(rows[:, 4], gain * packed[:, 4] + bias, rtol=1e-5)
+    base = np.random.default_rng(0).random((7, 5)).astype(np.float32)
+    mapped = unclamped_material(np.tile(fit.corrections[3, 2], (7, 1)), base)
+    expected = base[:, :3] @ fit.affine_albedo[3, 2, :, :3].T + fit.affine_albedo[3, 2, :, 3]
+    np.testing.assert_allclose(mapped[:, :3], expected, rtol=1e-5)
+    for channel, (gain, bias) in ((3, fit.affine_roughness[3, 2]), (4, fit.affine_metallic[3, 2])):
+        np.testing.assert_allclose(mapped[:, channel], gain * base[:, channel] + bias, rtol=1e-5)
 
 
 @pytest.mark.parametrize("preset", ["safe", "paper"])
-def test_both_backends_walk_the_same_way(preset):
+def test_both_engines_take_the_same_steps(preset):
     problem, _ = simulated()
     options = sgd_options(preset, texture="cells", iterations=8, batch=1024, median_gradient=False, records=8)
-    a, b = (solve_base_sgd(problem, options, backend=backend) for backend in ("numba", "torch"))
+    a, b = (solve_sgd(problem, options, backend=backend) for backend in ("numba", "torch"))
     for x, y in zip(a.history, b.history, strict=True):
         assert {n: v for n, v in x.items() if n != "step"} == pytest.approx({n: v for n, v in y.items() if n != "step"}, rel=1e-4)
     for x, y in ((a.value, b.value), (a.scale, b.scale)):  # Adam's steps have the size of a gradient's sign
@@ -346,42 +344,42 @@ def test_both_backends_walk_the_same_way(preset):
 def test_same_bytes_again_streamed_and_with_threads():
     problem, _ = simulated()
     options = replace(QUICK, iterations=60)
-    first = solve_base_sgd(problem, options, threads=1)
+    first = solve_sgd(problem, options, threads=1)
     streamed = replace(problem, predictions=lambda view: simulated()[0].predictions[view])
-    for other in (solve_base_sgd(problem, options, threads=2), solve_base_sgd(streamed, options, threads=3)):
+    for other in (solve_sgd(problem, options, threads=2), solve_sgd(streamed, options, threads=3)):
         for name in ("value", "scale", "corrections", "alpha", "error"):
             assert getattr(first, name).tobytes() == getattr(other, name).tobytes()
         assert first.history == other.history
-    other = solve_base_sgd(problem, replace(options, seed=1))
+    other = solve_sgd(problem, replace(options, seed=1))
     assert first.value.tobytes() != other.value.tobytes()
 
 
 def test_order_of_predictions_does_not_matter():
     problem, _ = simulated()
     order = np.random.default_rng(0).permutation(6)
-    a = solve_base_sgd(problem, QUICK)
-    b = solve_base_sgd(replace(problem, predictions=[p[order] for p in problem.predictions]), QUICK)
+    a = solve_sgd(problem, QUICK)
+    b = solve_sgd(replace(problem, predictions=[p[order] for p in problem.predictions]), QUICK)
     assert (a.alpha[:, order].argmax(1) == b.alpha.argmax(1)).mean() > 0.95
     assert b.history[-1]["total"] == pytest.approx(a.history[-1]["total"], rel=0.02)
 
 
 def test_a_given_selection_is_kept():
     problem, _ = simulated()
-    direct = solve_base(problem)
-    fit = solve_base_sgd(problem, QUICK, weight=direct.weight)
+    direct = solve_direct(problem)
+    fit = solve_sgd(problem, QUICK, weight=direct.weight)
     np.testing.assert_array_equal(fit.alpha, direct.weight)
     assert all(h["label"] == 0 for h in fit.history)
     with pytest.raises(InputError, match="weight has shape"):
-        solve_base_sgd(problem, QUICK, weight=direct.weight[:, :2])
+        solve_sgd(problem, QUICK, weight=direct.weight[:, :2])
 
 
 def test_one_prediction_needs_no_selection():
     problem, truth = simulated(samples=1)
-    fit = solve_base_sgd(problem, QUICK)
+    fit = solve_sgd(problem, QUICK)
     assert (fit.alpha == 1).all() and all(h["label"] == h["entropy"] == 0 for h in fit.history)
     assert np.isfinite(fit.value).all() and fit.history[-1]["data"] < fit.history[0]["data"]
     for backend in ("numba", "torch"):
-        paper = solve_base_sgd(problem, sgd_options("paper", texture="cells", iterations=5), backend=backend)
+        paper = solve_sgd(problem, sgd_options("paper", texture="cells", iterations=5), backend=backend)
         assert np.isfinite(paper.value).all() and (paper.alpha == 1).all()
 
 
@@ -389,7 +387,7 @@ def test_equal_predictions_share():
     problem, truth = simulated(strength=0.0, samples=1)
     tripled = replace(problem, predictions=[np.repeat(p, 3, 0) for p in problem.predictions])
     for choice in ("argmin", "soft"):
-        fit = solve_base_sgd(tripled, replace(QUICK, choice=choice))
+        fit = solve_sgd(tripled, replace(QUICK, choice=choice))
         np.testing.assert_allclose(fit.alpha, 1 / 3, atol=1e-6)
     cells = seen(problem)
     assert np.abs(fit.value - truth)[cells].mean() < 5e-3
@@ -404,7 +402,7 @@ def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(val
     predictions[4][1, 5, 5, 0] = value
     predictions[0][:] = value
     problem = replace(problem, predictions=predictions)
-    fit, direct = solve_base_sgd(problem, replace(QUICK, iterations=30)), solve_base(problem)
+    fit, direct = solve_sgd(problem, replace(QUICK, iterations=30)), solve_direct(problem)
     assert fit.dropped == direct.dropped
     np.testing.assert_array_equal(fit.observations, direct.observations)
     np.testing.assert_array_equal(fit.views, direct.views)
@@ -420,27 +418,27 @@ def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(val
 def test_coldest_temperatures_stay_finite(backend):
     problem, _ = simulated()
     options = sgd_options("paper", texture="cells", iterations=20, batch=512, anneal_schedule="fraction", anneal=0.7)
-    fit = solve_base_sgd(problem, options, backend=backend)
+    fit = solve_sgd(problem, options, backend=backend)
     assert fit.history[-1]["temperature"] < 2e-11
     for array in (fit.value, fit.scale, fit.corrections, fit.alpha):
         assert np.isfinite(array).all()
     assert np.isfinite([list(h.values()) for h in fit.history]).all()
     np.testing.assert_allclose(fit.alpha.sum(1), 1, atol=1e-5)
-    frozen = solve_base_sgd(problem, replace(options, anneal=0.01), backend=backend)  # to the last that float32 can divide by
+    frozen = solve_sgd(problem, replace(options, anneal=0.01), backend=backend)  # to the smallest by which float32 can divide
     assert frozen.history[-1]["temperature"] == 1e-30 and np.isfinite(frozen.value).all()
 
 
 def test_logits_that_are_not_scaled_tend_to_vote_shares():
     problem, _ = simulated()
     options = replace(QUICK, logits="direct", choice="soft", learning_rate=0.05)
-    fit = solve_base_sgd(problem, options)
+    fit = solve_sgd(problem, options)
     assert 0.01 < fit.history[-1]["entropy"] < np.log(6) - 0.05
 
 
 def test_unseen_cells_and_objects_of_one_pixel():
     obj = np.array([0, 0, 1, 2, 2])
     problem = problem_of([np.array([[0, 2, -1]])], [np.full((2, 1, 3, 5), 0.3)], obj, 0)
-    fit = solve_base_sgd(problem, sgd_options(iterations=5))
+    fit = solve_sgd(problem, sgd_options(iterations=5))
     np.testing.assert_allclose(fit.value[[0, 1, 2]], 0.3, atol=0.03)
     np.testing.assert_array_equal(fit.value[1], fit.value[0])
     np.testing.assert_array_equal(fit.value[3:], [NEUTRAL] * 2)
@@ -452,13 +450,13 @@ def test_constant_colour(level):
     obj, _ = surface()
     cells = [np.arange(SIZE * SIZE).reshape(SIZE, SIZE)] * 2
     problem = problem_of(cells, [np.full((2, SIZE, SIZE, 5), level)] * 2, obj)
-    fit = solve_base_sgd(problem, replace(QUICK, iterations=50))
+    fit = solve_sgd(problem, replace(QUICK, iterations=50))
     assert np.isfinite(fit.value).all()
     np.testing.assert_allclose(fit.value[: SIZE * SIZE], max(level, 0.02), atol=0.03)
 
 
 def test_values_outside_the_unit_interval_are_not_misread():
-    """Half bits of negative numbers or above 1 are not what the compiled loop reads: such maps become float32."""
+    """The compiled loop cannot read half bits of numbers below 0 or above 1; such maps become float32."""
     problem, _ = simulated()
     odd = [p.astype(np.float16) for p in problem.predictions]
     odd[1][2, 3, 4] = [-0.25, 1.5, 0.5, 1.25, -0.0]
@@ -486,7 +484,7 @@ def test_hash_grid_texture(preset):
     problem, truth = simulated()
     problem = on_a_wall(problem)
     options = sgd_options(preset, texture="hashgrid", grid=SMALL_GRID, iterations=150, batch=4096)
-    fit = solve_base_sgd(problem, options)
+    fit = solve_sgd(problem, options)
     assert fit.history[-1]["data"] < 0.8 * fit.history[0]["data"]
     cells = seen(problem)
     assert np.abs(fit.value - truth)[cells, :3].mean() < 0.2 and np.isfinite(fit.scale).all()
@@ -494,7 +492,7 @@ def test_hash_grid_texture(preset):
     cell = np.ravel(problem.cell_of_pixel[3])
     np.testing.assert_allclose(value, fit.value[cell], atol=1e-5)
     assert scale.shape == (SIZE * SIZE, 5)
-    other = solve_base_sgd(problem, options, threads=1)
+    other = solve_sgd(problem, options, threads=1)
     assert fit.value.tobytes() == other.value.tobytes()
     by_pixel = reference_loss(
         problem,
@@ -520,9 +518,9 @@ def test_points_are_normalised_by_a_cube():
 def test_jitter_moves_the_points():
     problem = on_a_wall(simulated()[0])
     options = sgd_options(texture="hashgrid", grid=SMALL_GRID, iterations=20, batch=2048)
-    still, moved = (solve_base_sgd(problem, replace(options, jitter=j)) for j in (False, True))
+    still, moved = (solve_sgd(problem, replace(options, jitter=j)) for j in (False, True))
     assert np.abs(still.value - moved.value).max() > 1e-4
-    without = solve_base_sgd(replace(problem, tangent=None), replace(options, jitter=True))
+    without = solve_sgd(replace(problem, tangent=None), replace(options, jitter=True))
     assert without.value.tobytes() == still.value.tobytes()
 
 
@@ -554,26 +552,26 @@ def test_bad_calls_are_refused():
     with pytest.raises(InputError, match="preset"):
         sgd_options("fast")
     with pytest.raises(InputError, match="surface points"):
-        solve_base_sgd(problem, sgd_options("paper"))
+        solve_sgd(problem, sgd_options("paper"))
     with pytest.raises(InputError, match="backend"):
-        solve_base_sgd(problem, QUICK, backend="jax")
+        solve_sgd(problem, QUICK, backend="jax")
     with pytest.raises(InputError, match="threads"):
-        solve_base_sgd(problem, QUICK, threads=0)
+        solve_sgd(problem, QUICK, threads=0)
     with pytest.raises(InputError, match="no pixel"):
-        solve_base_sgd(BaseProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
+        solve_sgd(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
     with pytest.raises(InputError, match="MiB"):
-        solve_base_sgd(problem, replace(QUICK, memory=1000))
+        solve_sgd(problem, replace(QUICK, memory=1000))
     with pytest.raises(InputError, match="two views"):
-        solve_base_sgd(replace(problem, segment_of_pixel=[problem.segment_of_pixel[0]] * 8), QUICK)
+        solve_sgd(replace(problem, segment_of_pixel=[problem.segment_of_pixel[0]] * 8), QUICK)
     with pytest.raises(InputError, match="cell id"):
-        solve_base_sgd(replace(problem, n_cells=10, object_of_cell=np.zeros(10, int)), QUICK)
+        solve_sgd(replace(problem, n_cells=10, object_of_cell=np.zeros(10, int)), QUICK)
     fewer = [problem.predictions[0], *(p[:3] for p in problem.predictions[1:])]
     with pytest.raises(InputError, match="same number"):
-        solve_base_sgd(replace(problem, predictions=fewer), QUICK)
+        solve_sgd(replace(problem, predictions=fewer), QUICK)
     assert OBJECTS == 4
 
 
 def test_a_loss_that_explodes_is_named():
     problem, _ = simulated()
     with pytest.raises(InputError, match="not finite at step"):
-        solve_base_sgd(problem, replace(QUICK, learning_rate=1e30))
+        solve_sgd(problem, replace(QUICK, learning_rate=1e30))

@@ -1,4 +1,4 @@
-"""The base solver where numbers stop being friendly (METHOD 5, H1-H14, H40-H45)."""
+"""Fusion of extreme inputs: many objects, few pixels, large ids, odd units, values that are not finite."""
 
 from dataclasses import replace
 
@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.fusion.direct import solve_base
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import LOWEST, BaseProblem, one_segment_per_view
+from iif_core.fusion.direct import solve_direct
+from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.pixels import surface_tangents
+from iif_core.fusion.problem import LOWEST, FusionProblem, one_segment_per_view
 from iif_core.fusion.selection import selection_weights
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
-from tests.unit.test_base import finite, oracle_psnr, simulated
+from tests.unit.test_fusion_direct import finite, oracle_psnr, simulated
 
 
 def every_array_is_finite(result):
@@ -22,12 +23,12 @@ def test_ten_thousand_objects_of_a_few_pixels():
     rng = np.random.default_rng(0)
     n = 10_000
     truth = rng.uniform(0.1, 0.9, (n, 5))
-    cell = np.arange(4 * n, dtype=np.int32)  # four cells an object, seen in two views
+    cell = np.arange(4 * n, dtype=np.int32)  # four cells per object, seen in two views
     objects = cell // 4
     predictions = [np.clip(truth[objects] + 0.02 * rng.standard_normal((3, 4 * n, 5)), 0, 1) for _ in range(2)]
     segments = [objects, n + objects]
-    problem = BaseProblem(predictions, [cell, cell], segments, 4 * n, objects, np.tile(np.arange(n, dtype=np.int32), 2))
-    result = solve_base(problem)
+    problem = FusionProblem(predictions, [cell, cell], segments, 4 * n, objects, np.tile(np.arange(n, dtype=np.int32), 2))
+    result = solve_direct(problem)
     assert every_array_is_finite(result) and result.value.shape == (4 * n, 5)
     assert np.abs(result.object_value - truth).mean() < 0.02
 
@@ -44,19 +45,19 @@ def test_cold_selection_in_float32_inputs_equals_float64(temperature):
 @pytest.mark.parametrize("temperature", [1e-12, 0.0, 1e12])
 def test_solver_at_extreme_temperatures(temperature):
     problem, truth = simulated()
-    options = BaseOptions(temperature=max(temperature, 1e-12), final_temperature=temperature)
-    result = solve_base(problem, options)
+    options = FusionOptions(temperature=max(temperature, 1e-12), final_temperature=temperature)
+    result = solve_direct(problem, options)
     assert every_array_is_finite(result)
     entropy = result.history[-1]["entropy"]
     assert entropy == pytest.approx(np.log(len(problem.predictions[0])), abs=1e-6) if temperature > 1 else entropy < 1e-6
 
 
 def test_scale_to_zero():
-    """Predictions that agree exactly: every scale at the floor, none below, none NaN."""
+    """Predictions that agree exactly have every scale at the floor, none below and none NaN."""
     problem, truth = simulated()
     maps = [np.broadcast_to(p[:1], p.shape).copy() for p in problem.predictions]
     for floor in (1e-2, 1e-6):
-        result = solve_base(replace(problem, predictions=maps), BaseOptions(scale_floor=floor))
+        result = solve_direct(replace(problem, predictions=maps), FusionOptions(scale_floor=floor))
         assert every_array_is_finite(result) and result.scale.min() >= np.float32(floor)
     assert (result.margin == 0).all()
 
@@ -66,7 +67,7 @@ def test_scale_to_zero():
 def test_predictions_at_the_ends_of_the_range(value, dtype):
     problem, _ = simulated()
     maps = [np.full(p.shape, value, dtype) for p in problem.predictions]
-    result = solve_base(replace(problem, predictions=maps))
+    result = solve_direct(replace(problem, predictions=maps))
     assert every_array_is_finite(result)
     np.testing.assert_allclose(result.value, np.maximum(np.full_like(result.value, value), LOWEST), atol=1e-4)
 
@@ -80,16 +81,16 @@ def test_one_view_misses_the_mesh():
         predictions=[*problem.predictions, np.full_like(problem.predictions[0], np.nan)],
         weight=[*problem.weight, problem.weight[0]],
     )
-    a, b = solve_base(problem), solve_base(blind)
+    a, b = solve_direct(problem), solve_direct(blind)
     np.testing.assert_array_equal(a.value, b.value)
 
 
 def test_ids_above_sixteen_bits():
-    """H43: objects, segments and cells beyond 65,535 keep apart."""
+    """Objects, segments and cells beyond 65,535 stay distinct (docs/method/numerics.md#ids-beyond-sixteen-bits)."""
     problem, truth = simulated()
     shift = 70_000
-    result = solve_base(problem)
-    moved = solve_base(
+    result = solve_direct(problem)
+    moved = solve_direct(
         replace(
             problem,
             object_of_cell=problem.object_of_cell + shift,
@@ -113,18 +114,18 @@ def test_millimetres_and_kilometres_make_the_same_cells(unit):
 
 
 def test_one_correction_an_image_underfits():
-    """The paper's ablation: objects err differently, so one affine an image cannot put them right."""
+    """Objects err differently, so one affine map per image cannot correct them (the paper's ablation)."""
     problem, truth = simulated()
     image = one_segment_per_view(problem)
     assert image.n_segments == len(problem.cell_of_pixel)
-    by_object, by_image = solve_base(problem), solve_base(image)
+    by_object, by_image = solve_direct(problem), solve_direct(image)
     assert finite(by_image)
     assert oracle_psnr(problem, by_object.value, truth) > oracle_psnr(problem, by_image.value, truth)
     assert by_image.object_value.shape[0] == by_object.object_value.shape[0]
 
 
 def test_memory_bound_changes_nothing():
-    """Predictions that do not fit are read again: the same bytes."""
+    """Predictions that do not fit into memory are read again and give the same bytes."""
     problem, _ = simulated()
     reads = []
 
@@ -133,7 +134,7 @@ def test_memory_bound_changes_nothing():
         return problem.predictions[view]
 
     streamed = replace(problem, predictions=read)
-    kept, again = (solve_base(streamed, BaseOptions(sweeps=4, memory=m)) for m in (1 << 30, 0))
+    kept, again = (solve_direct(streamed, FusionOptions(sweeps=4, memory=m)) for m in (1 << 30, 0))
     n_views = len(problem.cell_of_pixel)
     assert len(reads) == n_views + n_views * 7  # once; then start, sums, four sweeps, scales
     for name, value in vars(kept).items():
@@ -143,38 +144,27 @@ def test_memory_bound_changes_nothing():
 
 def test_tangents_lead_to_the_point_of_the_next_pixel():
     """On a tilted plane, the point of a pixel plus its tangent is the point of its neighbour."""
-    from types import SimpleNamespace
-
-    from workflow.stages.base import _tangents
-
     h, w, f = 6, 8, 50.0
     u, v = np.meshgrid(np.arange(w) + 0.5 - w / 2, np.arange(h) + 0.5 - h / 2)
     direction = np.stack([u / f, v / f, np.ones_like(u)], -1)
     normal = np.array([0.3, -0.2, -1.0])
     depth = (normal[2] * 2.0) / (direction @ normal)  # plane through (0, 0, 2)
-    corners = np.array([[0, 0, 2.0], [1, 0, 2 + 0.3], [0, 1, 2 - 0.2]])
-    view = SimpleNamespace(height=h, width=w, fx=f)
-    capture = SimpleNamespace(
-        mesh=lambda: (corners, np.array([[0, 1, 2]])),
-        gbuffer=lambda _: (depth, np.zeros((h, w), int)),
-        directions=lambda _: direction,
-    )
     points = depth[..., None] * direction
-    tangent = _tangents(capture, [view])(0).reshape(h, w, 2, 3)
+    tangent = surface_tangents(depth, direction, np.broadcast_to(normal / np.linalg.norm(normal), direction.shape))
     # to first order: half of the step to the left and half of that to the right
     np.testing.assert_allclose(tangent[:, 1:-1, 0], (points[:, 2:] - points[:, :-2]) / 2, atol=3e-5)
     np.testing.assert_allclose(tangent[1:-1, :, 1], (points[2:] - points[:-2]) / 2, atol=3e-5)
 
 
-def test_nan_where_there_is_no_surface_costs_nothing():
+def test_nan_where_there_is_no_surface_changes_nothing():
     problem, _ = simulated()
     hole = [c.copy() for c in problem.cell_of_pixel]
     maps = [p.copy() for p in problem.predictions]
     for c, p in zip(hole, maps, strict=True):
         c[:4] = -1
         p[:, :4] = np.nan
-    a = solve_base(replace(problem, cell_of_pixel=hole))
-    b = solve_base(replace(problem, cell_of_pixel=hole, predictions=maps))
+    a = solve_direct(replace(problem, cell_of_pixel=hole))
+    b = solve_direct(replace(problem, cell_of_pixel=hole, predictions=maps))
     assert not b.dropped
     np.testing.assert_array_equal(a.value, b.value)
 
@@ -182,7 +172,7 @@ def test_nan_where_there_is_no_surface_costs_nothing():
 @pytest.mark.parametrize("factor", [1e-3, 1e6])
 def test_units_of_the_weights_do_not_matter(factor):
     problem, _ = simulated()
-    a, b = solve_base(problem), solve_base(replace(problem, weight=[w * factor for w in problem.weight]))
+    a, b = solve_direct(problem), solve_direct(replace(problem, weight=[w * factor for w in problem.weight]))
     np.testing.assert_allclose(a.value, b.value, atol=2e-3)
 
 
@@ -190,4 +180,4 @@ def test_integer_maps_are_refused():
     problem, _ = simulated()
     maps = [(255 * p).astype(np.uint8) for p in problem.predictions]
     with pytest.raises(InputError, match="uint8; half or float"):
-        solve_base(replace(problem, predictions=maps))
+        solve_direct(replace(problem, predictions=maps))

@@ -1,19 +1,19 @@
-"""Levels that no view ties together: parts, anchors, seams."""
+"""Levels of parts that share no cell: parts, anchoring to the predictions, closing of seams."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from iif_core.fusion.direct import solve_base
+from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.gauge import Parts, anchor_shifts, seam_shifts
-from iif_core.fusion.options import BaseOptions
-from iif_core.fusion.problem import BaseProblem
+from iif_core.fusion.options import FusionOptions
+from iif_core.fusion.problem import FusionProblem
 from iif_core.surface import cells
 
 
 def two_sides(level=(0.4, 0.6), size=20, spread=0.15, k=6):
-    """One wall, its left half in one view and its right half in the other; the predictions' levels scatter by `spread`
-    about means that differ."""
+    """A wall whose left half is in one view and its right half in the other; the levels of the predictions scatter by
+    `spread` about two different means."""
     cell = np.arange(2 * size * size, dtype=np.int32).reshape(size, 2 * size)
     x = np.linspace(0, 3, 2 * size)[None, :, None]
     wall = 0.05 * np.sin(7 * x) * np.ones((size, 1, 5))
@@ -23,7 +23,7 @@ def two_sides(level=(0.4, 0.6), size=20, spread=0.15, k=6):
     pairs = np.concatenate([across, down])
     maps = [cell[:, :size].copy(), cell[:, size:].copy()]
     segments = [np.zeros((size, size), np.int32), np.ones((size, size), np.int32)]
-    problem = BaseProblem([left, right], maps, segments, cell.size, np.zeros(cell.size, np.int32), np.zeros(2, np.int32))
+    problem = FusionProblem([left, right], maps, segments, cell.size, np.zeros(cell.size, np.int32), np.zeros(2, np.int32))
     return replace(problem, neighbours=pairs.astype(np.int32)), cell
 
 
@@ -34,37 +34,37 @@ def step(value, cell):
 
 def test_seam_between_parts_is_closed_and_the_mean_kept():
     problem, cell = two_sides()
-    assert len(np.unique(solve_base(problem).part_of_cell)) == 2
-    open_, closed = (solve_base(problem, BaseOptions(seams=s)) for s in (False, True))
+    assert len(np.unique(solve_direct(problem).part_of_cell)) == 2
+    open_, closed = (solve_direct(problem, FusionOptions(seams=s)) for s in (False, True))
     assert step(open_.value, cell) > 0.18
     assert abs(step(closed.value, cell)) < 0.1 * step(open_.value, cell)
-    np.testing.assert_allclose(closed.value.mean(0), open_.value.mean(0), atol=1e-3)  # equal parts meet half-way
+    np.testing.assert_allclose(closed.value.mean(0), open_.value.mean(0), atol=1e-3)  # equal parts move by equal amounts
 
 
 def test_true_edge_at_a_seam_stays():
-    """Predictions that agree on their levels mean what they show: 0.2 against 0.8 is an edge, not a gauge."""
+    """An edge from 0.2 to 0.8 on whose levels the predictions agree is kept."""
     problem, cell = two_sides((0.2, 0.8), spread=0.0)
-    result = solve_base(problem)
+    result = solve_direct(problem)
     truth = np.concatenate([np.full((20, 20), 0.2), np.full((20, 20), 0.8)], 1)
     wave = 0.05 * np.sin(7 * np.linspace(0, 3, 40))
     np.testing.assert_allclose(result.value[cell, 0], truth + wave, atol=0.02)
     small, _ = two_sides((0.2, 0.8), spread=0.05)  # a jump of 0.6 is far beyond a spread of 0.03
-    np.testing.assert_array_equal(solve_base(small).value, solve_base(small, BaseOptions(seams=False)).value)
+    np.testing.assert_array_equal(solve_direct(small).value, solve_direct(small, FusionOptions(seams=False)).value)
 
 
 def test_properties_are_closed_each_on_its_own():
     problem, cell = two_sides()
     maps = [p.copy() for p in problem.predictions]
-    maps[0][..., 4], maps[1][..., 4] = 0.0, 1.0  # metal starts at the seam, and every prediction says so
-    value = solve_base(replace(problem, predictions=maps)).value
+    maps[0][..., 4], maps[1][..., 4] = 0.0, 1.0  # metal starts at the seam in every prediction
+    value = solve_direct(replace(problem, predictions=maps)).value
     assert abs(step(value, cell)) < 0.03
     np.testing.assert_allclose([value[cell[:, 0], 4].max(), value[cell[:, -1], 4].min()], [0, 1], atol=0.02)
 
 
 def test_corrections_move_with_the_seam():
-    """T v is still the texture: what moved is the gauge."""
+    """The corrected predictions still equal the texture after the seam was closed."""
     problem, _ = two_sides()
-    result = solve_base(problem)
+    result = solve_direct(problem)
     for view in range(2):
         mixed = 0
         for k in range(6):
@@ -74,17 +74,17 @@ def test_corrections_move_with_the_seam():
         np.testing.assert_allclose(mixed, result.value[problem.cell_of_pixel[view].ravel(), :3], atol=5e-3)
 
 
-def test_objects_that_hang_together_have_no_seam_to_close():
+def test_connected_objects_have_no_seam_to_close():
     problem, _ = two_sides()
     shared = problem.cell_of_pixel[1].copy()
     shared[0, 0] = problem.cell_of_pixel[0][0, 0]  # one common cell
     joined = replace(problem, cell_of_pixel=[problem.cell_of_pixel[0], shared])
-    result = solve_base(joined)
+    result = solve_direct(joined)
     assert len(np.unique(result.part_of_cell[result.part_of_cell >= 0])) == 1
-    np.testing.assert_array_equal(result.value, solve_base(joined, BaseOptions(seams=False)).value)
+    np.testing.assert_array_equal(result.value, solve_direct(joined, FusionOptions(seams=False)).value)
 
 
-def test_a_view_without_usable_predictions_ties_nothing():
+def test_a_view_without_usable_predictions_connects_nothing():
     problem, cell = two_sides()
     across = np.tile(cell[:, 10:30].ravel()[:, None], 1).reshape(20, 20).astype(np.int32)
     blind = replace(
@@ -94,7 +94,7 @@ def test_a_view_without_usable_predictions_ties_nothing():
         segment_of_pixel=[*problem.segment_of_pixel, np.full((20, 20), 2, np.int32)],
         object_of_segment=np.zeros(3, np.int32),
     )
-    a, b = solve_base(problem), solve_base(blind)
+    a, b = solve_direct(problem), solve_direct(blind)
     np.testing.assert_array_equal(a.value, b.value)
     np.testing.assert_array_equal(a.part_of_cell == a.part_of_cell[0], b.part_of_cell == b.part_of_cell[0])
 
@@ -107,7 +107,7 @@ def test_small_part_moves_to_the_large_one():
     assert count.tolist() == [10, 10]
     assert abs(shift[0]).max() < 0.02 and (shift[1] < -0.12).all()
     few, _ = seam_shifts(parts, texture, np.ones(110), pairs[:1], np.ones((2, 5)))
-    assert abs(few).max() < abs(shift).max()  # one pair says little
+    assert abs(few).max() < abs(shift).max()  # one pair moves the parts less than ten
 
 
 def test_seams_of_nothing():

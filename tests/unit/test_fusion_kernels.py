@@ -63,9 +63,8 @@ def test_mixture_and_disagreement_equal_numpy(half):
     got = kernels.mixture(words, blend, start, LOWEST)
     np.testing.assert_allclose(got, mixed, atol=2e-6)
     usable = np.array([True, False, True, True, True])
-    b_ref, votes = kernels.disagreement(
-        words, affine, got, target, weight, start, usable, kernels.sorting_network(4), LOWEST, 0.01
-    )
+    pixels_of_view = kernels.Pixels(words, got, target, weight, start)
+    b_ref, votes = kernels.disagreement(pixels_of_view, affine, usable, kernels.sorting_network(4), LOWEST, 0.01)
     corrected = np.clip(corrected[usable], LOWEST[:, None], 1)
     np.testing.assert_allclose(b_ref, laplace.reference_scale(mixed, corrected), atol=4e-6)
     error = np.abs(corrected - target)

@@ -1,4 +1,4 @@
-"""The paper's objective, minimised directly: against general minimisers, and by its own loss."""
+"""The paper's loss, minimised directly: compared with general minimisers and judged by the reference loss."""
 
 from dataclasses import replace
 
@@ -7,13 +7,13 @@ import pytest
 from scipy.optimize import minimize
 
 from iif_core.errors import InputError
-from iif_core.fusion.direct import describe_fit, solve_base
+from iif_core.fusion.direct import describe_fit, solve_direct
 from iif_core.fusion.matching import identity_penalty, penalised_affine, penalised_gain
-from iif_core.fusion.options import BaseOptions
+from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.reference_loss import loss_of_result
 from iif_core.fusion.sgd.options import sgd_options
-from iif_core.fusion.sgd.solve import converged, solve_base_sgd
-from tests.unit.test_base import simulated
+from iif_core.fusion.sgd.solve import converged, solve_sgd
+from tests.unit.test_fusion_direct import simulated
 
 
 def affine_problem(seed, n=200):
@@ -53,7 +53,7 @@ def test_a_step_never_raises_the_objective():
 
 
 def test_penalty_near_identity():
-    """R = 5 |sym|^2 + |skew|^2 + |b|^2 to second order (METHOD 2.3.7)."""
+    """R = 5 |sym|^2 + |skew|^2 + |t|^2 to second order (docs/method/fusion.md#identity-regulariser)."""
     rng = np.random.default_rng(2)
     delta, b = 1e-4 * rng.standard_normal((3, 3)), 1e-4 * rng.standard_normal(3)
     sym, skew = (delta + delta.T) / 2, (delta - delta.T) / 2
@@ -71,11 +71,11 @@ def test_penalised_gain_equals_ridge_regression():
 
 
 def test_polishing_lowers_the_papers_loss():
-    """Least squares with a hard selection is the start; every sweep of the paper's objective is below it."""
+    """Every sweep on the paper's loss is below the least squares with a hard selection, from which it starts."""
     problem, _ = simulated()
     problem = replace(problem, weight=None)
-    start = solve_base(problem, BaseOptions(final_temperature=0))
-    one, many = (solve_base(problem, BaseOptions(final_temperature=0, objective="distribution", polish=n)) for n in (1, 40))
+    start = solve_direct(problem, FusionOptions(final_temperature=0))
+    one, many = (solve_direct(problem, FusionOptions(final_temperature=0, objective="distribution", polish=n)) for n in (1, 40))
 
     def judged(result):
         loss = loss_of_result(problem, result)
@@ -84,17 +84,17 @@ def test_polishing_lowers_the_papers_loss():
     assert judged(many) < judged(one) < judged(start)
     assert (many.weight.max(1) == 1).all()
     totals = [h["data"] + h["regulariser"] for h in many.history if "data" in h]
-    assert all(b < a * 1.002 for a, b in zip(totals, totals[1:], strict=False))  # b_ref is renewed, so not strictly
+    assert all(b < a * 1.002 for a, b in zip(totals, totals[1:], strict=False))  # not strictly, because b_ref is computed again
     assert abs(totals[-1] - totals[-2]) < 0.01 * totals[-1]
 
 
 def test_direct_is_not_above_the_papers_optimiser_on_the_papers_loss():
-    """The same selection for both, the optimiser run until its loss is flat."""
+    """Both use one selection, and the optimiser runs until its loss is flat."""
     problem, _ = simulated()
     problem = replace(problem, weight=None)
-    fit = solve_base_sgd(problem, sgd_options("safe", iterations=1500))
+    fit = solve_sgd(problem, sgd_options("safe", iterations=1500))
     assert converged(fit.history)
-    direct = solve_base(problem, BaseOptions(objective="distribution", polish=40), chosen=fit.alpha.argmax(1))
+    direct = solve_direct(problem, FusionOptions(objective="distribution", polish=40), chosen=fit.alpha.argmax(1))
 
     def judged(result):
         loss = loss_of_result(problem, result)
@@ -102,18 +102,18 @@ def test_direct_is_not_above_the_papers_optimiser_on_the_papers_loss():
 
     assert judged(direct) <= judged(fit)
     own, twin = (loss_of_result(problem, result) for result in (direct, fit))
-    assert own.data <= twin.data + 1e-3  # no term is bought with the other
+    assert own.data <= twin.data + 1e-3  # no term is lower at the expense of the other
     assert abs(own.regulariser_albedo - twin.regulariser_albedo) < 1e-5
 
 
-def test_polish_counts_usable_predictions_alone():
-    """With some predictions dropped, the objective that is minimised is the one that judges."""
+def test_polish_counts_only_usable_predictions():
+    """With some predictions dropped, the loss that is minimised equals the reference loss."""
     problem, _ = simulated()
     maps = [p.copy() for p in problem.predictions]
     for p in maps:
         p[1:4] = np.nan
     problem = replace(problem, predictions=maps, weight=None)
-    result = solve_base(problem, BaseOptions(objective="distribution", polish=10, final_temperature=0))
+    result = solve_direct(problem, FusionOptions(objective="distribution", polish=10, final_temperature=0))
     loss = loss_of_result(problem, result)
     regulariser = 100 * (loss.regulariser_albedo + loss.regulariser_roughness + loss.regulariser_metallic)
     assert result.history[-1]["regulariser"] == pytest.approx(regulariser, rel=1e-4)
@@ -125,15 +125,15 @@ def test_a_selection_that_does_not_fit_is_refused(chosen):
     problem, _ = simulated()
     if chosen is None:
         with pytest.raises(InputError, match="needs objective `distribution`"):
-            solve_base(problem, chosen=np.zeros((problem.n_segments, 3), int))
+            solve_direct(problem, chosen=np.zeros((problem.n_segments, 3), int))
     else:
         with pytest.raises(InputError, match="chosen predictions"):
-            solve_base(problem, BaseOptions(objective="distribution"), chosen=chosen)
+            solve_direct(problem, FusionOptions(objective="distribution"), chosen=chosen)
 
 
 def test_described_fit_is_the_fit():
     problem, _ = simulated()
-    result = solve_base(problem)
+    result = solve_direct(problem)
     affine = np.concatenate(
         [result.affine_albedo.reshape(*result.weight.shape[:2], 12), result.affine_roughness, result.affine_metallic], -1
     )

@@ -1,4 +1,4 @@
-"""Calibrated uncertainty: planted laws are found, intervals cover what they say, the base's own claim holds on new data."""
+"""Calibrated uncertainty: planted laws are found, and intervals have their nominal coverage, also on new data."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 
 from iif_core.errors import InputError
 from iif_core.fusion import uncertainty
-from iif_core.fusion.direct import solve_base
+from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.selection import effective_number, margin
-from iif_core.fusion.uncertainty import LEVELS, Calibration, coverage, fit_calibration, gauge_free_error, interval
-from tests.unit.test_base import simulated
+from iif_core.fusion.uncertainty import NOMINAL_COVERAGES, Calibration, coverage, fit_calibration, gauge_free_error, interval
+from tests.unit.test_fusion_direct import simulated
 
 
 @pytest.mark.parametrize("beta", [1.0, 2.0])
@@ -29,15 +29,15 @@ def test_planted_law_is_found_and_covers(beta):
     for name, tolerance in (("g", 0.04), ("h", 0.04), ("q", 0.04), ("p", 0.04), ("beta_1", 0.35)):
         assert getattr(found, name) == pytest.approx(getattr(planted, name), abs=tolerance), name
     error, *facts = draw(8)
-    np.testing.assert_allclose(coverage(error, found.deviation(*facts), float(found.beta(8))), LEVELS, atol=0.015)
+    np.testing.assert_allclose(coverage(error, found.deviation(*facts), float(found.beta(8))), NOMINAL_COVERAGES, atol=0.015)
 
 
 @pytest.mark.parametrize("samples", [1, 3, 6, 16])
 @pytest.mark.parametrize("views", [2, 8])
-def test_claims_on_a_room_that_had_no_part_in_the_calibration(samples, views):
-    """Nine of ten errors of albedo within the 95 % interval at worst, and not everything within the 50 % one."""
+def test_coverage_on_a_room_that_had_no_part_in_the_calibration(samples, views):
+    """At least nine of ten albedo errors lie within the 95 % interval, and not all within the 50 % interval."""
     problem, truth = simulated(views=views, samples=samples)
-    result = solve_base(problem)
+    result = solve_direct(problem)
     seen = result.coverage > 0
     error = gauge_free_error(result.value[seen, :3], truth[seen, :3], problem.object_of_cell[seen])
     beta = float(uncertainty.CALIBRATION["albedo"].beta(samples))
@@ -45,7 +45,7 @@ def test_claims_on_a_room_that_had_no_part_in_the_calibration(samples, views):
     assert 0.25 < half < 0.75 and most > 0.8
 
 
-def test_a_photograph_twice_is_no_more_certain():
+def test_a_repeated_photograph_does_not_reduce_the_uncertainty():
     problem, _ = simulated()
     doubled = replace(
         problem,
@@ -55,7 +55,7 @@ def test_a_photograph_twice_is_no_more_certain():
         object_of_segment=np.tile(problem.object_of_segment, 2),
         weight=[*problem.weight] * 2,
     )
-    once, twice = solve_base(problem), solve_base(doubled)
+    once, twice = solve_direct(problem), solve_direct(doubled)
     np.testing.assert_allclose(twice.uncertainty, once.uncertainty, rtol=1e-3)
 
 
@@ -63,7 +63,7 @@ def test_intervals_are_those_of_the_distribution():
     assert interval(0.95, 1.0) == pytest.approx(np.log(20) / np.sqrt(2))
     assert interval(0.95, 2.0) == pytest.approx(1.959964)
     sample = np.random.default_rng(1).laplace(0, 0.2 / np.sqrt(2), 100_000)
-    np.testing.assert_allclose(coverage(sample, np.float64(0.2)), LEVELS, atol=0.006)
+    np.testing.assert_allclose(coverage(sample, np.float64(0.2)), NOMINAL_COVERAGES, atol=0.006)
 
 
 def test_gauge_free_error_ignores_any_affine_of_the_object():
@@ -74,16 +74,16 @@ def test_gauge_free_error_ignores_any_affine_of_the_object():
     value = np.einsum("nij,nj->ni", a[objects], truth) + b[objects] + noise
     error = gauge_free_error(value, truth, objects)
     assert 0.9 * noise.std() < error.std() < 1.01 * noise.std()
-    flat = gauge_free_error(0.3 + noise, np.full((300, 3), 0.7), objects)  # one colour: the affine is a level
+    flat = gauge_free_error(0.3 + noise, np.full((300, 3), 0.7), objects)  # one colour: the map is a level
     for o in range(3):
         np.testing.assert_allclose(flat[objects == o], noise[objects == o] - noise[objects == o].mean(0), atol=1e-9)
     assert gauge_free_error(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, int)).shape == (0, 3)
 
 
-def test_the_base_knows_where_it_is_wrong():
-    """On predictions and a room that had no part in the calibration: cells that claim more are more wrong."""
+def test_uncertainty_ranks_the_errors():
+    """On a room that had no part in the calibration, cells with a larger uncertainty have larger errors."""
     problem, truth = simulated()
-    result = solve_base(problem)
+    result = solve_direct(problem)
     seen = result.coverage > 0
     error = np.abs(gauge_free_error(result.value[seen, :3], truth[seen, :3], problem.object_of_cell[seen]))
     claimed = result.uncertainty[seen, :3]

@@ -1,4 +1,4 @@
-"""The base solver: recovers planted textures, keeps its gauge, survives bad predictions."""
+"""The direct solver: it recovers planted textures, keeps their level and contrast, and withstands bad predictions."""
 
 import os
 import subprocess
@@ -12,10 +12,10 @@ import pytest
 
 from iif_core.errors import InputError
 from iif_core.evaluation import metrics
-from iif_core.fusion.direct import solve_base
+from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.gauge import covisible_parts
-from iif_core.fusion.options import VARIANTS, BaseOptions
-from iif_core.fusion.problem import LOWEST, NEUTRAL, BaseProblem, object_means, prediction_faults
+from iif_core.fusion.options import VARIANTS, FusionOptions
+from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem, object_means, prediction_faults
 from iif_core.fusion.selection import selection_weights
 from iif_core.numerics import laplace
 from iif_core.priors import simulate
@@ -52,7 +52,7 @@ def problem_of(cell_maps, predictions, obj, border=1):
     maps = [obj[c].astype(np.int32) for c in cell_maps]
     segment_maps, table = segment_table(maps)
     weight = [np.where(interior(m, border), 1.0, 0.1) for m in maps]
-    return BaseProblem(
+    return FusionProblem(
         predictions,
         [c.astype(np.int32) for c in cell_maps],
         segment_maps,
@@ -75,7 +75,7 @@ def simulated(views=8, samples=6, seed=0, strength=1.0):
 
 
 def planted(views=6, samples=4, seed=0, spread=0.15):
-    """Predictions that are exact affine maps of the truth, one map a (view, object, k)."""
+    """Predictions that are exact affine maps of the truth, one map per view, object and k."""
     rng = np.random.default_rng(seed)
     obj, truth = surface(seed)
     truth = np.concatenate([0.2 + 0.5 * truth[:, :3], truth[:, 3:]], 1)  # so that nothing clips
@@ -90,7 +90,7 @@ def planted(views=6, samples=4, seed=0, spread=0.15):
 
 
 def oracle_psnr(problem, value, truth):
-    """Albedo PSNR after the best affine a view and object, mean over views (METHOD 6.1, COMPUTE 3)."""
+    """Albedo PSNR after the best affine map per view and object, mean over views (protocol `oracle_affine`)."""
     scores = []
     for cell in problem.cell_of_pixel:
         mask = cell >= 0
@@ -109,15 +109,15 @@ def seen(problem):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_selection_beats_corrections_beat_means(seed):
     problem, truth = simulated(seed=seed)
-    psnr = {v: oracle_psnr(problem, solve_base(problem, BaseOptions(v)).value, truth) for v in VARIANTS}
+    psnr = {v: oracle_psnr(problem, solve_direct(problem, FusionOptions(v)).value, truth) for v in VARIANTS}
     assert psnr["full"] > psnr["uniform"] + 0.8
     assert psnr["uniform"] > psnr["texel_mean"] + 0.3
     assert psnr["texel_mean"] > psnr["object_mean"] + 3
 
 
-def test_truth_goes_through_untouched():
+def test_exact_predictions_are_returned_unchanged():
     problem, truth = simulated(strength=0.0)
-    result = solve_base(problem)
+    result = solve_direct(problem)
     cells = seen(problem)
     np.testing.assert_allclose(result.value[cells], truth[cells], atol=2e-3)
     assert (result.scale[cells] < 1.1 * laplace.SCALE_FLOOR).all()
@@ -128,13 +128,15 @@ def test_truth_goes_through_untouched():
 def test_affine_predictions_are_made_consistent():
     """With exact affine errors the texture is an affine map of the truth, far closer than the plain mean."""
     problem, truth = planted()
-    full, mean = (solve_base(problem, BaseOptions(v, sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean"))
+    full, mean = (
+        solve_direct(problem, FusionOptions(v, sweeps=30, anneal=0.8, ridge=1e-3)).value for v in ("uniform", "texel_mean")
+    )
     assert oracle_psnr(problem, full, truth) > 45
     assert oracle_psnr(problem, full, truth) > oracle_psnr(problem, mean, truth) + 10
 
 
 def test_good_predictions_are_selected():
-    """One clean sample among patterns of noise, at another k in every view."""
+    """One clean prediction among patterns of noise, at a different k in every view."""
     problem, truth = planted(views=8, samples=5)
     rng = np.random.default_rng(1)
     good = rng.integers(0, 5, 8)
@@ -144,13 +146,13 @@ def test_good_predictions_are_selected():
             if k != good[v]:
                 p[k] += 0.12 * rng.standard_normal(p[k].shape)
     problem = replace(problem, predictions=predictions)
-    result = solve_base(problem)
+    result = solve_direct(problem)
     view_of_segment = np.array(
         [next(v for v, m in enumerate(problem.segment_of_pixel) if (m == s).any()) for s in range(problem.n_segments)]
     )
     assert (result.weight.argmax(1) == good[view_of_segment][:, None]).mean() > 0.9
     assert result.history[-1]["entropy"] < 0.01
-    hard = solve_base(problem, BaseOptions(final_temperature=0))
+    hard = solve_direct(problem, FusionOptions(final_temperature=0))
     assert hard.history[-1]["entropy"] == 0.0
 
 
@@ -159,7 +161,7 @@ def test_good_predictions_are_selected():
 
 def test_level_is_that_of_the_predictions_and_contrast_stays_over_many_sweeps():
     problem, truth = simulated()
-    few, many = (solve_base(problem, BaseOptions("uniform", sweeps=n)) for n in (12, 150))
+    few, many = (solve_direct(problem, FusionOptions("uniform", sweeps=n)) for n in (12, 150))
     weight = np.bincount(
         np.concatenate([c.ravel() for c in problem.cell_of_pixel]),
         np.concatenate([w.ravel() for w in problem.weight]),
@@ -175,10 +177,10 @@ def test_level_is_that_of_the_predictions_and_contrast_stays_over_many_sweeps():
     assert many.history[-1]["gain"] > 0.5
 
 
-def test_history_tells_every_sweep():
+def test_history_has_an_entry_per_sweep():
     problem, _ = simulated()
     calls = []
-    history = solve_base(problem, BaseOptions(sweeps=5), lambda done, total: calls.append((done, total))).history
+    history = solve_direct(problem, FusionOptions(sweeps=5), lambda done, total: calls.append((done, total))).history
     assert [round(h["temperature"], 4) for h in history] == [1, 0.6, 0.36, 0.216, 0.1]
     assert all(np.isfinite(list(h.values())).all() for h in history)
     assert history[-1]["error_albedo"] < history[0]["error_albedo"]
@@ -191,8 +193,8 @@ def test_history_tells_every_sweep():
 def test_order_of_predictions_does_not_matter():
     problem, _ = simulated()
     order = np.random.default_rng(0).permutation(6)
-    a = solve_base(problem)
-    b = solve_base(replace(problem, predictions=[p[order] for p in problem.predictions]))
+    a = solve_direct(problem)
+    b = solve_direct(replace(problem, predictions=[p[order] for p in problem.predictions]))
     np.testing.assert_allclose(a.value, b.value, atol=5e-5)  # rounding of sums, over twelve sweeps
     np.testing.assert_allclose(a.weight[:, order], b.weight, atol=5e-3)
 
@@ -201,7 +203,7 @@ def test_doubled_views_change_nothing():
     problem, _ = simulated()
     n = problem.n_segments
     shifted = [np.where(m >= 0, m + n, -1) for m in problem.segment_of_pixel]
-    twice = BaseProblem(
+    twice = FusionProblem(
         [*problem.predictions] * 2,
         [*problem.cell_of_pixel] * 2,
         [*problem.segment_of_pixel, *shifted],
@@ -210,7 +212,7 @@ def test_doubled_views_change_nothing():
         np.tile(problem.object_of_segment, 2),
         [*problem.weight] * 2,
     )
-    a, b = solve_base(problem), solve_base(twice)
+    a, b = solve_direct(problem), solve_direct(twice)
     np.testing.assert_array_equal(2 * a.observations, b.observations)
     for name in ("value", "scale", "uncertainty", "object_value"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), atol=2e-5, err_msg=name)
@@ -222,9 +224,9 @@ def test_doubled_views_change_nothing():
 
 def test_same_bytes_again_streamed_and_with_threads():
     problem, _ = simulated()
-    first = solve_base(problem)
+    first = solve_direct(problem)
     streamed = replace(problem, predictions=lambda view: simulated()[0].predictions[view])
-    for other in (solve_base(problem), solve_base(streamed, threads=3)):
+    for other in (solve_direct(problem), solve_direct(streamed, threads=3)):
         for name, value in vars(first).items():
             if isinstance(value, np.ndarray):
                 assert value.tobytes() == getattr(other, name).tobytes(), name
@@ -233,7 +235,7 @@ def test_same_bytes_again_streamed_and_with_threads():
 def test_half_precision_input():
     problem, _ = simulated()
     half = replace(problem, predictions=[p.astype(np.float16) for p in problem.predictions])
-    a, b = (solve_base(p, BaseOptions("uniform")).value for p in (problem, half))
+    a, b = (solve_direct(p, FusionOptions("uniform")).value for p in (problem, half))
     np.testing.assert_allclose(a, b, atol=2e-3)
 
 
@@ -241,9 +243,9 @@ def test_half_precision_input():
 
 
 def test_corrections_equal_ridge_regression_in_float64():
-    """One sweep from the median of K = 3: T is the ridge solution on the weighted pixels, the error its mean square."""
+    """After one sweep from the median of K = 3, maps and errors are those of a ridge regression on the weighted pixels."""
     problem, _ = simulated(samples=3)
-    result = solve_base(problem, BaseOptions(sweeps=1))
+    result = solve_direct(problem, FusionOptions(sweeps=1))
     texture = first_texture(problem)
     level = base_level_shift(problem, result)
     for segment in (0, 5):
@@ -283,7 +285,7 @@ def test_corrections_equal_ridge_regression_in_float64():
 
 
 def fit_weight(problem, view):
-    """Pixel weights in the fit of T: next to nothing where one view alone sees the cell."""
+    """Pixel weights in the fit of the maps; they are close to 0 where a single view sees the cell."""
     views = sum(np.bincount(np.unique(c), minlength=problem.n_cells) for c in problem.cell_of_pixel)
     return problem.weight[view] * (1 - 1 / np.maximum(views, 1) + 0.01)[problem.cell_of_pixel[view]]
 
@@ -298,7 +300,7 @@ def first_texture(problem):
 
 
 def base_level_shift(problem, result):
-    """Shift of each object that brings the selected, corrected mean to that of the predictions' median."""
+    """Shift of each object that brings the mean of the selected, corrected predictions to that of their median."""
     wanted, found, total = (np.zeros((OBJECTS, 5)) for _ in range(3))
     texture = first_texture(problem)
     for view, segments in enumerate(problem.segment_of_pixel):
@@ -334,10 +336,10 @@ def test_scale_equals_the_closed_form():
     """A cell seen by three one-pixel views: its scale is the mean of d + b_r e^(-d / b_r)."""
     values = np.array([[0.3, 0.34, 0.4], [0.5, 0.52, 0.6], [0.42, 0.44, 0.46]])  # views x K
     predictions = [np.repeat(v[:, None, None], 5, 2) for v in values]
-    problem = BaseProblem(
+    problem = FusionProblem(
         predictions, [np.zeros(1, int)] * 3, [np.array([i]) for i in range(3)], 1, np.zeros(1, int), np.zeros(3, int)
     )
-    result = solve_base(problem, BaseOptions("texel_mean"))
+    result = solve_direct(problem, FusionOptions("texel_mean"))
     mean = values.mean(1)
     assert result.value[0, 1] == pytest.approx(values.mean())
     b_ref = np.maximum(np.sort(np.abs(values - mean[:, None]), 1)[:, 1], 0.01)
@@ -389,9 +391,9 @@ def finite(result):
 
 def test_one_prediction_is_used_as_it_is_but_corrected():
     problem, truth = simulated(samples=1)
-    result = solve_base(problem)
+    result = solve_direct(problem)
     assert finite(result) and (result.weight == 1).all() and result.history[-1]["entropy"] == 0
-    mean = solve_base(problem, BaseOptions("texel_mean"))
+    mean = solve_direct(problem, FusionOptions("texel_mean"))
     assert oracle_psnr(problem, result.value, truth) > oracle_psnr(problem, mean.value, truth)
 
 
@@ -401,43 +403,43 @@ def test_two_predictions_that_tie_share():
     red, green = (np.full((SIZE, SIZE, 5), 0.5) for _ in range(2))
     red[..., 0], red[..., 1] = 0.6, 0.4
     green[..., 0], green[..., 1] = 0.4, 0.6
-    result = solve_base(problem_of([cell], [np.stack([red, green])], obj))
-    np.testing.assert_allclose(result.weight, 0.5, atol=5e-3)  # rounding of sums tips the balance a little
+    result = solve_direct(problem_of([cell], [np.stack([red, green])], obj))
+    np.testing.assert_allclose(result.weight, 0.5, atol=5e-3)  # rounding of sums shifts the weights a little
     np.testing.assert_allclose(result.value[cell], 0.5, atol=1e-6)
 
 
 def test_equal_predictions():
     problem, truth = simulated(strength=0.0, samples=1)
     tripled = replace(problem, predictions=[np.repeat(p, 3, 0) for p in problem.predictions])
-    result = solve_base(tripled)
+    result = solve_direct(tripled)
     np.testing.assert_allclose(result.weight, 1 / 3, atol=1e-6)
-    np.testing.assert_allclose(result.value, solve_base(problem).value, atol=1e-6)
+    np.testing.assert_allclose(result.value, solve_direct(problem).value, atol=1e-6)
 
 
 def test_all_predictions_wrong():
     obj, _ = surface()
     cells = [look(v) for v in range(4)]
     rng = np.random.default_rng(0)
-    result = solve_base(problem_of(cells, [rng.random((4, SIZE, SIZE, 5)) for _ in cells], obj))
+    result = solve_direct(problem_of(cells, [rng.random((4, SIZE, SIZE, 5)) for _ in cells], obj))
     assert finite(result) and result.value.min() >= 0 and result.value.max() <= 1
-    assert np.median(result.scale) > 3 * laplace.SCALE_FLOOR  # and it knows
+    assert np.median(result.scale) > 3 * laplace.SCALE_FLOOR  # the reported scale is large too
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
 def test_constant_colour_is_rank_one(level):
     obj, _ = surface()
     cells = [look(v) for v in range(3)]
-    result = solve_base(problem_of(cells, [np.full((2, SIZE, SIZE, 5), level)] * 3, obj))
+    result = solve_direct(problem_of(cells, [np.full((2, SIZE, SIZE, 5), level)] * 3, obj))
     assert finite(result)
     np.testing.assert_allclose(result.value, np.maximum(np.broadcast_to(level, (len(obj), 5)), LOWEST), atol=1e-5)
 
 
-def test_constant_objects_of_different_views_meet():
-    """Grey 0.4 in one view and 0.6 in the other: one texture between them, without a seam."""
+def test_constant_views_of_an_object_are_joined_without_a_seam():
+    """Grey 0.4 in one view and 0.6 in the other give one texture between them, without a seam."""
     obj = np.zeros(400, int)
     cells = [np.arange(300).reshape(15, 20), np.arange(100, 400).reshape(15, 20)]
     predictions = [np.full((1, 15, 20, 5), 0.4), np.full((1, 15, 20, 5), 0.6)]
-    result = solve_base(problem_of(cells, predictions, obj, 0), BaseOptions(sweeps=60))
+    result = solve_direct(problem_of(cells, predictions, obj, 0), FusionOptions(sweeps=60))
     assert np.ptp(result.value[:, 0]) < 0.06
     assert result.value[:, 0].mean() == pytest.approx(0.5, abs=0.01)
 
@@ -448,7 +450,7 @@ def test_predictions_that_are_not_finite_are_dropped_and_named(value):
     predictions = [p.copy() for p in problem.predictions]
     predictions[2][3] = value
     predictions[4][1, 5, 5, 0] = value
-    result = solve_base(replace(problem, predictions=predictions))
+    result = solve_direct(replace(problem, predictions=predictions))
     assert finite(result)
     assert [(d.view, d.k) for d in result.dropped] == [(2, 3), (4, -1)]
     assert "100 %" in result.dropped[0].reason and "1 pixels" in result.dropped[1].reason
@@ -461,7 +463,7 @@ def test_blank_map_among_others_is_dropped():
     problem, _ = simulated()
     predictions = [p.copy() for p in problem.predictions]
     predictions[0][2] = 0
-    result = solve_base(replace(problem, predictions=predictions))
+    result = solve_direct(replace(problem, predictions=predictions))
     assert [(d.view, d.k, d.reason) for d in result.dropped] == [(0, 2, "albedo is constant over the picture")]
 
 
@@ -469,29 +471,29 @@ def test_a_view_without_any_usable_prediction_does_not_count():
     problem, _ = simulated()
     predictions = [p.copy() for p in problem.predictions]
     predictions[0][:] = np.nan
-    result = solve_base(replace(problem, predictions=predictions))
-    rest = solve_base(replace(problem, weight=[0 * problem.weight[0], *problem.weight[1:]]))
+    result = solve_direct(replace(problem, predictions=predictions))
+    rest = solve_direct(replace(problem, weight=[0 * problem.weight[0], *problem.weight[1:]]))
     np.testing.assert_allclose(result.value, rest.value, atol=1e-9)
     assert (result.weight[np.unique(problem.segment_of_pixel[0])] == 0).all()
 
 
 def test_nothing_usable_at_all_gives_neutral():
     obj, _ = surface()
-    result = solve_base(problem_of([look(0)], [np.full((2, SIZE, SIZE, 5), np.nan)], obj))
+    result = solve_direct(problem_of([look(0)], [np.full((2, SIZE, SIZE, 5), np.nan)], obj))
     np.testing.assert_array_equal(result.value, np.broadcast_to(NEUTRAL, (len(obj), 5)))
     assert finite(result) and len(result.dropped) == 2 and (result.object_cells == 0).all()
 
 
 def test_clipped_albedo_does_not_bend_the_correction():
-    """A prediction 1.4 times too bright clips at 1: the gain is found from the pixels that do not."""
+    """Of a prediction that is 1.4 times too bright and clips at 1, the gain is found from the pixels that do not clip."""
     rng = np.random.default_rng(0)
     truth = rng.uniform(0.2, 0.85, (400, 5))
     cells = [np.arange(400).reshape(20, 20)] * 2
     predictions = [truth.reshape(1, 20, 20, 5), np.clip(1.4 * truth, 0, 1).reshape(1, 20, 20, 5)]
     problem = problem_of(cells, predictions, np.zeros(400, int), 0)
     problem = replace(problem, weight=[np.ones((20, 20)), np.full((20, 20), 1e-3)])  # the texture is the first view's
-    options = BaseOptions(sweeps=1, ridge=1e-9)
-    with_care, without = (solve_base(problem, replace(options, clip_share=s)) for s in (0.6, 0.0))
+    options = FusionOptions(sweeps=1, ridge=1e-9)
+    with_care, without = (solve_direct(problem, replace(options, clip_share=s)) for s in (0.6, 0.0))
     np.testing.assert_allclose(with_care.affine_albedo[1, 0, :, :3], np.eye(3) / 1.4, atol=2e-3)
     assert abs(without.affine_albedo[1, 0, 0, 0] - 1 / 1.4) > 0.02
 
@@ -500,9 +502,9 @@ def test_objects_of_one_pixel_and_unseen_cells():
     obj = np.array([0, 0, 1, 2, 2])
     cell = np.array([[0, 2, -1]])
     predictions = [np.full((2, 1, 3, 5), 0.3)]
-    result = solve_base(problem_of([cell], predictions, obj, 0))
+    result = solve_direct(problem_of([cell], predictions, obj, 0))
     assert finite(result)
-    np.testing.assert_allclose(result.value[[0, 1, 2]], 0.3, atol=1e-6)  # cell 1 nobody saw: its object's mean
+    np.testing.assert_allclose(result.value[[0, 1, 2]], 0.3, atol=1e-6)  # cell 1 is not seen and takes its object's mean
     np.testing.assert_array_equal(result.value[3:], [NEUTRAL] * 2)
     assert result.observations.tolist() == [1, 0, 1, 0, 0] and result.views.tolist() == [1, 0, 1, 0, 0]
     assert result.object_cells.tolist() == [1, 1, 0]
@@ -513,7 +515,7 @@ def test_border_pixels_weigh_little():
     cell = np.arange(100).reshape(10, 10)
     good, bad = np.full((1, 10, 10, 5), 0.4), np.full((1, 10, 10, 5), 0.8)
     problem = problem_of([cell, cell], [good, bad], obj, 0)
-    result = solve_base(replace(problem, weight=[np.ones((10, 10)), np.full((10, 10), 0.1)]), BaseOptions("texel_mean"))
+    result = solve_direct(replace(problem, weight=[np.ones((10, 10)), np.full((10, 10), 0.1)]), FusionOptions("texel_mean"))
     np.testing.assert_allclose(result.value, (0.4 + 0.08) / 1.1, atol=1e-6)
 
 
@@ -525,7 +527,7 @@ def test_robust_update_ignores_an_outlier():
     predictions = [truth + 0.005 * rng.standard_normal(truth.shape) for _ in range(5)]
     predictions[0][0, 3, 3] = 0.99
     problem = problem_of([cell] * 5, predictions, obj, 0)
-    plain, robust = (solve_base(problem, BaseOptions(robust=r)).value[33, 0] for r in (False, True))
+    plain, robust = (solve_direct(problem, FusionOptions(robust=r)).value[33, 0] for r in (False, True))
     assert abs(robust - truth[0, 3, 3, 0]) < 0.3 * abs(plain - truth[0, 3, 3, 0])
 
 
@@ -535,10 +537,10 @@ def test_prediction_faults():
     maps[2, ..., :3] = 0.5
     faults = prediction_faults(maps)
     assert faults[0] == faults[3] == "" and "2 %" in faults[1] and "constant" in faults[2]
-    assert prediction_faults(np.full((2, 3, 3, 5), 0.5)) == ["", ""]  # a plain wall is a plain wall
+    assert prediction_faults(np.full((2, 3, 3, 5), 0.5)) == ["", ""]  # all predictions constant: a plain wall
 
 
-# ----------------------------------------------------------------------------------------------------------- the rest
+# --------------------------------------------------------------------------------------------------- helpers and errors
 
 
 def test_object_means():
@@ -558,7 +560,7 @@ def test_parts_of_an_object_that_share_no_cell():
 
 
 def test_no_views():
-    result = solve_base(BaseProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)))
+    result = solve_direct(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)))
     np.testing.assert_array_equal(result.value, [NEUTRAL] * 3)
 
 
@@ -574,34 +576,34 @@ def test_no_views():
 def test_inputs_that_do_not_fit_are_refused(change, message):
     problem, _ = simulated()
     with pytest.raises(InputError, match=message):
-        solve_base(replace(problem, **change))
+        solve_direct(replace(problem, **change))
 
 
 def test_a_segment_in_two_views_is_refused():
     problem, _ = simulated()
     same = [problem.segment_of_pixel[0]] * 8
     with pytest.raises(InputError, match="two views"):
-        solve_base(replace(problem, segment_of_pixel=same))
+        solve_direct(replace(problem, segment_of_pixel=same))
 
 
 @pytest.mark.parametrize("options", [{"variant": "best"}, {"sweeps": 0}, {"ridge": 0.0}, {"anneal": 1.0}])
 def test_bad_options_are_refused(options):
     with pytest.raises(InputError, match="base"):
-        BaseOptions(**options)
+        FusionOptions(**options)
 
 
 def test_same_bytes_whatever_the_threads_of_blas():
-    """Odd sizes, large enough for OpenBLAS to share out; its thread count is fixed when NumPy is imported."""
+    """Uses odd sizes that OpenBLAS spreads over threads; their number is fixed when NumPy is imported."""
     program = """
 import hashlib, numpy as np
-from iif_core.base.direct import solve_base
-from iif_core.base.problem import BaseProblem
+from iif_core.fusion.direct import solve_direct
+from iif_core.fusion.problem import FusionProblem
 rng = np.random.default_rng(0)
 maps = rng.random((2, 8, 40001, 5)).astype(np.float32)
 cell = [rng.permutation(40001) // 3 for _ in range(2)]
 segment = [np.full(40001, i) for i in range(2)]
-problem = BaseProblem(list(maps), cell, segment, 13334, np.zeros(13334, int), np.zeros(2, int))
-result = solve_base(problem)
+problem = FusionProblem(list(maps), cell, segment, 13334, np.zeros(13334, int), np.zeros(2, int))
+result = solve_direct(problem)
 print(hashlib.sha256(result.value.tobytes() + result.scale.tobytes() + repr(result.history).encode()).hexdigest())
 """
     digests = set()

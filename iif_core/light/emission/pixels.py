@@ -1,0 +1,65 @@
+"""Which pixels enter the linear system of emission, and what they show (docs/method/light.md#rows)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+TILE_PIXELS = 8
+"""Pixels of one object in one tile of this edge are averaged into one row."""
+ANCHOR_PIXELS = 64
+"""At least this many directly seen pixels of each group enter the solve."""
+
+
+@dataclass(frozen=True)
+class EmissionPixels:
+    """The pixels whose transport is traced, n of them.
+
+    Attributes:
+        radiance: (n, 3) linear; bound: (n, 3) bool, `radiance` is a lower bound.
+        object_id, view, tile: (n,) int; pixels that agree in all three are averaged.
+        group: (n,) emitter group that the pixel looks at, -1 = none.
+    """
+
+    radiance: np.ndarray
+    bound: np.ndarray
+    object_id: np.ndarray
+    view: np.ndarray
+    tile: np.ndarray
+    group: np.ndarray
+
+
+def choose_pixels(
+    group: np.ndarray, usable: np.ndarray, interior: np.ndarray, elsewhere: int, per_group: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw pixels of one view: some that look at no emitter, and some for every emitter group in sight.
+
+    Args:
+        group: (n,) int emitter group that each pixel looks at, -1 = none.
+        usable: (n,) bool.
+        interior: (n,) bool, away from the borders of objects; border pixels are drawn only for groups without others.
+        elsewhere: pixels to draw that look at no emitter.
+        per_group: pixels to draw of every group.
+        rng: random numbers.
+
+    Returns:
+        Indices of the chosen pixels, increasing.
+    """
+    on_emitter = np.flatnonzero(usable & (group >= 0))
+    chosen = [rng.permutation(np.flatnonzero(usable & (group < 0)))[:elsewhere]]
+    for g in np.unique(group[on_emitter]):
+        own = on_emitter[group[on_emitter] == g]
+        inner = own[interior[own]]
+        chosen.append(rng.permutation(inner if len(inner) else own)[:per_group])
+    return np.sort(np.concatenate(chosen))
+
+
+def tile_of(index: np.ndarray, width: int) -> np.ndarray:
+    """Return (n,) int, the tile of pixels with the flattened indices (n,) in an image of `width` columns.
+
+    >>> tile_of(np.array([0, 7, 8, 160]), 20).tolist()
+    [0, 0, 1, 3]
+    """
+    row, column = index // width, index % width
+    return (row // TILE_PIXELS) * (-(-width // TILE_PIXELS)) + column // TILE_PIXELS

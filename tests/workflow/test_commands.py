@@ -1,0 +1,51 @@
+"""What Snakemake's own commands say about the workflow, in a folder that has nothing but one scene. No job is run."""
+
+import pytest
+from support import Workflow
+
+from workflow.registry import STAGES
+
+
+@pytest.fixture(scope="module")
+def fresh(repository, tmp_path_factory):
+    workflow = Workflow(repository, tmp_path_factory.mktemp("commands"))
+    workflow.write("tiny", "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
+    return workflow
+
+
+def succeeded(result):
+    assert result.returncode == 0 and "Traceback" not in result.stderr, result.stderr[-3000:]
+    return result.stdout
+
+
+def test_every_rule_has_a_description(fresh):
+    lines = succeeded(fresh.run("--list")).splitlines()
+    assert {line.split()[0] for line in lines} > set(STAGES)
+    assert all(line.endswith(".)") for line in lines), lines
+
+
+def test_the_linter_has_nothing_to_say(fresh):
+    succeeded(fresh.run("--lint"))
+
+
+def test_commands_that_run_nothing_know_the_default_target(fresh):
+    assert "scenes/tiny" in succeeded(fresh.run("--summary"))
+    assert "FROM " in succeeded(fresh.run("--containerize"))
+    graph = succeeded(fresh.run("--rulegraph"))
+    nodes = {line.split("[")[0].strip(): line.split('"')[1] for line in graph.splitlines() if "label" in line}
+    edges = {tuple(nodes[end.strip()] for end in line.split("->")) for line in graph.splitlines() if "->" in line}
+    wanted = {(needed, stage.name) for stage in STAGES.values() if not stage.on_demand for needed in stage.upstream}
+    assert wanted <= edges and ("publish", "batch") in edges
+
+
+def test_a_folder_without_scenes_knows_those_of_the_repository(repository, tmp_path):
+    elsewhere = Workflow(repository, tmp_path)
+    assert "publishing scenes/kitchen" in succeeded(elsewhere.run("scenes/kitchen", "-n"))
+    assert "kitchen: relighting" in succeeded(elsewhere.run("relight/kitchen", "-n"))
+    misspelt = elsewhere.run("scenes/kichen", "-n")
+    assert misspelt.returncode == 1 and "Did you mean scenes/kitchen?" in misspelt.stderr.strip().splitlines()[-1]
+
+
+def test_the_template_is_no_stage(fresh):
+    result = fresh.run("results/tiny/stage/manifest.json", "-n")
+    assert result.returncode == 1 and result.stderr.strip().splitlines()[-1] == "error: results/tiny/stage: no stage has this name"

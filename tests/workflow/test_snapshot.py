@@ -1,0 +1,38 @@
+"""Results may not drift: counts, files and scores of tiny and of the built-in kitchen at quality draft (snapshot.py)."""
+
+import json
+
+import pytest
+from snapshot import DECIBELS, GATED, PATH, moved, take
+from support import Workflow
+
+
+@pytest.fixture(scope="module")
+def kitchen(repository, tmp_path_factory):
+    """The scene of the README, run to the end."""
+    workflow = Workflow(repository, tmp_path_factory.mktemp("kitchen") / "run")
+    workflow.write("kitchen", (repository / "config/scenes/kitchen.yaml").read_text())
+    workflow.write_quality("draft", (repository / "config/quality/draft.yaml").read_text())
+    result = workflow.run("scenes/kitchen")
+    assert result.returncode == 0, result.stderr[-4000:]
+    return workflow
+
+
+@pytest.mark.parametrize("scene", ["tiny", "kitchen"])
+def test_counts_files_and_scores_stay(scene, request):
+    expected = json.loads(PATH.read_text())[scene]
+    found = take(request.getfixturevalue({"tiny": "finished"}.get(scene, scene)).folder, scene)
+    assert found["counts"] == expected["counts"]
+    assert found["structure"] == expected["structure"]
+    drift = {name: moved(name, found["scores"][name], value) for name, value in expected["scores"].items()}
+    assert max(drift.values()) <= DECIBELS, {
+        name: (found["scores"][name], expected["scores"][name], drift[name]) for name in drift
+    }
+
+
+def test_the_gate_is_complete_and_closes():
+    """All scores of the kitchen are gated, and a change that a reader of the results would notice does not pass."""
+    expected = json.loads(PATH.read_text())
+    assert set(expected["kitchen"]["scores"]) == {"/".join(key) for key in GATED}
+    assert moved("albedo/psnr/raw", 25.0, 25.4) > DECIBELS and moved("albedo/psnr/raw", 25.0, 25.2) < DECIBELS
+    assert moved("roughness/l2/raw", 0.040, 0.035) > DECIBELS and moved("metallic/l2/raw", 0.0, 5e-5) == 0.0

@@ -1,0 +1,219 @@
+# The stages, in order. Each reads the manifests of the stages named as its inputs, which lists their files with hashes, and
+# writes its own. What a stage may read, and which settings, is in workflow/registry.py.
+
+
+pathvars:
+    stage="stage",
+
+
+rule stage:
+    """Template of the stages below; not run itself."""
+    input:
+        no_stage,
+    output:
+        manifest="results/{scene}/<stage>/manifest.json",
+    log:
+        "results/{scene}/logs/<stage>.log",
+    benchmark:
+        "results/{scene}/benchmarks/<stage>.jsonl"
+    threads: 2
+    resources:
+        mem_mb=per_attempt(5000),
+        runtime=per_attempt(60),
+    params:
+        job=job,
+    shell:
+        "python3 -m workflow {params.job} --threads {threads} --log {log:q}"
+
+
+use rule stage as capture with:
+    input:
+        unpack(reads("capture")),
+    pathvars:
+        stage="capture",
+    resources:
+        mem_mb=per_attempt(5000),
+        runtime=per_attempt(120),
+    message:
+        "{wildcards.scene}: photographs, cameras and mesh into the normal form"
+
+
+use rule stage as prior with:
+    input:
+        unpack(reads("prior", "capture")),
+    pathvars:
+        stage="prior",
+    resources:
+        mem_mb=per_attempt(3000, diffusion=12000),
+        runtime=per_attempt(120, diffusion=720),
+    message:
+        "{wildcards.scene}: K material predictions for every photograph"
+
+
+use rule stage as segmentation with:
+    input:
+        unpack(reads("segmentation", "capture")),
+    pathvars:
+        stage="segmentation",
+    resources:
+        mem_mb=per_attempt(4000),
+        runtime=per_attempt(60),
+    message:
+        "{wildcards.scene}: faces to objects, pixels to segments"
+
+
+use rule stage as base with:
+    input:
+        unpack(reads("base", "capture", "prior", "segmentation")),
+    pathvars:
+        stage="base",
+    message:
+        "{wildcards.scene}: fusing the predictions into one base texture"
+
+
+use rule stage as emission with:
+    input:
+        unpack(reads("emission", "capture", "segmentation", "base")),
+    pathvars:
+        stage="emission",
+    message:
+        "{wildcards.scene}: emitters and their radiance"
+
+
+use rule stage as shading with:
+    input:
+        unpack(reads("shading", "capture", "segmentation", "base", "emission")),
+    pathvars:
+        stage="shading",
+    resources:
+        mem_mb=per_attempt(5000),
+        runtime=per_attempt(120),
+    message:
+        "{wildcards.scene}: cached incident shading"
+
+
+use rule stage as affines with:
+    input:
+        unpack(
+            reads(
+                "affines",
+                "capture",
+                "prior",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+            )
+        ),
+    pathvars:
+        stage="affines",
+    message:
+        "{wildcards.scene}: one affine map per object, and the camera response"
+
+
+use rule stage as render with:
+    input:
+        unpack(
+            reads("render", "capture", "segmentation", "base", "emission", "affines")
+        ),
+    pathvars:
+        stage="render",
+    resources:
+        mem_mb=per_attempt(5000),
+        runtime=per_attempt(120),
+    message:
+        "{wildcards.scene}: re-rendering every view"
+
+
+use rule stage as metrics with:
+    input:
+        unpack(
+            reads(
+                "metrics",
+                "capture",
+                "prior",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+                "affines",
+                "render",
+            )
+        ),
+    pathvars:
+        stage="metrics",
+    resources:
+        mem_mb=per_attempt(3000),
+        runtime=per_attempt(60),
+    message:
+        "{wildcards.scene}: scores"
+
+
+use rule stage as export with:
+    input:
+        unpack(
+            reads("export", "capture", "segmentation", "base", "emission", "affines")
+        ),
+    pathvars:
+        stage="export",
+    threads: 1
+    message:
+        "{wildcards.scene}: glTF, Mitsuba scene and tables"
+
+
+use rule stage as report with:
+    input:
+        unpack(
+            reads(
+                "report",
+                "capture",
+                "prior",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+                "affines",
+                "render",
+                "metrics",
+                "export",
+            )
+        ),
+    pathvars:
+        stage="report",
+    threads: 1
+    resources:
+        mem_mb=per_attempt(4000),
+        runtime=per_attempt(30),
+    message:
+        "{wildcards.scene}: the page"
+
+
+# On demand: `relight:` in config/scenes/<scene>.yaml (docs/guide/relighting.md).
+use rule stage as relight with:
+    input:
+        unpack(relight_inputs("capture", "segmentation", "base", "emission", "affines")),
+    pathvars:
+        stage="relight",
+    resources:
+        mem_mb=per_attempt(5000),
+        runtime=per_attempt(240),
+    message:
+        "{wildcards.scene}: relighting"
+
+
+# On demand: studies whose scores are those of the base texture.
+use rule stage as base_scores with:
+    input:
+        unpack(reads("base_scores", "capture", "prior", "segmentation", "base")),
+    pathvars:
+        stage="base_scores",
+    resources:
+        mem_mb=per_attempt(3000),
+        runtime=per_attempt(60),
+    message:
+        "{wildcards.scene}: scores of the base texture"
+
+
+for name, described in fingerprints.STAGES.items():
+    if name != "publish":
+        workflow.get_rule(name).docstring = described.purpose
