@@ -1,7 +1,6 @@
-"""What a scene requires, by measurement (METHOD 8): every function decides one component and says why.
+"""What a scene requires (docs/method/evaluation.md#what-a-scene-requires): each function decides one component of the model.
 
-All return the same record, ready for `plan.yaml`:
-`{component, included, measure, value, threshold, reason}` with plain Python values.
+All return the same record for `plan.yaml`, `{component, included, measure, value, threshold, reason}`, in plain Python values.
 """
 
 from __future__ import annotations
@@ -15,18 +14,27 @@ from iif_core.camera.gains import SIGNIFICANT, Evidence
 Decision = dict[str, Any]
 
 ESCAPE_PRIMARY = 1e-3
+"""Share of camera rays that leave the mesh, above which an environment is considered."""
 ESCAPE_SECONDARY = 2e-3
+"""The same for rays from the surface."""
 ESCAPE_BRIGHTNESS = 0.02
+"""Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 ESCAPE_OPEN = 0.3
-"""Share of escaping rays from which a mesh is a part of a room. What its holes show is then the rest of the room, near and
-different from everywhere: no map of what cameras see there, but twelve directions that the lit room decides
-(`iif_core.light.emission.environment`)."""
+"""Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
+and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
+(docs/method/light.md#open-meshes)."""
 EXPOSURE_LOG_RATIO = 0.05
+"""Median |log gain| between overlapping views, above which gains are estimated."""
 RESPONSE_ERRORS = 2.0
+"""Standard errors by which a larger family of responses must be better."""
 METALLIC_PRIOR = 0.25
+"""Median predicted metallic above which an object counts as predicted metal."""
 SPECULAR_ROUGHNESS = 0.85
+"""Roughness below which an object counts as glossy."""
 STABLE_OBJECTS = 0.7
+"""Adjusted Rand index below which the objects depend on the choice of photographs."""
 CACHE_COVERAGE = 0.3
+"""Share of secondary hits that must have been photographed for the radiance cache."""
 
 
 def _decision(component: str, included: bool, measure: str, value: float, threshold: float, reason: str) -> Decision:
@@ -42,14 +50,18 @@ def _decision(component: str, included: bool, measure: str, value: float, thresh
 
 
 def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
-    """Constant light from outside: needed when rays leave the mesh and what they meet is not black.
+    """Decide about light from outside, needed if rays leave the mesh and do not meet black.
+
+    See docs/method/light.md#when-an-environment-is-included.
 
     Args:
         setting: `on`, `off` or `auto`.
         primary_escape: share of camera rays without a hit.
         secondary_escape: share of cosine-distributed rays from the surface that leave.
-        relative_brightness: mean radiance of escaping camera rays / mean radiance of the photographs; None = none
-            escaped.
+        relative_brightness: mean radiance of escaping camera rays over that of the photographs; None = none escaped.
+
+    Returns:
+        The decision.
     """
     measure = "share of cosine-distributed rays from the surface that leave the mesh"
     if setting != "auto":
@@ -66,11 +78,17 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
 
 
 def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:
-    """Corrected poses and intrinsics, and photographs that are better left out (`iif_core.camera.registration`).
+    """Decide about corrected poses and intrinsics (`iif_core.camera.registration`).
 
     Args:
-        gain, error: fall of the loss on held-out texture, and its standard error; edges of the mesh decide where it does not.
-        moved: pixels of the photographs as given, median over the views.
+        accepted: whether the correction was accepted.
+        gain, error: fall of the loss on held-out texture, and its standard error; where it is not significant, edges of the mesh
+            decide.
+        moved: median over the views of the shift, in pixels of the given photographs.
+        left_out: number of photographs that are left out; views: number of photographs.
+
+    Returns:
+        The decision.
     """
     measure = "fall of the loss on texture that the fit did not see, in standard errors"
     value = gain / error if error > 0 else 0.0
@@ -85,11 +103,15 @@ def registration(accepted: bool, gain: float, error: float, moved: float, left_o
 
 
 def segmentation(kind: str, objects: int, stability: float | None, perturbed: str, facts: dict[str, Any]) -> Decision:
-    """Objects: where they come from, and how far they depend on the choice of photographs and thresholds.
+    """Describe where the objects come from, and how much they depend on the choice of photographs and thresholds.
 
     Args:
-        objects: seen by some photograph. stability: adjusted Rand index with the perturbed runs, None = nothing to perturb.
-        perturbed: what the runs change, in words. facts: numbers of the clustering, if there was one.
+        kind: of the segmentation; objects: number of objects that some photograph shows.
+        stability: adjusted Rand index with the perturbed runs; None = nothing to perturb.
+        perturbed: what these runs change, in words; facts: numbers of the clustering, if there was one.
+
+    Returns:
+        The decision.
     """
     component = f"objects ({kind})"
     if stability is None:
@@ -103,7 +125,7 @@ def segmentation(kind: str, objects: int, stability: float | None, perturbed: st
 
 
 def emitters(groups: int, dropped: int, candidates: int) -> Decision:
-    """Emitters: whether any group was found and survived the solve."""
+    """Decide about emitters: groups of faces that were found and kept by the solver."""
     if groups:
         reason = f"{groups} groups shine ({dropped} candidates dropped)"
     elif candidates:
@@ -114,16 +136,14 @@ def emitters(groups: int, dropped: int, candidates: int) -> Decision:
 
 
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
-    """Indirect light from photographed radiance, or from paths that go on with the base materials.
+    """Decide between photographed radiance and further bounces for indirect light (Eq. S.14).
 
-    The cache holds what the cameras saw; paths compound the error of the base albedo at every bounce. Against true incident
-    light (14 views of 112^2, LDR) the objects' diffuse shading was off by -0.6 % +- 1.8 % (kitchen) and +5 % +- 4.6 % (Country
-    Kitchen) with the cache, by -25 % +- 8 % and -51 % +- 19 % with paths; thinned to half of its hits the cache still won.
+    The cache holds what the cameras saw; paths compound the error of the base albedo at every bounce.
 
     Args:
         setting: `cache`, `path` or `auto`.
-        coverage: share of cosine-distributed rays from the surface that meet a voxel, of those that meet no emitter.
-        censored: share of the voxels that were only ever seen saturated.
+        coverage: share of cosine-distributed rays from the surface that meet a known voxel, among those that meet no emitter.
+        censored: share of the voxels that were seen by saturated pixels only.
     """
     measure = "share of secondary hits whose radiance was photographed"
     if setting != "auto":
@@ -133,10 +153,10 @@ def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
 
 
 def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision:
-    """Camera response: never for linear radiance; for LDR whatever `calibration.calibrate_response` chose, and why.
+    """Describe the camera response that the calibration chose; linear radiance has none.
 
     Args:
-        calibration: `calibration.calibration_facts`.
+        dynamic_range: `hdr` or `ldr`; calibration: facts of the calibration in `emission.json`.
     """
     table = calibration["candidates"]
     measure = "log likelihood by which the simplest curve is behind the best, in standard errors"
@@ -145,7 +165,7 @@ def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision
 
 
 def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
-    """Exposure gains of the views: whether what overlapping views disagree by exceeds 5 %."""
+    """Decide about exposure gains of the views: whether overlapping views disagree by more than 5 %."""
     spread = float(np.median(np.abs(log_gains))) if len(log_gains) else 0.0
     measure = "median |log gain| between overlapping views"
     if setting != "estimate":
@@ -156,10 +176,10 @@ def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
 
 
 def camera_term(term: str, evidence: Evidence) -> Decision:
-    """White balance of the views, or vignetting of the lens: whether held-out surface speaks for it.
+    """Decide about white balance of the views or vignetting of the lens by the loss on held-out surface.
 
     Args:
-        term: `white_balance` or `vignetting`; evidence: of `camera_gains.choose_gains`.
+        term: `white_balance` or `vignetting`; evidence: of `camera.gains.choose_gains`.
     """
     measure = "fall of the held-out loss by this term, in standard errors"
     value = evidence.gain / evidence.error if evidence.error > 0 else 0.0
@@ -172,7 +192,7 @@ def camera_term(term: str, evidence: Evidence) -> Decision:
 
 
 def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
-    """Metalness: where the photographs' evidence says metal, or metal in parts; dielectric elsewhere.
+    """Decide about metallic: objects that the photographs show to be metals, at least in parts.
 
     Args:
         free: (O,) bool, not a dielectric; prior_median: (O,) median predicted metalness.
@@ -186,16 +206,20 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
 
 
 def gloss_is_idle(glossy: float, matte: float) -> bool:
-    """Whether the views of a cell, all of one albedo of its own, differ no less with the fitted gloss than with none; not where
-    no cell can tell (0)."""
+    """Return whether gloss does not make the views of a cell, given an albedo of its own, more alike (Eq. M.44).
+
+    Args:
+        glossy, matte: how much they differ with the fitted gloss and without gloss; 0 = no cell can tell.
+    """
     return 0 < glossy and matte <= glossy
 
 
 def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
-    """Specular lobe: some object is glossier than 0.85 in 5 % of its cells, or metallic.
+    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels, or metallic.
 
     Args:
-        scatter: where gloss had to pay first, by how much the views of a cell differed with it and with none.
+        low_roughness: (O,) 5 % quantile of the fitted roughness; free_metallic: (O,) bool, not a dielectric.
+        scatter: how much the views of a cell differ with the fitted gloss and without (Eq. M.44); None = not compared.
     """
     if scatter is not None and gloss_is_idle(*scatter):
         measure = "how much more the views of a cell differ without gloss than with it (root mean square)"
@@ -208,7 +232,7 @@ def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tupl
 
 
 def affine_size(models: list[str]) -> Decision:
-    """Size of the per-object albedo map, from the colour directions of each object's texture."""
+    """Describe the sizes of the albedo maps, which follow the texture of each object (Eq. M.19)."""
     kinds = [m.split(",")[0].split(" (")[0] for m in models]
     counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "population", "identity")}
     value = counts["full"] / len(kinds) if kinds else 0.0
@@ -217,7 +241,7 @@ def affine_size(models: list[str]) -> Decision:
 
 
 def scale(kind: str, factor: float, relative_error: float) -> Decision:
-    """What fixes the scale between light and albedo (METHOD 7a, iif_core.fitting.gauge)."""
+    """Describe what fixes the scale between light and albedo (docs/method/fitting.md#level-of-all-albedos)."""
     reasons = {
         "found": "the light as it was found, by how much of it is indirect, weighed against the mean albedo of the base texture",
         "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",

@@ -87,7 +87,7 @@ class FitProgress:
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
     """Fit sixteen numbers for each object, and the response, by Gauss-Newton on all pixels at once.
 
-    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels take what the others have in common.
+    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels have the mean of the population.
 
     Args:
         problem: pixels, base values, cached shading.

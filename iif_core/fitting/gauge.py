@@ -16,7 +16,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.fitting.problem import FitProblem, FitResult
-from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import unclamped_material
 
 KINDS = ("found", "prior", "mean_albedo", "white_patch", "lamp")
@@ -56,7 +56,7 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     """Divide the albedo numbers of a fit by the factor of the gauge and multiply `light_scale` by it (Eq. M.36).
 
     `facts["scale"]` records `kind`, `factor` and `relative_error`. For conventions the error is that of the fitted numbers alone
-    (Eq. M.38); it does not say how true the convention is.
+    (Eq. M.38); it does not include the error of the convention.
     """
     factor, error = _factor(problem, fit, gauge)
     facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}
@@ -75,9 +75,9 @@ def _weigh_levels(problem: FitProblem, fit: FitResult, error: float) -> tuple[fl
     """Return factor and error of the weighted mean of found level and prior's level (Eq. M.37)."""
     if error <= 0:
         return 1.0, 0.0
-    share = 1.0 / (1.0 + (LEVEL_OF_PRIOR / error) ** 2) if np.isfinite(error) else 1.0
+    share = 1.0 / (1.0 + (PRIOR_LEVEL_ERROR / error) ** 2) if np.isfinite(error) else 1.0
     factor, _ = _factor(problem, fit, Gauge("prior"))
-    return factor**share, LEVEL_OF_PRIOR * float(np.sqrt(share))
+    return factor**share, PRIOR_LEVEL_ERROR * float(np.sqrt(share))
 
 
 def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:

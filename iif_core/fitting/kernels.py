@@ -490,9 +490,7 @@ def _add_piece(piece, last_half, m, layout, h, g):
 
 
 @_compiled
-def gradient(
-    pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, affine: NDArray, rows: NDArray, g: NDArray
-) -> None:
+def gradient(pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, affine: NDArray, rows: NDArray, g: NDArray) -> None:
     """Sum the gradient of the paper's loss over some pixels: (sum over channels of e^2) / 3 + w_r (1 - r) + w_m m (Eq. M.39).
 
     Args:

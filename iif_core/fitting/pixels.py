@@ -18,6 +18,7 @@ RANGE_WEIGHT = 0.05
 """Weight of the squared distance to the allowed range (Eq. M.11)."""
 _DEFAULT_CLUSTERS = 64
 """Clusters of an object if the problem names none."""
+_OF_EACH_PIXEL = ("index", "obj", "base", "diffuse", "lobes", "target", "exposure", "saturated", "trust")
 
 
 @dataclass
@@ -66,19 +67,7 @@ class Pixels:
         """Return a subset; `index` increases. Every cluster stays, possibly empty."""
         begin, end = (index.start, index.stop) if isinstance(index, slice) else (0, 0)
         starts = np.clip(self.starts, begin, end) - begin if end else np.searchsorted(index, self.starts)
-        return replace(
-            self,
-            index=self.index[index],
-            obj=self.obj[index],
-            base=self.base[index],
-            diffuse=self.diffuse[index],
-            lobes=self.lobes[index],
-            target=self.target[index],
-            exposure=self.exposure[index],
-            saturated=self.saturated[index],
-            trust=self.trust[index],
-            starts=starts,
-        )
+        return replace(self, starts=starts, **{name: getattr(self, name)[index] for name in _OF_EACH_PIXEL})
 
     def only(self, objects: np.ndarray) -> Pixels:
         """Return the pixels of some objects (increasing), which are numbered anew."""

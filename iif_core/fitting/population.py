@@ -118,7 +118,7 @@ def _weight_and_scatter(inverse: np.ndarray, noise: np.ndarray, discount: float)
 
 @dataclass(frozen=True)
 class ProfiledRoughness:
-    """Roughness of each object from its profile, and how far it is to be believed.
+    """Roughness of each object from its profile, and the error of it.
 
     Attributes:
         level: (O,) posterior mean; deviation: (O,) its posterior standard deviation, from discounted evidence.

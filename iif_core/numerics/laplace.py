@@ -99,26 +99,3 @@ def scale_contribution(distance: NDArray, b_ref: NDArray, floor: float = SCALE_F
     d = np.abs(distance)
     b_r = floored(b_ref, floor)
     return d + b_r * np.exp(-d / b_r)
-
-
-def closed_form_scale(
-    distance: NDArray, b_ref: NDArray, weight: NDArray | None = None, axis: int = 0, floor: float = SCALE_FLOOR
-) -> NDArray:
-    """Compute the scale that minimises the summed divergence of its observations (Eq. F.31).
-
-    Args:
-        distance, b_ref: distance and reference scale of every observation.
-        weight: weights >= 0 that broadcast against the observations; equal weights if None.
-        axis: axis of the observations.
-        floor: smallest scale, > 0.
-
-    Returns:
-        Scale with `axis` removed; the floor where the weights sum to 0.
-    """
-    contribution = scale_contribution(distance, b_ref, floor)
-    if weight is None:
-        return floored(contribution.mean(axis=axis), floor)
-    weight = np.broadcast_to(weight, contribution.shape)
-    total = weight.sum(axis=axis)
-    mean = (weight * contribution).sum(axis=axis) / np.where(total > 0, total, 1.0)
-    return floored(mean, floor)

@@ -91,8 +91,7 @@ def simulate_predictions(
 
     Args:
         albedo: (H, W, 3) linear truth; roughness, metallic: (H, W).
-        object_id: (H, W) int, the units that errors belong to; -1 = none is a unit of its own.
-        samples: K >= 1.
+        object_id: (H, W) int, the units that errors belong to; -1 = none is a unit of its own. samples: K >= 1.
         view, seed: any integers; equal ones give equal errors.
         strength: 0 = truth, 1 = the sizes in `errors`, at most 4.
         shading: (H, W) true shading > 0 up to scale (see `shading_proxy`); None = nothing leaks.

@@ -47,9 +47,9 @@ def main() -> None:
         start = time.process_time()
         for seed in range(arguments.seeds):
             photographs = scene.photographs(seed, arguments.photo_samples)
-            halves = scene.halves(seed, arguments.samples // 2)
+            transport = scene.transport(seed, arguments.samples // 2)
             for kind in ("hdr_hidden", "ldr_one"):
-                problem, initial = scene.problem(photographs, halves, kind)
+                problem, initial = scene.problem(photographs, transport, kind)
                 found = solve_families(problem.rows, initial, scene.families())
                 off = (found.radiance - scene.room.truth)[lit]
                 ratios.setdefault(kind, []).append(off / found.error[lit])

@@ -29,7 +29,7 @@ def information_limit(scene, photographs: np.ndarray, photo_paths: int, paths: l
 
     truth, group = scene.room.truth, scene.room.group[scene.face]
     own = (group >= 0) & truth[group].any(1)
-    halves = [sum(part) / 4 for part in zip(*[[a for a, _ in scene.halves(1000 + i, 128)] for i in range(4)], strict=True)]
+    halves = sum(scene.transport(1000 + i, 128).matrix[:, 0] for i in range(4)) / 4
     shown = [np.einsum("ngc,gc->nc", a, truth) for a in halves]
     # A E has noise of its own; what is left of the photographs' alone is told by the numbers of paths.
     square = (photographs - 0.5 * (shown[0] + shown[1])) ** 2 / (1 + photo_paths / 1024)
@@ -37,8 +37,9 @@ def information_limit(scene, photographs: np.ndarray, photo_paths: int, paths: l
     number, block = np.unique(key, axis=0, return_inverse=True)
 
     def means(values: np.ndarray) -> np.ndarray:
-        empty, ones, free = np.zeros((len(key), 0, 3), np.float32), np.ones((len(key), 3)), np.zeros((len(key), 3), bool)
-        return block_rows(EmissionRows(empty, empty, values[~own], values[~own], ones, free), block.ravel()).target
+        empty, ones, free = np.zeros((2, 1, len(key), 0, 3), np.float32), np.ones((len(key), 3)), np.zeros((len(key), 3), bool)
+        rows = EmissionRows(empty, values[~own], np.zeros((2, 1, len(key), 3)), ones, free)
+        return block_rows(rows, block.ravel())[0].observed
 
     size = np.bincount(block.ravel())[:, None]
     matrix = np.stack([means(0.5 * (halves[0][:, g] + halves[1][:, g])) for g in range(len(truth))], 1)
@@ -93,10 +94,10 @@ def main() -> None:
     print("| photographs | paths | solver | median | max | false | loss | trace s | solve s |\n" + 9 * "|---" + "|")
     for samples in arguments.samples:
         start = time.process_time()
-        halves = scene.halves(arguments.seed, max(samples // 2, 1))
+        transport = scene.transport(arguments.seed, max(samples // 2, 1))
         traced = time.process_time() - start
         for kind in ("hdr", "hdr_hidden", "ldr", "ldr_one"):
-            problem, initial = scene.problem(photographs, halves, kind)
+            problem, initial = scene.problem(photographs, transport, kind)
             rows = problem.rows
             solvers = {
                 "plain": lambda rows=rows, initial=initial: solve_emission(rows, initial, cross=False),

@@ -1,4 +1,4 @@
-"""A scene of a stranger: a small room with known cameras, written as a `folder` scene in many variants."""
+"""A small room with known cameras, written as a `folder` scene in many variants."""
 
 from __future__ import annotations
 

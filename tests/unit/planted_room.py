@@ -11,6 +11,7 @@ from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.camera.response import response
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import EmissionProblem, assemble, initial_radiance
+from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.sensor import Sensor
 
 SIZE = np.array([5.0, 4.0, 2.7])
@@ -148,7 +149,7 @@ class PlantedScene:
         scene = Scene(self.geometry, self.material, self.emitters)
         return render(scene, self.origins, self.directions, PathOptions(samples, BOUNCES, 7919 * seed + 1)).astype(np.float64)
 
-    def halves(self, seed: int, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    def transport(self, seed: int, samples: int) -> TracedTransport:
         """Two independent traces of `samples` paths a pixel each; emitters do not reflect, so their rows are 0."""
         from iif_core.light.transport.matrix import transport_matrix
         from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
@@ -158,12 +159,10 @@ class PlantedScene:
         columns = EmitterColumns(self.room.group, len(self.room.truth), self.side)
         scene = Scene(self.geometry, self.material, None)
         paths = [PathOptions(samples, BOUNCES, 7919 * seed + 11 + half) for half in range(2)]
-        by_lobe = (transport_matrix(scene, points, columns, half) for half in paths)
-        return [(matrix.sum(1), cached.sum(1)) for matrix, cached in by_lobe]
+        found = (transport_matrix(scene, points, columns, half) for half in paths)
+        return TracedTransport(*(np.stack(part).sum(2)[:, None] for part in zip(*found, strict=True)))
 
-    def problem(
-        self, photographs: np.ndarray, halves: list[tuple[np.ndarray, np.ndarray]], kind: str
-    ) -> tuple[EmissionProblem, np.ndarray]:
+    def problem(self, photographs: np.ndarray, transport: TracedTransport, kind: str) -> tuple[EmissionProblem, np.ndarray]:
         """(problem, initial radiance) of linear (`hdr`) or 8-bit photographs through sRGB (`ldr`, `ldr_one`).
 
         `ldr`: the views have five exposures, two stops apart; in the shortest some emitters are not saturated.
@@ -184,7 +183,7 @@ class PlantedScene:
         if kind == "hdr_hidden":
             bound, radiance = bound | (group >= 0)[:, None], np.where((group >= 0)[:, None], 1.0, radiance)
         rows = EmissionPixels(radiance, bound, self.room.object_id[self.face], self.view, self.tile, group)
-        problem = assemble(rows, halves, len(self.room.truth))
+        problem = assemble(rows, transport, len(self.room.truth))
         return problem, initial_radiance(rows, np.ones((len(self.room.truth), 3)), linear and kind == "hdr")
 
     def families(self) -> np.ndarray:

@@ -51,7 +51,7 @@ def name(i):
 
 
 def nerfstudio_matrix(pose):
-    """transform_matrix of the release for an OpenCV pose in the mesh's frame: METHOD 4.3 read backwards, row by row."""
+    """Return the release's transform_matrix of an OpenCV pose in the mesh's frame (docs/method/camera.md#axes-and-pixels)."""
     rows = np.stack([pose[1], pose[0], -pose[2], pose[3]])
     rows[:, 1:3] = -rows[:, 1:3]
     return rows

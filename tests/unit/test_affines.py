@@ -11,7 +11,7 @@ from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
-from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
 
@@ -310,8 +310,8 @@ def test_an_uncertain_level_is_averaged_with_the_prior():
     prior = apply_gauge(problem, free, Gauge("prior")).light_scale
     assert abs(np.log(prior)) > 0.02
     for error, share, left in (
-        (LEVEL_OF_PRIOR, 0.5, LEVEL_OF_PRIOR / np.sqrt(2)),
-        (np.inf, 1.0, LEVEL_OF_PRIOR),
+        (PRIOR_LEVEL_ERROR, 0.5, PRIOR_LEVEL_ERROR / np.sqrt(2)),
+        (np.inf, 1.0, PRIOR_LEVEL_ERROR),
         (1e-6, 0.0, 1e-6),
     ):
         pinned = apply_gauge(problem, free, Gauge("found", error=error))

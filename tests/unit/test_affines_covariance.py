@@ -22,7 +22,7 @@ def _psd(rng, n, size, rank):
 
 
 def test_leverage_is_corrected():
-    """Scores of covariance H_k - H_k B H_k, which a fit leaves of errors in proportion to H_k, are corrected to covariance H_k."""
+    """Scores of covariance H_k - H_k B H_k, which a fit leaves of errors in proportion to H_k, get the covariance H_k."""
     rng = np.random.default_rng(0)
     whole = _psd(rng, 6, 17, 6)
     h = whole[:, :16, :16]

@@ -10,7 +10,7 @@ from iif_core.errors import InputError
 from iif_core.fitting.baselines import loss as judge
 from iif_core.fitting.baselines.adam import AdamOptions, gradient, solve_adam
 from iif_core.fitting.baselines.camera import fit_camera
-from iif_core.fitting.baselines.direct import METALNESS, solve_direct
+from iif_core.fitting.baselines.direct import METALLIC_GRID, solve_direct
 from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, CellOptions
 from iif_core.fitting.baselines.problem import CellSums, PixelRows
 from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
@@ -27,7 +27,7 @@ def plant(cells=120, objects=3, per_cell=6, seed=0, family="identity", params=No
     truth = np.zeros((cells, 5))
     truth[:, :3] = rng.uniform(0.15, 0.8, (cells, 3))
     truth[:, 3] = 1.0 if matte else rng.choice(LEVELS, cells)
-    truth[:, 4] = 0.0 if matte else rng.choice(METALNESS, cells)
+    truth[:, 4] = 0.0 if matte else rng.choice(METALLIC_GRID, cells)
     cell = np.repeat(np.arange(cells), per_cell)
     n, count = len(cell), len(LEVELS)
     d = rng.uniform(0.1, 0.9, (n, 3)).astype(np.float32)
@@ -96,7 +96,7 @@ def test_the_search_finds_the_minimum():
         best = judge.losses(alone, solve_direct(problem, options).value, options)
         rng = np.random.default_rng(5)
         for _ in range(1000):
-            other = np.concatenate([rng.random((40, 3)), rng.uniform(0.02, 1, (40, 1)), rng.choice(METALNESS, (40, 1))], 1)
+            other = np.concatenate([rng.random((40, 3)), rng.uniform(0.02, 1, (40, 1)), rng.choice(METALLIC_GRID, (40, 1))], 1)
             assert (best <= judge.losses(alone, other, options) + 1e-6).all()
 
 

@@ -1,5 +1,4 @@
-"""The reflectance: against the published furnace table, float64, sampling statistics, and across array
-libraries."""
+"""Reflectance: published furnace table, float64, sampling statistics, equality across array libraries."""
 
 from __future__ import annotations
 
@@ -151,7 +150,7 @@ def test_half_vectors_follow_ggx(r):
 
 @pytest.mark.parametrize(("r", "NoV"), [(0.25, 0.8), (0.5, 0.3), (1.0, 0.05)])
 def test_directions_follow_mixture_pdf(r, NoV):
-    """Chi-squared of sampled directions against the integrated density; directions below the surface are one
+    """Chi-squared test of sampled directions against the integrated density; directions below the surface form one
     cell."""
     wo, n = view(NoV), 200_000
     u0, u1, u2 = RNG.random((3, n))

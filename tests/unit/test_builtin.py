@@ -1,4 +1,4 @@
-"""The built-in rooms: geometry, textures, cameras, and the capture that comes out of them."""
+"""The built-in rooms: geometry, textures, cameras, and their capture."""
 
 import hashlib
 import json
@@ -184,7 +184,7 @@ def _random_rays(room, per_camera, cameras=50, seed=0):
 
 
 def test_no_ray_escapes_and_nobody_sees_a_back_side(room, traced):
-    """20 000 rays from 50 cameras; a camera inside an object would see nothing but back sides."""
+    """Trace 20 000 rays from 50 cameras; a camera inside an object would see back sides only."""
     from iif_core.light.transport.geometry import trace
 
     origin, direction = _random_rays(room, 400)
@@ -296,7 +296,7 @@ def test_noise_is_continuous_centred_and_uses_its_range():
 
 
 def test_truth_and_renderer_see_the_same_material(llvm, room):
-    """NumPy and Dr.Jit agree everywhere but on the edges of cells, where rounding decides."""
+    """NumPy and Dr.Jit agree except at the edges of cells, where rounding decides."""
     corner = room.vertices[room.faces]
     rng = np.random.default_rng(3)
     face = np.repeat(np.arange(len(corner)), 1 + 20_000 // len(corner))
@@ -481,7 +481,7 @@ def test_unknown_room_is_refused():
 
 
 def test_source_is_light_to_ask(repository):
-    """Snakemake imports it while parsing: no renderer, no SciPy."""
+    """Snakemake imports the source while it parses, so the import must load neither the renderer nor SciPy."""
     code = (
         "import sys, json; from workflow.sources import builtin; assert builtin.raw_inputs({}) == [];"
         "print(json.dumps([m for m in ('mitsuba', 'drjit', 'scipy', 'torch', 'open3d') if m in sys.modules]))"

@@ -1,4 +1,4 @@
-"""Camera response from shared surface: planted curves, the choice of the family, honest errors, extremes."""
+"""Camera response from shared surface: known curves, choice of the family, size of the errors, extreme input."""
 
 import numpy as np
 import pytest
@@ -70,7 +70,7 @@ def test_a_glossy_block_and_outliers_do_not_matter():
 
 
 def test_claimed_errors_cover_the_truth():
-    """Errors that patches of an object share make naive standard errors far too small."""
+    """Correlated errors of the patches of an object make standard errors of independent rows far too small."""
     square = []
     for seed in range(8):
         rows, exposure = _rows(np.random.default_rng(seed), response("gamma", [1.9]), n_patches=300, common=0.1)
@@ -169,7 +169,7 @@ def test_thinning_keeps_the_same_patches_in_every_view_and_joining_numbers_them(
     ("truth", "limit"), [(response("gamma", [1.9]), 0.5), (response_curve("filmic"), 1.0)], ids=["gamma", "filmic"]
 )
 def test_unknown_exposures_give_the_curve_up_to_a_power(truth, limit):
-    """f(x^(1 / p)) with exposures e^p shows the same photographs: the power is reported, the rest is found."""
+    """f(x^(1 / p)) with exposures e^p gives the same photographs: all but the power is estimated."""
     rows, exposure = _rows(np.random.default_rng(3), truth)
     out = calibrate_response(rows, np.ones(8), ("srgb", "spline"), given=False)
     assert "power" in out.gauge and np.exp(np.mean(np.log(out.exposure))) == pytest.approx(1.0)

@@ -1,4 +1,4 @@
-"""Exposure, white balance and vignetting from shared surface: planted, tried where there is none, held-out views."""
+"""Exposure, white balance and vignetting from shared surface: known gains, scenes without an effect, held-out views."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_each_term_by_itself():
 
 
 def test_a_lens_that_falls_off_with_cos4():
-    """Not of the family: the curve is met within 1.5 % all the same."""
+    """The true curve is not in the family, but is matched within 1.5 %."""
     rows, _ = planted(3)
     tangent2 = 0.45 * rows.radius2  # half the diagonal at 34 degrees
     y = rows.y / falloff(VIGNETTING, rows.radius2)[:, None] / ((1 + tangent2) ** 2)[:, None]
@@ -108,7 +108,7 @@ def test_radius_is_one_in_the_corners():
 
 
 def test_with_the_response_unknown_too():
-    """8-bit values through gamma 1.9: chroma and falloff to 1.5 %; the exposure's power is a convention."""
+    """8-bit values through gamma 1.9: chroma and vignetting to 1.5 %; the power of the exposures is a convention."""
     rows, gain = planted(6, patches=300)
     curve = response("gamma", [1.9])
     value = np.round(255 * curve(np.clip(rows.y, 0, 1))) / 255
@@ -143,11 +143,11 @@ def test_plain_gains():
 
 
 def test_balanced_light_shows_what_the_gains_say():
-    """Stage affines knows one exposure a pixel; the channels' ratios to it are in the light."""
-    from workflow.stages.affines import _balanced
+    """Stage affines uses one exposure per pixel; the light includes the ratios of the channels to it."""
+    from workflow.fitting.inputs import balanced
 
     rng = np.random.default_rng(0)
     factor, lobes = rng.uniform(0.3, 3, (5, 3)), rng.uniform(0, 1, (5, 4, 3))
     exposure = np.exp(np.log(factor).mean(1))
-    shown = exposure[:, None, None] * _balanced(lobes, factor / exposure[:, None])
+    shown = exposure[:, None, None] * balanced(lobes, factor / exposure[:, None])
     np.testing.assert_allclose(shown, factor[:, None] * lobes)

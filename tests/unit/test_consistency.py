@@ -8,7 +8,7 @@ from iif_core.evaluation.consistency import ShadingLeft, ViewSpread, held_out_ga
 
 
 def surface(n=4000, seed=0):
-    """(albedo, light, object): texture that knows nothing of the light."""
+    """(albedo, light, object): texture that is independent of the light."""
     rng = np.random.default_rng(seed)
     object_id = rng.integers(0, 5, n)
     albedo = (0.2 + 0.6 * rng.random((5, 3)))[object_id] * np.exp(0.1 * rng.standard_normal((n, 1)))

@@ -120,7 +120,7 @@ def test_a_photograph_is_encoded_once(made, kind, monkeypatch):
 
 
 def test_rgbx_is_ddim_by_hand(made):
-    """The whole chain once more: float64, the paper's DDIM with zero terminal SNR, no scheduler class, no batching."""
+    """Compare with a plain float64 version: the paper's DDIM with zero terminal SNR, no scheduler class, no batches."""
     from diffusers import AutoencoderKL, UNet2DConditionModel
     from transformers import CLIPTextModel, CLIPTokenizer
 
@@ -154,7 +154,7 @@ def test_rgbx_is_ddim_by_hand(made):
 
 
 def test_marigold_is_the_pipeline_of_diffusers(made):
-    """Two roads to one number: diffusers' own pipeline on the same noise."""
+    """Compare with diffusers' own pipeline on the same noise."""
     from diffusers import MarigoldIntrinsicsPipeline
 
     pipeline = MarigoldIntrinsicsPipeline.from_pretrained(made["marigold"])
@@ -211,7 +211,7 @@ def test_tiles_cover_and_weights_sum_to_one(length):
     assert covered.min() >= 1 and all(b - a <= 12 for a, b in zip(starts, starts[1:], strict=False))
     picture = torch.rand(2, length, 20, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = diffusion.blend_tiles(lambda rows, columns: picture[:, rows, columns] ** 2, length, 20, 16)
-    np.testing.assert_allclose(found, picture**2, rtol=1e-6)  # what needs no neighbours does not see the tiles
+    np.testing.assert_allclose(found, picture**2, rtol=1e-6)  # a function of single pixels does not depend on the tiles
 
 
 def test_resizing_and_padding():

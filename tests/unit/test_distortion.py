@@ -1,4 +1,4 @@
-"""Lens distortion: known values, there and back, a picture with a closed form, and directions that must not be seen."""
+"""Lens distortion: known values, inversion, a picture with a closed form, and directions that must not be visible."""
 
 import math
 

@@ -9,6 +9,7 @@ from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import assemble
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
+from tests.unit.emission_systems import transport_of
 
 
 def _middles():
@@ -63,13 +64,13 @@ def test_groups_of_texels_are_solved_with_the_rest():
     n, truth = 3000, np.array([5.0, 3.0, 0.4, 1.5])[:, None] * [1.0, 0.9, 0.8]
     a = rng.random((n, 4, 3))
     y = np.einsum("ngc,gc->nc", a, truth)
-    noisy = [(a * (1 + 0.2 * rng.standard_normal(a.shape)), np.zeros((n, 3))) for _ in range(2)]
+    noisy = transport_of(tuple(a * (1 + 0.2 * rng.standard_normal(a.shape)) for _ in range(2)))
     none = np.full(n, -1)
     pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.arange(n) % 9, np.arange(n) % 4, np.arange(n), none)
     columns = np.repeat([0, 0, 1, 2], HEIGHT * WIDTH // 4).reshape(HEIGHT, WIDTH)
     sky = Sky(columns, np.array([500, 500, 0]), truth[1:] * [[1], [1], [0]], np.zeros(3, bool))
     problem = assemble(pixels, noisy, 4, None, sky)
-    assert problem.anchor.sum() == 2 and problem.rows.cluster.shape == problem.owner.shape == (len(problem.rows.target),)
+    assert problem.anchor.sum() == 2 and problem.rows.cluster.shape == problem.owner.shape == (len(problem.rows.observed),)
     found = solve_emission(problem.rows, np.ones((4, 3)))
     np.testing.assert_allclose(found.radiance, truth, rtol=0.03)
     np.testing.assert_allclose(found.radiance[1:3], truth[1:3], rtol=2e-3)

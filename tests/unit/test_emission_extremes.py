@@ -10,14 +10,13 @@ from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import assemble, initial_radiance, white_surface
 from iif_core.light.emission.pruning import prune_groups
-from iif_core.light.emission.rows import EmissionRows
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.surface.segments import face_adjacency
+from tests.unit.emission_systems import rows_of, transport_of
 
 
 def _rows(a, target, bound=None):
-    bound = np.zeros(target.shape, bool) if bound is None else bound
-    return EmissionRows(*[a.astype(np.float32)] * 2, target, target, np.ones(target.shape), bound)
+    return rows_of(a, observed=target, bound=bound)
 
 
 def _matrix(n=300, groups=3, seed=0):
@@ -69,7 +68,7 @@ def test_descent_reaches_the_answer_on_exact_rows_and_prunes_what_is_dark():
 
 
 def test_clamped_loss_has_no_gradient_where_the_prediction_is_too_bright():
-    """METHOD H32: the published loss leaves an emitter too bright that `safe` brings down."""
+    """The published loss leaves an emitter too bright that `safe` brings down (docs/method/numerics.md#clamped-loss)."""
     a = np.ones((64, 1, 3))
     rows = _rows(a, np.full((64, 3), 0.5))
     ceiling = np.full((64, 3), 0.005)  # below where the descent starts
@@ -85,7 +84,7 @@ def test_reference_loss_does_not_reward_shrinking():
     a = _matrix(100_000, 1, 5)
     halves = [(a * (1 + rng.standard_normal(a.shape))).astype(np.float32) for _ in range(2)]
     y = 4.0 * a[:, 0]
-    rows = EmissionRows(*halves, y, y, np.ones(y.shape), np.zeros(y.shape, bool))
+    rows = rows_of(tuple(halves), observed=y)
     at = {e: [reference_loss(rows, np.full((1, 3), e), cross) for cross in (True, False)] for e in (3.0, 4.0)}
     assert at[4.0][0] < at[3.0][0] and at[4.0][1] > at[3.0][1]
     assert abs(at[4.0][0]) < 0.02
@@ -141,9 +140,8 @@ def test_one_object_and_five_thousand(objects):
     group = np.where(np.arange(n) < 200, np.arange(n) % 2, -1)
     y[:200] = truth[group[:200]]
     pixels = EmissionPixels(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
-    halves = [(a, np.zeros((n, 3)))] * 2
     initial = initial_radiance(pixels, np.ones((2, 3)), True)
-    problem = assemble(pixels, halves, 2).with_gains(initial)
+    problem, _ = assemble(pixels, transport_of(a), 2).solve_object_gains(initial)
     np.testing.assert_allclose(solve_emission(problem.rows, initial).radiance, truth, rtol=0.02)
 
 
@@ -154,10 +152,9 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     group = np.where(np.arange(1000) < 50, 0, -1)
     y[:50] = truth[0]
     pixels = EmissionPixels(y, np.zeros((1000, 3), bool), np.zeros(1000, int), np.zeros(1000, int), np.arange(1000) // 4, group)
-    halves = [(a.astype(np.float32), np.zeros((1000, 3), np.float32))] * 2
-    white = [(np.zeros((50, 2, 3), np.float32), np.full((50, 3), 0.1, np.float32))] * 2
+    white = transport_of(np.zeros((50, 2, 3), np.float32), 0.1)
     seen = initial_radiance(pixels, np.full((2, 3), 2.0), True)
-    trial = assemble(pixels, halves, 2, white)
+    trial = assemble(pixels, transport_of(a.astype(np.float32)), 2, white)
     evidence = white_surface(pixels, seen, white)
     out = prune_groups(trial.rows, seen, np.ones(2), evidence, ~trial.anchor, np.zeros(2, bool))
     assert out.kept.all() and np.isinf(out.excess[1])

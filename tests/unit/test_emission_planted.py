@@ -12,13 +12,13 @@ from tests.unit.planted_room import PlantedScene, build_room, relative_errors
 @pytest.fixture(scope="module")
 def planted(llvm):
     scene = PlantedScene(build_room(), views=10, size=48)
-    return scene, scene.photographs(0, 128), scene.halves(0, 8)
+    return scene, scene.photographs(0, 128), scene.transport(0, 8)
 
 
 @pytest.mark.parametrize(("kind", "median"), [("hdr", 0.02), ("ldr", 0.06)])
 def test_planted_groups_are_recovered(planted, kind, median):
-    scene, photographs, halves = planted
-    problem, initial = scene.problem(photographs, halves, kind)
+    scene, photographs, transport = planted
+    problem, initial = scene.problem(photographs, transport, kind)
     found = solve_families(problem.rows, initial, scene.families())
     assert np.median(relative_errors(scene.room, found.radiance)) < median
     assert found.radiance[~scene.room.truth.any(1)].max() < 1.0  # of up to 20: the distractors
@@ -28,7 +28,7 @@ def test_planted_groups_are_recovered(planted, kind, median):
 def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
     """Single triangles are not told apart by so few paths; the light of each object is."""
     scene, photographs, _ = planted
-    problem, initial = scene.problem(photographs, scene.halves(1, 32), "ldr_one")
+    problem, initial = scene.problem(photographs, scene.transport(1, 32), "ldr_one")
     found = solve_families(problem.rows, initial, scene.families())
     for family in np.unique(scene.families())[:3]:
         own = scene.families() == family
@@ -39,8 +39,8 @@ def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
 
 
 def test_twins_are_judged_by_one_loss(planted):
-    scene, photographs, halves = planted
-    problem, initial = scene.problem(photographs, halves, "hdr_hidden")
+    scene, photographs, transport = planted
+    problem, initial = scene.problem(photographs, transport, "hdr_hidden")
     direct = solve_families(problem.rows, initial, scene.families())
     descent = solve_emission_sgd(problem.rows, initial, SgdOptions(steps=600, prune=()))
     losses = [reference_loss(problem.rows, s.radiance) for s in (direct, descent)]

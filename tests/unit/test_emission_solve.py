@@ -6,17 +6,27 @@ from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
 from iif_core.light.emission.direct import solve_emission, solve_families
-from iif_core.light.emission.gains import SHARED_ERROR, WHITE_SHARE, object_gains
+from iif_core.light.emission.gains import MAX_SHARE_ABOVE_WHITE, SHARED_LEVEL_ERROR, GainOptions, estimate_object_gains
 from iif_core.light.emission.pruning import WhiteSurface, prune_groups
-from iif_core.light.emission.rows import EmissionRows, GlossRows, block_rows, scale_rows
+from iif_core.light.emission.rows import EmissionRows, block_rows
+from tests.unit.emission_systems import rows_of
 
 TRUE = np.array([5.0, 10.0, 20.0])[:, None] * np.array([1.0, 0.8, 0.5])
 
 
-def _rows(a1, a2, target, weight=None, bound=None):
-    weight = np.ones_like(target) if weight is None else weight
-    bound = np.zeros(target.shape, bool) if bound is None else bound
-    return EmissionRows(a1.astype(np.float32), a2.astype(np.float32), target, target, weight, bound)
+def _rows(a1, a2, y, weight=None, bound=None):
+    return rows_of((a1, a2), observed=y, weight=weight, bound=bound)
+
+
+def _gains(rows, owner, identifiable=True, rounds=15, shrinkage=0.05, initial=None, **options):
+    """Gains of rows of three groups."""
+    initial = np.ones((3, 3)) if initial is None else initial
+    return estimate_object_gains(rows, owner, initial, identifiable, options=GainOptions(True, rounds, shrinkage), **options)
+
+
+def _light(rows, owner, found, **options):
+    """Radiance of rows scaled by the gains found."""
+    return solve_emission(rows.scaled(found.gain[owner], found.gloss_gain[owner]), np.ones((3, 3)), **options).radiance
 
 
 def _random(n=500, groups=3, seed=0):
@@ -33,7 +43,7 @@ def test_planted_emission_is_recovered():
 
 
 def test_noise_in_a_attenuates_and_two_estimates_cure_it():
-    """METHOD 7a: (7.3, 9.8, 14.8) against (4.98, 9.97, 20.05); the first follows in closed form for uniform A."""
+    """Eq. L.18 and L.19: the attenuated answer (7.27, 9.77, 14.77) follows in closed form for uniform A."""
     rng = np.random.default_rng(1)
     a, y = _random(200_000, seed=2)
     a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))
@@ -94,7 +104,7 @@ def test_saturated_rows_are_one_sided():
     out = solve_emission(_rows(a, a, target, bound=bound), np.ones((3, 3)), ridge=1e-12)
     np.testing.assert_allclose(out.radiance, TRUE, rtol=1e-5)
     naive = solve_emission(_rows(a, a, target), np.ones((3, 3)), ridge=1e-12)
-    assert np.abs(naive.radiance / TRUE - 1).max() > 0.1  # treating them as equalities is plainly wrong
+    assert np.abs(naive.radiance / TRUE - 1).max() > 0.1  # as equalities they give a wrong answer
     assert out.violated == 0
 
 
@@ -123,19 +133,20 @@ def test_blocks_average_and_keep_bounds_apart():
     bound[3] = True
     weight = np.ones((64, 3))
     weight[1] = 3
-    out = block_rows(_rows(a, a, y, weight, bound), block)
-    assert len(out.target) == 17 and out.lower_bound.any(1).sum() == 1
+    out, pixel = block_rows(_rows(a, a, y, weight, bound), block)
+    assert len(out.observed) == 17 and out.lower_bound.any(1).sum() == 1
+    np.testing.assert_array_equal(block[pixel], np.r_[0, 0, 1:16])
     np.testing.assert_allclose(out.weight.sum(0), weight.sum(0))
-    np.testing.assert_allclose(out.target[0], (y[0] + 3 * y[1] + y[2]) / 5, rtol=1e-6)
-    np.testing.assert_allclose(out.first[1], a[3], rtol=1e-6)
+    np.testing.assert_allclose(out.observed[0], (y[0] + 3 * y[1] + y[2]) / 5, rtol=1e-6)
+    np.testing.assert_allclose(out.matrices[0, 1], a[3], rtol=1e-6)
     solution = solve_emission(out, np.ones((3, 3)), ridge=1e-12)
     np.testing.assert_allclose(solution.radiance, TRUE, rtol=1e-4)
 
 
 def test_blocks_with_zero_weight_are_harmless():
     a, y = _random(8)
-    out = block_rows(_rows(a, a, y, np.zeros((8, 3))), np.zeros(8, int))
-    assert (out.weight == 0).all() and np.isfinite(out.target).all()
+    out, _ = block_rows(_rows(a, a, y, np.zeros((8, 3))), np.zeros(8, int))
+    assert (out.weight == 0).all() and np.isfinite(out.observed).all()
     assert (solve_emission(out, np.ones((3, 3))).radiance == 1).all()
 
 
@@ -146,7 +157,7 @@ def test_blocks_cut_the_attenuation():
     y = np.einsum("ngc,gc->nc", a, TRUE)
     noisy = a * (1 + rng.standard_normal(a.shape))
     pixel = _rows(noisy, noisy, y)
-    blocks = block_rows(pixel, np.repeat(np.arange(400), 64))
+    blocks, _ = block_rows(pixel, np.repeat(np.arange(400), 64))
     error = [np.abs(solve_emission(r, np.ones((3, 3)), cross=False).radiance - TRUE).max() for r in (pixel, blocks)]
     assert error[1] < 0.1 * error[0]
 
@@ -161,10 +172,10 @@ def test_refused(initial):
 def test_non_finite_rows_are_refused():
     a, y = _random(10)
     y[3, 1] = np.nan
-    with pytest.raises(InputError, match="target"):
+    with pytest.raises(InputError, match="observed"):
         solve_emission(_rows(a, a, y), np.ones((3, 3)))
     with pytest.raises(InputError, match="weight"):
-        EmissionRows(a, a, y, y, np.ones(3), np.zeros((10, 3), bool))
+        EmissionRows(np.stack([a, a])[:, None], y, np.zeros((2, 1, 10, 3)), np.ones(3), np.zeros((10, 3), bool))
 
 
 def test_right_hand_side_crosses_the_noise_of_one_trace():
@@ -173,8 +184,7 @@ def test_right_hand_side_crosses_the_noise_of_one_trace():
     a = rng.random((60_000, 2, 3))
     y = np.einsum("ngc,gc->nc", a, TRUE[:2]) + 1.0
     noise = [0.5 * rng.standard_normal(a.shape) * a for _ in range(2)]
-    targets = [y - (1.0 - n.sum(1)) for n in noise]
-    rows = EmissionRows(*(np.float32(a + n) for n in noise), *targets, np.ones(y.shape), np.zeros(y.shape, bool))
+    rows = rows_of(tuple(a + n for n in noise), observed=y, cached=[tuple(1.0 - n.sum(1) for n in noise)])
     out = solve_emission(rows, np.ones((2, 3)), ridge=1e-9)
     np.testing.assert_allclose(out.radiance, TRUE[:2], rtol=0.03)
 
@@ -198,7 +208,7 @@ def _pruning(shown, seen, matrix, area, noise=0.05, seed=9):
 
 
 def test_pruning_keeps_what_shines():
-    """A lamp; a lit wall beside it; a strip brighter than white but without power; nothing; the environment."""
+    """A lamp; a lit wall beside it; a strip brighter than white but without power; a dark group; the environment."""
     matrix = np.zeros((5, 5))
     matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
     out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, [1.0, 1.0, 1e-3, 1.0, 0.0])
@@ -239,8 +249,8 @@ def test_pruning_with_nothing():
     assert out.kept.shape == (0,)
 
 
-def test_parts_of_one_object_share_what_only_their_sum_tells():
-    """Two panes whose light arrives almost alike, under noise: alone one takes all, as a family both are near the truth."""
+def test_parts_of_one_object_share_what_only_their_sum_determines():
+    """Two panes whose light arrives almost alike, with noise: alone one gets all, as a family both are near the truth."""
     rng = np.random.default_rng(3)
     common = rng.random((300, 1, 3))
     a = np.concatenate([common, common + 1e-3 * rng.standard_normal((300, 1, 3)), rng.random((300, 1, 3))], 1)
@@ -263,7 +273,7 @@ def test_pixels_that_noise_has_saturated_do_not_push(soft):
     a = rng.uniform(0.5, 1.5, (n, 1, 3))
     y = 2.0 * a[:, 0] + 0.5 * rng.standard_normal((n, 3))
     bound = y > level
-    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[np.minimum(y, level)] * 2, np.ones((n, 3)), bound)
+    rows = rows_of(a, observed=np.minimum(y, level), bound=bound)
     rows = replace(rows, noise=np.ones(n)) if soft else rows
     out = solve_emission(rows, np.ones((1, 3)))
     assert (np.abs(out.radiance / 2 - 1).max() < 0.02) == soft
@@ -286,19 +296,19 @@ def test_standard_errors_are_those_of_repeated_solves():
     assert 0.58 < inside.mean() < 0.78
 
 
-def test_rows_that_err_together_count_as_few():
+def test_rows_with_a_common_error_count_as_few():
     rng = np.random.default_rng(12)
     a, y = _random(900)
     off = np.repeat(1 + 0.1 * rng.standard_normal((30, 1)), 30, 0)
     alone = solve_emission(_rows(a, a, y * off), np.ones((3, 3)))
     rows = replace(_rows(a, a, y * off), cluster=np.repeat(np.arange(30), 30))
     together = solve_emission(rows, np.ones((3, 3)))
-    np.testing.assert_allclose(alone.radiance, together.radiance, rtol=0.03)  # only the prior counts for more
+    np.testing.assert_allclose(alone.radiance, together.radiance, rtol=0.03)  # only the prior has more weight
     assert (together.error > 1.5 * alone.error).any()
 
 
-def test_prior_is_weighed_against_what_rows_really_know():
-    """Errors that many rows share, and a prior: the answer is near the mean of both, weighed by their real errors."""
+def test_prior_is_weighed_by_the_design_effect_of_the_rows():
+    """Errors that many rows share, and a prior: the answer is near the mean of both, weighted by their variances."""
     rng = np.random.default_rng(13)
     objects, rows_each, true, start = 8, 400, 4.0, 5.0
     found, plain = [], []
@@ -308,7 +318,7 @@ def test_prior_is_weighed_against_what_rows_really_know():
         rows = replace(_rows(a, a, true * a[:, 0] * off), cluster=np.repeat(np.arange(objects), rows_each))
         found.append(solve_emission(rows, np.full((1, 3), start), prior_width=0.2).radiance[0])
         plain.append(solve_emission(replace(rows, cluster=None), np.full((1, 3), start), prior_width=0.2).radiance[0])
-    # data: sd 0.5 * 4 / sqrt(8) = 0.7 around 4; prior: 1 around 5. Independent rows would leave the prior no say.
+    # Data: standard deviation 0.5 * 4 / sqrt(8) = 0.7 around 4; prior: 1 around 5, which independent rows would outweigh.
     share = 1.0 / (1.0 + 0.71**2)
     assert np.mean(found) == pytest.approx(share * 4 + (1 - share) * 5, abs=0.15)
     assert np.mean(plain) == pytest.approx(4.0, abs=0.25)
@@ -317,21 +327,21 @@ def test_prior_is_weighed_against_what_rows_really_know():
 
 @pytest.mark.parametrize("level", [0.6, 1.0, 1.5])
 def test_indirect_light_tells_light_from_albedo(level):
-    """All albedos off by one factor and no emitter seen: the share of photographed indirect light tells light from albedo."""
+    """All albedos wrong by one factor and no emitter seen: the share of photographed indirect light determines the level."""
     rng = np.random.default_rng(14)
     n, owner = 4000, np.repeat(np.arange(8), 500)
     a = (rng.random((n, 3)) ** 2)[:, :, None] * np.ones(3)  # many pixels see little of the emitters
     h = rng.uniform(2, 20, (n, 3))
     y = level * (np.einsum("ngc,gc->nc", a, TRUE) + h) * (1 + 0.1 * rng.standard_normal((n, 3)))
-    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, 1 / y**2, np.zeros(y.shape, bool))
-    gain = object_gains(rows, y, owner, np.ones((3, 3)), True).gain
-    light = solve_emission(scale_rows(rows, y, gain[owner]), np.ones((3, 3))).radiance
-    assert np.median(gain) == pytest.approx(level, rel=0.06)
+    rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
+    found = _gains(rows, owner)
+    light = _light(rows, owner, found)
+    assert np.median(found.gain) == pytest.approx(level, rel=0.06)
     np.testing.assert_allclose(light.sum(0), TRUE.sum(0), rtol=0.12)
 
 
 def test_level_and_its_error_from_unlike_shares_of_photographed_light():
-    """Albedos off by object, errors that an object's rows share: the level lies within the claimed error two times of three."""
+    """Albedos wrong by object, errors that the rows of an object share: the error of the level is the scatter of the level."""
     z = []
     for seed in range(24):
         rng = np.random.default_rng(seed)
@@ -341,51 +351,50 @@ def test_level_and_its_error_from_unlike_shares_of_photographed_light():
         gain = np.exp(0.25 * rng.standard_normal((20, 3)))[owner]
         seen = gain * (np.einsum("ngc,gc->nc", a, TRUE) + h * np.exp(0.15 * rng.standard_normal((20, 1)))[owner])
         y = seen * (1 + 0.1 * rng.standard_normal((n, 3)))
-        rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, 1 / y**2, np.zeros(y.shape, bool))
-        found = object_gains(rows, y, owner, np.ones((3, 3)), True)
-        light = solve_emission(scale_rows(rows, y, found.gain[owner]), np.ones((3, 3))).radiance
-        own = np.sqrt(found.level_error**2 - SHARED_ERROR**2)
+        rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
+        found = _gains(rows, owner)
+        light = _light(rows, owner, found)
+        own = np.sqrt(found.level_error**2 - SHARED_LEVEL_ERROR**2)
         z.append(np.log(light.sum() / TRUE.sum()) / own)
     assert 0.5 < np.std(z) < 1.6 and abs(np.mean(z)) < 1.0
 
 
 def test_light_is_raised_until_albedos_are_possible():
-    """A base twice too bright asks for light that is too dim; nothing reflects more than it receives."""
+    """A base texture that is too bright would make the light too dim; nothing reflects more than it receives."""
     rng = np.random.default_rng(12)
     n, owner = 2000, np.repeat(np.arange(20), 100)
     base = rng.uniform(0.3, 0.9, (20, 3))
     a = rng.uniform(0.05, 1, (n, 3))[:, :, None] * np.ones(3)
-    h = rng.uniform(2, 20, (n, 3))  # photographed light, which holds the level at gains of 1.6
+    h = rng.uniform(2, 20, (n, 3))  # photographed light, which determines the level: gains of 1.6
     y = 1.6 * (np.einsum("ngc,gc->nc", a, TRUE) + h)
-    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, 1 / y**2, np.zeros(y.shape, bool))
-    plain = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6).gain
-    assert ((plain * base).max(1)[owner] > 1).mean() > 0.2
-    raised = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=base)
-    found = raised.gain
-    assert raised.raised > 0.1
-    whitest = (found * base).max(1)
-    assert (whitest[owner] > 1).mean() <= WHITE_SHARE
-    assert np.quantile(whitest, 0.97) > 0.9  # and no more than is needed
-    light = [solve_emission(scale_rows(rows, y, g[owner]), np.ones((3, 3))).radiance.sum() for g in (plain, found)]
+    rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
+    plain = _gains(rows, owner, shrinkage=1e-6)
+    assert ((plain.gain * base).max(1)[owner] > 1).mean() > 0.2
+    raised = _gains(rows, owner, shrinkage=1e-6, albedo=base)
+    assert raised.level_raised > 0.1
+    brightest = (raised.gain * base).max(1)
+    assert (brightest[owner] > 1).mean() <= MAX_SHARE_ABOVE_WHITE
+    assert np.quantile(brightest, 0.97) > 0.9  # and no more than is needed
+    light = [_light(rows, owner, found).sum() for found in (plain, raised)]
     assert light[0] == pytest.approx(TRUE.sum(), rel=0.05) and light[1] > 1.2 * light[0]
-    # Where albedos are possible as they are nothing changes, to the last bit.
-    dark = object_gains(rows, y, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=0.3 * base)
-    np.testing.assert_array_equal(dark.gain, plain)
-    assert dark.raised == 0
-    # Nor where no level makes them so: photographed light alone asks for gains of 1.6, emitters are next to nothing.
-    faint = EmissionRows(*[1e-3 * rows.first] * 2, *[1.6 * h - h] * 2, 1 / y**2, rows.lower_bound)
-    assert object_gains(faint, 1.6 * h, owner, np.ones((3, 3)), True, shrink=1e-6, albedo=np.full((20, 3), 0.9)).raised == 0
+    # Where albedos are possible as they are, nothing changes to the last bit.
+    dark = _gains(rows, owner, shrinkage=1e-6, albedo=0.3 * base)
+    np.testing.assert_array_equal(dark.gain, plain.gain)
+    assert dark.level_raised == 0
+    # Nor where no level makes them possible: photographed light alone implies gains of 1.6, emitters give next to nothing.
+    faint = rows_of(1e-3 * a, observed=1.6 * h, cached=[h], weight=1 / y**2)
+    assert _gains(faint, owner, shrinkage=1e-6, albedo=np.full((20, 3), 0.9)).level_raised == 0
 
 
-def test_level_without_a_witness_is_unknown():
+def test_level_is_unknown_where_nothing_determines_it():
     a, y = _random(400)
     rows, owner = _rows(a, a, y), np.repeat(np.arange(4), 100)
-    assert object_gains(rows, y, owner, np.ones((3, 3)), False).level_error == np.inf
+    assert _gains(rows, owner, False).level_error == np.inf
     # Without photographed light any level does as well as any other.
-    assert object_gains(rows, y, owner, np.ones((3, 3)), True).level_error > 1
+    assert _gains(rows, owner).level_error > 1
     anchored = np.r_[owner[:-3], [-1] * 3]
     a[-3:], y[-3:] = np.eye(3)[:, :, None], TRUE
-    assert object_gains(_rows(a, a, y), y, anchored, np.ones((3, 3)), True).level_error < 0.05
+    assert _gains(_rows(a, a, y), anchored).level_error < 0.05
 
 
 def _room_with_lamps_in_sight(shown, groups, seed=15):
@@ -400,16 +409,16 @@ def _room_with_lamps_in_sight(shown, groups, seed=15):
     weight = 1 / y**2
     weight[n:] *= 1e6
     emitted = [np.einsum("ngc,gc->nc", a[:n, which], TRUE[which]) for which in (groups, list(set(range(3)) - set(groups)))]
-    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y - h] * 2, weight, np.zeros(y.shape, bool))
+    rows = rows_of(a, observed=y, cached=[h], weight=weight)
     share = (emitted[0] * weight[:n] * y[:n]).sum() / (sum(emitted) * weight[:n] * y[:n]).sum()
-    return object_gains(rows, y, owner, TRUE, True), share
+    return _gains(rows, owner, initial=TRUE), share
 
 
-def test_lamp_in_sight_is_sure_of_its_own_light_alone():
-    """What is not seen has the error that all objects share, in proportion to its share of the light."""
+def test_lamp_in_sight_determines_its_own_light_alone():
+    """Lamps out of sight have the error that all objects share, in proportion to their share of the light."""
     found, share = _room_with_lamps_in_sight(1.0, [2])
     assert 0.3 < share < 0.9
-    assert (found.error_of_group[2] == 0).all() and found.error_of_group[:2] == pytest.approx(SHARED_ERROR, rel=0.2)
+    assert (found.error_of_group[2] == 0).all() and found.error_of_group[:2] == pytest.approx(SHARED_LEVEL_ERROR, rel=0.2)
     assert found.level_error == pytest.approx((1 - share) * found.error_of_group[0, 0], rel=0.1)
     assert _room_with_lamps_in_sight(1.0, [0, 1, 2])[0].level_error < 0.02
 
@@ -420,33 +429,33 @@ def test_lamps_that_show_another_light_than_the_room_are_not_trusted():
     assert found.level_error == pytest.approx(np.log(2), rel=0.15)
 
 
-@pytest.mark.parametrize("pinned", [False, True])
-def test_light_and_object_gains_together(pinned):
+@pytest.mark.parametrize("identifiable", [False, True])
+def test_light_and_object_gains_together(identifiable):
     """Objects that face the lights differently, with albedos off by up to 2: solved plainly the light is wrong."""
     rng = np.random.default_rng(10)
     n, owner = 2000, np.repeat(np.arange(5), 400)
-    lean = rng.uniform(0.05, 1, (5, 3))[owner]
-    a = (rng.random((n, 3)) * lean)[:, :, None] * np.ones(3)
+    facing = rng.uniform(0.05, 1, (5, 3))[owner]
+    a = (rng.random((n, 3)) * facing)[:, :, None] * np.ones(3)
     h = rng.uniform(0, 2, (n, 3))
     gain = np.exp(rng.uniform(-0.7, 0.7, (5, 3)))
     y = gain[owner] * (np.einsum("ngc,gc->nc", a, TRUE) + h)
-    if pinned:  # one row sees each emitter
+    if identifiable:  # one row sees each emitter
         a = np.concatenate([a, np.eye(3)[:, :, None] * np.ones(3)])
         h, y, owner = np.r_[h, np.zeros((3, 3))], np.r_[y, TRUE], np.r_[owner, [-1] * 3]
     weight = 1 / (y + 0.1) ** 2
     weight[n:] *= 1e6
-    rows = _rows(a, a, y - h, weight)
-    found = object_gains(rows, y, owner, np.ones((3, 3)), pinned, rounds=200, shrink=1e-6).gain
+    rows = rows_of(a, observed=y, cached=[h], weight=weight)
+    found = _gains(rows, owner, identifiable, 200, 1e-6).gain
     of_row = np.where((owner >= 0)[:, None], found[owner], 1.0)
-    radiance = solve_emission(scale_rows(rows, y, of_row), np.ones((3, 3)), ridge=1e-9).radiance
+    radiance = solve_emission(rows.scaled(of_row, np.ones(len(owner))), np.ones((3, 3)), ridge=1e-9).radiance
     plain = solve_emission(rows, np.ones((3, 3)), ridge=1e-9).radiance
 
     def colour_free(e):
-        return e if pinned else e / e.mean(0)
+        return e if identifiable else e / e.mean(0)
 
-    truth = TRUE if pinned else TRUE / TRUE.mean(0)
+    truth = TRUE if identifiable else TRUE / TRUE.mean(0)
     assert np.abs(colour_free(radiance) / truth - 1).max() < 0.03
-    if not pinned:
+    if not identifiable:
         assert np.abs(colour_free(plain) / truth - 1).max() > 0.2
         np.testing.assert_allclose((found / gain).std(0) / (found / gain).mean(0), 0, atol=0.02)
     else:
@@ -455,11 +464,11 @@ def test_light_and_object_gains_together(pinned):
 
 def test_gains_without_reflecting_rows():
     a, y = _random(10)
-    assert object_gains(_rows(a, a, y), y, np.full(10, -1), np.ones((3, 3)), False).gain.shape == (0, 3)
+    assert _gains(_rows(a, a, y), np.full(10, -1), False).gain.shape == (0, 3)
 
 
 def _glossy_room(strength, seed=16, n=3000, objects=6, noise=0.0):
-    """Rows whose gloss is `strength` (objects,) times as strong as predicted; (rows, y, owner, gloss)."""
+    """Rows whose gloss is `strength` (objects,) times as strong as predicted; (rows, owner, gain)."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), n // objects)
     diffuse, glossy = rng.random((n, 3)) ** 2, rng.random((n, 3)) ** 6  # highlights are small
@@ -470,82 +479,73 @@ def _glossy_room(strength, seed=16, n=3000, objects=6, noise=0.0):
     y = gain[owner] * (light[0] + h) + strength[owner, None] * (light[1] + k)
     weight = 1 / y**2
     y = y * (1 + noise * rng.standard_normal(y.shape))
-    whole, cached = (diffuse + glossy).astype(np.float32), h + k
-    rows = EmissionRows(whole, whole, y - cached, y - cached, weight, np.zeros(y.shape, bool))
-    return rows, y, owner, GlossRows(*[glossy.astype(np.float32)] * 2, k, k), gain
+    return rows_of(diffuse + glossy, glossy, observed=y, cached=[h + k, k], weight=weight), owner, gain
 
 
 def test_gloss_of_another_strength_than_predicted_does_not_dim_the_light():
-    """Plaster predicted as glossy shows no lamps: with one gain for both lobes the light has to give way."""
+    """Plaster predicted as glossy shows no lamps: with one gain for both lobes the light comes out too dim."""
     strength = np.array([0.0, 0.0, 0.1, 0.0, 1.0, 2.0])
-    rows, y, owner, gloss, gain = _glossy_room(strength, noise=0.05)
+    rows, owner, gain = _glossy_room(strength, noise=0.05)
     light = {}
-    for part in (None, gloss):
-        found = object_gains(rows, y, owner, np.ones((3, 3)), True, rounds=100, shrink=1e-6, gloss=part)
-        scaled = scale_rows(rows, y, found.gain[owner], part, found.gloss_gain[owner])
-        light[part is gloss] = solve_emission(scaled, np.ones((3, 3))).radiance.sum() / TRUE.sum()
-        if part is None:
+    for part in (rows.without_lobes(), rows):
+        found = _gains(part, owner, rounds=100, shrinkage=1e-6)
+        light[part.has_lobes] = _light(part, owner, found).sum() / TRUE.sum()
+        if not part.has_lobes:
             assert (found.gloss_gain == 1).all()
     assert light[False] < 0.9 and light[True] == pytest.approx(1, abs=0.03)
     np.testing.assert_allclose(found.gloss_gain, strength, atol=0.1)
     np.testing.assert_allclose(found.gain, gain, rtol=0.05)
 
 
-def test_gloss_that_few_rows_tell_stays_as_predicted():
-    """Ten rows an object are not worth doubting the prediction; as is an object whose rows have no gloss."""
+def test_gloss_of_few_rows_stays_as_predicted():
+    """Ten rows of an object do not outweigh the prediction; nor do rows without gloss."""
     strength = np.zeros(6)
-    rows, y, owner, gloss, _ = _glossy_room(strength, n=60, noise=0.3)
-    few = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss).gloss_gain
-    rows, y, owner, gloss, _ = _glossy_room(strength, n=6000, noise=0.3)
-    many = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss).gloss_gain
+    rows, owner, _ = _glossy_room(strength, n=60, noise=0.3)
+    few = _gains(rows, owner).gloss_gain
+    rows, owner, _ = _glossy_room(strength, n=6000, noise=0.3)
+    many = _gains(rows, owner).gloss_gain
     assert few.min() > 0.4 and many.max() < 0.2
-    none = GlossRows(*(np.zeros_like(x) for x in (gloss.first, gloss.second, gloss.cached, gloss.cached_second)))
-    matte, plain = (object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=part) for part in (none, None))
+    together = rows.without_lobes()
+    none = replace(
+        rows, **{k: np.concatenate([v, 0 * v], 1) for k, v in (("matrix", together.matrix), ("cached", together.cached))}
+    )
+    matte, plain = (_gains(part, owner) for part in (none, together))
     np.testing.assert_allclose(matte.gain, plain.gain, rtol=1e-9)
     assert (matte.gloss_gain == 1).all() and matte.level_error == pytest.approx(plain.level_error, rel=1e-9)
 
 
 def test_objects_without_rows_have_the_common_gain_that_goes_with_the_gloss_found():
-    """Gloss is a twentieth of the predicted one and strong: subtracted as predicted it would leave objects in the dark."""
-    rows, y, owner, gloss, _ = _glossy_room(np.full(6, 0.05), n=6000)
-    gloss = replace(gloss, cached=2.5 * gloss.cached, cached_second=2.5 * gloss.cached_second)
-    more = 1.5 / 2.5 * gloss.cached  # of it in h, a twentieth of it in y
-    rows = replace(rows, target=rows.target - 0.95 * more, target_second=rows.target_second - 0.95 * more)
-    y = y + 0.05 * more
-    found = object_gains(rows, y, owner, np.ones((3, 3)), True, n_objects=8, gloss=gloss)
+    """Strong gloss, in truth a twentieth of the predicted one: subtracted as predicted it would leave objects dark."""
+    rows, owner, _ = _glossy_room(np.full(6, 0.05), n=6000)
+    more = 1.5 * rows.cached[:, 1:]
+    rows = replace(rows, cached=rows.cached + more, observed=rows.observed + 0.05 * more[0, 0])
+    found = _gains(rows, owner, n_objects=8)
     assert found.gain[7].min() > 0.9 * found.gain[:6].min(0).min() and (found.gain[6] == found.gain[7]).all()
 
 
 def test_saturated_rows_do_not_loosen_the_gloss():
-    """Rows that say nothing are no witnesses for it."""
-    rows, y, owner, gloss, _ = _glossy_room(np.zeros(6), n=120, noise=0.3)
-    one = object_gains(rows, y, owner, np.ones((3, 3)), True, gloss=gloss)
-
-    def often(x):
-        return np.concatenate([x] * 10)
-
-    bound = np.concatenate([rows.lower_bound, np.ones((9 * len(y), 3), bool)])
-    parts = {k: often(getattr(rows, k)) for k in ("first", "second", "target", "target_second", "weight")}
-    parts["target"][len(y) :] -= 100.0  # bounds that are met
-    parts["target_second"][len(y) :] -= 100.0
-    many = EmissionRows(**parts, lower_bound=bound)
-    glosses = GlossRows(*(often(x) for x in (gloss.first, gloss.second, gloss.cached, gloss.cached_second)))
-    seen = often(y)
-    seen[len(y) :] -= 100.0
-    ten = object_gains(many, seen, often(owner), np.ones((3, 3)), True, gloss=glosses)
+    """Bounds that are met say nothing about its strength."""
+    rows, owner, _ = _glossy_room(np.zeros(6), n=120, noise=0.3)
+    one = _gains(rows, owner)
+    n = len(owner)
+    seen = np.concatenate([rows.observed] * 10)
+    seen[n:] -= 100.0
+    bound = np.concatenate([rows.lower_bound, np.ones((9 * n, 3), bool)])
+    lobes = [np.concatenate([part] * 10, 2) for part in (rows.matrix, rows.cached)]
+    many = EmissionRows(lobes[0], seen, lobes[1], np.concatenate([rows.weight] * 10), bound)
+    ten = _gains(many, np.tile(owner, 10))
     np.testing.assert_allclose(ten.gloss_gain, one.gloss_gain, atol=0.1)
 
 
 def test_gains_of_both_lobes_against_a_dense_solution():
     """At the level that was found, g and t of an object are the least-squares solution of its rows (4 unknowns)."""
     strength = np.array([0.5, 1.5, 0.8, 0.2, 1.0, 2.0])
-    rows, y, owner, gloss, _ = _glossy_room(strength, noise=0.1)
-    found = object_gains(rows, y, owner, np.ones((3, 3)), True, rounds=300, shrink=1e-9, gloss=gloss)
-    scaled = scale_rows(replace(rows, weight=found.weight), y, found.gain[owner], gloss, found.gloss_gain[owner])
-    light = solve_emission(scaled, np.ones((3, 3)), max_rounds=5).radiance
-    e, k = np.einsum("ngc,gc->nc", gloss.first, light), gloss.cached
-    z = e + k
-    x = np.einsum("ngc,gc->nc", rows.first, light) - e + (y - rows.target) - k
+    rows, owner, _ = _glossy_room(strength, noise=0.1)
+    y = rows.observed
+    found = _gains(rows, owner, rounds=300, shrinkage=1e-9)
+    light = _light(replace(rows, weight=found.weight), owner, found, max_rounds=5)
+    whole, z = (np.einsum("ngc,gc->nc", rows.matrix[0, lobe], light) + rows.cached[0, lobe] for lobe in range(2))
+    x = whole - z
     for o in range(6):
         own = owner == o
         design = np.zeros((own.sum(), 3, 4))
@@ -559,9 +559,8 @@ def test_objects_without_rows_have_the_common_gain():
     a, y = _random(300)
     y = 1.4 * y
     h = np.full(y.shape, 0.5)
-    rows = EmissionRows(*[a.astype(np.float32)] * 2, *[y] * 2, np.ones(y.shape), np.zeros(y.shape, bool))
-    rows = replace(rows, target=y - h, target_second=y - h)
-    found = object_gains(rows, y, np.repeat([0, 1, 4], 100), np.ones((3, 3)), True, n_objects=7)
+    rows = rows_of(a, observed=y, cached=[h])
+    found = _gains(rows, np.repeat([0, 1, 4], 100), n_objects=7)
     assert found.gain.shape == (7, 3) and found.gloss_gain.shape == (7,)
     np.testing.assert_allclose(found.gain[[2, 3, 5, 6]], np.tile(found.gain[[2]], (4, 1)))
     assert found.gain[2].min() >= found.gain[[0, 1, 4]].min() and found.gain[2].max() <= found.gain[[0, 1, 4]].max()

@@ -1,4 +1,4 @@
-"""Exporters: what other programs get is what we have, on a room of known colours."""
+"""Exporters: other programs read the same geometry, colours and light, on a room of known colours."""
 
 import json
 import os
@@ -196,7 +196,7 @@ def accessor_array(document, binary, index):
 
 
 def structural_errors(data):
-    """What the validator would call errors, as far as this file can have them."""
+    """Check the file for errors that the validator would report."""
     document, binary = chunks_of(data)
     errors = []
     assert document["asset"]["version"] == "2.0" and document["buffers"] == [{"byteLength": len(binary)}]
@@ -420,7 +420,7 @@ def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
 
 
 def test_glb_looks_the_same_when_it_comes_back(mi, glb, tmp_path):
-    """Our renderer, fed with what another program reads from the file; roughness is a mean there, so not to the bit."""
+    """Render what another program reads from the file; the images differ slightly because roughness is a mean there."""
     trimesh = pytest.importorskip("trimesh")
     (tmp_path / "scene.glb").write_bytes(glb)
     loaded = trimesh.load(tmp_path / "scene.glb", process=False)

@@ -30,7 +30,7 @@ def test_gross_outliers_do_not_matter_and_error_is_honest():
     assert np.abs(np.log(out.gain) - truth).max() < 0.03
     assert 0.0005 < out.error.max() < 0.02
     plain = np.array([np.log(value[view == v]).mean() for v in range(6)])
-    assert np.abs(plain - plain.mean() - truth).max() > 0.03  # the obvious estimate is worse
+    assert np.abs(plain - plain.mean() - truth).max() > 0.03  # the mean of the view's values is worse
 
 
 def test_gauge_and_invariance_to_scale():

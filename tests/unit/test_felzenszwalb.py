@@ -42,7 +42,7 @@ def corner(n, noise=0.0, seed=0):
 
 
 def oracle(count, pairs, weights, k):
-    """The paper's rule with sets, no tricks."""
+    """The published rule, implemented with sets."""
     region = [{i} for i in range(count)]
     inner = [0.0] * count
     for e in np.argsort(weights, kind="stable"):

@@ -1,4 +1,4 @@
-"""Source `folder`: cameras, pictures, meshes of a stranger, and whether they belong together."""
+"""Source `folder`: cameras, pictures and meshes of users, and the check that they belong together."""
 
 import json
 
@@ -483,7 +483,7 @@ def test_agreement_of_a_few_pixels_by_chance_does_not_count():
 
 
 def test_depth_of_another_camera(tmp_path):
-    """A depth sensor 5 cm to the side with other intrinsics: compared where it looks, not pixel by pixel."""
+    """A depth sensor 5 cm beside the camera, with other intrinsics, is compared at the points that it sees."""
     from iif_core.camera.distortion import Pinhole
 
     path = own.project(tmp_path)

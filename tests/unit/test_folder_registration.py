@@ -1,4 +1,4 @@
-"""What `source.registration` does with what registration found: cameras, names, words."""
+"""`source.registration`: how its result changes cameras, frames and notes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_cameras_are_corrected_and_read_back(found):
     json.dumps(out.facts, allow_nan=False)
     for frame, pose in zip(out.frames[:-1], out.poses[:-1], strict=True):
         np.testing.assert_allclose(opencv_pose(frame.matrix, "opengl", 0.001), pose, atol=1e-9)
-    # Rotation, translation and principal point share the shift; a point in front of the camera shows what they make of it.
+    # Rotation, translation and principal point share the shift; the image of a point in front of the camera shows their sum.
     columns = []
     for k in (k for k in range(11) if k not in (2, 6)):
         camera, point = out.frames[k].camera, poses[k] @ [0.0, 0.0, 1.6, 1.0]

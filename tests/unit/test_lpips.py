@@ -43,7 +43,7 @@ def pool(x):
 
 
 def oracle(a, b, weights):
-    """LPIPS with AlexNet, written out once more in NumPy."""
+    """LPIPS with AlexNet in plain NumPy."""
     w = {name: array.astype(np.float64) for name, array in weights.items()}
 
     def layers(x):
@@ -86,7 +86,7 @@ def test_full_mask_is_the_standard_number_and_excluded_pixels_change_nothing(ale
     spoilt_a, spoilt_b = a.copy(), b.copy()
     spoilt_a[~mask] = np.nan
     assert lpips(spoilt_a, b, alex, mask) == lpips(a, b, alex, mask)
-    spoilt_b[~mask] = np.nan  # truth that means nothing there is taken as black
+    spoilt_b[~mask] = np.nan  # invalid truth counts as black
     assert np.isfinite(lpips(a, spoilt_b, alex, mask))
 
 

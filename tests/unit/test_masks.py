@@ -1,4 +1,4 @@
-"""2D masks -> objects: view consensus by hand, against loops, on planted things, and through the stage with real files."""
+"""Objects from 2D masks: view consensus by hand, against loops, on known objects, and through the stage with files."""
 
 from dataclasses import replace
 
@@ -121,7 +121,7 @@ def test_a_mask_that_views_split_is_dropped_and_its_opinion_with_it():
 
 
 def test_masks_that_share_no_view_stay_apart():
-    """Two halves of a wall, each seen by its own cameras: nobody holds them together, nobody splits them."""
+    """Two halves of a wall with cameras of their own: no view contains both in one mask, and none splits them."""
     label = np.ones(40, int)
     visible = np.array([np.arange(40) < 20] * 3 + [np.arange(40) >= 20] * 3)
     np.testing.assert_array_equal(mc.cluster_masks(planted([label] * 6, visible)), [0, 0, 0, 1, 1, 1])
@@ -169,7 +169,7 @@ def test_election_by_hand():
 
 
 def test_small_things_win_against_what_they_stand_on():
-    """A face seen once in its own mask and twice in that of the table: the table's masks are 100 times as large."""
+    """A face that is once in its own mask and twice in that of the table, whose masks are 100 times as large."""
     face = np.zeros(3, int)
     views = [
         view_votes(face, pack_keys(np.full((3, 3), 4), cluster), np.ones(3, bool), np.ones(3, bool), 2) for cluster in (0, 0, 1)
@@ -471,7 +471,7 @@ def test_binary_masks_say_the_same_as_a_label_map(photographed, tmp_path):
 
 
 def test_masks_follow_the_lens(tmp_path, monkeypatch):
-    """What the camera saw through the lens fits what the mesh shows without it, better than ids resampled twice (capture)."""
+    """Masks of a distorted photograph match the undistorted view of the mesh better than ids that capture resampled twice."""
     from iif_core.camera.distortion import Distortion
     from workflow.segmentations.mask_files import mask_files
 

@@ -212,7 +212,7 @@ def test_ssim_of_colours_is_the_common_one():
 
 
 def test_one_target_scores_many_predictions():
-    """What is kept of the truth does not depend on what was scored before; the functions say the same."""
+    """Cached properties of the truth do not depend on earlier predictions; the plain functions give the same scores."""
     truth, mask, objects = image(15), ALL.copy(), np.arange(24 * 32).reshape(24, 32) // 200
     mask[4:9, :20] = False
     target = m.Target("albedo", truth, mask, objects)
@@ -241,7 +241,7 @@ def test_scaled_gain_is_ratio_of_sums_not_least_squares():
 
 
 def test_scaling_does_not_erase_false_emitters():
-    """Nothing shines, something was found: the error stays in every protocol, and a mask has no scaled score."""
+    """The truth does not emit but the prediction does: the error remains in every protocol, and IoU has no scaled score."""
     prediction, truth = np.zeros((8, 8, 3)), np.zeros((8, 8, 3))
     prediction[2:4, 2:4] = 5.0
     scores = m.score_map("emission", prediction, truth, np.ones((8, 8), bool))

@@ -239,7 +239,7 @@ F0 = [((e - 1) ** 2 + k * k) / ((e + 1) ** 2 + k * k) for e, k in ((0.2, 3.9), (
 @pytest.mark.parametrize("nonlinear", [False, True])
 @pytest.mark.parametrize("kind", ["plastic", "roughplastic"])
 def test_plastic_truth_is_the_albedo_that_mitsuba_shows(load, kind, nonlinear):
-    """Two roads: the mapping, and Mitsuba's own BSDF without its specular lobe integrated over both directions."""
+    """Compare the conversion with Mitsuba's own BSDF, without its specular lobe, integrated over both directions."""
     text = (
         f"<bsdf type='{kind}'>{RGB.format('diffuse_reflectance')}<float name='int_ior' value='1.5'/>"
         f"<float name='ext_ior' value='1'/><boolean name='nonlinear' value='{str(nonlinear).lower()}'/>"
@@ -350,7 +350,7 @@ def test_masks_drop_thin_faces_only(load):
 @pytest.mark.parametrize("bump", ["", "bumpmap"])
 @pytest.mark.parametrize("raw", ["true", "false"])
 def test_textures_are_linear_and_follow_their_uv(load, tmp_path, bump, raw):
-    """Two roads to one number: our albedo, and pi f / cos of Mitsuba's own diffuse BSDF at the same points."""
+    """Compare the albedo with pi f / cos of Mitsuba's own diffuse BSDF at the same points."""
     import drjit as dr
     import mitsuba as mi
 

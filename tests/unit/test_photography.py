@@ -1,4 +1,4 @@
-"""Making photographs: response curves, exposures, eight bits."""
+"""Simulated photographs: response curves, exposures, eight bits."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Priors at the border: prediction files of other models, and what stage prior does with bad ones."""
+"""Prediction files of other models, and the handling of unusable predictions in stage prior."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -25,13 +25,13 @@ def test_poses_are_found_again(photos: list[Photo]) -> None:
     assert found.accepted
     before, after = off(np.array(wrong), photos), off(found.pose, photos)
     assert np.median(before) > 1.0
-    # Half a pixel of drift of all together remains: texture slides along the surface, edges alone forbid it.
+    # A common drift of half a pixel remains, because texture slides along the surface and only edges prevent it.
     assert np.median(after) < 0.6
     assert found.held_out[1] < 0.5 * found.held_out[0]
 
 
 def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> None:
-    """Photographs whose true principal point lies (2, -1.5) pixels from the believed one."""
+    """The true principal point is (2, -1.5) pixels from the given one."""
     taken = [replace(p, image=np.repeat(look(p.pose, (66.0, 46.5))[0][..., None], 3, -1)) for p in photos]
     found = register(taken, points=4000, poses=False)
     assert found.accepted
@@ -47,7 +47,7 @@ def test_what_is_right_is_left_alone(photos: list[Photo]) -> None:
 
 
 def test_a_view_that_is_kept_for_testing_moves_nobody(photos: list[Photo]) -> None:
-    """The texture it is laid on is the others': changing its picture changes nothing but its own pose."""
+    """A held-out photograph is aligned with the texture of the others; its picture changes its own pose only."""
     wrong = posed(
         photos, [twisted(p.pose, np.array([0.0, 0.02, 0.0]), np.zeros(3)) if k == 3 else p.pose for k, p in enumerate(photos)]
     )

@@ -1,4 +1,4 @@
-"""Retinex prior: planted scenes, the mesh's help, edge cases."""
+"""Retinex prior: scenes with known albedo, use of the mesh, extreme input."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def test_removes_smooth_light():
 
 
 def test_mesh_tells_material_from_light():
-    """A dark corner: the same wall turns by 90 degrees and gets a third of the light. Only normals can tell."""
+    """A dark corner: the wall turns by 90 degrees and receives a third of the light. Only the normals show this."""
     albedo = np.full((32, 32, 3), 0.5)
     light = np.where(np.arange(32) < 16, 0.9, 0.3)[None, :, None]
     normals = np.where(np.arange(32)[None, :, None] < 16, [0, 0, 1.0], [1.0, 0, 0]) * np.ones((32, 1, 1))
@@ -68,7 +68,7 @@ def test_screened_integration_is_the_least_squares_solution():
 
 
 def test_known_light_gives_the_albedo_as_it_is():
-    """Two versions of the light, used in turn: the right one leaves the albedo, level included."""
+    """Two versions of the light, used in turn: the correct one gives the albedo including its level."""
     albedo, photo, tile = patches()
     right = np.log(photo / albedo)
     found = retinex.retinex_predictions(photo, 4, object_id=tile, light=np.stack([right, right + np.log(2.0)]))[..., :3]

@@ -55,7 +55,7 @@ def test_the_turn_of_the_world_is_a_rotation_and_its_own_inverse():
     turn = scannetpp.MESH_FROM_NERFSTUDIO
     np.testing.assert_array_equal(turn @ turn, np.eye(4))
     assert np.linalg.det(turn) == pytest.approx(1)
-    # The pose that METHOD 4.3 describes: C rows = (T'_row1, T'_row0, -T'_row2) with columns 1, 2 of T negated.
+    # docs/method/camera.md#axes-and-pixels: rows (T'_row1, T'_row0, -T'_row2), with columns 1 and 2 of T negated.
     pose = own.poses(1)[0]
     np.testing.assert_allclose(turn @ mini.nerfstudio_matrix(pose) @ np.diag([1, -1, -1, 1]), pose, atol=1e-15)
 
@@ -76,8 +76,8 @@ def test_cameras_lists_and_bad_photographs(release, captured):
 
 
 def test_surface_points_land_on_their_own_colour(release, captured):
-    """Axes, undistortion and pixel centres at once: a point of the mesh goes through the true fisheye into the released
-    photograph, and through the captured pinhole into the captured one; both show the colour that the point has."""
+    """Check axes, undistortion and pixel centres together: a point of the mesh is projected by the true fisheye into the released
+    photograph and by the captured pinhole into the captured one, and both show its colour."""
     _, views, home = release
     for view in captured:
         photo, valid = captured.photo(view, held_out=True)
@@ -130,7 +130,7 @@ def test_masked_pixels_do_not_count(release, captured, tmp_path):
         covered = hidden[pixels[:, 1].clip(0, 96), pixels[:, 0].clip(0, 145)] & (int(view.name[3:]) in mini.MASKED)
         assert not valid[rows, columns][covered].any()
         assert (photo[~valid] == 0).all()
-    # What lies under a mask leaves no trace: other garbage there (the JPEG blocks around it differ a little), same counts.
+    # Pixels under a mask have no influence: with other values there the counts are equal (JPEG blocks around differ a little).
     other = mini.release(tmp_path / "other", room, views, garbage=0.0)
     project(tmp_path, other)
     again = own.run(tmp_path, "capture")
@@ -142,7 +142,7 @@ def test_masked_pixels_do_not_count(release, captured, tmp_path):
 
 
 def test_the_same_scene_as_a_folder_gives_the_same_capture(release, captured, tmp_path):
-    """All that later stages read is equal, so their results are: every stage is deterministic."""
+    """Everything that later stages read is equal; as every stage is deterministic, so are their results."""
     room, views, home = release
     path = own.project(tmp_path, None, SETTINGS, {"kind": "given"})
     mini.twin(home, path, room, views)
@@ -232,7 +232,7 @@ def test_lists_without_pose_hidden_tests_and_train_alone(copy, tmp_path):
 
 
 def test_overlapping_groups_and_foreign_segments(tmp_path):
-    """The smaller of two objects that claim a segment wins; segments that no vertex has do no harm; 0 is no object."""
+    """Of two objects with the same segment the smaller one gets it; segments without vertices are ignored; 0 is no object."""
     (tmp_path / "s.json").write_text(json.dumps({"segIndices": [7, 7, 7, 9, 9, 4, 5]}))
     groups = [
         {"objectId": 3, "label": "sofa", "segments": [7, 9]},

@@ -1,4 +1,4 @@
-"""Stage segmentation: objects from given ids or from shape, and the tables and maps that follow."""
+"""Stage segmentation: objects from given ids or from shape, and the tables and maps derived from them."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def tables(root):
 
 
 def check_consistent(root, capture):
-    """What must hold for every kind: maps, segments and objects tell one story."""
+    """Check what must hold for every kind: maps, segments and objects are consistent."""
     reader, object_of_face, objects, segments = tables(root)
     count = len(objects["object_id"])
     np.testing.assert_array_equal(objects["object_id"], np.arange(count))

@@ -59,7 +59,10 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "emission: {iterations: 5}\n", ["`emission`: `iterations`: read by `solver: sgd` alone", "`solver: direct`"]),
         (GOOD + "emission: {preset: paper}\n", ["`emission`: `preset`: read by `solver: sgd` alone"]),
         (GOOD + "affines: {epochs: 5, rate: 1}\n", ["`affines`: `epochs`, `rate`: read by `solver: sgd` alone"]),
-        (GOOD + "affines: {solver: adam, robust_width: 1}\n", ["`robust_width`: read by `solver: direct` alone", "`solver: adam`"]),
+        (
+            GOOD + "affines: {solver: adam, robust_width: 1}\n",
+            ["`robust_width`: read by `solver: direct` alone", "`solver: adam`"],
+        ),
         (GOOD + "affines: {model: fipt, scale: prior}\n", ["`scale`: read by `model: objects` alone", "set the model"]),
         (GOOD + "affines: {model: iris, solver: adam, epochs: 9}\n", ["`epochs`: read by `model: objects` alone"]),
         (GOOD + "metrics: {views: all}\n", ["`metrics.views`: unknown key. It was removed", "delete it"]),

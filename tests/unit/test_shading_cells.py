@@ -1,4 +1,4 @@
-"""Diffuse light per piece of surface: which pixels share one, when paths are enough, and that it is the light of the pixels."""
+"""Diffuse light per surface cell: which pixels share a cell, number of paths, and agreement with the light of the pixels."""
 
 import numpy as np
 import pytest
@@ -33,7 +33,7 @@ def built(parts, edge=EDGE):
 def test_pixels_share_a_cell_by_place_object_and_direction():
     points, normals = patch(400)
     ids = np.where(points[:, 0] < 1, 3, -1)
-    tilted = np.tile(np.float32([0.02, -0.02, 0.9996]), (400, 1))  # rounding noise of a normal makes no cell
+    tilted = np.tile(np.float32([0.02, -0.02, 0.9996]), (400, 1))  # rounding noise of a normal creates no cell
     cells = built([(points, normals, ids), (points[:50], tilted[:50], ids[:50]), (points, np.tile(SIDE, (400, 1)), ids)])
     voxel = np.floor((points + 0.1) / EDGE).astype(int)
     expected = {(*v, i, b) for v, i in zip(voxel, ids, strict=True) for b in (0, 1)}
@@ -103,9 +103,9 @@ def test_paths_are_added_where_it_is_noisy_until_it_is_not():
     scatter = (found.diffuse.mean(0)[:, 0] / value - 1)[noisy].std()
     assert scatter == pytest.approx(4 / np.sqrt(found.samples[noisy][0]), rel=0.2)
     error = np.median(relative_error(found.diffuse)[noisy])
-    assert error == pytest.approx(4 / np.sqrt(3 * found.samples[noisy][0]), rel=0.15)  # what is claimed is what it is
+    assert error == pytest.approx(4 / np.sqrt(3 * found.samples[noisy][0]), rel=0.15)  # the estimated error is the true one
     residual = (found.diffuse[..., 0] / value - 1)[:, noisy]
-    assert abs(np.corrcoef(residual)[0, 1]) < 4 / np.sqrt(noisy.sum())  # halves know nothing of each other
+    assert abs(np.corrcoef(residual)[0, 1]) < 4 / np.sqrt(noisy.sum())  # the halves are independent
     assert len({seed for _, _, seed in log}) == len(log)
 
 

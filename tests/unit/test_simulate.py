@@ -8,7 +8,7 @@ from iif_core.priors import simulate
 
 
 def room(height=64, width=96, seed=0):
-    """Truth like a country kitchen's: white walls, grey cupboards, a dark glossy floor, some metal, small things."""
+    """Truth similar to a kitchen: white walls, grey cupboards, a dark glossy floor, some metal, small objects."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:height, :width] / np.array([height, width]).reshape(2, 1, 1)
     ids = np.where(y < 0.25, 0, np.where(y < 0.62, 1, 3)).astype(np.int32)
@@ -58,7 +58,7 @@ def test_a_sample_does_not_depend_on_how_many_are_made():
 
 
 def test_errors_of_an_object_do_not_depend_on_what_else_is_in_view():
-    """Without blur, pattern and noise the values of one object stay when the other objects change."""
+    """Without blur, pattern and noise the values of one object do not depend on the other objects."""
     errors = simulate.SimulatedErrors(
         **{**simulate.RGBX.__dict__, "blur": 0.0, "pattern": 0.0, "noise": 0.0, "material_pattern": 0.0}
     )
@@ -71,7 +71,7 @@ def test_errors_of_an_object_do_not_depend_on_what_else_is_in_view():
 
 
 def test_bias_is_common_to_views_and_samples():
-    """The mean over many views and samples keeps an error: no average repairs it, so the fit to photographs must."""
+    """The mean over many views and samples keeps an error, which only the fit to the photographs can correct."""
     scene = room()
     mean = np.mean([predict(scene, 8, view).mean(0) for view in range(6)], 0)
     wall = scene[3] == 1

@@ -48,4 +48,6 @@ def test_a_folder_without_scenes_knows_those_of_the_repository(repository, tmp_p
 
 def test_the_template_is_no_stage(fresh):
     result = fresh.run("results/tiny/stage/manifest.json", "-n")
-    assert result.returncode == 1 and result.stderr.strip().splitlines()[-1] == "error: results/tiny/stage: no stage has this name"
+    assert (
+        result.returncode == 1 and result.stderr.strip().splitlines()[-1] == "error: results/tiny/stage: no stage has this name"
+    )

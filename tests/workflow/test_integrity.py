@@ -114,7 +114,9 @@ def test_the_last_line_is_the_reason_of_the_failed_job(workflow):
     failed = workflow.run("scenes/mm")
     last = failed.stderr.strip().splitlines()[-1]
     assert failed.returncode == 1
-    assert last.startswith("error: mm: capture failed (results/mm/logs/capture.log): data/mm/mesh.ply: the scene is 5590 m across")
+    assert last.startswith(
+        "error: mm: capture failed (results/mm/logs/capture.log): data/mm/mesh.ply: the scene is 5590 m across"
+    )
     assert "long ago" not in failed.stderr
 
 

@@ -1,1 +1,1 @@
-"""File work of stage `affines`: earlier methods, and textures of cells."""
+"""File work of stage `affines`: material models of earlier methods, and textures of cells."""

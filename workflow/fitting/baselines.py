@@ -1,12 +1,12 @@
-"""What stage affines does for `affines.model` other than `objects`: earlier methods, over the same light and shading.
+"""Stage `affines` for values of `affines.model` other than `objects`: the material models of earlier methods.
 
-All read the emission and the cached shading that ours reads, and leave what ours leaves, so that rendering, scores, export
-and page need not know. `base`: the fused base as it is. `object_mean`: the mean of all predictions of an object.
-`texture_average`: the photographs' mean colour in every surface cell, taken as albedo, with no prior at all. `fipt`,
-`iris`: a free BRDF in every surface cell (METHOD 6.2, 6.3).
+All read the same light and cached shading as `objects` and write the same artefacts, so later stages need not know which
+model was used (docs/method/fitting.md#earlier-methods-on-the-same-light). `base` is the fused base texture, `object_mean` the
+mean of all predictions of an object, `texture_average` the mean colour that photographs show of a surface cell, taken as
+albedo. `fipt` and `iris` fit a free material to every surface cell.
 
-Where the originals would do worse for reasons that have nothing to do with their idea, they get our treatment: the light of
-stage emission, exposures, saturated values as bounds, dark pixels left out, border pixels weighted down.
+Where an original method would do worse for reasons unrelated to its idea, it is given what `objects` has: the light of stage
+emission, exposures, saturated values as bounds, no dark pixels, and small weights on border pixels.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from iif_core.fitting.baselines.direct import solve_direct
 from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, albedo_deviation, fill_unknown, object_means
 from iif_core.fitting.baselines.problem import DARK, CellSums, PixelRows
 from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
-from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL
+from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL, NUMBERS_OF
 from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
+from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
@@ -40,15 +41,17 @@ from workflow.scene.base_scene import (
     view_pixels,
 )
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scene.recovered import write_response
+from workflow.scene.recovered import object_names, write_response
 
 BORDER_WEIGHT = 0.1
+"""Weight of a pixel on the border of an object."""
 BLOCK_FOOTPRINTS = 1.6
-"""Edge, in median pixel footprints, of the blocks of cells that share roughness, metalness and diffuse light."""
+"""Edge, in median pixel footprints, of the blocks of cells that share roughness, metallic and diffuse light."""
 CAMERA_PIXELS = 200_000
-"""Pixels, of whole blocks, that the camera response is fitted to."""
-_SEEDS = 0x626C6E  # keeps the random numbers of this module apart from those of others
-WORDS = {
+"""Approximate number of pixels, of whole blocks, that the camera response is fitted to."""
+_STREAM = 0x626C6E
+"""Random stream of this module."""
+MODEL_NAMES = {
     "base": "identity",
     "object_mean": "mean of the predictions",
     "texture_average": "mean of the photographs",
@@ -70,7 +73,7 @@ class _Result:
 
 
 def run(job: Job) -> None:
-    """Write what stage affines writes, for the model that the settings name."""
+    """Write the artefacts of stage `affines` for the model that the settings name."""
     model = job.settings.affines.model
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     if model == "texture_average":
@@ -94,7 +97,7 @@ def run(job: Job) -> None:
 
 
 def _given(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
-    """Nothing is fitted: the base, or one constant per object."""
+    """Return materials without a fit: those of the base, or one constant for each object."""
     cells = job.read("base").table("cells.parquet")
     deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1).mean(1)
     objects = scene.object_values if model == "base" else _object_means(job, capture, scene)
@@ -103,7 +106,7 @@ def _given(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _R
 
 
 def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndarray:
-    """(O, 5): mean over views, pixels and predictions of each object (METHOD 6.1 B1); the base's where none has any."""
+    """Return the mean over views, pixels and predictions of each object, (O, 5), or its base where it has no prediction."""
     used = int(job.read("base").json("base.json")["predictions"])
     sums = np.zeros((scene.n_objects, 6))
     for view in capture.views:
@@ -124,10 +127,10 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
 
 
 def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Result:
-    """Mean radiance that the used photographs show of every cell (of the object, where none does), as albedo: matte, no metal.
+    """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.50).
 
-    One gain for all: that with which albedo x the diffuse light of stage shading is nearest to the radiance (least squares). The
-    response is that of stage emission, saturated values count as they are.
+    Cells that no photograph shows have the mean of their object. One gain for all cells makes albedo times diffuse light match
+    the radiance in least squares. The response is that of stage emission; saturated values are used as they are.
     """
     curve, gains = _start(job), read_gains(job)
     cells, objects = np.zeros((len(scene.cell_object), 4)), np.zeros((scene.n_objects, 4))
@@ -137,7 +140,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
         if view.split == "test":
             continue
         pixels = view_pixels(job, capture, scene, view)
-        cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+        cell = cells_of(job, view)[pixels.index]
         use = pixels.valid & (cell >= 0) & ~emits[pixels.face]
         pixels, cell = pixels.take(use), cell[use]
         radiance = np.asarray(pixels.value, np.float64)
@@ -165,8 +168,8 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
 
 
 def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
-    """Roughness and metalness of blocks of cells, then the albedo of every cell."""
-    levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
+    """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.46, M.49)."""
+    levels = roughness_levels(job)
     options = FIPT if model == "fipt" else IRIS
     edge = max(1, round(BLOCK_FOOTPRINTS * _footprint(capture) / scene.cell_edge))
     block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
@@ -177,7 +180,7 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
     curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
     if goal is not None and not capture.is_hdr:
         share = min(1.0, CAMERA_PIXELS / max(views.count, 1))
-        chosen = np.random.default_rng([job.seed, _SEEDS]).random(len(owner)) < share
+        chosen = np.random.default_rng([job.seed, _STREAM]).random(len(owner)) < share
         rows = _joined([rows.take(np.flatnonzero(chosen[rows.cell])) for rows, _ in views])
         with job.timed("solve"):
             fitted = fit_camera(rows, sums, _start(job), goal, options, dark=views.dark)
@@ -199,8 +202,8 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
         with job.timed("solve"):
             fine.add(replace(rows, cell=cell), levels, own[:, 3], own[:, 4], curve, views.dark)
     values = blocks[block_of]
-    pull = {"prior": goal[block_of] / max(fit.scale, 1e-6), "weight": options.prior * fit.scale**2} if goal is not None else {}
-    values[:, :3] = fine.albedo(values[:, :3], **pull)
+    towards = {"prior": goal[block_of] / max(fit.scale, 1e-6), "weight": options.prior * fit.scale**2} if goal is not None else {}
+    values[:, :3] = fine.albedo(values[:, :3], **towards)
     pixels = np.bincount(owner, problem.pixels, scene.n_objects)
     facts = {"history": fit.history, "camera_history": camera, "residual": _residual(fit), "prior_scale": fit.scale}
     facts |= {"blocks": len(owner), "blocks_seen": int(fit.known.sum()), "solver": job.settings.affines.solver}
@@ -209,11 +212,12 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
 
 
 def _residual(fit: CellFit) -> float:
+    """Return the root of the last loss."""
     return float(np.sqrt(max(fit.history[-1], 0.0))) if fit.history else 0.0
 
 
 def _footprint(capture: CaptureReader) -> float:
-    """Median over the views of the median size of a pixel on the surface, in metres; 0 where nothing is seen."""
+    """Return the median over the views of the median size of a pixel on the surface, m; 0 if no pixel shows surface."""
     sizes = []
     for view in capture.views:
         depth = capture.gbuffer(view)[0]
@@ -223,17 +227,18 @@ def _footprint(capture: CaptureReader) -> float:
 
 
 class CellPixels:
-    """Valid pixels of surface that does not shine, view by view: rows by block, and the cell of each.
+    """Valid pixels of surface that does not emit, view by view: rows by block, and the cell of each pixel.
 
     Attributes:
-        count: how many there are; dark: light below which a pixel says nothing (`PixelRows.usable`).
+        count: number of pixels; dark: light below which a pixel is not used (`PixelRows.usable`).
+        diffuse: (B, 3) mean diffuse light of the blocks.
     """
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, block_of: np.ndarray, blocks: int):
         self.job, self.capture, self.scene, self.block_of = job, capture, scene, block_of
         require_denoiser()
         self.emits = read_light(job, len(scene.faces)).emits
-        self.levels = len(job.read("shading").table("levels.parquet")["roughness"])
+        self.levels = len(roughness_levels(job))
         light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
         for rows, _ in self._views(None):
             light.add(rows.cell, rows.diffuse)
@@ -248,12 +253,12 @@ class CellPixels:
         return self._views(self.diffuse)
 
     def _views(self, diffuse: np.ndarray | None) -> Iterator[tuple[PixelRows, np.ndarray]]:
-        """With the diffuse light of blocks; without: that of the pixels, and no lobes."""
+        """Yield rows and cells with the diffuse light of blocks; if None, with that of the pixels and without lobes."""
         job, capture, gains = self.job, self.capture, read_gains(self.job)
         views = capture.used
         for done, view in enumerate(views):
             pixels = view_pixels(job, capture, self.scene, view)
-            cell = ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[pixels.index]
+            cell = cells_of(job, view)[pixels.index]
             use = pixels.valid & (cell >= 0) & ~self.emits[pixels.face]
             channels = job.read("shading").exr(f"maps/{view.name}.exr")
             d = _denoised(channels, view, pixels)[use] if diffuse is None else np.zeros(0)
@@ -264,21 +269,17 @@ class CellPixels:
             d = d if diffuse is None else diffuse[block]
             value = np.asarray(pixels.value, np.float32)
             value, saturated = sensor_bounds(value, capture.is_hdr, job.settings.emission.saturation)
-            number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
-            factor = np.ones((len(cell), 3)) if capture.is_hdr else pixel_gains(gains, number, view, pixels.index)
-            exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
-            if not gains.is_plain:
-                ratio = (factor / exposure[:, None]).astype(np.float32)
-                # Blocks average light before any photograph's white balance.
-                d = d if diffuse is None else d * ratio
-                s0, s1 = s0 * ratio[:, None], s1 * ratio[:, None]
+            exposure, balance = exposure_and_balance(capture, gains, view, pixels.index)
+            if diffuse is not None:  # blocks average light before the white balance of a photograph
+                d = balanced(d, balance)
+            s0, s1 = balanced(s0, balance), balanced(s1, balance)
             weight = np.where(pixels.interior, 1.0, BORDER_WEIGHT)
             yield PixelRows(block, weight, d, s0, s1, value, exposure, saturated), cell
             job.progress(done + 1, len(views), "views read")
 
 
 def _denoised(channels: dict[str, np.ndarray], view: View, pixels: ViewPixels) -> np.ndarray:
-    """(n, 3) diffuse light of pixels, denoised as FIPT does; a free albedo would keep all of its noise."""
+    """Return the denoised diffuse light of pixels, (n, 3), as FIPT does; a free albedo would keep all noise of the light."""
     normals = np.zeros((view.height * view.width, 3), np.float32)
     normals[pixels.index] = pixels.normals
     shape = (view.height, view.width, 3)
@@ -287,11 +288,13 @@ def _denoised(channels: dict[str, np.ndarray], view: View, pixels: ViewPixels) -
 
 
 def _mean_of_halves(channels: dict[str, np.ndarray], layer: str, index: np.ndarray) -> np.ndarray:
+    """Return the mean over the halves of a cached layer at some pixels, (n, 3)."""
     halves = [rgb(channels, f"half{half}.{layer}").reshape(-1, 3)[index] for half in range(2)]
     return 0.5 * (halves[0] + halves[1])
 
 
 def _lobes(channels: dict[str, np.ndarray], name: str, levels: int, index: np.ndarray) -> np.ndarray:
+    """Return S0 or S1 of some pixels, (n, J, 3)."""
     if not levels:
         return np.zeros((len(index), 0, 3), np.float32)
     return np.stack([_mean_of_halves(channels, f"{name}.{j:02d}", index) for j in range(levels)], 1)
@@ -302,7 +305,7 @@ def _joined(parts: list[PixelRows]) -> PixelRows:
 
 
 def _start(job: Job) -> Response:
-    """Where stage emission left the response, one row of parameters a channel."""
+    """Return the response of stage emission, with parameters for each channel."""
     start = response_from_facts(job.read("emission").json("emission.json")["response"])
     return start.with_params(np.tile(start.params, (3, 1))) if start.names and start.params.ndim == 1 else start
 
@@ -311,22 +314,18 @@ def _start(job: Job) -> Response:
 
 
 def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> None:
-    """Affines that map the base's object means, which surface without cells shows, to those of the model: a constant, or
-    the identity."""
-    table = job.read("segmentation").table("objects.parquet")
-    names = [f"object{i}" for i in range(scene.n_objects)]
-    for i, name in zip(table["object_id"], table["name"], strict=True):
-        names[int(i)] = str(name)
+    """Write affine maps that turn the object means of the base, which surface without cells has, into those of the model."""
+    names = object_names(job, scene.n_objects)
     affine = np.tile(IDENTITY, (scene.n_objects, 1))
     if model != "base":
         affine[:] = 0.0
         affine[:, [3, 7, 11, 13, 15]] = result.objects
     columns: dict[str, Any] = {"object_id": np.arange(len(names), dtype=np.int32), "name": np.array(names, dtype=str)}
     columns["pixels"] = result.pixels.astype(np.int64)
-    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
+    for name, part in NUMBERS_OF.items():
         columns[f"T_{name}"], columns[f"std_{name}"] = affine[:, part], np.zeros_like(affine[:, part])
     zeros = np.zeros(len(names))
-    columns |= {"covariance_trace": zeros, "residual": zeros, "model": np.array([WORDS[model]] * len(names), dtype=str)}
+    columns |= {"covariance_trace": zeros, "residual": zeros, "model": np.array([MODEL_NAMES[model]] * len(names), dtype=str)}
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 
 
@@ -338,7 +337,7 @@ def _write_cells(job: Job, result: _Result) -> None:
 
 
 def _write_maps(job: Job, capture: CaptureReader, scene: BaseScene, result: _Result, per_pixel: bool) -> None:
-    """Materials of the cell of every pixel; of its object where it has none. `per_pixel`: the base's own maps."""
+    """Write the material of the cell of every pixel, or of its object where it has no cell. `per_pixel`: the maps of the base."""
     base, segmentation = job.read("base"), job.read("segmentation")
     for done, view in enumerate(capture.views):
         file = f"maps/{view.name}.exr"

@@ -1,4 +1,4 @@
-"""Cells with the texture of the photographs themselves, for stage affines: what it reads, and in which order."""
+"""Texture of surface cells from the photographs (docs/method/fitting.md#texture-of-cells-from-the-photographs)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,21 @@ from iif_core.fitting.problem import FitResult
 from iif_core.reflectance.material import MATTE_GLOSS, apply_affines
 from iif_core.surface.cells import neighbour_pairs, pack_keys
 from workflow.fitting.baselines import CellPixels
+from workflow.fitting.inputs import roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene
 from workflow.scene.normal_form import CaptureReader
 
 
 def _points(job: Job) -> np.ndarray:
-    """(C, 3) metres, means of what was seen of the cells."""
+    """Return the mean observed position of each cell, (C, 3), m."""
     cells = job.read("base").table("cells.parquet")
     return np.stack([cells[c] for c in "xyz"], 1)
 
 
 @dataclass(frozen=True)
 class CellTextures:
-    """Cells with the photographs' own texture, for priors that had no light to divide by."""
+    """Cells and pixels from which the texture of the photographs is taken, for priors that could not divide by the light."""
 
     job: Job
     scene: BaseScene
@@ -34,33 +35,35 @@ class CellTextures:
 
     @classmethod
     def of(cls, job: Job, capture: CaptureReader, scene: BaseScene) -> CellTextures | None:
+        """Read them, or return None where `affines.texture` does not ask for them."""
         texture, cells = job.settings.affines.texture, len(scene.cell_object)
         if texture == "base" or (texture == "auto" and job.settings.prior.kind != "retinex") or not cells:
             return None
-        levels = job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
         views = CellPixels(job, capture, scene, np.arange(cells), cells)
         views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)
-        return cls(job, scene, views, levels)
+        return cls(job, scene, views, roughness_levels(job))
 
     def scatter(self, fit: FitResult) -> tuple[float, float]:
-        """How much the views of a cell differ with the fitted gloss, and with none (root mean square). Of these priors no gloss
-        is known, and in real rooms it is where errors of light and normals go: it has to pay."""
+        """Return how much the views of a cell differ with the fitted gloss, and without gloss (Eq. M.44).
+
+        The comparison decides whether the scene has gloss (docs/method/fitting.md#gloss-has-to-pay)."""
         fitted = self._fitted(fit)
         glossy, matte = (sums.scatter() for sums in self._sums(fit, (fitted[:, 3:], np.tile(MATTE_GLOSS[1:3], (len(fitted), 1)))))
         return glossy, matte
 
     def albedo(self, fit: FitResult) -> np.ndarray:
-        """(C, 3)."""
+        """Return the albedo of the cells with the texture of the photographs, (C, 3)."""
         fitted, scene = self._fitted(fit), self.scene
         (sums,) = self._sums(fit, (fitted[:, 3:],))
         pairs = neighbour_pairs(pack_keys(scene.cell_ijk, scene.cell_object))
         return textured_albedo(fitted[:, :3], *sums.sums, scene.cell_ijk, pairs, _points(self.job), scene.cell_object)
 
     def _fitted(self, fit: FitResult) -> np.ndarray:
+        """Return the materials of the cells under the fit, (C, 5)."""
         return apply_affines(fit.affine, self.scene.cell_object.astype(np.int64), self.scene.cell_values)
 
     def _sums(self, fit: FitResult, glosses: tuple[np.ndarray, ...]) -> list[AlbedoSums]:
-        """For each (C, 2) roughness and metalness of the cells."""
+        """Collect the albedo sums for each given roughness and metallic of the cells (C, 2)."""
         out, scale = [AlbedoSums(len(gloss)) for gloss in glosses], np.float32(fit.light_scale)
         for rows, cell in self.views:
             rows = replace(rows, diffuse=rows.diffuse * scale, s0=rows.s0 * scale, s1=rows.s1 * scale)

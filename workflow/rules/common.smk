@@ -87,13 +87,11 @@ def manifest(stage, scene):
     return f"results/{fingerprints.home(stage, scene, QUALITY)}/{stage}/manifest.json"
 
 
-def job(wildcards, output):
-    """Arguments of `python3 -m workflow`; the fingerprint makes Snakemake run again what changed, and only that."""
-    return job_of(Path(output.manifest).parent.name)(wildcards)
+def job(stage):
+    """Arguments of `python3 -m workflow` for a stage; the fingerprint makes Snakemake run again what changed, and only that.
 
-
-def job_of(stage):
-    """As `job`, for a stage whose output does not tell its name."""
+    It must be a function of the wildcards alone: Snakemake does not compare parameters that depend on inputs or outputs.
+    """
 
     def arguments(wildcards):
         mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
@@ -120,7 +118,7 @@ def resolved(scene):
 
 
 def no_stage(wildcards):
-    """Input of the template, which nobody shall run."""
+    """Input of the template, which is not to be run."""
     stop(f"results/{wildcards.scene}/stage: no stage has this name")
 
 
@@ -230,7 +228,7 @@ def tell_reasons():
     if batch_asked:
         # Jobs failed, so the summary was not made: it tells of what there is. It is not `complete`, so the next run makes it.
         command = [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY]
-        atexit.register(subprocess.run, command, check=False)
+        atexit.register(subprocess.run, command, cwd=os.getcwd(), check=False)
     elif found := reasons(STARTED) or damages():
         atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
 

@@ -31,7 +31,7 @@ rule publish:
         "results/{scene}/logs/publish.log",
     localrule: True
     params:
-        job=job_of("publish"),
+        job=job("publish"),
     message:
         "{wildcards.scene}: publishing scenes/{wildcards.scene}"
     shell:
@@ -45,7 +45,7 @@ rule relit:
     output:
         pictures=report(
             directory("relight/{scene}"),
-            patterns=["{lighting}/{frame}.png"],
+            patterns=["{picture}.png"],
             caption="../report/captions/relighting.rst",
             category="Relighting",
             subcategory="{scene}",

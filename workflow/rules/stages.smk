@@ -20,8 +20,6 @@ rule stage:
     resources:
         mem_mb=per_attempt(5000),
         runtime=per_attempt(60),
-    params:
-        job=job,
     shell:
         "python3 -m workflow {params.job} --threads {threads} --log {log:q}"
 
@@ -34,6 +32,8 @@ use rule stage as capture with:
     resources:
         mem_mb=per_attempt(5000),
         runtime=per_attempt(120),
+    params:
+        job=job("capture"),
     message:
         "{wildcards.scene}: photographs, cameras and mesh into the normal form"
 
@@ -46,6 +46,8 @@ use rule stage as prior with:
     resources:
         mem_mb=per_attempt(3000, diffusion=12000),
         runtime=per_attempt(120, diffusion=720),
+    params:
+        job=job("prior"),
     message:
         "{wildcards.scene}: K material predictions for every photograph"
 
@@ -58,6 +60,8 @@ use rule stage as segmentation with:
     resources:
         mem_mb=per_attempt(4000),
         runtime=per_attempt(60),
+    params:
+        job=job("segmentation"),
     message:
         "{wildcards.scene}: faces to objects, pixels to segments"
 
@@ -67,6 +71,8 @@ use rule stage as base with:
         unpack(reads("base", "capture", "prior", "segmentation")),
     pathvars:
         stage="base",
+    params:
+        job=job("base"),
     message:
         "{wildcards.scene}: fusing the predictions into one base texture"
 
@@ -76,6 +82,8 @@ use rule stage as emission with:
         unpack(reads("emission", "capture", "segmentation", "base")),
     pathvars:
         stage="emission",
+    params:
+        job=job("emission"),
     message:
         "{wildcards.scene}: emitters and their radiance"
 
@@ -88,6 +96,8 @@ use rule stage as shading with:
     resources:
         mem_mb=per_attempt(5000),
         runtime=per_attempt(120),
+    params:
+        job=job("shading"),
     message:
         "{wildcards.scene}: cached incident shading"
 
@@ -107,6 +117,8 @@ use rule stage as affines with:
         ),
     pathvars:
         stage="affines",
+    params:
+        job=job("affines"),
     message:
         "{wildcards.scene}: one affine map per object, and the camera response"
 
@@ -121,6 +133,8 @@ use rule stage as render with:
     resources:
         mem_mb=per_attempt(5000),
         runtime=per_attempt(120),
+    params:
+        job=job("render"),
     message:
         "{wildcards.scene}: re-rendering every view"
 
@@ -145,6 +159,8 @@ use rule stage as metrics with:
     resources:
         mem_mb=per_attempt(3000),
         runtime=per_attempt(60),
+    params:
+        job=job("metrics"),
     message:
         "{wildcards.scene}: scores"
 
@@ -157,6 +173,8 @@ use rule stage as export with:
     pathvars:
         stage="export",
     threads: 1
+    params:
+        job=job("export"),
     message:
         "{wildcards.scene}: glTF, Mitsuba scene and tables"
 
@@ -184,6 +202,8 @@ use rule stage as report with:
     resources:
         mem_mb=per_attempt(4000),
         runtime=per_attempt(30),
+    params:
+        job=job("report"),
     message:
         "{wildcards.scene}: the page"
 
@@ -197,6 +217,8 @@ use rule stage as relight with:
     resources:
         mem_mb=per_attempt(5000),
         runtime=per_attempt(240),
+    params:
+        job=job("relight"),
     message:
         "{wildcards.scene}: relighting"
 
@@ -210,10 +232,27 @@ use rule stage as base_scores with:
     resources:
         mem_mb=per_attempt(3000),
         runtime=per_attempt(60),
+    params:
+        job=job("base_scores"),
     message:
         "{wildcards.scene}: scores of the base texture"
 
 
-for name, described in fingerprints.STAGES.items():
-    if name != "publish":
-        workflow.get_rule(name).docstring = described.purpose
+# Shown by `snakemake --list`: snakefmt knows no docstrings in `use rule`.
+descriptions = {
+    "capture": "Bring photographs, cameras and mesh into the normal form, or render them.",
+    "prior": "Predict materials K times for every photograph.",
+    "segmentation": "Assign faces of the mesh to objects, and pixels to segments.",
+    "base": "Fuse the predictions of all views into one base texture.",
+    "emission": "Find the emitters and solve for their radiance.",
+    "shading": "Trace the light that arrives at every pixel, once for all later fits.",
+    "affines": "Fit one affine map per object, and the camera response, to the photographs.",
+    "render": "Render every view again with the recovered materials and lights.",
+    "metrics": "Score the result against ground truth, where there is any, and against the photographs.",
+    "export": "Write the result for other programs: glTF, Mitsuba, tables.",
+    "report": "Write report.html and plan.yaml.",
+    "relight": "Render the recovered scene under other light; made on demand.",
+    "base_scores": "Score the base texture; made on demand by studies.",
+}
+for name, text in descriptions.items():
+    workflow.get_rule(name).docstring = text

@@ -39,7 +39,7 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
 
 
 def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]:
-    """Return what a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job` is the whole, with max_rss_mb, threads.
+    """Return what a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job`: the whole, with max_rss_mb, threads.
 
     Empty if there is no readable file. Snakemake samples too rarely to measure the CPU time of a short job.
     """

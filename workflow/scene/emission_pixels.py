@@ -54,8 +54,8 @@ class ViewRecord:
         base: (n, 5) float32 base albedo, roughness and metallic of these pixels; empty for a held-out view.
         median_depth: metres, of the pixels with depth; None without any.
         counted: number of valid pixels of the whole photograph.
-        escaping: (k,) flattened indices of the valid pixels that meet no surface; escaping_value, escaping_direction: (k, 3) what they
-            show, and their directions in the world.
+        escaping: (k,) flattened indices of the valid pixels that meet no surface.
+        escaping_value, escaping_direction: (k, 3) what these pixels show, and their directions in the world.
     """
 
     pixels: ViewPixels

@@ -53,10 +53,7 @@ def read_recovered(job: Job) -> Recovered:
     """
     base = read_base_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
-    objects = job.read("segmentation").table("objects.parquet")
-    names = [f"object{i}" for i in range(base.n_objects)]
-    for i, name in zip(objects["object_id"], objects["name"], strict=True):
-        names[int(i)] = str(name)
+    names = object_names(job, base.n_objects)
     cells, fitted = job.read("base").table("cells.parquet"), affines.table("cells.parquet")
     if not np.array_equal(cells["cell_id"], fitted["cell_id"]):
         raise InputError(
@@ -86,6 +83,15 @@ def read_recovered(job: Job) -> Recovered:
         radiance,
         scale,
     )
+
+
+def object_names(job: Job, n_objects: int) -> list[str]:
+    """Return the name of every object id of the segmentation; `object<id>` where it has none."""
+    table = job.read("segmentation").table("objects.parquet")
+    names = [f"object{i}" for i in range(n_objects)]
+    for i, name in zip(table["object_id"], table["name"], strict=True):
+        names[int(i)] = str(name)
+    return names
 
 
 def read_affines(reader: StageReader, n_objects: int) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""affines: one correction per object and the camera response, fitted to the photographs (METHOD 2.8, 7b)."""
+"""affines: one affine map for each object and the camera response, fitted to the photographs (Eq. M.1, M.14)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from iif_core.fitting.pixels import fair_shares
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
-from iif_core.reflectance.material import CHANNELS, MATTE_GLOSS, apply_affines
+from iif_core.reflectance.material import CHANNELS, MATTE_GLOSS, NUMBERS_OF, apply_affines
 from workflow import decisions
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
+from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,
     base_maps,
-    pixel_gains,
     read_base_scene,
     read_gains,
     read_light,
@@ -35,11 +35,13 @@ from workflow.scene.base_scene import (
     view_pixels,
 )
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scene.recovered import write_response
+from workflow.scene.recovered import object_names, write_response
+from workflow.settings.affines import KnownLamp
 
 THIN_PIXELS = 50
-"""Objects with fewer interior pixels are fitted with their border pixels too, which mix with what is beside them."""
-_SEEDS = 0x616666  # keeps the random numbers of this stage apart from those of others
+"""Objects with fewer interior pixels are fitted with their border pixels too, which mix with the neighbouring surface."""
+_STREAM = 0x616666
+"""Random stream of this stage."""
 
 
 def run(job: Job) -> None:
@@ -47,15 +49,15 @@ def run(job: Job) -> None:
     if job.settings.affines.model != "objects":
         return baselines.run(job)
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    names = _names(job, scene.n_objects)
-    find_gauge = _gauge(job, capture, names)  # bad settings stop here, before any work
+    names = object_names(job, scene.n_objects)
+    find_gauge = _gauge(job, capture, names)  # wrong settings stop the stage before any work
     emits = read_light(job, len(scene.faces)).emits
     problem, places = _problem(job, capture, scene, emits, read_gains(job))
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     textures = CellTextures.of(job, capture, scene)
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
-    direct = job.settings.affines.solver == "direct"  # the twins know no fit without gloss
+    direct = job.settings.affines.solver == "direct"  # only the direct solver can fit without gloss
     scatter = textures.scatter(fit) if textures is not None and direct else None
     if scatter is not None and decisions.gloss_is_idle(*scatter):
         fit, free = _fitted(job, problem, start, prior, places, find_gauge, matte=True)
@@ -81,7 +83,7 @@ def _fitted(
     find_gauge: Callable[[FitProblem, _Places], Gauge],
     matte: bool = False,
 ) -> tuple[FitResult, FitResult]:
-    """The fit in its gauge, and as it came."""
+    """Return the fit in its gauge, and in the gauge of the given light."""
     with job.timed("solve"):
         free = _solver(job, prior, matte)(problem, start)
     if matte:
@@ -90,7 +92,7 @@ def _fitted(
 
 
 def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) -> Callable[[FitProblem, Response], FitResult]:
-    """The solver that the settings name; `prior`: of the response."""
+    """Return the solver that the settings name; `prior` is mean and precision of the response."""
     settings = job.settings.affines
     if settings.solver == "direct":
         options = FitOptions(
@@ -107,6 +109,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
 
 
 def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[decisions.Decision]) -> None:
+    """Write affines.json."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
     job.writer.json(
@@ -133,14 +136,14 @@ def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[de
 
 @dataclass(frozen=True)
 class _Places:
-    """Where the pixels of the problem are: view id and index into the flattened image, (n,)."""
+    """View id and index into the flattened image of each pixel of the problem, (n,)."""
 
     view: np.ndarray
     index: np.ndarray
 
 
 def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitProblem, _Places], Gauge]:
-    """What fixes the scale, checked now; what needs the pixels is found when they are there."""
+    """Check `affines.scale` and return a function that makes the gauge once the pixels of the problem are known."""
     scale = job.settings.affines.scale
     if isinstance(scale, str):
         gauge = Gauge("found", error=_light_error(job)) if capture.is_hdr or scale == "found" else Gauge(scale)
@@ -177,12 +180,13 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
 
 
 def _light_error(job: Job) -> float:
-    """Standard error of the logarithm of the level of the light; infinite where the photographs do not tell it."""
+    """Return the standard error of the logarithm of the level of the light; infinite if the photographs do not determine it."""
     error = job.read("emission").json("emission.json")["level_error"]
     return float("inf") if error is None else float(error)
 
 
-def _lamp_gauge(job: Job, lamp: Any) -> Callable[[FitProblem, _Places], Gauge]:
+def _lamp_gauge(job: Job, lamp: KnownLamp) -> Callable[[FitProblem, _Places], Gauge]:
+    """Return the gauge of a lamp of known radiance, which must be among the emitters that were kept."""
     table = job.read("emission").table("emitters.parquet")
     row = np.flatnonzero((table["emitter_id"] == lamp.emitter_id) & table["kept"].astype(bool))
     if not len(row):
@@ -198,7 +202,7 @@ def _lamp_gauge(job: Job, lamp: Any) -> Callable[[FitProblem, _Places], Gauge]:
 
 
 def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray] | None, dict[str, Any]]:
-    """Where stage emission left the response, one row of parameters a channel; its prior; what is known about it."""
+    """Return the response of stage emission with parameters for each channel, its prior, and the facts of its calibration."""
     facts = job.read("emission").json("emission.json")["response"]
     start, known = response_from_facts(facts), facts["calibration"]
     if not start.names:
@@ -219,7 +223,7 @@ class _Chosen:
 def _eligible(
     job: Job, capture: CaptureReader, scene: BaseScene, view: View, emits: np.ndarray, thin: np.ndarray | None = None
 ) -> _Chosen:
-    """Valid pixels of surface that does not shine: interior ones, and all of those of `thin` objects (O,)."""
+    """Return the valid pixels of surface that does not emit: interior ones, and all of those of `thin` objects (O,) bool."""
     pixels = view_pixels(job, capture, scene, view)
     use = pixels.valid & (pixels.object_id >= 0) & ~emits[pixels.face]
     use &= pixels.interior if thin is None else pixels.interior | thin[np.maximum(pixels.object_id, 0)]
@@ -229,47 +233,43 @@ def _eligible(
 def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
-    """The pixels of the fit, drawn evenly over objects, with what the shading stage cached for them."""
+    """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
     views = capture.used
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
         counts += np.bincount(_eligible(job, capture, scene, view, emits).object_id, minlength=len(counts))
     thin = counts < THIN_PIXELS
     share = fair_shares(counts, job.settings.affines.pixels)
-    shading, levels = job.read("shading"), job.read("shading").table("levels.parquet")["roughness"].astype(np.float64)
+    shading, levels = job.read("shading"), roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
     for done, view in enumerate(views):
         chosen = _eligible(job, capture, scene, view, emits, thin)
-        rng = np.random.default_rng([job.seed, _SEEDS, view.view_id])
+        rng = np.random.default_rng([job.seed, _STREAM, view.view_id])
         keep = rng.random(len(chosen.index)) < share[chosen.object_id]
         index = chosen.index[keep]
         rows["object"].append(chosen.object_id[keep])
         rows["base"].append(base_maps(job, view)[index])
         rows["value"].append(chosen.value[keep])
-        number = next(i for i, other in enumerate(capture.views) if other.view_id == view.view_id)
-        factor = pixel_gains(gains, number, view, index) if not capture.is_hdr else np.ones((len(index), 3))
-        exposure = factor[:, 0] if gains.is_plain else np.exp(np.log(factor).mean(1))
+        exposure, balance = exposure_and_balance(capture, gains, view, index)
         rows["exposure"].append(exposure)
         rows["view"].append(np.full(len(index), view.view_id, np.int32))
         rows["index"].append(index.astype(np.int32))
-        rows["cell"].append(ids_from_disk(job.read("base").exr(f"maps/{view.name}.exr")["cell.id"]).ravel()[index])
+        rows["cell"].append(cells_of(job, view)[index])
         channels = shading.exr(f"maps/{view.name}.exr")
         for half in range(2):
             for layer, part in enumerate(_cached(channels, half, len(levels), index)):
-                cached[half][layer].append(part if gains.is_plain else _balanced(part, factor / exposure[:, None]))
+                cached[half][layer].append(balanced(part, balance))
         job.progress(done + 1, len(views), "views read")
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
     value, saturated = sensor_bounds(np.asarray(joined["value"], np.float32), capture.is_hdr, job.settings.emission.saturation)
     halves = [[np.concatenate(part) for part in half] for half in cached]
     d, s0, s1 = ((halves[0][i], halves[1][i]) for i in range(3))
     object_id, cell = joined["object"].astype(np.int32), joined["cell"].astype(np.int64)
-    # Pixels without a cell of their own are a place of their own.
-    position = (
-        np.where((cell >= 0)[:, None], scene.cell_ijk[np.maximum(cell, 0)], -1)
-        if len(scene.cell_ijk)
-        else np.zeros((len(cell), 3))
-    )
+    # Pixels without a cell share one position.
+    position = np.zeros((len(cell), 3))
+    if len(scene.cell_ijk):
+        position = np.where((cell >= 0)[:, None], scene.cell_ijk[np.maximum(cell, 0)], -1)
     problem = FitProblem(
         object_id,
         scene.n_objects,
@@ -289,7 +289,7 @@ def _problem(
 def _cached(
     channels: dict[str, np.ndarray], half: int, levels: int, index: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Diffuse (n, 3), s0 and s1 (n, J, 3) of some pixels."""
+    """Return D (n, 3), S0 and S1 (n, J, 3) of some pixels in one half of the cache."""
 
     def read(layer: str) -> np.ndarray:
         return np.stack([channels[f"half{half}.{layer}.{c}"].reshape(-1)[index] for c in "RGB"], -1)
@@ -298,33 +298,19 @@ def _cached(
     return read("diffuse"), lobes[0], lobes[1]
 
 
-def _balanced(light: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Light (n, ..., 3) as the view's white balance shows it; ratio (n, 3) of the channels' gains to their mean."""
-    return light * ratio.reshape(len(ratio), *[1] * (light.ndim - 2), 3).astype(light.dtype)
-
-
-def _names(job: Job, n_objects: int) -> list[str]:
-    table = job.read("segmentation").table("objects.parquet")
-    names = [f"object{i}" for i in range(n_objects)]
-    for i, name in zip(table["object_id"], table["name"], strict=True):
-        names[int(i)] = str(name)
-    return names
-
-
 # ------------------------------------------------------------------------------------------------------------- output
 
 
 def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
+    """Write objects.parquet: numbers, standard deviations and model of every object."""
     spread = np.sqrt(np.clip(np.diagonal(fit.covariance, axis1=1, axis2=2), 0.0, None))
     columns: dict[str, Any] = {
         "object_id": np.arange(len(names), dtype=np.int32),
         "name": np.array(names, dtype=str),
         "pixels": fit.pixels,
     }
-    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
-        columns[f"T_{name}"] = fit.affine[:, part]
-    for name, part in (("albedo", slice(0, 12)), ("roughness", slice(12, 14)), ("metallic", slice(14, 16))):
-        columns[f"std_{name}"] = spread[:, part]
+    columns |= {f"T_{name}": fit.affine[:, part] for name, part in NUMBERS_OF.items()}
+    columns |= {f"std_{name}": spread[:, part] for name, part in NUMBERS_OF.items()}
     columns |= {
         "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2),
         "residual": fit.residual,
@@ -334,6 +320,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
 
 
 def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
+    """Write cells.parquet: corrected materials, with the given albedo (C, 3) instead if there is one."""
     cells = job.read("base").table("cells.parquet")
     base = np.stack([cells[name] for name in CHANNELS], 1)
     deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
@@ -350,17 +337,18 @@ def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
 
 
 def _write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndarray | None) -> None:
+    """Write the corrected materials of every view."""
     base, segmentation = job.read("base"), job.read("segmentation")
     for done, view in enumerate(capture.views):
         file = f"maps/{view.name}.exr"
         object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)
-        values = base_maps(job, view)
-        deviation = base.exr(file)["uncertainty.albedo"].ravel().astype(np.float32)
+        values, maps = base_maps(job, view), base.exr(file)
+        deviation = maps["uncertainty.albedo"].ravel().astype(np.float32)
         fitted = apply_affines(fit.affine, object_id, values).astype(np.float32)
         spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, values, np.repeat(deviation[:, None], 3, 1))
         seen = object_id >= 0
         if albedo is not None:
-            cell = ids_from_disk(base.exr(file)["cell.id"]).ravel()
+            cell = ids_from_disk(maps["cell.id"]).ravel()
             fitted[cell >= 0, :3] = albedo[cell[cell >= 0]]
         fitted[~seen], spread[~seen] = 0.0, 0.0
         shape = (view.height, view.width)
@@ -384,6 +372,7 @@ def _plan(
     dynamic_range: str,
     scatter: tuple[float, float] | None,
 ) -> list[decisions.Decision]:
+    """Return the decisions of this stage with their measured reasons."""
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
     medians, glossy = np.zeros(problem.n_objects), np.ones(problem.n_objects)
@@ -394,7 +383,7 @@ def _plan(
         if len(own):
             medians[o] = np.median(problem.base[own, 4])
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
-    metal = np.any(fit.affine[:, 14:] != 0, 1)  # of an object that keeps its prediction too, which is not fitted
+    metal = np.any(fit.affine[:, 14:] != 0, 1)  # also objects whose metallic is as predicted, which is not fitted
     return [
         decisions.camera_response(dynamic_range, calibration),
         decisions.metallic(metal & fit.free.any(1), medians),

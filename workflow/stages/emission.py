@@ -1,4 +1,4 @@
-"""emission: which faces shine and how brightly, and the radiance cache of everything else (METHOD 2.0, 2.4-2.6, 7a)."""
+"""emission: which faces shine and how brightly, and the radiance cache of everything else (docs/method/light.md)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.candidates import emitter_candidates
 from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
 from iif_core.light.emission.environment import Sky
-from iif_core.light.emission.gains import LEVEL_OF_PRIOR
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
 from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.pixels import EmissionPixels
-from iif_core.light.emission.problem import EmissionProblem, Halves, assemble, initial_radiance, white_surface
-from iif_core.light.emission.pruning import CERTAIN, CERTAIN_OPEN, PrunedEmission, prune_groups
+from iif_core.light.emission.problem import assemble, initial_radiance, white_surface
+from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN, PrunedEmission, prune_groups
+from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.sensor import Sensor
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.surface.segments import face_adjacency
@@ -42,9 +43,9 @@ if TYPE_CHECKING:
     from iif_core.light.transport.materials import CellMaterials
 
 WHITE = (1.0, 1.0, 1.0, 1.0, 0.0)
-"""Base material of the brightest surface that only reflects."""
+"""Material of the brightest surface that only reflects."""
 METAL = 0.9
-"""Predicted metalness from which a surface counts as metal in the solve."""
+"""Predicted metalness above which a surface counts as metal in the solve."""
 
 
 def run(job: Job) -> None:
@@ -72,7 +73,7 @@ def run(job: Job) -> None:
         notes.append(
             f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
         )
-    certain = CERTAIN_OPEN if outside is not None and outside.is_unseen else CERTAIN
+    certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
     pruned, gain = _trial(photos, groups, cache, outside, certain)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
@@ -80,7 +81,7 @@ def run(job: Job) -> None:
     groups = groups.select(lit)
     if left_out.size:
         cache = radiance_cache(photos, groups)[0]
-    solution, loss, level_error, raised, gain = _solve(photos, gain, groups, cache, outside)
+    solution, loss, found, gain = _solve(photos, gain, groups, cache, outside)
     table = _table(groups, left_out, reasons, solution, outside)
     _write(job, groups, table, cache, outside)
     gains = {f"gain_{c}": gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
@@ -92,10 +93,9 @@ def run(job: Job) -> None:
         notes.append(f"{len(areas)} candidates (the largest {max(areas):.2g} m^2) left out before the solve: {why}")
     if not kept and not environment["included"]:
         notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
-    if raised > 0:
-        notes.append(
-            f"light raised {np.exp(raised):.2f} times so that albedos are at most 1; the error of its level does not contain that"
-        )
+    if found.level_raised > 0:
+        raised = f"light raised {np.exp(found.level_raised):.2f} times so that albedos are at most 1"
+        notes.append(f"{raised}; the error of its level does not contain that")
     plan = [environment, *gain_plan(capture, photos.gains), decisions.emitters(kept, candidates - kept, candidates)]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
@@ -107,8 +107,8 @@ def run(job: Job) -> None:
             "residual": solution.residual,
             "solver": job.settings.emission.solver,
             "reference_loss": loss,
-            "level_error": level_error if np.isfinite(level_error) else None,
-            "level_raised": raised,
+            "level_error": found.level_error if np.isfinite(found.level_error) else None,
+            "level_raised": found.level_raised,
             "active_set": active_set,
             "escape_share": {"primary": escape, "secondary": secondary},
             "threshold": threshold if np.isfinite(threshold) else None,
@@ -128,56 +128,53 @@ def run(job: Job) -> None:
 def _trial(
     photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float
 ) -> tuple[PrunedEmission, np.ndarray]:
-    """Which groups shine, and the albedo gains of objects (n_objects, 3), from half of the rows."""
+    """Find which groups shine, and the albedo gains of objects (n_objects, 3), from half of the rows."""
     pixels, base, rows = choose_rows(photos, groups, 2)
     own = rows.group >= 0
-    halves, _ = _trace(photos, pixels, base, groups, voxels, sky, 0)
+    transport = _trace(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
     paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
-    white, _ = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1)
+    white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
     seen, initial = _initial(photos, groups, rows, sky)
     n_groups = len(initial)
-    trial = assemble(rows, halves, n_groups, white, sky).with_gains(
-        initial, _not_above_white(photos, sky), photos.scene.n_objects
-    )
+    problem = assemble(rows, transport, n_groups, white, sky)
+    trial, gains = problem.solve_object_gains(initial, _albedo_limit(photos, sky), photos.scene.n_objects)
     area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
-    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), _known(trial)
+    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), _reliable(gains)
 
 
-def _known(problem: EmissionProblem) -> np.ndarray:
-    """(n_objects, 3) gains of objects; 1 where the level of the light, and so theirs, is known no better than by the prior."""
-    return problem.gain if problem.level_error < LEVEL_OF_PRIOR else np.ones_like(problem.gain)
+def _reliable(gains: ObjectGains) -> np.ndarray:
+    """(n_objects, 3) gains, 1 where the level of the light, and so theirs, is no better known than from the prior."""
+    return gains.gain if gains.level_error < PRIOR_LEVEL_ERROR else np.ones_like(gains.gain)
 
 
-def _not_above_white(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
-    """(objects, 3) base albedos that no gain may bring above 1, for light from where no camera sees: its level is least known.
-
-    In a closed room the gains of single objects are less sure than the light: gloss and texture would raise that of Country
-    Kitchen by 40 %, which is 5 % too dim without."""
+def _albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
+    """(n_objects, 3) base albedos that no gain may bring above 1, where light comes from where no camera looks: its level is
+    the least certain. In a closed room the gains of single objects are less certain than the light: None."""
     return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
 
 
 def _initial(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance seen on the groups, and with the environment's."""
+    """Radiance seen on the groups; and the same followed by that of the environment's groups."""
     seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
     return seen, seen if sky is None else np.concatenate([seen, sky.radiance])
 
 
 def _solve(
     photos: Photographs, gain: np.ndarray, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None
-) -> tuple[EmissionSolution, float, float, float, np.ndarray]:
-    """Emission of the groups that shine, which are black from here on, and of the environment; its loss; error of its level; by
-    how much it was raised; and the gains of objects that go with it.
+) -> tuple[EmissionSolution, float, ObjectGains, np.ndarray]:
+    """Solve for the groups that shine, which are black from here on, and for the environment.
 
-    gain: (n_objects, 3) from the trial, for surface that paths meet and no photograph shows: at the base albedos it would lose
-    light (5 to 8 % of the indirect light of the kitchen)."""
+    `gain` (n_objects, 3), from the trial, multiplies the albedo of surface that paths meet and no photograph shows. Returns the
+    solution, its loss, the gains found with it, and those that other stages use.
+    """
     pixels, base, rows = choose_rows(photos, groups)
-    halves, gloss = _trace(photos, pixels, base, groups, voxels, sky, 3, photos.scene.with_gains(gain).materials())
+    transport = _trace(photos, pixels, base, groups, voxels, sky, 3, photos.scene.with_gains(gain).materials())
     initial = _initial(photos, groups, rows, sky)[1]
-    problem = assemble(rows, halves, len(initial), None, sky, gloss)
-    problem = problem.with_gains(initial, _not_above_white(photos, sky), photos.scene.n_objects)
-    # Parts of one object shine alike, more or less; the environment knows no such thing.
+    problem = assemble(rows, transport, len(initial), None, sky)
+    problem, found = problem.solve_object_gains(initial, _albedo_limit(photos, sky), photos.scene.n_objects)
+    # Parts of one object shine alike, more or less; groups of the environment are unrelated where cameras see them.
     face = np.flatnonzero(groups.of_face >= 0)
     family = -1 - np.arange(len(initial))
     family[groups.of_face[face]] = photos.scene.object_id[face]
@@ -186,15 +183,15 @@ def _solve(
         family[groups.size :], width[groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
     settings = photos.job.settings.emission
     if settings.solver == "sgd":
-        # What shines is known by now, so the paper's pruning has nothing left to do in `safe`.
+        # Which groups shine is known by now, so `safe` has nothing to prune.
         prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
         options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
         solution = solve_families(problem.rows, initial, family, width=width)
-    solution = solution.with_level_error(np.minimum(problem.error_of_group, LEVEL_OF_PRIOR))
-    gain = _known(problem) if len(initial) else gain  # without emitters the trial's stay
-    return solution, reference_loss(problem.rows, solution.radiance), problem.level_error, problem.level_raised, gain
+    solution = solution.with_level_error(np.minimum(found.error_of_group, PRIOR_LEVEL_ERROR))
+    gain = _reliable(found) if len(initial) else gain  # without emitters those of the trial stay
+    return solution, reference_loss(problem.rows, solution.radiance), found, gain
 
 
 def _trace(
@@ -205,37 +202,39 @@ def _trace(
     voxels: RadianceVoxels,
     sky: Sky | None,
     stream: int,
-    met: CellMaterials | None = None,
-) -> tuple[Halves, Halves]:
-    """Two independent estimates of (A, h); and their specular part, of what is not certainly metal.
+    unseen: CellMaterials | None = None,
+) -> TracedTransport:
+    """Two independent estimates of (A, h), by lobe.
 
-    met: materials of surface that paths meet and no photograph shows; None: the base texture."""
+    unseen: materials of surface that paths meet and no photograph shows; None = the base texture."""
     job, settings = photos.job, photos.job.settings.emission
     geometry, material = photos.world
-    material = material if met is None else met
     from iif_core.light.transport.cache import RadianceCache
     from iif_core.light.transport.matrix import transport_matrix
     from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
-    side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
-    # Predicted metalness is rarely right and would darken the diffuse light of half the room; only the certain is
-    # believed.
+    scene = Scene(geometry, material if unseen is None else unseen, None, cache)
+    # A wrongly predicted metal would remove the diffuse light of a whole surface; only high values are believed.
     metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
     points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
-    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
+    side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None
     columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels)
-    halves, gloss = [], []
+    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
+    halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        paths = PathOptions(samples, settings.max_bounces, seed + half)
-        matrix, cached = transport_matrix(Scene(geometry, material, None, cache), points, columns, paths)
-        halves.append((matrix.sum(1), cached.sum(1)))
-        dielectric = (metallic == 0)[:, None]
-        gloss.append((matrix[:, 1] * dielectric[:, None], cached[:, 1] * dielectric))
+        found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half))
+        halves.append([_all_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
-    return halves, gloss
+    return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
+
+
+def _all_and_gloss(values: np.ndarray, dielectric: np.ndarray) -> np.ndarray:
+    """(2, n, ...) of (n, 2, ...) values by diffuse and specular lobe: their sum, and the specular part of dielectrics, which is
+    not proportional to the albedo."""
+    return np.stack([values.sum(1), np.where(dielectric.reshape(-1, *[1] * (values.ndim - 2)), values[:, 1], 0.0)])
 
 
 # ------------------------------------------------------------------------------------------------------------ writing
@@ -244,7 +243,7 @@ def _trace(
 def _table(
     groups: EmitterGroups, left_out: EmitterGroups, reasons: list[str], solution: EmissionSolution, sky: Sky | None
 ) -> dict[str, Any]:
-    """Emitters, the environment, and the groups that turned out to reflect."""
+    """Columns of emitters.parquet: emitters, the environment, and the groups that turned out to reflect."""
     outside, out = sky.size if sky else 0, left_out.size
     sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
     pixels = sky.pixels if sky else np.zeros(0)

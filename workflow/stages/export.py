@@ -16,10 +16,10 @@ from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered, read_recovered
 
 VERTEX_SPACING = 0.05
-"""Edges are halved until they are this short (metres), or two cells where cells are larger."""
+"""Edges are halved until they are this short, m; two cells where cells are larger."""
 
 SPLIT_FACES = 200_000
-"""Splitting stops here; a mesh that has more faces is exported as it is."""
+"""Largest number of faces that splitting makes; a mesh that has more is exported unchanged."""
 
 MAX_SENSORS = 16
 
@@ -53,7 +53,7 @@ def run(job: Job) -> None:
 
 
 def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredScene:
-    """The scene with what the exporters need to know about who looked at it."""
+    """Return the scene with the number of pixels that see each side of a face, and the up direction."""
     front, back = np.zeros((2, len(recovered.surface.faces)), np.int64)
     vertices = recovered.surface.vertices.astype(np.float64)
     for view in capture.views:
@@ -84,7 +84,7 @@ def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredSc
 
 
 def _environment_note(environment: np.ndarray) -> dict[str, Any]:
-    """glTF has no light from outside: its mean radiance for `asset.extras`, and where the map is."""
+    """Return mean radiance and map of the environment for `asset.extras`, because glTF has no light from outside."""
     if not environment.any():
         return {}
     radiance = as_map(environment)
@@ -94,7 +94,7 @@ def _environment_note(environment: np.ndarray) -> dict[str, Any]:
 
 
 def _emitter_table(job: Job, recovered: Recovered) -> None:
-    """The emitters of stage emission with the light scale of the fit, so that they go with the published albedo."""
+    """Write the emitters times the light scale of the fit, which goes with the published albedo."""
     table = dict(job.read("emission").table("emitters.parquet"))
     for name in [n for n in table if n.startswith(("radiance_", "error_"))]:
         table[name] = (table[name] * recovered.light_scale).astype(np.float32)

@@ -1,4 +1,4 @@
-"""metrics: scores of the result, and of what it should be better than, against ground truth and photographs."""
+"""metrics: scores of the result and of simple baselines against ground truth and photographs (docs/method/evaluation.md)."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ BASELINES = {
 
 
 MEAN_METRICS = ("l2", "psnr")
-"""What `prior_mean_k` has: the others take most of the stage's time when every prediction is scored with them."""
+"""Metrics of `prior_mean_k`; others would take most of the time of the stage, because every prediction is scored."""
 
 LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(LPIPS_NETWORKS))
-"""Variant -> learned metrics of its albedo."""
+"""Variant -> learned metrics that its albedo is scored with."""
 
 
 def run(job: Job) -> None:
@@ -60,7 +60,7 @@ def run(job: Job) -> None:
         return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means, networks_of))
 
     with ThreadPoolExecutor(job.threads) as pool:
-        # map keeps the order of the views, so the tables do not depend on the number of threads
+        # `map` keeps the order of the views, so the tables do not depend on the number of threads.
         for done, scored in enumerate(pool.map(scores_of, range(len(capture.views)))):
             for entry in scored:
                 rows.add(*entry)
@@ -80,7 +80,7 @@ def _view_scores(
     means: _PredictionMeans | None,
     networks: Mapping[str, Mapping[str, Weights]],
 ) -> Iterator[tuple[str, str, str, list[metrics.Score]]]:
-    """(variant, view, quantity, scores) of one view."""
+    """Yield (variant, view, quantity, scores) of one view."""
     photo, valid = capture.photo(view, held_out=True)
     rgb_of = "rgb_held_out" if view.split == "test" else "rgb"
     _, face_id = capture.gbuffer(view)
@@ -134,7 +134,7 @@ def _view_scores(
 
 
 def _scores(materials: MaterialTruth, variant: str, maps: dict[str, np.ndarray], quantity: str) -> list[metrics.Score]:
-    """All scores of the result; of the others FLIP and LPIPS, which take most of the time, only where they are looked at."""
+    """Return all scores of the result; of other variants LPIPS, which takes most of the time, only as `LEARNED` says."""
     learned = LEARNED.get(variant, ()) if quantity == "albedo" else ()
     visual = ("raw", "scaled")
     if variant == "result":
@@ -146,13 +146,13 @@ def _scores(materials: MaterialTruth, variant: str, maps: dict[str, np.ndarray],
 
 
 def _log_scores(prediction: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> list[metrics.Score]:
-    """log_l2 of radiance, also up to the gain that LDR photographs leave open."""
+    """Return log_l2 of radiance, also up to the gain that LDR photographs leave open."""
     by_protocol = metrics.score_map("emission", prediction, truth, mask, metrics=("log_l2",))
     return [score for score in by_protocol if score.metric == "log_l2"]
 
 
 def _mean_scores(lists: list[list[metrics.Score]]) -> list[metrics.Score]:
-    """Mean of each score over the predictions."""
+    """Return the mean of each score over the predictions."""
     out = []
     for group in zip(*lists, strict=True):
         numbers = [score.value for score in group if score.value is not None]
@@ -163,7 +163,7 @@ def _mean_scores(lists: list[list[metrics.Score]]) -> list[metrics.Score]:
 
 
 class _PredictionMeans:
-    """The two baselines that average predictions in 3D (METHOD 6.1 B1, B2); one pass over the views."""
+    """The two baselines that average predictions over objects and over surface cells, from one pass over the views."""
 
     def __init__(self, job: Job, capture: CaptureReader):
         base: StageReader = job.read("base")
@@ -188,14 +188,14 @@ class _PredictionMeans:
                     sums[name][touched, i] += np.bincount(rows, weights[i])
                 sums[name][touched, 5] += np.bincount(rows)
             job.progress(done + 1, len(capture.views), "views averaged for the baselines")
-        # id -1 reads the last row
+        # Id -1 reads the last row.
         self.means = {
             name: np.concatenate([table[:, :5] / np.maximum(table[:, 5:], 1), np.zeros((1, 5))]).astype(np.float32)
             for name, table in sums.items()
         }
 
     def maps(self, object_id: np.ndarray, cell_id: np.ndarray | None) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-        """(variant, maps) of one view; pixels without an id are 0. `cell_id` None: the base has no such view."""
+        """Yield (variant, maps) of one view; pixels without an id are 0. `cell_id` is None if the base lacks the view."""
         if cell_id is None:
             return
         for name, ids in (("object_mean", object_id), ("texel_mean", cell_id)):
@@ -208,12 +208,12 @@ def _stack(maps: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
-    """Means over the views per variant, and how far the result is ahead of the raw predictions."""
+    """Return the means over the views for each variant, and the gain of the result over the raw predictions."""
     means = rows.means()
 
     def gain(quantity: str, protocol: str) -> dict[str, float] | None:
         pair = [means.get(v, {}).get(quantity, {}).get(protocol) for v in ("prior_mean_k", "result")]
-        if any(scores is None or "psnr" not in scores for scores in pair):  # without truth there is no distance to it
+        if any(scores is None or "psnr" not in scores for scores in pair):  # there is no ground truth
             return None
         prior, result = pair
         out = {"psnr_db": round(result["psnr"]["mean"] - prior["psnr"]["mean"], 4)}

@@ -1,4 +1,4 @@
-"""publish: the deliverable scenes/<scene>/, copies of what the stages wrote; quick, because it comes last."""
+"""publish: the deliverable scenes/<scene>/, copied from the artefacts of the stages."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ TIMING_COLUMNS: dict[str, Any] = {
 
 
 def run(job: Job) -> None:
-    """Build `scenes/.<scene>.tmp`, then rename it to `scenes/<scene>`: the folder is complete or not there.
+    """Build `scenes/.<scene>.tmp` and rename it to `scenes/<scene>`, so the folder is either complete or absent.
 
-    Every upstream stage is opened first, so a stage that was built under other settings or code stops here.
+    Every upstream stage is opened first, so an artefact that was built under other settings or code stops the stage.
     """
     readers = {stage: job.read(stage) for stage in job.stage.upstream}
     target = Path("scenes") / job.scene
@@ -44,7 +44,7 @@ def run(job: Job) -> None:
 
 
 def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[str, dict[str, Any]]:
-    """Fill the folder, its manifest last; returns the files of the manifest."""
+    """Fill the folder, its manifest last; return the files of the manifest."""
     temporary.mkdir(parents=True)
     for stage, name in deliverables(readers):
         place(readers[stage].path(name), inside(temporary, name))
@@ -59,7 +59,7 @@ def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[s
 
 
 def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
-    """(stage, file) of everything that is published under its own name; taken from manifests, never from a folder."""
+    """Return (stage, file) of everything that is published under its own name, as the manifests list it."""
     export = readers["export"]
     chosen = [("export", name) for name in export.names() if name != "export.json"]
     chosen += [("render", name) for name in readers["render"].names("maps/")]
@@ -71,7 +71,7 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
 
 
 def place(source: Path, destination: Path) -> None:
-    """A copy: editing the deliverable must not reach back into results/."""
+    """Copy a file, so that editing the deliverable does not change results/."""
     destination.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, destination)
 
@@ -90,7 +90,7 @@ def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
 
 
 def _replace(temporary: Path, target: Path) -> None:
-    """Rename into place; Snakemake has usually removed the old folder, but not when the stage is run by hand."""
+    """Rename into place. Snakemake has removed the old folder unless the stage is run by hand."""
     old = target.with_name(f".{target.name}.old")
     shutil.rmtree(old, ignore_errors=True)
     if target.exists():

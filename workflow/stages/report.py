@@ -1,4 +1,4 @@
-"""report: one page that a person can judge the result from, and the plan of the scene."""
+"""report: one page to judge the result by, and the plan of the scene."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def run(job: Job) -> None:
 
 
 def collect_plan(job: Job) -> list[dict[str, Any]]:
-    """Plan items that the stages left under `plan` in their JSON documents, in workflow order, with the rule's name."""
+    """Return the plan items in the JSON documents of the stages (key `plan`), in workflow order, with the name of the rule."""
     items = []
     for stage in job.stage.upstream:
         reader = job.read(stage)
@@ -71,7 +71,7 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
 
 
 def plan_text(job: Job, plan: list[dict[str, Any]]) -> str:
-    """plan.yaml: what the scene was found to require, what was left out, and the measured reason for each."""
+    """Return plan.yaml: what the scene requires, what was left out, and the measured reason for each."""
     document = {"scene": job.scene, "quality": job.quality, "components": plan}
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
 
@@ -90,17 +90,17 @@ def _headline(summary: dict[str, Any], capture: CaptureReader, recovered: Recove
     text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
     held_out = means.get("rgb_held_out", {}).get("raw", {}).get("psnr")
     if held_out is not None:
-        text += f" {held_out['views']} photographs that nothing was fitted to: {held_out['mean']:.1f} dB."
+        text += f" The {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB."
     gains = summary.get("gain_over_raw_predictions", {})
     gain = gains.get("albedo", {}).get("scaled", {}).get("psnr_db")
     if gain is not None:
         raw = means.get("albedo", {}).get("raw", {}).get("psnr", {}).get("mean")
-        as_it_is = f"albedo has {raw:.1f} dB as it is; " if raw is not None else ""
-        text += f" Against ground truth, {as_it_is}up to scale it gains {gain:+.1f} dB over the raw predictions of the prior."
+        uncorrected = f"albedo has {raw:.1f} dB without correction; " if raw is not None else ""
+        text += f" Against ground truth, {uncorrected}up to scale it gains {gain:+.1f} dB over the raw predictions of the prior."
         plain = summary["means"].get("object_mean", {}).get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         own = means.get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         if plain is not None and own is not None:
-            text += f" Scaled albedo: {own:.1f} dB; the mean prediction of each object, painted flat, has {plain:.1f} dB."
+            text += f" Scaled albedo: {own:.1f} dB; the mean prediction of each object, as one flat colour, has {plain:.1f} dB."
     if not np.any(recovered.light.emits):
         text += " No lamp was found, so relighting has none to switch off."
     if gain is None and not capture.has_truth:
@@ -146,7 +146,7 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
 
 
 def _objects_fact(job: Job, count: int) -> str:
-    """How many, where from, and how far they depend on what should not decide them (docs/guide/segmentation.md)."""
+    """Return number, source and stability of the objects in words (docs/guide/segmentation.md)."""
     facts = _document(job, "segmentation", "segmentation.json")
     if not facts:
         return str(count)
@@ -186,7 +186,7 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
             "With the best affine per image and object (an oracle)",
             means,
             oracle,
-            "Every variant may correct each object by the truth: what remains is error inside objects. Not a result.",
+            "Every variant may correct each object by the truth; what remains is the error inside objects. Not a result.",
         ),
     ]
     return [table for table in tables if table]
@@ -207,7 +207,7 @@ def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewR
 
 
 def _emission_exposure(recovered: Recovered) -> float:
-    """Factor that shows the emitters at the middle of the emitting area just below white; brighter ones clip."""
+    """Return the factor at which emitters of median radiance, by area, appear just below white; brighter ones clip."""
     lit = np.flatnonzero(recovered.light.emits)
     peak, area = recovered.light.radiance[lit].max(-1), recovered.surface.areas[lit]
     order = np.argsort(peak, kind="stable")
@@ -285,7 +285,7 @@ def _truth(
 
 
 def _prediction(channels: dict[str, np.ndarray], photograph: Picture | None) -> Strip:
-    """The first prediction, and how far the predictions are apart."""
+    """Show the first prediction, and the spread of the predictions."""
     numbers = prediction_numbers(channels)
     first = _materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
     spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
@@ -294,20 +294,20 @@ def _prediction(channels: dict[str, np.ndarray], photograph: Picture | None) -> 
 
 
 def _checks(job: Job, file: str, sensor: np.ndarray, depth: np.ndarray, counted: np.ndarray) -> list[Picture | None]:
-    """Alignment, objects, selected prediction, uncertainty and base texture of a view, as far as they exist."""
+    """Show alignment, objects, selected prediction, uncertainty and base texture of a view, as far as they exist."""
     out: list[Picture | None] = []
     if job.read("segmentation").has(file):
         channels = job.read("segmentation").exr(file)
         object_id, segment_id = ids_from_disk(channels["object.id"]), ids_from_disk(channels["segment.id"])
         out.append(_tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
-        out.append(_tile("objects", pic.overlay(sensor, object_id), "one colour an object, over the photograph"))
+        out.append(_tile("objects", pic.overlay(sensor, object_id), "one colour for each object, over the photograph"))
         table = job.read("base").table("selection.parquet")
         if len(table["k"]):
             k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
-            out.append(_tile("selected prediction", pic.ids(k), "one colour a number k", lossless=True))
+            out.append(_tile("selected prediction", pic.ids(k), "one colour for each number k", lossless=True))
     if job.read("affines").has(file):
         uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
-        note = f"claimed for the albedo, 0 to {UNCERTAINTY_RANGE}; errors that all predictions share cannot be seen in it"
+        note = f"claimed for the albedo, 0 to {UNCERTAINTY_RANGE}; errors that all predictions share are not in it"
         out.append(_tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
     if job.read("base").has(file):
         base = job.read("base").exr(file)

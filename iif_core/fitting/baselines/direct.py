@@ -22,7 +22,8 @@ from iif_core.fitting.baselines.loss import (
 )
 from iif_core.fitting.baselines.problem import CellProblem
 
-METALNESS = np.linspace(0.0, 1.0, 11)
+METALLIC_GRID = np.linspace(0.0, 1.0, 11)
+"""Values of the metallic that are searched."""
 STARTS = ((1.0, 0.0), (1.0, 0.2), (0.85, 0.3), (0.8, 0.0), (0.4, 0.0), (0.85, 0.85), (0.4, 1.0), (0.15, 1.0))
 """Starts of the fixed point: mean roughness and metallic of a part. The best is kept for each object, judged on `_START_CELLS` of
 its cells."""
@@ -78,14 +79,14 @@ def _prior_term(problem: CellProblem, options: CellOptions, target: np.ndarray, 
 
 def _search(problem: CellProblem, options: CellOptions, target: np.ndarray, scale: float) -> np.ndarray:
     """Return the loss without propagation at every level and metallic with the best albedo, (C, J, M) float32."""
-    table = np.empty((len(problem.pixels), len(problem.levels), len(METALNESS)), np.float32)
+    table = np.empty((len(problem.pixels), len(problem.levels), len(METALLIC_GRID)), np.float32)
     for start in range(0, len(table), _CELLS_AT_ONCE):
         part = slice(start, start + _CELLS_AT_ONCE)
         few = problem.take(part)
         prior_weight, goal = _prior_term(few, options, target[part], scale)
         for j, level in enumerate(problem.levels):
             lobes = few.lobes[:, j].astype(np.float64)
-            for k, metal in enumerate(METALNESS):
+            for k, metal in enumerate(METALLIC_GRID):
                 a = best_albedo(few.dd, lobes, metal, prior_weight, goal)
                 cost = (data_loss(few.dd, lobes, a, metal) + prior_weight * (a - goal) ** 2).mean(1)
                 table[part, j, k] = cost + few.pixels * options.regulariser * (1.0 - level + metal)
@@ -155,10 +156,10 @@ def _cells_at(
         few = problem.take(part)
         mean_r, mean_m = means[few.object_id].T
         weight = (options.propagation * few.pixels)[:, None]
-        away_r, away_m = np.abs(problem.levels - mean_r[:, None]), np.abs(METALNESS - mean_m[:, None])
+        away_r, away_m = np.abs(problem.levels - mean_r[:, None]), np.abs(METALLIC_GRID - mean_m[:, None])
         total = table[part] + (weight * away_r)[:, :, None] + (weight * away_m)[:, None, :]
-        j, k = np.divmod(total.reshape(len(mean_r), -1).argmin(1), len(METALNESS))
-        on_r, on_m = problem.levels[j], METALNESS[k]
+        j, k = np.divmod(total.reshape(len(mean_r), -1).argmin(1), len(METALLIC_GRID))
+        on_r, on_m = problem.levels[j], METALLIC_GRID[k]
         prior_weight, goal = _prior_term(few, options, target[part], scale)
         cost = np.full(len(mean_r), np.inf)
         for r, m in ((on_r, on_m), (mean_r, on_m), (on_r, mean_m), (mean_r, mean_m)):

@@ -1,14 +1,9 @@
-"""Emission from photographs: light is linear in emission, so the emitters follow from non-negative least squares.
+"""Emission from photographs by non-negative least squares (docs/method/light.md#least-squares).
 
-With materials and geometry fixed, pixel p shows L_p = h_p + sum_g A_pg E_g in each colour channel (METHOD 7a). A
-is traced, so it is noisy, and a plain normal matrix M = E[A'A] = A'A + noise shrinks the answer (errors in
-variables): 50 % noise turns (5, 10, 20) into (7.3, 9.8, 14.8). Two independent traces A1, A2 remove that: H = (A1' W
-A2 + A2' W A1) / 2.
-
-H may be indefinite. Its eigenvalues relative to M are reliabilities: the share of what a direction of E does in the rows
-that is signal, at most 1. K = (A1' W A2 - A2' W A1) / 2 is nothing but noise, so |K| relative to M is how far such a
-share can be trusted. Directions below that are lifted to it, and what is lifted goes to the prior. Relative to M and not
-to the identity, because neighbouring triangles differ in directions that do little yet are well known.
+With materials and geometry held fixed, radiance is linear in emission: y = A E + h in each colour channel (Eq. L.11). A is
+traced, so it is noisy, and the plain normal matrix E[A'A] = A'A + noise attenuates the answer (errors in variables, Eq. L.18).
+Two independent traces remove that: H = (A1' W A2 + A2' W A1) / 2 (Eq. L.19). H may be indefinite; directions whose reliability
+relative to M = mean(A)' W mean(A) is lost in noise are lifted, and the lifted part goes to the prior (Eq. L.21).
 """
 
 from __future__ import annotations
@@ -20,10 +15,10 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.light.emission.rows import EmissionRows
 
-TRUSTED = 1.5
+TRUSTED_RELIABILITY = 1.5
 """Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
-_DAMPED = 6  # rounds of re-weighting after which steps are halved
-_CHUNK = 1 << 24  # bytes of float64 rows converted at a time
+_DAMPED_AFTER = 6  # rounds of re-weighting after which steps are halved (docs/method/numerics.md#answers-that-alternate)
+_CHUNK_BYTES = 1 << 24  # of float64 rows converted at a time
 
 
 @dataclass(frozen=True)
@@ -32,15 +27,13 @@ class EmissionSolution:
 
     Attributes:
         radiance: (G, 3) float64 >= 0.
-        error: (G, 3) standard error: H^-1 (sum_k s_k s_k') H^-1 with the scores s_k of the clusters of rows, each the
-            cross of one trace's A with the other's residual, so that tracing noise is in it once and without bias;
-            plus the prior's own width in as far as the data leave a group to it.
+        error: (G, 3) standard error (Eq. L.26 without the level).
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
-        condition: largest / smallest eigenvalue of the normal matrix scaled to unit diagonal (worst channel), cut
-            at the noise level.
+        condition: largest / smallest eigenvalue of the lifted normal matrix at unit diagonal, of the worst channel.
         residual: weighted root mean square of target - A E, relative to that of the target.
         violated: number of lower bounds that the answer does not reach.
-        iterations: rounds of re-weighting; `converged` says whether the answer came to rest.
+        iterations: rounds of re-weighting.
+        converged: the answer came to rest.
     """
 
     radiance: np.ndarray
@@ -53,7 +46,7 @@ class EmissionSolution:
     converged: bool
 
     def with_level_error(self, level_error: float | np.ndarray) -> EmissionSolution:
-        """The same answer, with the error of the logarithm of the light that groups share (number or (G, 3)) in each one's."""
+        """Add the error of the logarithm of the light that groups share (a number or (G, 3)) to the error of each."""
         return replace(self, error=np.hypot(self.error, level_error * self.radiance))
 
 
@@ -66,28 +59,23 @@ def solve_emission(
     prior_width: float | np.ndarray = 5.0,
     family: np.ndarray | None = None,
 ) -> EmissionSolution:
-    """Radiance of every emitter group: weighted non-negative least squares with one-sided rows (METHOD 7a).
+    """Solve for the radiance of every emitter group: weighted non-negative least squares with one-sided rows (Eq. L.17).
 
-    min over E >= 0 of  sum_equal w (t - A E)^2 + sum_bound w (t - A E)_+^2 + ridge |E - E0|^2 (in units of the
-    diagonal)
-                        + sum_g v_g (E_g - E0_g)^2 / (prior_width E0_g)^2,
-    v_g = residual variance of a row of weight 1, times the design effect (`_design_effect`) once the answer has come to rest.
-    How sharp the bounds are is told by the noise of the rows (`_censored`); re-weighted until the answer rests.
+    Saturated rows are as sharp as the noise of the rows (Eq. L.23). Their weights, the residual variance and the prior are
+    updated until the answer comes to rest.
 
     Args:
         rows: the system (see `block_rows`).
-        initial: (G, 3) E0 >= 0: where the answer stays when the data say nothing (unseen group, noise, duplicate
+        initial: (G, 3) E0 >= 0, where the answer stays when the data do not determine it (unseen group, noise, duplicate
             columns).
-        cross: normal matrix from both estimates of A (unbiased); False: from their mean (biased low, always definite).
-        ridge: pull towards E0 relative to the diagonal of the normal matrix.
+        cross: normal matrix from both traces of A (unbiased); False = from their mean (biased low, always definite).
+        ridge: weight of E0 relative to the diagonal of the normal matrix.
         max_rounds: of the re-weighting.
-        prior_width: number or (G,), standard deviation of E relative to E0 before looking at what it lights; keeps
-            small groups whose light reaches few pixels from taking any value at all. Infinity switches it off.
-        family: (G,) int, groups whose initial values are one number that the data already gave: they miss it in
-            different directions. None = each for itself.
+        prior_width: number or (G,), standard deviation of E relative to E0; infinity switches the prior off.
+        family: (G,) int, groups whose common initial value was itself found from the data; None = each for itself.
 
     Returns:
-        `EmissionSolution`; always finite.
+        The solution, always finite.
 
     Raises:
         InputError: `initial` of the wrong shape, negative or non-finite; non-finite rows.
@@ -96,17 +84,20 @@ def solve_emission(
     initial = np.asarray(initial, np.float64)
     if initial.shape != (groups, 3) or not np.isfinite(initial).all() or (initial < 0).any():
         raise InputError(f"emission: initial radiance of shape {initial.shape}, needed ({groups}, 3), finite and >= 0")
-    for name in ("first", "second", "target", "target_second", "weight"):
+    for name in ("matrix", "observed", "cached", "weight"):
         if not np.isfinite(getattr(rows, name)).all():
             raise InputError(f"emission rows: {name} holds non-finite values; drop those pixels first")
     radiance, error, shares = initial.copy(), initial.copy(), np.zeros((groups, 3))
     condition, violated, iterations, converged = 1.0, 0, 0, True
-    if groups == 0 or len(rows.target) == 0:
+    if groups == 0 or len(rows.observed) == 0:
         return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
     square, square_target = 0.0, 0.0
+    matrices, targets = rows.matrices, rows.targets
+    cluster = np.full(len(rows.observed), -1) if rows.cluster is None else rows.cluster
     for c in range(3):
-        width = _width(initial[:, c], prior_width)
-        channel = _ChannelRows.of(rows, c, initial[:, c], width, cross, ridge).solve(max_rounds, family)
+        prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge
+        data = *(a[:, :, c] for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
+        channel = _ChannelRows(*data, cluster, rows.noise, *prior).solve(max_rounds, family)
         radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
         condition = max(condition, channel.condition)
         violated += channel.violated
@@ -121,20 +112,23 @@ def solve_emission(
 FAMILY_WIDTH = 0.3
 """Standard deviation of the groups of one object around their common radiance, relative to it."""
 OUTSIDE_WIDTH = 0.5
-"""The same of the directions that stand for what lies outside a mesh with large openings."""
+"""The same for the directions that stand for the outside of a mesh with large openings."""
 
 
 def solve_families(
     rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float | np.ndarray = FAMILY_WIDTH
 ) -> EmissionSolution:
-    """`solve_emission` in two steps: groups of one object first share one radiance, then deviate from it.
+    """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.27).
 
-    The triangles of a window light the room almost alike, so what is known well is their sum. Solved alone, noise and
-    wrong albedos make one black and its neighbour twice as bright. The shared radiance becomes the initial value, and the
-    prior width of groups that have company is `width`.
+    The triangles of a window light the room almost alike, so only their sum is well known.
 
     Args:
-        family: (G,) int, groups with the same number are parts of one object; width: number or (G,).
+        rows, initial, cross: as in `solve_emission`.
+        family: (G,) int, groups with the same number are parts of one object.
+        width: number or (G,), relative standard deviation of groups around the radiance that they share.
+
+    Returns:
+        The solution of the second step.
     """
     number, members = np.unique(family, return_inverse=True)
     size = np.bincount(members, minlength=len(number))
@@ -143,28 +137,24 @@ def solve_families(
     joint = np.zeros((len(number), 3))
     np.add.at(joint, members, initial)
     joint /= size[:, None]
-    shared = replace(rows, first=_summed(rows.first, members, len(number)), second=_summed(rows.second, members, len(number)))
+    matrix = np.zeros((*rows.matrix.shape[:3], len(number), 3), np.float32)
+    for group, member in enumerate(members):
+        matrix[:, :, :, member] += rows.matrix[:, :, :, group]
+    shared = replace(rows, matrix=matrix)
     start = solve_emission(shared, joint, cross).radiance[members]
     together = size[members] > 1
     start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
     return solve_emission(rows, start, cross, prior_width=np.where(together, width, 5.0), family=family)
 
 
-def _summed(matrix: np.ndarray, members: np.ndarray, count: int) -> np.ndarray:
-    out = np.zeros((len(matrix), count, 3), np.float32)
-    for group, family in enumerate(members):
-        out[:, family] += matrix[:, group]
-    return out
-
-
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(H lifted, the lift, condition number), all of unit diagonal; see the head of this module."""
+    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.21)."""
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
     share, directions = np.linalg.eigh(inverse @ normal.h @ inverse)
     noise = float(np.linalg.norm(inverse @ normal.k @ inverse, 2)) if normal.k.any() else 0.0
-    lift = np.where(share < max(TRUSTED * noise, 1e-6), 1.0 - share, 0.0)
+    lift = np.where(share < max(TRUSTED_RELIABILITY * noise, 1e-6), 1.0 - share, 0.0)
     whole = root @ directions
     lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
     spectrum = np.linalg.eigvalsh(normal.h + lifted)
@@ -174,10 +164,8 @@ def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, fl
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
 
-    A pixel with noise sigma is saturated with probability Phi(-z), z = (bound - prediction) / sigma (Tobin 1958). One
-    Newton step on -log Phi(-z), with lambda = phi(z) / Phi(-z) and delta = lambda (lambda - z) in (0, 1), is the row
-    prediction + sigma lambda / delta with weight delta. sigma -> 0: those that are missed count fully, others not at
-    all. A hard bound instead would be pushed up by every pixel that noise alone has saturated.
+    One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.22, L.23). For sigma -> 0 rows below
+    their bound count fully and the others not at all.
     """
     from scipy.special import log_ndtr
 
@@ -198,7 +186,7 @@ def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | Non
 
 
 def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
-    """Standard deviation of the prior; without any initial brightness there is no scale for it, and it is left out."""
+    """Standard deviation of the prior; infinite without any initial brightness, which would be its scale."""
     largest = float(initial.max(initial=0.0))
     if largest <= 0:
         return np.full(len(initial), np.inf)
@@ -220,7 +208,7 @@ class _Channel:
 
 @dataclass(frozen=True)
 class _Normal:
-    """H, noise part K, M and b of one channel, float64."""
+    """H, its noise part K, M and b of one channel (Eq. L.19, L.20), float64."""
 
     h: np.ndarray
     k: np.ndarray
@@ -230,10 +218,11 @@ class _Normal:
 
 @dataclass(frozen=True)
 class _System:
-    """Normal equations of the groups that the rows know, scaled to unit diagonal of M.
+    """Normal equations of the groups to which some row responds, scaled to unit diagonal of M.
 
     Attributes:
-        known: (G,) bool; scale: of the unknowns; matrix, right: lifted H and prior, b; lifted: the part of the prior.
+        known: (G,) bool; scale: of the unknowns; matrix: lifted H plus prior; lifted: the part of it that belongs to the
+            prior; right: b.
     """
 
     known: np.ndarray
@@ -257,7 +246,7 @@ class _System:
 
 @dataclass(frozen=True)
 class _ChannelRows:
-    """The rows of one colour channel and what is known of its answer beforehand.
+    """The rows of one colour channel and the prior of its answer.
 
     Attributes:
         first, second: (n, G) float32 views; target, target_second, weight: (n,); bound: (n,) bool.
@@ -278,25 +267,18 @@ class _ChannelRows:
     cross: bool
     ridge: float
 
-    @classmethod
-    def of(cls, rows: EmissionRows, c: int, initial: np.ndarray, width: np.ndarray, cross: bool, ridge: float) -> _ChannelRows:
-        """Channel c."""
-        data = (rows.first[:, :, c], rows.second[:, :, c], rows.target[:, c], rows.target_second[:, c], rows.weight[:, c])
-        cluster = np.full(len(rows.target), -1) if rows.cluster is None else rows.cluster
-        return cls(*data, rows.lower_bound[:, c], cluster, rows.noise, initial, width, cross, ridge)
-
     @property
     def mean_target(self) -> np.ndarray:
         return 0.5 * (self.target + self.target_second)
 
     @property
     def sure(self) -> np.ndarray:
-        """Weights without the bounds: one that is reached says where the answer stops, not how far off it is."""
+        """Weights without the bounds: a bound that is reached says where the answer stops, not how far off it is."""
         return np.where(self.bound, 0.0, self.weight)
 
     def chunks(self) -> list[slice]:
-        """Rows that are converted to float64 at a time."""
-        step = max(1, _CHUNK // (8 * max(self.first.shape[1], 1)))
+        """Slices of rows that are converted to float64 at a time."""
+        step = max(1, _CHUNK_BYTES // (8 * max(self.first.shape[1], 1)))
         return [slice(start, start + step) for start in range(0, len(self.target), step)]
 
     def normal(self, weight: np.ndarray, shift: np.ndarray) -> _Normal:
@@ -319,7 +301,7 @@ class _ChannelRows:
         return _Normal(h if self.cross else m, k, m, b)
 
     def scores(self, answer: np.ndarray) -> np.ndarray:
-        """sum_k s_k s_k' over clusters of rows that are no bounds: (G, G)."""
+        """S of Eq. L.24, over clusters of rows that are no bounds: (G, G)."""
         parts, weight = [], self.sure
         for part in self.chunks():
             w = weight[part, None]
@@ -337,8 +319,8 @@ class _ChannelRows:
         return single[alone].T @ single[alone] + together.T @ together
 
     def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> _System | None:
-        """With the given weights and shifts, `variance` (G,) of a row of weight 1 to weigh the prior with; None when the rows
-        know nothing."""
+        """Normal equations with the given weights and shifts; `variance` (G,) of a row of weight 1 weighs the prior. None when no
+        row responds to any group."""
         normal = self.normal(weight, shift)
         diagonal = np.diag(normal.m)
         known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
@@ -352,7 +334,7 @@ class _ChannelRows:
         return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
 
     def solve(self, max_rounds: int, family: np.ndarray | None) -> _Channel:
-        """Re-weighted until the answer rests; then the prior is weighed against what the rows really know."""
+        """Solve and re-weight until the answer rests, then once more with the prior weighed by the design effect."""
         bound, weight, target = self.bound, self.weight, self.mean_target
         mean_a = 0.5 * (self.first + self.second)
         bounded = bool(np.isfinite(self.width).any())
@@ -369,7 +351,7 @@ class _ChannelRows:
             system = self.system(weight * share, shift, variance)
             if system is not None:
                 answer, condition = system.solve(self.initial), system.condition
-            if rounds > _DAMPED:  # two answers by turns: the one between them
+            if rounds > _DAMPED_AFTER:  # two answers may alternate: take the one between them
                 answer = 0.5 * (before + answer)
             difference = target - mean_a @ answer
             used = np.where(bound & (difference <= 0), 0.0, weight)
@@ -396,40 +378,36 @@ class _ChannelRows:
         )
 
     def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """(G,) >= 1, how many times less the rows know about a group than if their errors were independent (Kish 1965).
-
-        diag(H^-1 sum_k s_k s_k' H^-1) / diag(v H^-1): tracing noise and errors that the rows of an object share. The prior is
-        weighed against what the rows really know; otherwise neighbouring panes of one window are told apart by nothing but noise.
-        """
+        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.25)."""
         effect = np.ones(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is not None:
             known, inverse = system.known, np.linalg.inv(system.matrix)
-            real = np.diag(inverse @ self._meat(system, answer) @ inverse)
+            real = np.diag(inverse @ self._score_covariance(system, answer) @ inverse)
             claimed = variance[known] * np.diag(inverse)
             effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
         return effect
 
-    def _meat(self, system: _System, answer: np.ndarray) -> np.ndarray:
+    def _score_covariance(self, system: _System, answer: np.ndarray) -> np.ndarray:
         """`scores` of the known groups in units of the system's scale."""
         return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
 
     def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """(standard error, share of the answer that is not the prior's), both (G,)."""
+        """(standard error of Eq. L.26 without the level, share of the answer that comes from data), both (G,)."""
         error, share = self.initial.copy(), np.zeros(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is None:
             return error, share
         known, scale, initial = system.known, system.scale, self.initial[system.known]
         inverse = np.linalg.inv(system.matrix)
-        pull = inverse @ system.lifted  # d answer / d initial
-        prior_part = pull * np.minimum(self.width[known], np.maximum(initial, 1e-300)) * scale
+        response = inverse @ system.lifted  # d answer / d initial
+        prior_part = response * np.minimum(self.width[known], np.maximum(initial, 1e-300)) * scale
         if family is not None:
             member = family[known][:, None] == np.unique(family)
             size = member.sum(0)
             mean = prior_part @ (member / np.maximum(size, 1))
             prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
-        data_part = np.clip(np.diag(inverse @ self._meat(system, answer) @ inverse), 0, None)
-        share[known] = 1.0 - np.clip(np.diag(pull), 0.0, 1.0)
+        data_part = np.clip(np.diag(inverse @ self._score_covariance(system, answer) @ inverse), 0, None)
+        share[known] = 1.0 - np.clip(np.diag(response), 0.0, 1.0)
         error[known] = np.sqrt(data_part + (prior_part**2).sum(1)) / scale
         return error, share

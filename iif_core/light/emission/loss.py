@@ -1,4 +1,4 @@
-"""One loss for every solver of emission."""
+"""One loss that judges every solver of emission."""
 
 from __future__ import annotations
 
@@ -8,19 +8,16 @@ from iif_core.light.emission.rows import EmissionRows
 
 
 def reference_loss(rows: EmissionRows, radiance: np.ndarray, cross: bool = True) -> float:
-    """Mean over rows and channels of w r^2, relative to that of w t^2; a bound counts only where it is not reached.
+    """Return the mean over rows and channels of w r^2 relative to that of w t^2 (Eq. L.42).
 
-    METHOD 7a: the published loss with a defect less: a prediction above the saturation level keeps its gradient (H32).
-    With `cross` the square is the product of the residuals of the two traces, whose noise is independent: its
-    expectation is that of exact transport, so it does not favour an answer that is shrunk to make the noise small.
-    It can then be slightly negative. Bounds use the mean residual.
+    With `cross` the square is the product of the residuals of the two traces, whose noise is independent, so that an answer that
+    is shrunk to reduce the noise is not favoured; the loss can then be slightly negative. A bound counts only where the mean
+    prediction is below it (docs/method/numerics.md#clamped-loss).
 
-    Args:
-        radiance: (G, 3).
+    radiance: (G, 3).
     """
     radiance = np.asarray(radiance, np.float64)
-    first = rows.target - np.einsum("ngc,gc->nc", rows.first, radiance)
-    second = rows.target_second - np.einsum("ngc,gc->nc", rows.second, radiance)
+    first, second = (t - np.einsum("ngc,gc->nc", a, radiance) for a, t in zip(rows.matrices, rows.targets, strict=True))
     mean = 0.5 * (first + second)
     square = np.where(rows.lower_bound, np.maximum(mean, 0.0) ** 2, first * second if cross else mean**2)
     total = float((rows.weight * rows.mean_target**2).sum())

@@ -1,10 +1,10 @@
-"""Groups that only reflect are recognised by the solve and dropped (METHOD 2.5, 8).
+"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect).
 
-What a white surface would show in a group's place is known from the same transport: A_w E + h_w, light of the other
-groups. A group that is clearly brighter than that shines, whatever its albedo. Any other may just be a bright surface
-near a lamp, and one with little power something that shines through; such groups stay only if the rest of the scene
-misses their light. The least credible one goes first, because the light of a false emitter makes its neighbours look
-like reflectors. A group that is dropped goes on to show what was seen of it: once it is no emitter, the radiance cache holds it.
+What a white surface would show in place of a group is known from the same transport (Eq. L.28). A group that is clearly
+brighter than that shines, whatever its albedo. Any other group may be a bright surface near a lamp, and one with little power
+something that shines through; such groups stay only if the rest of the scene needs their light. The least credible group goes
+first, because the light of a false emitter makes its neighbours look like reflectors. A dropped group continues to light the
+scene with the radiance that was seen on it, which the radiance cache will hold.
 """
 
 from __future__ import annotations
@@ -16,20 +16,16 @@ import numpy as np
 from iif_core.light.emission.direct import EmissionSolution, solve_emission
 from iif_core.light.emission.rows import EmissionRows
 
-CERTAIN = 2.0
-"""Brightness relative to a white surface from which a group shines for certain; twice, since the light that the white
-surface would reflect is only known as well as the other emitters are."""
-CERTAIN_OPEN = 8.0
-"""The same where much of the light comes through large openings of the mesh, from lamps that no camera sees: a table under such
-a lamp is three times as bright as a white surface under the mean light, a lamp in view ten times or more."""
-
-
-RESIDUAL_CHANGE = 0.03
-"""Growth of the residual from which a group is missed. METHOD 8 has 0.001; with albedos that are only predicted, one
-more free column always finds something to explain (kitchen: 0.3 to 1 % for a lit wall)."""
-
-
-_ROUNDS = 6  # of re-weighting in a trial, which only says which groups are needed
+CERTAIN_EXCESS = 2.0
+"""Brightness relative to a white surface from which a group shines for certain; more than 1, since the light that the white
+surface would reflect is known only as well as the other emitters."""
+CERTAIN_EXCESS_OPEN = 8.0
+"""The same where much of the light comes through large openings of the mesh: surface below a lamp that no camera sees is much
+brighter than a white surface under the mean light."""
+MAX_RESIDUAL_GROWTH = 0.03
+"""Growth of the residual from which the scene needs a group; with albedos that are only predicted, one more free column always
+explains something."""
+_TRIAL_ROUNDS = 6  # of re-weighting in a trial, which only says which groups are needed
 
 
 @dataclass(frozen=True)
@@ -38,8 +34,8 @@ class WhiteSurface:
 
     Attributes:
         seen: (G, 3) radiance seen on each group, 0 = not seen.
-        matrix: (G, G, 3) mean of A over the pixels of each group (first axis) if they were white; cached: (G, 3)
-            the same of h.
+        matrix: (G, G, 3) mean of A over the pixels of each group (first axis) if they were white.
+        cached: (G, 3) the same of h.
     """
 
     seen: np.ndarray
@@ -47,8 +43,8 @@ class WhiteSurface:
     cached: np.ndarray
 
     def excess(self, radiance: np.ndarray) -> np.ndarray:
-        """(G,) brightness of each group relative to the white surface under the light of the others; infinite without
-        light, 0 where the group was not seen."""
+        """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.28); infinite
+        without light, 0 where the group was not seen."""
         others = self.matrix * (1.0 - np.eye(len(self.seen)))[:, :, None]
         white = (np.einsum("ghc,hc->gc", others, radiance) + self.cached).sum(1)
         seen = self.seen.sum(1)
@@ -57,8 +53,8 @@ class WhiteSurface:
 
 @dataclass(frozen=True)
 class PrunedEmission:
-    """Result of `prune_groups`: the solution with dropped groups at 0, which were kept, and why not; (G,) `excess` of the
-    last round a group took part in."""
+    """Result of `prune_groups`: the solution with dropped groups at 0, which were kept, why others were dropped, and `excess`
+    (G,) of the last round in which a group took part."""
 
     solution: EmissionSolution
     kept: np.ndarray
@@ -74,25 +70,32 @@ def prune_groups(
     elsewhere: np.ndarray,
     protected: np.ndarray,
     share: float = 0.01,
-    certain: float = CERTAIN,
-    residual_change: float = RESIDUAL_CHANGE,
+    certain: float = CERTAIN_EXCESS,
+    max_growth: float = MAX_RESIDUAL_GROWTH,
     cross: bool = True,
 ) -> PrunedEmission:
     """Solve, then drop groups that do not shine, the least credible first, and solve again.
 
-    Dropped is a group without emission left; and, unless the residual elsewhere grows by more than `residual_change`
-    without it, one that is not brighter than `certain` white surfaces or has less than `share` of the total power
+    A group is dropped when no emission is left for it; and, unless the residual elsewhere grows by more than `max_growth`
+    without it (Eq. L.29), when it is not brighter than `certain` white surfaces or has less than `share` of the total power
     area x sum E.
 
     Args:
         rows, initial, cross: as in `solve_emission`.
-        area: (G,) m^2; white: what their pixels say.
+        area: (G,) m^2.
+        white: what the groups show, and what a white surface would show.
         elsewhere: (n,) bool, rows that are not a group's own pixels: what its light does, not what it looks like.
         protected: (G,) bool, never dropped (environment).
+        share: of the total power.
+        certain: brightness relative to a white surface from which a group shines for certain.
+        max_growth: relative growth of the residual from which a group is needed.
+
+    Returns:
+        The solution with the groups that remain.
     """
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
-    solution = solve_emission(rows, initial, cross, max_rounds=_ROUNDS)
+    solution = solve_emission(rows, initial, cross, max_rounds=_TRIAL_ROUNDS)
     while True:
         emission = solution.radiance.sum(1)
         power = area * emission * ~protected
@@ -115,8 +118,8 @@ def prune_groups(
         trial = _solve_subset(rows, initial, kept & ~drop, white.seen, cross)
         before = _misfit(rows, shown, elsewhere)
         after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
-        if not dark.any() and after > before * (1 + residual_change) + 1e-12:
-            # One lamp that is missed must not keep those that were to go with it.
+        if not dark.any() and after > before * (1 + max_growth) + 1e-12:
+            # One lamp that is needed must not keep the groups that were tried together with it.
             if drop.sum() > 1 and not singly:
                 singly = True
             else:
@@ -138,15 +141,15 @@ def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
 
 def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float:
     """Weighted root sum of squares of some rows; bounds that are met do not count."""
-    mean = 0.5 * (rows.first[mask] + rows.second[mask])
+    mean = rows.matrices[:, mask].mean(0)
     difference = rows.mean_target[mask] - np.einsum("ngc,gc->nc", mean, radiance)
     counted = np.where(rows.lower_bound[mask] & (difference < 0), 0.0, rows.weight[mask])
     return float(np.sqrt((counted * difference**2).sum()))
 
 
 def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray, cross: bool) -> EmissionSolution:
-    """Solution over all groups, 0 outside `kept`: the others light the scene with what they show, as the cache will."""
-    part = solve_emission(_without(rows, kept, shown), initial[kept], cross, max_rounds=_ROUNDS)
+    """Solution over all groups, 0 outside `kept`; the others light the scene with what they show, as the cache will."""
+    part = solve_emission(_without(rows, kept, shown), initial[kept], cross, max_rounds=_TRIAL_ROUNDS)
     radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
     determined = np.zeros(len(initial))
     radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
@@ -154,6 +157,6 @@ def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, sho
 
 
 def _without(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
-    """The system of the `kept` groups; the light of the others, `shown` (G, 3), is taken off the targets."""
-    first, second = (np.einsum("ngc,gc->nc", a[:, ~kept], shown[~kept]) for a in (rows.first, rows.second))
-    return replace(rows.columns(kept), target=rows.target - first, target_second=rows.target_second - second)
+    """The system of the `kept` groups; the light of the others, `shown` (G, 3), is added to what is cached."""
+    light = np.einsum("klngc,gc->klnc", rows.matrix[:, :, :, ~kept], shown[~kept])
+    return replace(rows.columns(kept), cached=rows.cached + light)

@@ -1,4 +1,5 @@
-"""Rows of the linear system: what pixels show, and two noisy estimates of how emitters make them show it."""
+"""Rows of the linear system y = A E + h: what averaged pixels show, and two independent traces of how they are lit
+(docs/method/light.md#rows)."""
 
 from __future__ import annotations
 
@@ -10,66 +11,112 @@ from iif_core.errors import InputError
 
 
 @dataclass(frozen=True)
-class EmissionRows:
-    """Rows of the linear system; G groups, three channels that decouple.
+class TracedTransport:
+    """A and h (Eq. L.11) of n points, from two independent traces (first axis).
 
     Attributes:
-        first, second: (n, G, 3) float32, two independent estimates of A (`second` may be `first` when A is exact).
-        target, target_second: (n, 3) observed radiance minus h of the same two estimates. h and A of one trace
-            share their noise, so the right-hand side crosses them too: b = (A1' W t2 + A2' W t1) / 2.
-        weight: (n, 3) >= 0, weight of the squared residual.
-        lower_bound: (n, 3) bool: the sensor was saturated, the target is a lower bound and only a prediction below
-            it counts.
-        cluster: (n,) int, rows with the same number >= 0 may err together (one object in one view: its albedo is off);
-            -1 or None = alone.
-        noise: (n,) > 0, relative size of the noise of one pixel of a row (radiance, up to a common factor that the
-            residuals tell): how sharp a bound is, and what the weights are relative to. None = bounds are exact.
+        matrix: (2, L, n, G, 3) float32. The second axis is the lobe: 0 = all that is reflected, 1 = the part of it that the
+            specular lobe of dielectrics reflects, which is not proportional to the albedo; L = 1: that part is not known apart.
+        cached: (2, L, n, 3) radiance that was photographed where it was last reflected.
     """
 
-    first: np.ndarray
-    second: np.ndarray
-    target: np.ndarray
-    target_second: np.ndarray
+    matrix: np.ndarray
+    cached: np.ndarray
+
+    def without_lobes(self) -> TracedTransport:
+        """The same transport with one factor for all that is reflected."""
+        return TracedTransport(self.matrix[:, :1], self.cached[:, :1])
+
+
+@dataclass(frozen=True)
+class EmissionRows:
+    """Rows of the linear system; the three channels are independent of each other.
+
+    Attributes:
+        matrix: (2, L, n, G, 3), cached: (2, L, n, 3) as in `TracedTransport`. The two traces may be the same array when A is
+            exact. A and h of one trace share their noise, so the right-hand side of the normal equations crosses the traces
+            as well (Eq. L.19).
+        observed: (n, 3) radiance y; a row asks for A E = y - h.
+        weight: (n, 3) >= 0, weight of the squared residual.
+        lower_bound: (n, 3) bool: the sensor was saturated, y is a lower bound and only a prediction below it counts.
+        cluster: (n,) int, rows with the same number >= 0 may err together (one object in one view: its albedo is off); -1 or
+            None = independent.
+        noise: (n,) > 0, relative size of the noise of one pixel of a row (nu of Eq. L.13). None = bounds are exact.
+    """
+
+    matrix: np.ndarray
+    observed: np.ndarray
+    cached: np.ndarray
     weight: np.ndarray
     lower_bound: np.ndarray
     cluster: np.ndarray | None = None
     noise: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        n, groups = self.first.shape[:2]
-        shapes = {"first": (n, groups, 3), "second": (n, groups, 3)}
-        shapes |= dict.fromkeys(("target", "target_second", "weight", "lower_bound"), (n, 3))
+        lobes, n, groups = self.matrix.shape[1:4]
+        shapes = {"matrix": (2, lobes, n, groups, 3), "cached": (2, lobes, n, 3)}
+        shapes |= dict.fromkeys(("observed", "weight", "lower_bound"), (n, 3))
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:
                 raise InputError(f"emission rows: {name} has shape {getattr(self, name).shape}, needed {shape}")
 
     @property
     def groups(self) -> int:
-        return self.first.shape[1]
+        return self.matrix.shape[3]
+
+    @property
+    def has_lobes(self) -> bool:
+        """The specular lobe of dielectrics is known apart."""
+        return self.matrix.shape[1] == 2
+
+    @property
+    def matrices(self) -> np.ndarray:
+        """(2, n, G, 3) A of both traces, of all that is reflected."""
+        return self.matrix[:, 0]
+
+    @property
+    def targets(self) -> np.ndarray:
+        """(2, n, 3) what emission must explain in both traces: y - h."""
+        return self.observed - self.cached[:, 0]
 
     @property
     def mean_target(self) -> np.ndarray:
-        return 0.5 * (self.target + self.target_second)
+        """(n, 3) mean of the two targets."""
+        return self.targets.mean(0)
 
     def columns(self, keep: np.ndarray) -> EmissionRows:
-        """The system of a subset of the groups."""
-        return replace(self, first=self.first[:, keep], second=self.second[:, keep])
+        """The system of a subset of the groups, a mask (G,)."""
+        return replace(self, matrix=self.matrix[:, :, :, keep])
+
+    def without_lobes(self) -> EmissionRows:
+        """The same rows with one factor for all that is reflected."""
+        return replace(self, matrix=self.matrix[:, :1], cached=self.cached[:, :1])
+
+    def scaled(self, gain: np.ndarray, gloss_gain: np.ndarray) -> EmissionRows:
+        """Rows, without lobes, of materials that reflect `gain` (n, 3) > 0 times as much, and whose gloss, where it is known,
+        reflects `gloss_gain` (n,) >= 0 times as much. The observation is not scaled."""
+        matrix, cached = gain[:, None].astype(np.float32) * self.matrix[:, 0], gain * self.cached[:, 0]
+        if self.has_lobes:
+            more = gloss_gain[:, None] - gain
+            matrix = matrix + more[:, None].astype(np.float32) * self.matrix[:, 1]
+            cached = cached + more * self.cached[:, 1]
+        return replace(self, matrix=matrix[:, None], cached=cached[:, None])
 
 
-def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
-    """Averages of the rows of each block: the answer is the same, the noise of A falls with the block's size.
+def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.ndarray]:
+    """Average the rows of each block: the answer stays the same, and the noise of A falls with the size of the block.
 
     Args:
         rows: pixel rows.
-        block: (n,) int; pixels of one block should see one object in one small tile of one view (rows of different
-            objects
-            must not be averaged: they differ for a reason). Lower bounds and equalities never mix.
+        block: (n,) int. Pixels of one block should see one object in one small tile of one view; rows of different objects
+            must not be averaged. Lower bounds and equalities are never mixed.
 
     Returns:
-        Rows in order of block number; weight is the sum of the weights, target and A are weighted means per channel.
+        Rows in the order of the block numbers - weights are sums, the other values weighted means for each channel - and for
+        each of them the index of a pixel row of its block.
     """
     if not len(block):
-        return rows
+        return rows, np.zeros(0, np.int64)
     code = rows.lower_bound @ np.array([1, 2, 4])
     order = np.lexsort((code, block))
     key = np.asarray(block, np.int64)[order] * 8 + code[order]
@@ -84,48 +131,10 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> EmissionRows:
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(values[order] * (share[:, None] if values.ndim == 3 else share), starts, 0)
 
-    return EmissionRows(
-        mean(rows.first),
-        mean(rows.second),
-        mean(rows.target),
-        mean(rows.target_second),
-        total,
-        rows.lower_bound[order][starts],
-    )
-
-
-@dataclass(frozen=True)
-class GlossRows:
-    """The part of A and h (as in `EmissionRows`, n rows in the same order) that the specular lobe reflects.
-
-    Attributes:
-        first, second: (n, G, 3); cached, cached_second: (n, 3).
-    """
-
-    first: np.ndarray
-    second: np.ndarray
-    cached: np.ndarray
-    cached_second: np.ndarray
-
-
-def scale_rows(
-    rows: EmissionRows,
-    observed: np.ndarray,
-    gain: np.ndarray,
-    gloss: GlossRows | None = None,
-    gloss_gain: np.ndarray | None = None,
-) -> EmissionRows:
-    """The system for materials that reflect `gain` times as much: A and h are scaled, the observation is not.
-
-    Args:
-        observed: (n, 3) radiance y, so that h = y - target; gain: (n, 3) > 0.
-        gloss: this part is scaled by gloss_gain (n,) instead.
-    """
-    factor = gain[:, None].astype(np.float32)
-    first, second = rows.first * factor, rows.second * factor
-    cached, cached_second = gain * (observed - rows.target), gain * (observed - rows.target_second)
-    if gloss is not None and gloss_gain is not None:
-        more = gloss_gain[:, None] - gain
-        first, second = (a + more[:, None].astype(np.float32) * s for a, s in ((first, gloss.first), (second, gloss.second)))
-        cached, cached_second = cached + more * gloss.cached, cached_second + more * gloss.cached_second
-    return replace(rows, first=first, second=second, target=observed - cached, target_second=observed - cached_second)
+    observed = mean(rows.observed)
+    matrix = np.array([[mean(lobe) for lobe in trace] for trace in rows.matrix])
+    cached = np.array([[np.zeros(observed.shape), *(mean(lobe) for lobe in trace[1:])] for trace in rows.cached])
+    # mean(h) as mean(y) - mean(y - h): the order of operations decides the last bits of everything that follows.
+    cached[:, 0] = [observed.astype(np.float64) - mean(target) for target in rows.targets]
+    first = order[starts]
+    return EmissionRows(matrix, observed, cached, total, rows.lower_bound[first]), first

@@ -1,13 +1,10 @@
-"""The paper's way to the emitters: stochastic gradient descent on traced pixels (METHOD 2.5), the twin of `direct`.
+"""Emission by stochastic gradient descent on traced pixels, the paper's kind of optimiser, as a twin of `direct`
+(docs/method/light.md#stochastic-gradient-descent).
 
-The paper traces fresh paths for every batch. Here every row of a batch takes one of its two traces at random, which is the
-same estimator, its noise included, with correct multiple importance sampling and without tracing again.
-
-`safe`: steps are divided by the diagonal of the normal matrix and fall as 1 / t, so no learning rate has to be found; a
-saturated row pulls only while the prediction is below it. `paper`: plain descent at rate 100 on the mean over rows and
-channels, both sides of the difference clamped at `ceiling`, which leaves no gradient where a prediction is too bright (H32).
-
-Neither removes the bias that the noise of A puts into E[A'A]; `direct` does.
+The paper traces fresh paths for every batch. Here every row of a batch takes one of its two traces at random, which has the
+same expectation and the same noise bias without tracing again. Preset `safe` scales steps by the diagonal of the normal matrix
+(Eq. L.43); preset `paper` descends at rate 100 (Eq. L.44) and clamps both sides of the difference at `ceiling`
+(docs/method/numerics.md#clamped-loss). Neither removes the bias that the noise of A puts into E[A'A]; `direct` does.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from iif_core.errors import InputError
 from iif_core.light.emission.direct import EmissionSolution
 from iif_core.light.emission.rows import EmissionRows
 
-START = 0.01
+START = 0.01  # radiance of every group at first
 PAPER_RATE = 100.0
 
 
@@ -30,10 +27,11 @@ class SgdOptions:
     """How to descend.
 
     Attributes:
-        preset: see the head of this module.
-        steps: batches; batch: rows of one.
-        prune: ((step, share), ...): groups whose sum of channels is at most `share` of the largest are switched off
-            then; nothing happens when none would remain (H26). `paper`: (100, none that grew) and (1000, 5 %).
+        preset: `safe` or `paper`, see the head of this module.
+        steps: batches.
+        batch: rows of a batch.
+        prune: ((step, share), ...): after that step groups whose sum of channels is at most `share` of the largest are switched
+            off, unless none would remain (docs/method/numerics.md#pruning-everything).
         seed: of the draws.
     """
 
@@ -47,23 +45,23 @@ class SgdOptions:
 def solve_emission_sgd(
     rows: EmissionRows, initial: np.ndarray, options: SgdOptions | None = None, ceiling: np.ndarray | None = None
 ) -> EmissionSolution:
-    """Radiance of every group by projected stochastic gradient descent.
+    """Solve for the radiance of every group by projected stochastic gradient descent.
 
     Args:
-        rows, initial: as in `solve_emission`; `initial` is only where groups stay that no row sees (the descent starts at
-            0.01).
-        options: see `SgdOptions`.
+        rows: as in `solve_emission`.
+        initial: (G, 3) radiance of groups to which no row responds; the descent starts at 0.01.
+        options: None = defaults.
         ceiling: (n, 3) target at which `paper` clamps (sensor value 0.9); None = nowhere.
 
     Returns:
-        `EmissionSolution`; `error` and `determined` are 0, there is no covariance; `converged` is False when the descent
-        left the finite numbers (the radiance is then that of the step before) or ended worse than it began.
+        The solution; `error` and `determined` are 0, since there is no covariance; `converged` is False when the descent left
+        the finite numbers (the radiance is then that of the step before) or ended worse than it began.
 
     Raises:
         InputError: `initial` of the wrong shape.
     """
     options = options or SgdOptions()
-    groups, count = rows.groups, len(rows.target)
+    groups, count = rows.groups, len(rows.observed)
     if np.shape(initial) != (groups, 3):
         raise InputError(f"emission: initial radiance of shape {np.shape(initial)}, needed ({groups}, 3)")
     radiance = np.full((groups, 3), START)
@@ -71,15 +69,16 @@ def solve_emission_sgd(
     if not groups or not count:
         return EmissionSolution(np.array(initial, np.float64), zeros, none, 1.0, 0.0, 0, 0, True)
     rng = np.random.default_rng(options.seed)
+    first, second, targets = *rows.matrices, rows.targets
     mean_weight = np.maximum(rows.weight.mean(0), 1e-300)
-    diagonal = np.maximum(np.einsum("nc,ngc->gc", rows.weight, np.square(rows.first, dtype=np.float64)) / count, 1e-300)
+    diagonal = np.maximum(np.einsum("nc,ngc->gc", rows.weight, np.square(first, dtype=np.float64)) / count, 1e-300)
     kept, schedule, finite = np.ones(groups, bool), dict(options.prune), True
     average = np.zeros((groups, 3))
     for step in range(1, options.steps + 1):
         pick = rng.integers(0, count, min(options.batch, count))
         half = rng.random(len(pick)) < 0.5
-        a = np.where(half[:, None, None], rows.first[pick], rows.second[pick])
-        t = np.where(half[:, None], rows.target[pick], rows.target_second[pick])
+        a = np.where(half[:, None, None], first[pick], second[pick])
+        t = np.where(half[:, None], *targets[:, pick])
         predicted = np.einsum("ngc,gc->nc", a, radiance)
         residual = predicted - t
         if options.preset == "safe":
@@ -107,19 +106,19 @@ def solve_emission_sgd(
             average += radiance
     if finite and options.preset == "safe" and options.steps > 1:  # the mean of the second half (Polyak and Juditsky 1992)
         radiance = average / (options.steps - options.steps // 2) * kept[:, None]
-    blind = np.einsum("nc,ngc->gc", rows.weight, np.abs(rows.first)) <= 0
+    blind = np.einsum("nc,ngc->gc", rows.weight, np.abs(first)) <= 0
     radiance = np.where(blind, initial, radiance)
     square, norm, violated = _misfit(rows, radiance)
-    # Steps that are too long end in 0, clamped, rather than in infinity: worse than where the descent began.
+    # Steps that are too long end in 0, clamped, rather than in infinity, and so worse than where the descent began.
     finite &= square <= _misfit(rows, np.full((groups, 3), START))[0] * (1 + 1e-6)
     residual = float(np.sqrt(square / norm)) if norm > 0 else 0.0
     return EmissionSolution(radiance, zeros, none, 1.0, residual, violated, step, bool(finite))
 
 
 def _misfit(rows: EmissionRows, radiance: np.ndarray) -> tuple[float, float, int]:
-    """Weighted sum of squares, that of the target, and bounds that are not reached."""
-    mean = 0.5 * (rows.first + rows.second)
-    difference = rows.mean_target - np.einsum("ngc,gc->nc", mean, radiance)
+    """Weighted sum of squares, that of the target, and number of bounds that are not reached."""
+    target = rows.mean_target
+    difference = target - np.einsum("ngc,gc->nc", rows.matrices.mean(0), radiance)
     counted = np.where(rows.lower_bound & (difference < 0), 0.0, rows.weight)
-    square, norm = float((counted * difference**2).sum()), float((counted * rows.mean_target**2).sum())
+    square, norm = float((counted * difference**2).sum()), float((counted * target**2).sum())
     return square, norm, int((rows.lower_bound & (difference > 0)).sum())

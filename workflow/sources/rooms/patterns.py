@@ -269,7 +269,15 @@ def _hash(xp: Namespace, i: Any, j: Any, k: Any) -> Any:
 
 
 def noise(xp: Namespace, x: Any, y: Any, z: Any) -> Any:
-    """Return value noise in [0, 1] of mean 1/2: random values at the integers, smoothly interpolated, with stretched contrast."""
+    """Compute value noise: random values at the integers, smoothly interpolated, with stretched contrast.
+
+    Args:
+        xp: array namespace.
+        x, y, z: coordinates; the noise has about one cycle per unit.
+
+    Returns:
+        Values in [0, 1] of mean 1/2.
+    """
     i, j, k = xp.floor(x), xp.floor(y), xp.floor(z)
     fx, fy, fz = (f * f * (3 - 2 * f) for f in (x - i, y - j, z - k))
     i0, j0, k0 = (_modulo(xp, c) for c in (i, j, k))

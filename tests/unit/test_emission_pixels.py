@@ -1,0 +1,45 @@
+"""Pixels of the linear system, and rows that keep what was observed and what was cached apart."""
+
+import numpy as np
+
+from iif_core.light.emission.pixels import EmissionPixels, choose_pixels, tile_of
+from iif_core.light.emission.problem import assemble
+from iif_core.light.emission.rows import TracedTransport
+
+
+def test_pixels_are_drawn_evenly_and_border_pixels_only_where_there_are_no_others():
+    group = np.repeat([-1, 0, 1], [100, 20, 20])
+    interior = np.arange(140) % 2 == 0
+    interior[120:] = False  # group 1 has no interior pixel
+    usable = np.arange(140) != 100
+    chosen = choose_pixels(group, usable, interior, 30, 5, np.random.default_rng(0))
+    assert np.bincount(group[chosen] + 1).tolist() == [30, 5, 5] and (np.diff(chosen) > 0).all()
+    assert usable[chosen].all() and interior[chosen[group[chosen] == 0]].all()
+    few = choose_pixels(group, usable, interior, 1000, 1000, np.random.default_rng(0))
+    assert np.bincount(group[few] + 1).tolist() == [100, 9, 20]
+
+
+def test_tiles_are_squares_of_eight_pixels():
+    index = np.arange(20 * 17)
+    tile = tile_of(index, 20)
+    assert np.bincount(tile).tolist() == [64, 64, 32, 64, 64, 32, 8, 8, 4]
+
+
+def test_averaged_rows_hold_the_means_of_what_was_observed_and_cached():
+    """Everything that is reflected, and its specular part, by trace."""
+    rng = np.random.default_rng(1)
+    n, tile = 600, np.arange(600) // 6
+    matrix, cached = rng.random((2, 2, n, 3, 3)).astype(np.float32), rng.random((2, 2, n, 3)).astype(np.float32)
+    radiance = 3.0 * rng.random((n, 3)).astype(np.float32)
+    none = np.zeros(n, int)
+    pixels = EmissionPixels(radiance, np.zeros((n, 3), bool), none, none, tile, none - 1)
+    rows = assemble(pixels, TracedTransport(matrix, cached), 3).rows
+    np.testing.assert_allclose(rows.observed, radiance.reshape(-1, 6, 3).mean(1), rtol=1e-6)
+    np.testing.assert_allclose(rows.cached, cached.reshape(2, 2, -1, 6, 3).mean(3), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(rows.matrix, matrix.reshape(2, 2, -1, 6, 3, 3).mean(3), rtol=1e-5)
+    gain, gloss = rng.random((100, 3)) + 0.5, rng.random(100)
+    scaled = rows.scaled(gain, gloss)
+    assert not scaled.has_lobes
+    expected = gain * (rows.cached[:, 0] - rows.cached[:, 1]) + gloss[:, None] * rows.cached[:, 1]
+    np.testing.assert_allclose(scaled.cached[:, 0], expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(scaled.observed, rows.observed)
