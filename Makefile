@@ -47,7 +47,7 @@ test-all: setup validator
 GLTF_VALIDATOR := .node/node_modules/gltf-validator
 validator:
 	@if [ ! -d $(GLTF_VALIDATOR) ] && command -v npm >/dev/null; then \
-	  npm install --no-save --no-audit --no-fund --silent --prefix .node gltf-validator@2.0.0-dev.3.10 \
+	  npm install --fetch-retries=1 --fetch-timeout=60000 --no-save --no-audit --no-fund --silent --prefix .node gltf-validator@2.0.0-dev.3.10 \
 	    || echo 'validator: npm could not install gltf-validator; its test will be skipped' >&2; fi
 
 # Needs nothing installed: it tells what is missing.

@@ -25,7 +25,7 @@ sys.path[:0] = [path for path in (str(ROOT), str(ROOT / "tests" / "benchmarks"))
 
 from hashgrid_options import OPTIONS, OURS  # noqa: E402
 
-from iif_core.fusion.hashgrid.levels import HashGridOptions, layout, parameter_counts  # noqa: E402
+from iif_core.fusion.hashgrid.levels import HashGridOptions, layout, widths_of  # noqa: E402
 
 SIZES = ((16, 17), (32, 19))  # levels, log2_entries
 BATCH = 65_536
@@ -140,8 +140,11 @@ def memory_bound(options: HashGridOptions, batch: int) -> tuple[float, float]:
     Parameters and two moments are read and written once; per sample: features written and read twice, hidden values
     written and read, slopes of the features written and read.
     """
-    inputs = 2 * len(layout(options))
-    moved = 4 * 6 * sum(parameter_counts(options)) + 4 * batch * (5 * inputs + 2 * options.hidden * options.hidden_layers)
+    levels = layout(options)
+    widths = widths_of(options, levels)
+    inputs = widths[0]
+    parameters = 2 * sum(level.entries for level in levels) + sum(a * b + b for a, b in zip(widths, widths[1:], strict=False))
+    moved = 4 * 6 * parameters + 4 * batch * (5 * inputs + 2 * options.hidden * options.hidden_layers)
     array = np.zeros(32 << 20, np.float32)
     times = []
     for _ in range(6):

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from iif_core.fusion.hashgrid.levels import HashGridOptions, layout
-from iif_core.fusion.hashgrid.texture import HashGridTexture
+from tests.oracles.torch_hashgrid import TorchTexture
 
 RATE = 1e-2
 Iterate = Callable[[int], None]
@@ -100,17 +100,14 @@ def _corners(u, level):
     return row + level.start, torch.where(offset == 1, weight[:, None, :], 1 - weight[:, None, :]).prod(-1)
 
 
-def _ours(backend: str):
-    def make(options: HashGridOptions, batches: list, threads: int) -> Iterate:
-        texture = HashGridTexture(options, threads=threads, backend=backend)
+def _ours(options: HashGridOptions, batches: list, threads: int) -> Iterate:
+    texture = TorchTexture(options, threads=threads)
 
-        def iterate(i: int) -> None:
-            _loss(texture(batches[i])).backward()
-            texture.step(RATE)
+    def iterate(i: int) -> None:
+        _loss(texture(batches[i])).backward()
+        texture.step(RATE)
 
-        return iterate
-
-    return make
+    return iterate
 
 
 def _torch(encode_with, optimisers):
@@ -297,8 +294,7 @@ def _c(options: HashGridOptions, batches: list, threads: int) -> Iterate:
 
 OURS = "ours, numba"
 OPTIONS: dict[str, Callable[[HashGridOptions, list, int], Iterate]] = {
-    OURS: _ours("numba"),
-    "ours, torch backend": _ours("torch"),
+    OURS: _ours,
     "torch gather": _torch(_gather, _adam),
     "torch autograd function": _torch(_function, _fused),
     "torch embedding_bag": _torch(_bag(False), _fused),

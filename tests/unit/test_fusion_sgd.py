@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from iif_core.errors import InputError
 from iif_core.fusion.direct import solve_direct
@@ -12,14 +13,14 @@ from iif_core.fusion.kernels import IDENTITY, as_words
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
 from iif_core.fusion.reference_loss import loss_of_result, reference_loss
-from iif_core.fusion.sgd import kernels, numba_engine, torch_engine
+from iif_core.fusion.sgd import engine, kernels, solve
 from iif_core.fusion.sgd import pool as sgd_pool
 from iif_core.fusion.sgd.options import SgdOptions, sgd_options
 from iif_core.fusion.sgd.solve import converged, solve_sgd
 from iif_core.reflectance.material import unclamped_material
+from tests.oracles import torch_sgd
 from tests.unit.test_fusion_direct import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
-torch = pytest.importorskip("torch")
 TERMS = ("data", "label", "regulariser", "entropy", "gain")
 QUICK = sgd_options(iterations=300, batch=4096)
 SMALL_GRID = HashGridOptions(levels=6, log2_entries=12, base_resolution=8, growth=1.6, hidden=16)
@@ -57,10 +58,10 @@ def compiled(p, options, temperature=0.3, divisor=0.7, real=np.float64):
     batch = kernels.Batch(start, segment, values, pixels, share, raw)
     maps = (a.astype(real) for a in (p["affine"], alpha, log_alpha))
     tables = kernels.SegmentTables(*maps, p["usable"], *kernels.selection_networks(alpha.shape[1]))
-    settings = numba_engine.loss_settings(options, temperature, real)
+    settings = engine.loss_settings(options, temperature, real)
     out = kernels.Gradients(d_raw, d_affine, d_alpha, votes, error, sums)
     kernels.batch_loss(0, len(segment), batch, tables, settings, out)
-    d_z = numba_engine.logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
+    d_z = engine.logit_slope(alpha.astype(real), d_alpha, votes, options.label_weight, divisor)
     return dict(zip(TERMS, sums.sum(0), strict=True)), {"raw": d_raw, "affine": d_affine, "z": d_z}, error
 
 
@@ -76,9 +77,9 @@ def automatic(p, options, temperature=0.3, divisor=0.7):
     """Terms of the loss and gradients by torch."""
     t = {name: torch.from_numpy(a) for name, a in p.items()}
     wanted = [t[name].requires_grad_() for name in ("raw", "affine", "z")]
-    batch = torch_engine.TorchBatch(*(t[name] for name in ("raw", "values", "segment", "share")))
-    tables = torch_engine.TorchTables(*(t[name] for name in ("affine", "z", "usable")))
-    found = torch_engine.torch_losses(batch, tables, temperature, divisor, options)
+    batch = torch_sgd.TorchBatch(*(t[name] for name in ("raw", "values", "segment", "share")))
+    tables = torch_sgd.TorchTables(*(t[name] for name in ("affine", "z", "usable")))
+    found = torch_sgd.torch_losses(batch, tables, temperature, divisor, options)
     o = options
     loss = o.data_weight * found["data"] + o.label_weight * found["label"] + o.regulariser * found["regulariser"]
     slopes = dict(zip(("raw", "affine", "z"), (g.numpy() for g in torch.autograd.grad(loss, wanted)), strict=True))
@@ -172,7 +173,7 @@ def test_half_precision_pools_are_read_as_they_are():
         batch = kernels.Batch(start, segment, pool, np.arange(100, dtype=np.int32), share, raw)
         tables = kernels.SegmentTables(affine, alpha, log_alpha, p["usable"], *kernels.selection_networks(6))
         gradients = kernels.Gradients(d_raw, *rest, np.zeros((4, 6, 3)), sums)
-        kernels.batch_loss(0, 4, batch, tables, numba_engine.loss_settings(options, 0.3, np.float32), gradients)
+        kernels.batch_loss(0, 4, batch, tables, engine.loss_settings(options, 0.3, np.float32), gradients)
         out.append((sums, d_raw))
     np.testing.assert_array_equal(out[0][0], out[1][0])
     np.testing.assert_array_equal(out[0][1], out[1][1])
@@ -202,7 +203,7 @@ def test_adam_is_that_of_torch():
     rng = np.random.default_rng(0)
     start = rng.standard_normal(1000).astype(np.float32)
     ours, theirs = start.copy(), torch.from_numpy(start.copy()).requires_grad_()
-    adam, optimiser = numba_engine.Adam(ours), torch.optim.Adam([theirs], lr=0.01)
+    adam, optimiser = engine.Adam(ours), torch.optim.Adam([theirs], lr=0.01)
     for step in range(20):
         gradient = (rng.standard_normal(1000) * (rng.random(1000) < 0.3)).astype(np.float32)
         adam.gradient[:], theirs.grad = gradient, torch.from_numpy(gradient.copy())
@@ -297,12 +298,13 @@ def test_good_predictions_are_selected_and_the_texture_found():
 
 
 @pytest.mark.parametrize("preset", ["safe", "paper"])
-def test_loss_of_the_solver_is_the_reference_loss(preset):
+def test_loss_of_the_solver_is_the_reference_loss(preset, monkeypatch):
     """With all pixels in one batch and steps of size 0, the first history entry is the loss of the result."""
     problem, _ = simulated()
     options = sgd_options(preset, texture="cells", init="mean", iterations=1, batch=1 << 20, learning_rate=1e-30)
-    for backend in ("numba", "torch"):
-        fit = solve_sgd(problem, replace(options, choice="soft"), backend=backend)
+    for each in (engine.Engine, torch_sgd.TorchEngine):
+        monkeypatch.setattr(solve, "Engine", each)
+        fit = solve_sgd(problem, replace(options, choice="soft"))
         expected = reference_loss(
             problem,
             *(fit.value, fit.scale, (fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
@@ -312,6 +314,7 @@ def test_loss_of_the_solver_is_the_reference_loss(preset):
         assert fit.history[0]["total"] == pytest.approx(expected.total, rel=1e-5)
         assert fit.history[0]["data"] == pytest.approx(expected.data, rel=1e-5)
         assert fit.history[0]["label"] == pytest.approx(expected.label, rel=1e-5)
+    monkeypatch.undo()
     weighted = solve_sgd(problem, replace(options, weighted=True))
     assert weighted.history[0]["data"] == pytest.approx(loss_of_result(problem, weighted, weighted=True).data, rel=1e-5)
 
@@ -330,10 +333,12 @@ def test_loss_with_moved_corrections_is_the_reference_loss():
 
 
 @pytest.mark.parametrize("preset", ["safe", "paper"])
-def test_both_engines_take_the_same_steps(preset):
+def test_steps_are_those_of_automatic_differentiation(preset, monkeypatch):
     problem, _ = simulated()
     options = sgd_options(preset, texture="cells", iterations=8, batch=1024, median_gradient=False, records=8)
-    a, b = (solve_sgd(problem, options, backend=backend) for backend in ("numba", "torch"))
+    a = solve_sgd(problem, options)
+    monkeypatch.setattr(solve, "Engine", torch_sgd.TorchEngine)
+    b = solve_sgd(problem, options)
     for x, y in zip(a.history, b.history, strict=True):
         assert {n: v for n, v in x.items() if n != "step"} == pytest.approx({n: v for n, v in y.items() if n != "step"}, rel=1e-4)
     for x, y in ((a.value, b.value), (a.scale, b.scale)):  # Adam's steps have the size of a gradient's sign
@@ -363,24 +368,13 @@ def test_order_of_predictions_does_not_matter():
     assert b.history[-1]["total"] == pytest.approx(a.history[-1]["total"], rel=0.02)
 
 
-def test_a_given_selection_is_kept():
-    problem, _ = simulated()
-    direct = solve_direct(problem)
-    fit = solve_sgd(problem, QUICK, weight=direct.weight)
-    np.testing.assert_array_equal(fit.alpha, direct.weight)
-    assert all(h["label"] == 0 for h in fit.history)
-    with pytest.raises(InputError, match="weight has shape"):
-        solve_sgd(problem, QUICK, weight=direct.weight[:, :2])
-
-
 def test_one_prediction_needs_no_selection():
     problem, truth = simulated(samples=1)
     fit = solve_sgd(problem, QUICK)
     assert (fit.alpha == 1).all() and all(h["label"] == h["entropy"] == 0 for h in fit.history)
     assert np.isfinite(fit.value).all() and fit.history[-1]["data"] < fit.history[0]["data"]
-    for backend in ("numba", "torch"):
-        paper = solve_sgd(problem, sgd_options("paper", texture="cells", iterations=5), backend=backend)
-        assert np.isfinite(paper.value).all() and (paper.alpha == 1).all()
+    paper = solve_sgd(problem, sgd_options("paper", texture="cells", iterations=5))
+    assert np.isfinite(paper.value).all() and (paper.alpha == 1).all()
 
 
 def test_equal_predictions_share():
@@ -414,17 +408,16 @@ def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(val
     assert (fit.alpha[np.unique(problem.segment_of_pixel[0])] == 0).all()
 
 
-@pytest.mark.parametrize("backend", ["numba", "torch"])
-def test_coldest_temperatures_stay_finite(backend):
+def test_coldest_temperatures_stay_finite():
     problem, _ = simulated()
     options = sgd_options("paper", texture="cells", iterations=20, batch=512, anneal_schedule="fraction", anneal=0.7)
-    fit = solve_sgd(problem, options, backend=backend)
+    fit = solve_sgd(problem, options)
     assert fit.history[-1]["temperature"] < 2e-11
     for array in (fit.value, fit.scale, fit.corrections, fit.alpha):
         assert np.isfinite(array).all()
     assert np.isfinite([list(h.values()) for h in fit.history]).all()
     np.testing.assert_allclose(fit.alpha.sum(1), 1, atol=1e-5)
-    frozen = solve_sgd(problem, replace(options, anneal=0.01), backend=backend)  # to the smallest by which float32 can divide
+    frozen = solve_sgd(problem, replace(options, anneal=0.01))  # to the smallest by which float32 can divide
     assert frozen.history[-1]["temperature"] == 1e-30 and np.isfinite(frozen.value).all()
 
 
@@ -553,8 +546,6 @@ def test_bad_calls_are_refused():
         sgd_options("fast")
     with pytest.raises(InputError, match="surface points"):
         solve_sgd(problem, sgd_options("paper"))
-    with pytest.raises(InputError, match="backend"):
-        solve_sgd(problem, QUICK, backend="jax")
     with pytest.raises(InputError, match="threads"):
         solve_sgd(problem, QUICK, threads=0)
     with pytest.raises(InputError, match="no pixel"):

@@ -1,1 +1,1 @@
-"""The paper's optimiser (docs/method/fusion.md#sgd): `solve.solve_sgd`, with a compiled and a torch engine."""
+"""The paper's optimiser (docs/method/fusion.md#sgd): `solve.solve_sgd`."""

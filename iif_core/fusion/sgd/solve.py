@@ -2,14 +2,12 @@
 
 It reads the same problem as the direct solver, its result is described in the same way (`direct.describe_fit`), and
 `reference_loss.reference_loss` judges both. The loss of a batch of pixels is Eq. F.16, minimised by one Adam over the
-texture, the maps and the logits. On the CPU, loss and gradient are closed forms in one compiled pass (kernels.py); the torch
-engine uses automatic differentiation, runs on any device and checks the former. Every choice of the published behaviour that
-is numerically fragile is an option: docs/method/fusion.md#schedules compares the presets `safe` and `paper`.
+texture, the maps and the logits, with gradients in closed form (kernels.py). Every choice of the published behaviour that is
+numerically fragile is an option: docs/method/fusion.md#schedules compares the presets `safe` and `paper`.
 
-The same problem, options and seed give the same bytes on the CPU, for any number of threads with the compiled engine and for
-a fixed number of torch threads with the torch engine; on CUDA the gradients of the texture are added in no fixed order. The
-order of the predictions changes the result by rounding only. All predictions stay in memory (in half precision if they come
-so), since a batch draws from every view.
+The same problem, options and seed give the same bytes for any number of threads; the order of the predictions changes the
+result by rounding only. All predictions stay in memory (in half precision if they come so), since a batch draws from every
+view.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from numpy.typing import NDArray
 from iif_core.errors import InputError
 from iif_core.fusion.problem import Dropped, FusionProblem, object_means
 from iif_core.fusion.selection import selection_weights
-from iif_core.fusion.sgd.numba_engine import NumbaEngine
+from iif_core.fusion.sgd.engine import Engine
 from iif_core.fusion.sgd.options import SgdOptions
 from iif_core.fusion.sgd.pool import (
     TERMS,
@@ -37,7 +35,6 @@ from iif_core.fusion.sgd.pool import (
     temperature_at,
     unit_coordinates,
 )
-from iif_core.fusion.sgd.torch_engine import TorchEngine
 
 
 @dataclass(frozen=True)
@@ -114,9 +111,6 @@ def solve_sgd(
     options: SgdOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
-    device: str = "cpu",
-    weight: NDArray | None = None,
-    backend: str | None = None,
 ) -> SgdFit:
     """Solve a problem by the paper's optimiser.
 
@@ -124,9 +118,7 @@ def solve_sgd(
         problem: predictions on cells, with surface points for a hash grid.
         options: how to solve; None = the safe preset.
         progress: called as progress(done, total) with numbers of steps.
-        threads: threads of the compiled engine or of the hash grid; device: torch device.
-        weight: (S, K, 3) selection weights to keep instead of learning them, for comparing solvers at one selection.
-        backend: "numba" (CPU), "torch", or None = numba on the CPU and torch elsewhere.
+        threads: at least 1.
 
     Returns:
         Texture, affine maps, selection and history.
@@ -136,22 +128,12 @@ def solve_sgd(
             a hash grid without surface points, a loss that is not finite.
     """
     options = options or SgdOptions()
-    on_cpu = str(device).startswith("cpu")
-    backend = backend or ("numba" if on_cpu else "torch")
-    if backend not in ("numba", "torch") or (backend == "numba" and not on_cpu):
-        raise InputError(f"base sgd: backend {backend!r} on device {device}; numba runs on the cpu, torch anywhere")
     if threads < 1:
         raise InputError(f"base sgd: {threads} threads; at least 1")
     pool = gather(problem, options)
-    n_segments, k = pool.usable.shape
-    if weight is not None and np.shape(weight) != (n_segments, k, 3):
-        raise InputError(f"base sgd: weight has shape {np.shape(weight)}; needed is {(n_segments, k, 3)}")
-    if backend == "numba":
-        engine: NumbaEngine | TorchEngine = NumbaEngine(pool, options, problem.n_cells, threads)
-    else:
-        engine = TorchEngine(pool, options, problem.n_cells, threads, device)
+    engine = Engine(pool, options, problem.n_cells, threads)
     try:
-        return _solve(problem, options, pool, engine, weight, progress)
+        return _solve(problem, options, pool, engine, progress)
     finally:
         engine.close()
 
@@ -160,8 +142,7 @@ def _solve(
     problem: FusionProblem,
     options: SgdOptions,
     pool: Pool,
-    engine: NumbaEngine | TorchEngine,
-    weight: NDArray | None,
+    engine: Engine,
     progress: Callable[[int, int], None] | None,
 ) -> SgdFit:
     batch = min(options.batch, len(pool))
@@ -170,9 +151,9 @@ def _solve(
     rng = np.random.default_rng(options.seed)
     stream = batches(len(pool), batch, rng)
     single = pool.usable.shape[1] == 1
-    if weight is not None or single:
-        engine.fix(weight if weight is not None else pool.usable[..., None] * np.ones(3))
-    choose = options.choice == "argmin" and weight is None and not single
+    if single:
+        engine.fix(pool.usable[..., None] * np.ones(3))
+    choose = options.choice == "argmin" and not single
     choose_at = round(options.choose_at * steps)
     history: list[dict[str, float]] = []
     every = max(1, steps // options.records)
@@ -234,18 +215,18 @@ def _fit(
     problem: FusionProblem,
     options: SgdOptions,
     pool: Pool,
-    engine: NumbaEngine | TorchEngine,
+    engine: Engine,
     total: NDArray,
     temperature: float,
     history: list[dict[str, float]],
 ) -> SgdFit:
     n_cells, seen = problem.n_cells, pool.observations > 0
     if pool.coordinates is None:
-        raw = engine.cells()
+        raw = engine.table
     else:
         centre = np.stack([np.bincount(pool.cell, pool.coordinates[:, a], n_cells) for a in range(3)], 1)
         centre /= np.maximum(pool.observations, 1)[:, None]
-        raw = engine.at(centre.astype(np.float32))
+        raw = engine.grid.evaluate(centre.astype(np.float32))
     value, scale = activated(raw, options)
     object_value, _ = object_means(value, problem.object_of_cell, pool.observations)
     value[~seen] = object_value[problem.object_of_cell[~seen]]
@@ -259,12 +240,12 @@ def _fit(
             return value[cell], scale[cell]
         point = of_view(problem.point, view).reshape(-1, 3)
         point = np.where(np.isfinite(point), point, np.float32(pool.box[0]))
-        return activated(engine.at(unit_coordinates(point, pool.box)), options)
+        return activated(engine.grid.evaluate(unit_coordinates(point, pool.box)), options)
 
     return SgdFit(
         value=value,
         scale=scale,
-        corrections=engine.state().copy(),
+        corrections=engine.affine.copy(),
         alpha=np.where(count > 0, alpha, 0).astype(np.float32),
         log_alpha=log_alpha,
         temperature=temperature,

@@ -1,4 +1,4 @@
-"""The optimiser's step on the CPU, with loss and gradient as closed forms in one compiled pass (kernels.py)."""
+"""The optimiser's step, with loss and gradient as closed forms in one compiled pass (kernels.py)."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class Adam:
         run(update, range(0, len(self.live), piece))
 
 
-class NumbaEngine:
-    """Engine for the CPU with closed-form gradients; the selection is fixed from a call of `fix` on."""
+class Engine:
+    """Parameters, optimisers and closed-form gradients; the selection is fixed from a call of `fix` on."""
 
     def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int):
         from iif_core.fusion.sgd import kernels
@@ -63,7 +63,7 @@ class NumbaEngine:
         self.networks = kernels.selection_networks(k)
         self.adam_affine, self.adam_z = Adam(self.affine), Adam(self.z)
         self.d_alpha, self.votes = np.zeros((s, k, 3), np.float32), np.zeros((s, k, 3), np.float32)
-        self.grid = HashGridTexture(options.grid, options.seed, "cpu", threads) if options.texture == "hashgrid" else None
+        self.grid = HashGridTexture(options.grid, options.seed, threads) if options.texture == "hashgrid" else None
         if self.grid is None:
             self.table = start_values(pool, n_cells, options)
             self.adam_table = Adam(self.table)
@@ -127,23 +127,15 @@ class NumbaEngine:
         """Update texture, maps and logits once; return the sums (SUMS,)."""
         share = shares(self.pool, step.pixels, self.options)
         error = np.zeros((*self.pool.usable.shape, 3))
-        rows, graph = self.pool.cell[step.pixels], None
-        if self.grid is None:
-            raw = self.table[rows]
-        else:
-            import torch
-
-            graph = self.grid(torch.from_numpy(step.coordinates))
-            raw = graph.detach().numpy()
+        rows = self.pool.cell[step.pixels]
+        raw, kept = (self.table[rows], None) if self.grid is None else self.grid.forward(step.coordinates)
         d_raw, sums = self.losses(step, raw, share, error)
         if np.isfinite(sums).all():
-            if graph is None:
+            if self.grid is None:
                 self.kernels.add_rows(self.adam_table.gradient.reshape(self.table.shape), rows, d_raw)
                 self.adam_table.step(step.learning_rate, self.run)
             else:
-                import torch
-
-                graph.backward(torch.from_numpy(d_raw))
+                self.grid.backward(kept, d_raw)
                 self.grid.step(step.learning_rate)
             self.adam_affine.step(step.learning_rate, self.run)
             if self.fixed is None:
@@ -165,22 +157,10 @@ class NumbaEngine:
         """Return the raw outputs at pixels of the pool, without jitter."""
         if self.grid is None:
             return self.table[self.pool.cell[pixels]]
-        return self.at(self.pool.coordinates[pixels])
-
-    def at(self, coordinates: NDArray) -> NDArray:
-        """Return the raw outputs of the hash grid at coordinates (N, 3)."""
-        import torch
-
-        return self.grid.evaluate(torch.from_numpy(coordinates)).numpy()
-
-    def cells(self) -> NDArray:
-        return self.table
+        return self.grid.evaluate(self.pool.coordinates[pixels])
 
     def fix(self, alpha: NDArray) -> None:
         self.fixed = np.ascontiguousarray(alpha, np.float32)
-
-    def state(self) -> NDArray:
-        return self.affine
 
 
 def loss_settings(options: SgdOptions, temperature: float, real: type[np.floating]) -> LossSettings:

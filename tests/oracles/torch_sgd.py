@@ -1,21 +1,18 @@
-"""The optimiser's step on any device with automatic differentiation, which checks the closed forms of the compiled engine."""
+"""The optimiser's step on a texture of cells by automatic differentiation, against which the closed forms are tested."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from iif_core.fusion.hashgrid.texture import HashGridTexture
 from iif_core.fusion.kernels import IDENTITY
 from iif_core.fusion.problem import LOWEST
 from iif_core.fusion.sgd.kernels import LOCATION, SCALE
 from iif_core.fusion.sgd.options import SgdOptions
 from iif_core.fusion.sgd.pool import TERMS, Pool, Step, softmax, start_values
-
-if TYPE_CHECKING:
-    import torch
 
 _PROPERTY_OF_CHANNEL = [0, 0, 0, 1, 2]
 
@@ -47,94 +44,66 @@ class TorchTables(NamedTuple):
 
 
 class TorchEngine:
-    """Engine for any device; the methods are those of numba_engine.NumbaEngine."""
+    """Engine whose methods and attributes are those of sgd.engine.Engine."""
 
-    def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int, device: str):
-        import torch
+    grid = None
 
-        self.torch, self.pool, self.options, self.device = torch, pool, options, torch.device(device)
+    def __init__(self, pool: Pool, options: SgdOptions, n_cells: int, threads: int):
+        self.pool, self.options = pool, options
         s, k = pool.usable.shape
-        values = pool.values.view(np.float16) if pool.values.dtype == np.uint16 else pool.values
-        self.values = self.tensor(values)
-        self.segment, self.cell = self.tensor(pool.segment.astype(np.int64)), self.tensor(pool.cell.astype(np.int64))
-        self.usable, self.weight = self.tensor(pool.usable), self.tensor(pool.weight)
-        self.affine = self.tensor(np.tile(IDENTITY, (s, k, 1))).requires_grad_()
-        self.z = torch.zeros((s, k, 3), device=self.device, requires_grad=True)
+        self.values = torch.from_numpy(pool.values.view(np.float16) if pool.values.dtype == np.uint16 else pool.values)
+        self.segment, self.cell = (torch.from_numpy(a.astype(np.int64)) for a in (pool.segment, pool.cell))
+        self.usable, self.weight = torch.from_numpy(pool.usable), torch.from_numpy(pool.weight)
+        self.table, self.affine = start_values(pool, n_cells, options), np.tile(IDENTITY, (s, k, 1))
+        self.z = torch.zeros((s, k, 3), requires_grad=True)
         self.fixed = None
-        self.grid, self.table = None, None
-        if options.texture == "hashgrid":
-            self.grid = HashGridTexture(options.grid, options.seed, str(device), threads)
-            parameters = [self.affine, self.z]
-        else:
-            self.table = self.tensor(start_values(pool, n_cells, options)).requires_grad_()
-            parameters = [self.table, self.affine, self.z]
-        self.optimiser = torch.optim.Adam(parameters, lr=options.learning_rate)
-
-    def tensor(self, array: NDArray) -> torch.Tensor:
-        return self.torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
+        # tensors that share the memory of the arrays, which Adam therefore updates
+        self.texture, self.maps = (torch.from_numpy(a).requires_grad_() for a in (self.table, self.affine))
+        self.optimiser = torch.optim.Adam([self.texture, self.maps, self.z], lr=options.learning_rate)
 
     def close(self) -> None:
         pass
 
     def losses(self, pixels: torch.Tensor, raw: torch.Tensor, temperature: float) -> dict[str, torch.Tensor]:
         segment = self.segment[pixels]
-        share = self.weight[pixels] if self.options.weighted else self.torch.ones_like(self.weight[pixels])
+        share = self.weight[pixels] if self.options.weighted else torch.ones_like(self.weight[pixels])
         divisor = temperature if self.options.logits == "scaled" else 1.0
-        batch = TorchBatch(raw, self.values[pixels].to(self.torch.float32), segment, share / share.sum())
-        tables = TorchTables(self.affine, self.z, self.usable, self.fixed)
+        batch = TorchBatch(raw, self.values[pixels].to(torch.float32), segment, share / share.sum())
+        tables = TorchTables(self.maps, self.z, self.usable, self.fixed)
         found = torch_losses(batch, tables, temperature, divisor, self.options)
         if self.fixed is not None:
-            found["label"] = self.torch.zeros_like(found["label"])  # a fixed selection has no label loss
+            found["label"] = torch.zeros_like(found["label"])  # a fixed selection has no label loss
         return found
 
     def step(self, step: Step) -> NDArray:
-        pixels = self.tensor(step.pixels.astype(np.int64))
-        raw = self.grid(self.tensor(step.coordinates)) if self.table is None else self.table[self.cell[pixels]]
-        found = self.losses(pixels, raw, step.temperature)
+        pixels = torch.from_numpy(step.pixels.astype(np.int64))
+        found = self.losses(pixels, self.texture[self.cell[pixels]], step.temperature)
         o = self.options
         loss = o.data_weight * found["data"] + o.regulariser * found["regulariser"] + o.label_weight * found["label"]
-        sums = self.torch.stack([found[name].detach() for name in TERMS]).cpu().numpy().astype(np.float64)
-        if np.isfinite(sums).all():
-            self.optimiser.zero_grad(set_to_none=False)
-            loss.backward()
-            self.optimiser.param_groups[0]["lr"] = step.learning_rate
-            self.optimiser.step()
-            if self.grid is not None:
-                self.grid.step(step.learning_rate)
-        return sums
+        self.optimiser.zero_grad(set_to_none=False)
+        loss.backward()
+        self.optimiser.param_groups[0]["lr"] = step.learning_rate
+        self.optimiser.step()
+        return torch.stack([found[name].detach() for name in TERMS]).numpy().astype(np.float64)
 
     def errors(self, temperature: float) -> NDArray:
         total = np.zeros((*self.pool.usable.shape, 3))
-        with self.torch.no_grad():
+        with torch.no_grad():
             for low in range(0, len(self.pool), self.options.batch):
-                rows = np.arange(low, min(low + self.options.batch, len(self.pool)))
-                found = self.losses(self.tensor(rows), self.tensor(self.raw(rows)), temperature)["error"]
-                np.add.at(total, self.pool.segment[rows], found.cpu().numpy())
+                rows = torch.arange(low, min(low + self.options.batch, len(self.pool)))
+                found = self.losses(rows, self.texture[self.cell[rows]], temperature)["error"]
+                np.add.at(total, self.pool.segment[rows.numpy()], found.numpy())
         return total
-
-    def raw(self, pixels: NDArray) -> NDArray:
-        if self.table is None:
-            return self.at(self.pool.coordinates[pixels])
-        return self.table.detach()[self.cell[self.tensor(pixels.astype(np.int64))]].cpu().numpy()
-
-    def at(self, coordinates: NDArray) -> NDArray:
-        return self.grid.evaluate(self.tensor(coordinates)).cpu().numpy()
-
-    def cells(self) -> NDArray:
-        return self.table.detach().cpu().numpy()
 
     def weights(self, temperature: float) -> tuple[NDArray, NDArray]:
         if self.fixed is not None:
-            alpha = self.fixed.cpu().numpy()
+            alpha = self.fixed.numpy()
             return alpha, np.log(alpha, out=np.zeros_like(alpha), where=alpha > 0)
         divisor = temperature if self.options.logits == "scaled" else 1.0
-        return softmax(self.z.detach().cpu().numpy(), divisor, self.pool.usable)
+        return softmax(self.z.detach().numpy(), divisor, self.pool.usable)
 
     def fix(self, alpha: NDArray) -> None:
-        self.fixed = self.tensor(np.asarray(alpha, np.float32))
-
-    def state(self) -> NDArray:
-        return self.affine.detach().cpu().numpy()
+        self.fixed = torch.from_numpy(np.asarray(alpha, np.float32))
 
 
 def torch_losses(
@@ -149,8 +118,6 @@ def torch_losses(
     Returns:
         data, label, regulariser (without its weight), entropy and gain: scalars; error: (N, K, 3) L1 errors without graph.
     """
-    import torch
-
     raw, values, segment, share = batch
     low = torch.as_tensor(LOWEST, device=raw.device).to(raw.dtype)
     use, t = tables.usable[segment], tables.affine[segment]
@@ -193,8 +160,6 @@ def _texture(raw: torch.Tensor, low: torch.Tensor, options: SgdOptions) -> tuple
 
 def _corrected(values: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
     """Predictions (N, K, 5) under the maps of their segments (N, K, 16), before the clamp."""
-    import torch
-
     albedo = t[..., :12].unflatten(-1, (3, 4))
     return torch.cat(
         [
@@ -208,8 +173,6 @@ def _corrected(values: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
 
 def _selection(tables: TorchTables, divisor: float, real: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
     """alpha and log alpha (S, K, 3), 0 where a prediction is not usable (Eq. F.2)."""
-    import torch
-
     if tables.fixed is not None:
         alpha = tables.fixed.to(real)
         return alpha, torch.where(alpha > 0, alpha, 1.0).log()
@@ -221,8 +184,6 @@ def _selection(tables: TorchTables, divisor: float, real: torch.dtype) -> tuple[
 
 def _reference_scale(spread: torch.Tensor, use: torch.Tensor, n_used: torch.Tensor) -> torch.Tensor:
     """Lower median (N, 5) of the deviations (N, K, 5) of usable predictions; its gradient reaches the first that equals it."""
-    import torch
-
     ranked = torch.where(use[..., None], spread.detach(), torch.inf).sort(dim=1).values
     median = ranked.gather(1, ((n_used - 1).clamp_min(0) // 2)[:, None, None].expand(-1, 1, 5))
     index = torch.arange(use.shape[1], device=spread.device)[None, :, None]
@@ -233,8 +194,6 @@ def _reference_scale(spread: torch.Tensor, use: torch.Tensor, n_used: torch.Tens
 
 def _distance_from_identity(t: torch.Tensor) -> torch.Tensor:
     """Identity regulariser (N, K) of maps (N, K, 16) (Eq. F.14)."""
-    import torch
-
     albedo = t[..., :12].unflatten(-1, (3, 4))
     a, identity = albedo[..., :3], torch.eye(3, dtype=t.dtype, device=t.device)
     penalty = ((a - identity) ** 2).sum((-1, -2)) + (albedo[..., 3] ** 2).sum(-1)
@@ -244,8 +203,6 @@ def _distance_from_identity(t: torch.Tensor) -> torch.Tensor:
 
 def _clamped(x: torch.Tensor, low: torch.Tensor, gradient: str) -> torch.Tensor:
     """x clamped to [low, 1], with the gradient that SgdOptions.clamp_gradient names."""
-    import torch
-
     clamped = torch.maximum(torch.minimum(x, torch.ones_like(x)), low.expand_as(x))
     outside = x.detach() - clamped.detach()
     dead = torch.where(outside == 0, x, clamped.detach())
