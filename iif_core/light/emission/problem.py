@@ -42,14 +42,9 @@ class EmissionProblem:
     ) -> tuple[EmissionProblem, ObjectGains]:
         """Estimate the albedo gains of objects together with the light (up to 15 solves; docs/method/light.md#object-gains).
 
-        Args:
-            initial: (G, 3) radiance to start from.
-            albedo: (n_objects, 3) mean base albedo that no gain may bring above 1; None = no such limit.
-            n_objects: gains for at least so many objects.
-
-        Returns:
-            The problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and the
-            gains.
+        `initial` is the (G, 3) radiance to start from; no gain brings the mean base albedo (n_objects, 3), if given, above 1.
+        Returns the problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and
+        the gains.
         """
         identifiable = self.scale_is_identifiable
         # Without a scale the two lobes would fix one by how much they differ, for which predicted gloss is not good enough.
@@ -101,7 +96,8 @@ def assemble(
         clear = own & ~pixels.bound.any(1)
         upper = np.zeros((*matrix.shape[:2], int(clear.sum()), n_groups, 3), matrix.dtype)
         upper[:, 0] = -direct[clear]
-        matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, np.zeros_like(upper[:, :, :, 0])], 2)
+        none = np.zeros((*upper.shape[:3], 3), upper.dtype)
+        matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, none], 2)
         observed, bound = np.r_[observed, -observed[clear]], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
     problem = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
