@@ -136,14 +136,11 @@ def emitters(groups: int, dropped: int, candidates: int) -> Decision:
 
 
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
-    """Decide between photographed radiance and further bounces for indirect light (Eq. S.14).
+    """Decide between photographed radiance and further bounces for indirect light (Eq. S.14); `setting` is `cache`, `path` or
+    `auto`.
 
-    The cache holds what the cameras saw; paths compound the error of the base albedo at every bounce.
-
-    Args:
-        setting: `cache`, `path` or `auto`.
-        coverage: share of cosine-distributed rays from the surface that meet a known voxel, among those that meet no emitter.
-        censored: share of the voxels that were seen by saturated pixels only.
+    `coverage` is the share of cosine-distributed rays from the surface that meet a known voxel, among those that meet no emitter;
+    `censored` the share of the voxels that were seen by saturated pixels only.
     """
     measure = "share of secondary hits whose radiance was photographed"
     if setting != "auto":
@@ -153,11 +150,7 @@ def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
 
 
 def camera_response(dynamic_range: str, calibration: dict[str, Any]) -> Decision:
-    """Describe the camera response that the calibration chose; linear radiance has none.
-
-    Args:
-        dynamic_range: `hdr` or `ldr`; calibration: facts of the calibration in `emission.json`.
-    """
+    """Describe the camera response that the calibration chose (its facts are in `emission.json`); linear radiance has none."""
     table = calibration["candidates"]
     measure = "log likelihood by which the simplest curve is behind the best, in standard errors"
     value = table[0]["behind"] / max(table[0]["error"], 1e-9) if table else 0.0
@@ -176,11 +169,7 @@ def exposure(setting: str, log_gains: np.ndarray, estimated: int) -> Decision:
 
 
 def camera_term(term: str, evidence: Evidence) -> Decision:
-    """Decide about white balance of the views or vignetting of the lens by the loss on held-out surface.
-
-    Args:
-        term: `white_balance` or `vignetting`; evidence: of `camera.gains.choose_gains`.
-    """
+    """Decide about `white_balance` of the views or `vignetting` of the lens by the loss on held-out surface."""
     measure = "fall of the held-out loss by this term, in standard errors"
     value = evidence.gain / evidence.error if evidence.error > 0 else 0.0
     what = "median |log gain| of a channel" if term == "white_balance" else "largest |log falloff|"
@@ -192,11 +181,7 @@ def camera_term(term: str, evidence: Evidence) -> Decision:
 
 
 def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
-    """Decide about metallic: objects that the photographs show to be metals, at least in parts.
-
-    Args:
-        free: (O,) bool, not a dielectric; prior_median: (O,) median predicted metalness.
-    """
+    """Decide about metallic: objects (`free`, not dielectrics) that the photographs show to be metals, at least in parts."""
     count = int(np.count_nonzero(free))
     predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
     value = float(np.max(prior_median)) if len(prior_median) else 0.0
@@ -206,20 +191,14 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
 
 
 def gloss_is_idle(glossy: float, matte: float) -> bool:
-    """Return whether gloss does not make the views of a cell, given an albedo of its own, more alike (Eq. M.44).
-
-    Args:
-        glossy, matte: how much they differ with the fitted gloss and without gloss; 0 = no cell can tell.
-    """
+    """Return whether the views of a cell differ as much with the fitted gloss as without (Eq. M.44); 0 = no cell can tell."""
     return 0 < glossy and matte <= glossy
 
 
 def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
-    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels, or metallic.
+    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic.
 
-    Args:
-        low_roughness: (O,) 5 % quantile of the fitted roughness; free_metallic: (O,) bool, not a dielectric.
-        scatter: how much the views of a cell differ with the fitted gloss and without (Eq. M.44); None = not compared.
+    `scatter`: how much the views of a cell differ with the fitted gloss and without (Eq. M.44); None = not compared.
     """
     if scatter is not None and gloss_is_idle(*scatter):
         measure = "how much more the views of a cell differ without gloss than with it (root mean square)"

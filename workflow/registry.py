@@ -1,7 +1,7 @@
 """The stages, in one table: what each needs and which settings it reads.
 
 `settings` are dotted paths into the settings tree. A stage can see no others (`Job.settings` refuses), so its fingerprint covers
-everything that it can depend on. Nothing heavy is imported here, because the Snakefile reads this table.
+everything that it can depend on.
 """
 
 from dataclasses import dataclass

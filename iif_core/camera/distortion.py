@@ -1,14 +1,7 @@
 """Lens distortion: resampling of a distorted photograph to a pinhole camera (docs/method/camera.md#lens-distortion).
 
-Points are normalised camera coordinates (x, y) = (X/Z, Y/Z) with OpenCV axes, r = |(x, y)|. Both models are those of OpenCV
-(Eq. C.4, C.5):
-
-    radial_tangential   x_d = x c + 2 p1 x y + p2 (r^2 + 2 x^2)      c = 1 + k1 r^2 + k2 r^4 + k3 r^6
-                        y_d = y c + p1 (r^2 + 2 y^2) + 2 p2 x y
-    fisheye             (x_d, y_d) = t_d / r (x, y)      t = atan r,  t_d = t (1 + k1 t^2 + ... + k4 t^8)
-
-Outside the picture the polynomial may turn back, so that two directions reach one pixel. Directions beyond the first turning
-point count as not visible (docs/method/numerics.md#lens-that-folds-back).
+Points are normalised camera coordinates (x, y) = (X/Z, Y/Z) with OpenCV axes; both models are OpenCV's (Eq. C.4, C.5).
+Directions beyond the first turning point count as not visible (docs/method/numerics.md#lens-that-folds-back).
 """
 
 from __future__ import annotations

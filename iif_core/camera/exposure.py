@@ -1,8 +1,4 @@
-"""Exposure of every view from surface that several views share (Eq. C.25 with one gain per view, Eq. C.26).
-
-A surface cell c that the views v and w both see is, up to gloss, equally bright in both: log y_vc = g_v + s_c. Eliminating
-the levels s_c leaves a V x V problem in the gains g_v, which iteratively reweighted least squares (Cauchy) solves.
-"""
+"""Exposure of every view from surface that several views share (Eq. C.25 with one gain per view, Eq. C.26)."""
 
 from __future__ import annotations
 
@@ -12,6 +8,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.graph import component_labels
+
+_MIN_PAIRS = 8  # (cell, view) pairs on shared cells that a view needs
 
 
 @dataclass(frozen=True)
@@ -36,9 +34,7 @@ class ExposureGains:
     pairs: int
 
 
-def estimate_gains(
-    cell: np.ndarray, view: np.ndarray, value: np.ndarray, n_views: int, iterations: int = 20, min_pairs: int = 8
-) -> ExposureGains:
+def estimate_gains(cell: np.ndarray, view: np.ndarray, value: np.ndarray, n_views: int) -> ExposureGains:
     """Estimate the relative exposure of the views: the robust minimum of sum w (log y_vc - g_v - s_c)^2 over g and s.
 
     Args:
@@ -47,8 +43,6 @@ def estimate_gains(
         value: (n,) or (n, 3) linearised, unsaturated sensor values f^-1(I); values that are not positive and finite are
             ignored. The three channels share the gain.
         n_views: V.
-        iterations: number of reweighted solves.
-        min_pairs: (cell, view) pairs on shared cells that a view needs.
 
     Returns:
         Gains, up to one factor per group of overlapping views: the mean of the log gains of a group is 0.
@@ -68,7 +62,7 @@ def estimate_gains(
     while len(cell):
         count = np.bincount(cell)
         shared = count[cell] >= 2
-        enough = np.bincount(view[shared], minlength=n_views) >= min_pairs
+        enough = np.bincount(view[shared], minlength=n_views) >= _MIN_PAIRS
         keep = shared & enough[view]
         if keep.all():
             break
@@ -77,7 +71,7 @@ def estimate_gains(
         return nothing
     cell = np.unique(cell, return_inverse=True)[1]
     group = view_groups(cell, view, n_views)
-    gains, error, scale = _solve(cell, view, log_y, weight, group, n_views, iterations)
+    gains, error, scale = _solve(cell, view, log_y, weight, group, n_views)
     estimated = group >= 0
     return ExposureGains(np.where(estimated, np.exp(gains), 1.0), error, estimated, group, scale, len(cell))
 
@@ -108,13 +102,7 @@ def view_groups(cell: np.ndarray, view: np.ndarray, n_views: int) -> np.ndarray:
 
 
 def _solve(
-    cell: np.ndarray,
-    view: np.ndarray,
-    log_y: np.ndarray,
-    weight: np.ndarray,
-    group: np.ndarray,
-    n_views: int,
-    iterations: int,
+    cell: np.ndarray, view: np.ndarray, log_y: np.ndarray, weight: np.ndarray, group: np.ndarray, n_views: int
 ) -> tuple[np.ndarray, np.ndarray, float]:
     from scipy.sparse import coo_matrix
 
@@ -126,7 +114,7 @@ def _solve(
     gauge = one_hot @ (one_hot / one_hot.sum(0)).T  # projector on the group means
     scale = 0.0
     normal = np.eye(len(present))
-    for _ in range(max(iterations, 1)):
+    for _ in range(20):
         w = weight * robust
         total = np.bincount(cell, w, n_cells)
         mixed = coo_matrix((w, (view, cell)), (n_views, n_cells)).tocsr()

@@ -1,12 +1,6 @@
 """Exposure, white balance and vignetting from surface that photographs share (docs/method/camera.md, Eq. C.25 to C.27).
 
-A surface patch p that the views v and w both see sends, up to gloss, the same light to both:
-
-    log y_pvc = g_vc + a r^2 + b r^4 + s_pc,      y = f^-1(I), r: distance from the picture's centre / half its diagonal.
-
-The fit is robust (Cauchy). The levels s_pc are eliminated; the unknowns are one gain per view (exposure) or three (exposure
-and white balance), and the vignetting exp(a r^2 + b r^4), which all views share. A term enters the model when it helps on
-surface that the fit did not use (`choose_gains`).
+The robust fit eliminates the levels of the patches; a term enters the model when it helps on surface that the fit did not use.
 """
 
 from __future__ import annotations

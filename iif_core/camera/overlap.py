@@ -1,9 +1,6 @@
 """Surface patches that several photographs show, for calibrating exposure and response (docs/method/camera.md#patches).
 
-A patch is a voxel of one object with one direction of the normal. Its pixels in one photograph become one row, the mean of the
-middle half of their sensor values. This mean is nearly equivariant under any rising response curve, because quantiles are.
-Patches that are uneven in a photograph (texture, the edge of a shadow, a highlight) are left out there, because another
-photograph sees another mixture of them.
+A row is the mean of the middle half of a patch's sensor values in one photograph, since quantiles commute with any response.
 """
 
 from __future__ import annotations

@@ -1,15 +1,7 @@
 """Registration of photographs with a mesh: small corrections of poses and common intrinsics, and the sharpness of each view.
 
-A surface point p that several photographs show has one texture value C_p. With feature images I_v (`feature_image`) the
-objective is (Eq. C.30)
-
-    sum_pv rho((I_v(pi_v(p)) - C_p) / s)  +  sum_vk ((1 - e_v(pi_v(q_k))) / s_e)^2  +  prior
-
-over one twist per view (rotation and translation in the camera's frame) and over focal length and principal point, which all
-views share. The first term makes the photographs agree with each other. It hardly notices a drift of all cameras together,
-because texture then slides along the surface. The second term ties the photographs to the mesh: q_k are points on creases and
-silhouettes of the mesh as view v sees them, and e_v are the edges of the photograph. C_p is eliminated (Schur complement).
-Steps are Gauss-Newton with Cauchy's weights, on images that are blurred less and less.
+The photographs have to agree with each other on surface points, and with the edges of the mesh (Eq. C.30). The texture values of
+the points are eliminated; steps are Gauss-Newton with Cauchy's weights, on images that are blurred less and less.
 """
 
 from __future__ import annotations

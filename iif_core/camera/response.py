@@ -1,24 +1,8 @@
 """Camera response: the sensor value f(x) of exposed radiance x = e L, its derivatives and its inverse.
 
-A `Response` is a family and its parameters (docs/method/camera.md#response-families). Every family increases from f(0) = 0 to
-f(1) = 1. Beyond [0, 1] it continues as a straight line with the slope of that end, so that a prediction that is too bright
-keeps a gradient (Eq. C.16, docs/method/numerics.md#response-above-white).
-
-| family | parameters | f(x), 0 <= x <= 1 |
-|---|---|---|
-| identity | - | x (HDR; a straight line everywhere) |
-| srgb | - | IEC 61966-2-1 (Eq. C.11) |
-| gamma | gamma | x^(1 / gamma) (Eq. C.12) |
-| ggcm | a0, a1, a2 | x^exp(a0 + a1 x + a2 x^2), the generalised gamma curve model of Ng, Chang and Tsui (Eq. C.13) |
-| spline | rise_1 ... rise_{K-1}, slope_0 ... slope_K | S(x^0.45), K even bins (Eq. C.14) |
-| sampled | - | straight lines between given samples |
-
-S is the monotone rational-quadratic spline of Gregory and Delbourgo: knots at k / K, slopes exp(slope_k) there, and rises
-between knots that are the softmax of (rise_1, ..., rise_{K-1}, 0). Any parameters give a strictly rising curve with a closed
-inverse; all zeros give x^0.45.
-
-Powers have an infinite slope at 0. Below x = 1e-4, less than one 8-bit step, a parabola through the origin with the same value
-and slope at 1e-4 replaces them (Eq. C.15, docs/method/numerics.md#pow-at-zero).
+Every family (docs/method/camera.md#response-families, Eq. C.11 to C.14) increases from f(0) = 0 to f(1) = 1. Beyond [0, 1] it
+continues as a straight line (Eq. C.16, docs/method/numerics.md#response-above-white); below x = 1e-4 a parabola replaces powers,
+whose slope is infinite at 0 (Eq. C.15, docs/method/numerics.md#pow-at-zero).
 """
 
 from __future__ import annotations
@@ -290,11 +274,8 @@ class Response:
 
 
 def response(family: str, params: np.ndarray | None = None) -> Response:
-    """Make a response of a named family.
-
-    Args:
-        family: any of `FAMILIES` but `sampled`.
-        params: parameters, (P,) or (C, P); those of `START`, which are near sRGB, if None.
+    """Make a response of a named family (any of `FAMILIES` but `sampled`) with parameters (P,) or (C, P); None = `START`, near
+    sRGB.
 
     Raises:
         InputError: unknown family, wrong number of parameters, or a parameter that is not finite.
@@ -326,10 +307,8 @@ def parameter_names(family: str, size: int) -> tuple[str, ...]:
 def sampled_response(x: np.ndarray, y: np.ndarray) -> Response:
     """Make the response of a measured curve: straight lines between samples, made increasing and scaled to f(0) = 0, f(1) = 1.
 
-    Args:
-        x: (S,) exposed radiance, strictly increasing, from 0 to 1, S >= 2.
-        y: (S,) shared, or (C, S), one row per channel: sensor value. Increments below 1e-6 of the range are raised to it
-            (docs/method/numerics.md#flat-pieces-of-a-response).
+    `x` (S,) increases from 0 to 1; `y` is (S,) or (C, S). Increments below 1e-6 of the range are raised to it
+    (docs/method/numerics.md#flat-pieces-of-a-response).
 
     Raises:
         InputError: wrong shapes, x not from 0 to 1, samples that are not finite, or a curve that never rises.

@@ -1,9 +1,6 @@
 """Simulated photographs: rendered radiance through exposure, response curve and eight bits (Eq. C.34).
 
-    I_c = round(255 f_c(clip(e_v L_c, 0, 1))) / 255
-
-The curves are S-shaped tone curves over a gamma (Eq. C.35). They belong to none of the families of `iif_core.camera.response`,
-so that a solver that estimates the response is not given the form of the answer.
+The S-shaped curves (Eq. C.35) belong to none of the families that the solver fits.
 """
 
 from __future__ import annotations
@@ -154,15 +151,9 @@ def _closing(exposure: float, pixels: np.ndarray, saturated: float) -> float:
 
 
 def expose(radiance: np.ndarray, exposure: float, curve: Callable[[np.ndarray], np.ndarray] | None = None) -> np.ndarray:
-    """Simulate a photograph: round(255 f(clip(e L, 0, 1))) / 255, without sensor noise (Eq. C.34).
+    """Simulate a photograph of linear radiance (..., 3) without sensor noise (Eq. C.34): float32 multiples of 1 / 255.
 
-    Args:
-        radiance: (..., 3) linear; negative values count as 0.
-        exposure: e > 0.
-        curve: a `ResponseCurve` or any function of (..., 3) into [0, 1]; `response_curve()` if None.
-
-    Returns:
-        (..., 3) float32 in [0, 1], multiples of 1 / 255.
+    `curve` is a `ResponseCurve` or any function of (..., 3) into [0, 1]; `response_curve()` if None.
 
     Raises:
         InputError: exposure not positive and finite, or non-finite radiance.

@@ -1,7 +1,6 @@
 """Scores without ground truth: shading left in albedo, agreement between views, and the gain of a held-out photograph.
 
-All are sums over pixels to which views are added one after another, so memory grows with the objects or surface cells only
-(docs/method/evaluation.md#scores-without-truth).
+All are sums over pixels to which views are added one after another (docs/method/evaluation.md#scores-without-truth).
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""LDR-FLIP, the difference that an observer sees when two images alternate (Andersson et al. 2020, HPG; Eq. E.5, E.6).
-
-Both images are filtered with the contrast sensitivity of the eye and compared in a uniform colour space (HyAB distance of
-Hunt-adjusted L*a*b*). The difference is increased where edges and points differ: flip = colour^(1 - feature).
-"""
+"""LDR-FLIP, the difference that an observer sees when two images alternate (Andersson et al. 2020, HPG; Eq. E.5, E.6)."""
 
 from __future__ import annotations
 

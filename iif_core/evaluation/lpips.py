@@ -1,8 +1,5 @@
 """LPIPS v0.1, the learned distance of image patches (Zhang et al. 2018), with weights that the caller supplies (Eq. E.7).
 
-    d(x, y) = sum_l mean_p sum_c w_lc (f_lc(x, p) - f_lc(y, p))^2
-
-f_l are the activations of layer l of a classification network, scaled to unit length per pixel p; w_l >= 0 is the learned head.
 torch is imported where it is used; the caller chooses its number of threads (`torch.set_num_threads`).
 """
 

@@ -1,17 +1,8 @@
 """Scores of one image (docs/method/evaluation.md): L2, PSNR, SSIM, FLIP and LPIPS of maps; log-L2 and IoU of emission.
 
-A protocol says what a prediction is forgiven before it is compared:
-
-| protocol | the prediction is |
-|---|---|
-| `raw` | used as it is |
-| `scaled` | multiplied by one gain per image and channel, sum truth / sum prediction (Eq. E.9) |
-| `oracle_affine` | mapped by each object's best affine to the truth, 3x4 for albedo, 1x2 for roughness and metallic (Eq. E.10) |
-
-The masks of the pixels that count come from the truth (Eq. E.1), so a prediction cannot change its own mask. All images are
-linear float (H, W) or (H, W, 3), not quantised to 8 bits; `mask` is (H, W) bool. A score that cannot be computed is a `Score`
-with `value=None` and the reason, never NaN. The functions of single metrics take prediction, truth and a mask that is not
-empty; `Target` shares what several predictions of one truth need.
+Protocols (`catalogue.PROTOCOLS`) say what a prediction is forgiven before it is compared. The masks of the pixels that count come
+from the truth (Eq. E.1). Images are linear float (H, W) or (H, W, 3), not quantised to 8 bits; `mask` is (H, W) bool. A score
+that cannot be computed is a `Score` with `value=None` and the reason, never NaN.
 """
 
 from __future__ import annotations
@@ -73,33 +64,8 @@ def material_masks(valid: Array, hit: Array, emission: Array, roughness: Array) 
     }
 
 
-def l2(prediction: Array, truth: Array, mask: Array) -> float:
-    """Compute the mean squared error over the masked pixels and the channels (Eq. E.2)."""
-    difference = prediction[mask].astype(np.float64) - truth[mask]
-    return float(np.mean(difference * difference))
-
-
-def psnr(prediction: Array, truth: Array, mask: Array) -> float:
-    """Compute 10 log10(1 / MSE) in dB for data range 1, at most 100 (Eq. E.3). Example: every pixel 0.1 off -> 20."""
-    return _decibel(l2(prediction, truth, mask))
-
-
 def _decibel(error: float) -> float:
     return PSNR_CAP if error <= 10 ** (-PSNR_CAP / 10) else float(-10 * np.log10(error))
-
-
-def ssim(prediction: Array, truth: Array, mask: Array) -> float:
-    """Compute structural similarity: Gaussian window of 11 pixels, sigma 1.5, K1 0.01, K2 0.03, range 1 (Eq. E.4).
-
-    Pixels that do not count get the truth on both sides. A window that reaches over the border of the mask sees agreement
-    there, so such pixels score slightly too well. The 5 pixels next to the image border are part of windows only, unless
-    nothing else counts.
-
-    Raises:
-        InputError: an image smaller than the window.
-    """
-    truth = np.where(np.isfinite(truth), truth, 0)
-    return _Structure(truth, mask).similarity(np.where(mask if mask.ndim == truth.ndim else mask[..., None], prediction, truth))
 
 
 class _Structure:
@@ -171,50 +137,10 @@ def iou(prediction: Array, truth: Array, mask: Array) -> float:
     return np.count_nonzero(p & t) / union if union else 1.0
 
 
-def scaled(prediction: Array, truth: Array, mask: Array, limit: float | None = 1.0) -> Array:
-    """Multiply the prediction by one gain per channel, sum truth / sum prediction over the mask (Eq. E.9).
-
-    A channel whose mean prediction is below 1e-4 or whose truth is black keeps the gain 1
-    (docs/method/numerics.md#scaling-a-black-image).
-
-    Args:
-        prediction, truth: (H, W, 3).
-        mask: (H, W) bool.
-        limit: upper limit of the result; None = no limit.
-
-    Returns:
-        (H, W, 3) float64, >= 0.
-    """
-    prediction = np.asarray(prediction, np.float64)
-    return _gained(prediction, prediction[mask].mean(0), np.asarray(truth, np.float64)[mask].mean(0), limit)
-
-
 def _gained(values: Array, mean_prediction: Array, mean_truth: Array, limit: float | None) -> Array:
     known = (mean_prediction >= _MIN_MEAN) & (mean_truth > 0)
     gain = np.where(known, mean_truth / np.maximum(mean_prediction, _MIN_MEAN), 1.0)
     return np.clip(values * gain, 0, limit)
-
-
-def oracle_affine(prediction: Array, truth: Array, mask: Array, object_id: Array, ridge: float = 1e-6) -> Array:
-    """Map the prediction by the affine of each object that is nearest to the truth: an upper bound, not a result (Eq. E.10).
-
-    Least squares per object, y = A (x - mean x) + mean y with A = S_yx (S_xx + ridge I)^-1 from the object's pixels in `mask`.
-    Where the prediction is constant, A tends to 0 and the object gets its true mean.
-
-    Args:
-        prediction, truth: (H, W, 3), or (H, W).
-        mask: (H, W) bool; pixels outside are unchanged.
-        object_id: (H, W) int; -1 forms one object.
-        ridge: added variance; with 1e-6 differences of 0.001 are not stretched.
-
-    Returns:
-        float64 in the shape of the prediction, within [0, 1] in the mask.
-    """
-    x = np.array(prediction, np.float64).reshape(*mask.shape, -1)
-    y = np.asarray(truth, np.float64).reshape(*mask.shape, -1)
-    if mask.any():
-        x[mask] = _Groups(object_id[mask], y[mask]).nearest(x[mask], ridge)
-    return x.reshape(np.shape(prediction))
 
 
 class _Groups:
@@ -312,15 +238,10 @@ class Target:
     def scores(
         self, prediction: Array, metrics: Iterable[str] | None = None, perceptual: Container[str] = PROTOCOLS
     ) -> list[Score]:
-        """Score one prediction, (H, W, 3) or (H, W) as the truth, under every protocol of the quantity.
+        """Score one prediction, of the shape of the truth, under every protocol of the quantity.
 
-        Args:
-            prediction: map of the shape of the truth.
-            metrics: all of the quantity if None; LPIPS only where its network is given.
-            perceptual: protocols under which FLIP and LPIPS are computed, which take most of the time.
-
-        Returns:
-            Scores in the order of the protocols.
+        `metrics` are all of the quantity if None, LPIPS only where its network is given; `perceptual` are the protocols under
+        which FLIP and LPIPS are computed, which take most of the time.
 
         Raises:
             InputError: shapes that do not match.

@@ -1,14 +1,7 @@
 """Texture of surface cells from the photographs, once light, response and affine maps are known (Eq. M.41 to M.43).
 
-A prior that was made from the photographs alone (retinex) divided by a light that was not known yet. With the light that was
-found, the division is done again. Over the pixels of a cell and of the cells of its object that touch it, G and h from cached
-shading (L = a G + h),
-
-    r_i = sum w G (y - h - a_i G),      b_i = sum w G^2,
-
-and the albedo becomes a_i + (r_i - b_i slow(r / b)_i) / (b_i + BASE_WEIGHT g), g the mean of w G^2 over the pixels. The part
-slow(r / b) that changes slowly inside an object cannot be told from an error of the light and is left to it, so levels and slow
-changes stay those of the affine fit.
+A prior that was made from the photographs alone (retinex) divided by a light that was not known yet; the division is done again,
+except for slow changes inside an object, which cannot be told from an error of the light.
 """
 
 from __future__ import annotations

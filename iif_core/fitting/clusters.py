@@ -13,11 +13,7 @@ def patches(object_id: np.ndarray, position: np.ndarray) -> np.ndarray:
     """Number the patches of each object and return the patch of every pixel, (n,) int32.
 
     The pixels of an object are ordered along a Z-curve through its bounding box and cut into equal runs of about 48 pixels, 12 to
-    200 for each object. Neighbours on the surface are near in that order, and an object of few pixels still has enough patches
-    for a variance between them.
-
-    Args:
-        object_id: (n,) int; position: (n, 3) in any unit, e.g. indices of surface cells.
+    200 for each object. Positions (n, 3) may have any unit.
     """
     object_id = np.asarray(object_id)
     if not len(object_id):

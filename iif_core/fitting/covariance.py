@@ -1,16 +1,7 @@
-"""Covariance of every fitted number and of the response: a sandwich over clusters of pixels that share errors.
+"""Covariance of every fitted number and of the response: a sandwich over clusters of pixels that share errors (Eq. M.32 to M.34).
 
-With u_k the gradient of cluster k, H the normal matrix, W the weight of the prior and B = (H + W)^-1, the numbers of an object
-have the covariance (Eq. M.32)
-
-    B (sum_k v_k v_k' + W S W) B,    v_k = (1 - H_k B)^(-1/2) u_k,
-
-where S is the covariance of the prior's centre. A cluster has drawn the fit towards itself, which makes its gradient too small;
-v_k has the size that errors in proportion to H_k would have had (Bell and McCaffrey 2002, "CR2"). The first term is enlarged
-for the uncertainty of a scatter that is estimated from few clusters (Eq. M.33). The response, common to all objects, is
-eliminated as in the descent (Eq. M.34).
-
-Errors of light and geometry that all clusters of an object share are not in it.
+Clusters are corrected for having drawn the fit towards themselves (Bell and McCaffrey 2002, "CR2"). Errors of light and geometry
+that all clusters of an object share are not in it.
 """
 
 from __future__ import annotations

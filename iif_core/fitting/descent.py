@@ -1,7 +1,6 @@
 """Damped Gauss-Newton on all objects and the response at once (Eq. M.16 to M.18).
 
-Objects share only the few parameters of the response, so the system is an arrowhead: a small block for each object and one
-small Schur complement. Steps are damped for each object (Levenberg-Marquardt) and taken only if the objective falls.
+The system is an arrowhead: a small block for each object and one small Schur complement for the response.
 """
 
 from __future__ import annotations
@@ -212,7 +211,6 @@ def descend(
     tone: Tone,
     opt: FitOptions,
     iterations: int | None = None,
-    fit_response: bool | None = None,
     start_params: np.ndarray | None = None,
 ) -> tuple[DescentState, Terms]:
     """Minimise the objective (Eq. M.14) until its expected fall is below `opt.tolerance` of its size.
@@ -227,7 +225,6 @@ def descend(
         state: start; prior: of the objects; tone: curve of the residuals; opt: options.
         iterations: largest number of steps of everything, each followed by at most one of the objects alone if it was refused;
             None: `opt.iterations`, with several rounds of the objects between them.
-        fit_response: move the response; None: `opt.free_response`.
         start_params: (P,) mean of the response's prior where `opt.response_prior` is None; None: those of `state`.
 
     Returns:
@@ -235,7 +232,7 @@ def descend(
     """
     most = opt.iterations if iterations is None else iterations
     start_params = state.params if start_params is None else start_params
-    fitted = bool((opt.free_response if fit_response is None else fit_response) and tone.size)
+    fitted = bool(opt.free_response and tone.size)
     curve_prior = make_response_prior(opt, len(px.obj), start_params)
 
     def total_of(cost: np.ndarray, affine: np.ndarray, params: np.ndarray) -> float:

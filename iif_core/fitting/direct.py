@@ -1,8 +1,7 @@
 """One affine map for each object and the camera response, fitted to the photographs over cached shading (Eq. M.14).
 
-Noise in the cached shading flattens the slope of log I over log L, so a plain fit overestimates gamma and shrinks gains. The
-cache comes in two independent halves, and the objective is built on the product of their residuals, whose expectation is the
-square of the residual without noise (Eq. M.7 and M.8; docs/method/numerics.md#noise-in-cached-shading).
+The objective is built on the product of the residuals of two independent halves of the cache (Eq. M.7 and M.8;
+docs/method/numerics.md#noise-in-cached-shading).
 """
 
 from __future__ import annotations
@@ -87,15 +86,8 @@ class FitProgress:
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
     """Fit sixteen numbers for each object, and the response, by Gauss-Newton on all pixels at once.
 
-    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels have the mean of the population.
-
-    Args:
-        problem: pixels, base values, cached shading.
-        response: starting response; `identity` means linear radiance (HDR).
-        options: see `FitOptions`.
-
-    Returns:
-        `FitResult`, always finite. The gauge is that of the given light (`gauge.apply_gauge` sets another).
+    Which numbers are free follows the texture (Eq. M.19). Objects with too few pixels have the mean of the population. Response
+    `identity` means linear radiance (HDR). The gauge is that of the given light (`gauge.apply_gauge` sets another).
     """
     opt = options or FitOptions()
     everything, tone = prepare_pixels(problem, response, opt.min_pixels, MAX_PIXELS_PER_OBJECT)
@@ -120,7 +112,7 @@ def _descend_all(
         measured, roughness = some.target, texture.mean[:, 3]
         for _ in range(2):
             weigh_by_halves(some, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
-            state, _ = descend(some, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
+            state, _ = descend(some, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
             terms = evaluate(some, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
             noise = row_variance(terms, some, state.free)
             population = update_population(
@@ -131,10 +123,10 @@ def _descend_all(
     measured = px.target
     if not opt.population:
         weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
-        state, _ = descend(px, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
+        state, _ = descend(px, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
         fit = replace(fit, state=state)
     weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
-    state, _ = descend(px, fit.state, fit.prior, tone, opt, None, None, start_params)
+    state, _ = descend(px, fit.state, fit.prior, tone, opt, None, start_params)
     return replace(fit, state=state)
 
 
@@ -201,7 +193,7 @@ def _select_kinds(
     weigh_by_halves(few, few.target, fit.state.affine, tone, opt)
     # Bounds alone cannot tell one local minimum from another.
     measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
-    state, _ = descend(few, fit.state, fit.prior, tone, opt, WARM_START_STEPS, None, start_params)
+    state, _ = descend(few, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
     noise = row_variance(terms, few, state.free)
     prior = population_prior(initial_population(), noise, texture.mean[:, 3], fit.metallic)

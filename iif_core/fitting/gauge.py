@@ -1,10 +1,6 @@
 """The factor between light and albedo (docs/method/fitting.md#level-of-all-albedos).
 
-Multiplying all light by s and dividing all albedos by s leaves direct light as it is, so from direct light alone only the product
-is known. Indirect light tells them apart: it was photographed in the units of all photographs, and direct plus indirect light
-times one albedo fits pixels with much and with little of it for one level of the light only. Stage emission solves for that level
-and states its error. By default it is averaged with the level that the mean albedo of the base texture implies, weighted by the
-variances (Eq. M.37). This is the only place where another scale, a convention or something known, enters.
+This is the only place where another scale, a convention or something known, enters.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """Compiled loops of the fit over the pixels of whole objects; each call is single-threaded and releases the interpreter.
 
-Pixels are sorted by (object, cluster). An object is worked through in pieces of `PIECE` pixels: what the Gauss-Newton
-system needs of a pixel is laid out column by column, so that the sums over pixels become vector instructions. `reassoc`
-lets the compiler add a piece in lanes; the order is fixed when the code is compiled. The sums of an object are made by one
-thread in one order, so the bytes do not depend on the number of threads.
-
-Model of a pixel: Eq. M.1 and M.2; residuals, loss and derivatives: Eq. M.6 to M.10; interpolation in r: Eq. M.4, M.5; tables
-of the response: `tone`.
+Pixels are sorted by (object, cluster) and worked through in pieces of `PIECE`, column by column, so that sums over pixels become
+vector instructions. One thread makes the sums of an object in one order, so the bytes do not depend on the number of threads.
+Model of a pixel: Eq. M.1 and M.2; residuals, loss and derivatives: Eq. M.6 to M.10; interpolation in r: Eq. M.4, M.5.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Shading at any roughness between the cached levels (Eq. M.4, M.5).
+"""Shading at any roughness between the cached levels by the monotone cubic of Fritsch and Butland (Eq. M.4, M.5).
 
-The monotone cubic of Fritsch and Carlson (1980), with the slopes of Fritsch and Butland (1984), passes through the levels,
-never overshoots, and has a continuous derivative (docs/method/numerics.md#kinks-at-the-roughness-levels). The compiled fit
-evaluates the same formulae one pixel at a time (`kernels`).
+The compiled fit evaluates the same formulae one pixel at a time (docs/method/numerics.md#kinks-at-the-roughness-levels).
 """
 
 from __future__ import annotations
@@ -11,11 +9,7 @@ import numpy as np
 
 
 def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return shading at any roughness, and its derivative by the roughness, (n, 3) float64 each.
-
-    Args:
-        shading: (n, J, 3); levels: (J,) increasing; roughness: (n,), clamped to the range of the levels.
-    """
+    """Return shading (n, J, 3) at any roughness (n,) between increasing levels (J,), and its derivative, (n, 3) float64 each."""
     levels, r = np.asarray(levels, np.float64), np.clip(np.asarray(roughness, np.float64), levels[0], levels[-1])
     j = np.clip(np.searchsorted(levels, r, side="right") - 1, 0, len(levels) - 2)
     k = np.arange(len(r))

@@ -1,9 +1,6 @@
 """What the objects of a scene have in common, as a prior of each of them (empirical Bayes; docs/method/fitting.md#population).
 
-The numbers of an object are draws from the population of the scene: gains around one mean in each channel, which carries the
-open level of light times albedo; biases and cross terms around 0; level and contrast of roughness around their means. Means and
-spreads are learnt by EM on the quadratic model of the objective. The first spreads count as two values, which keeps a scene of
-one object finite, and Student's weights keep outliers from deciding.
+Means and spreads of the numbers are learnt by EM on the quadratic model of the objective.
 """
 
 from __future__ import annotations
@@ -61,14 +58,8 @@ def initial_population(level: float = 0.6, width: float = 0.25) -> Population:
 
 
 def population_mean(population: Population, roughness: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """Return the mean of the numbers of each object under the population.
-
-    Args:
-        population: means and spreads; roughness: (O,) mean base roughness of the objects.
-        metallic: (O, 2) their gain and bias of the metallic, which are selected.
-
-    Returns:
-        (O, 16) float64.
+    """Return the mean (O, 16) of the numbers of each object under the population, given its mean base roughness and its metallic
+    map.
     """
     out = np.zeros((len(roughness), NUMBERS))
     out[:, GAINS] = population.gain

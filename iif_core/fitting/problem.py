@@ -13,8 +13,6 @@ import numpy as np
 from iif_core.camera.response import Response
 from iif_core.errors import InputError
 
-SOLVERS = ("direct", "sgd", "adam")
-
 
 @dataclass(frozen=True)
 class FitProblem:
@@ -148,10 +146,6 @@ class SgdOptions:
     seed: int = 0
     free_response: bool = True
     steps: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.method not in ("sgd", "adam"):
-            raise InputError(f"solver {self.method!r}; allowed: sgd, adam")
 
 
 @dataclass(frozen=True)

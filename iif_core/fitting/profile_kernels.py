@@ -1,8 +1,6 @@
 """Compiled loop of the profile: the albedo numbers of one object at one roughness and one metallic (Eq. M.20).
 
-With both held, a pixel shows e L = a U + V in each channel, U = e ((1 - m) D + m S0), V = e (0.04 (1 - m) S0 + S1). The three
-channels separate, and each is a problem of at most four numbers with known coefficients. Each object and channel is descended
-on its own, so the pixels of an object stay in the cache of the processor. Order of the sums: as in `kernels`.
+With both held, the channels separate into problems of at most four numbers. Order of the sums: as in `kernels`.
 """
 
 from __future__ import annotations

@@ -1,10 +1,6 @@
-"""The loss of the paper's material stage, by which all solvers are judged (Eq. M.39).
+"""The loss of the paper's material stage, by which all solvers are judged (Eq. M.39, M.9; docs/method/numerics.md#clamped-loss).
 
-    mean over pixels and channels of e^2 + 1e-3 mean |r - 1| + 5e-3 mean |m|
-
-e = f(e L) - I where I < 0.9, and min(f(e L) - 0.9, 0) elsewhere (Eq. M.9; docs/method/numerics.md#clamped-loss). L is the mean of
-the halves of the cache. The terms of the paper's own response basis have no counterpart, because every family is monotone. For
-HDR, e is measured in the curve of Eq. M.3.
+The terms of the paper's own response basis have no counterpart. For HDR, the error is measured in the curve of Eq. M.3.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""Which numbers each object can carry, and its kind and local minimum of roughness.
-
-The objective has a dielectric and a metallic local minimum and several in the roughness, so one descent is not enough
-(docs/method/fitting.md#selection-of-kind-and-roughness). Roughness is therefore profiled: for each kind of material and each of a
-few roughness values the albedo numbers are fitted, which gives the evidence of the pair. A histogram over the pairs, common to
-the objects of the scene and learnt by EM, is the prior.
+"""Which numbers each object can carry, and its kind and local minimum of roughness
+(docs/method/fitting.md#selection-of-kind-and-roughness).
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """The paper's optimiser on the same problem: stochastic gradient descent on the paper's loss (Eq. M.39, M.40).
 
-One step size serves the numbers of all objects and of the response: 3 epochs of batches of 32,768 pixels, the rate times 0.2
-after each. The loss is a mean over pixels, so the step of an object is proportional to its share of them
-(docs/method/numerics.md#small-objects-under-a-mean-loss). `adam`, which is not in the paper, takes steps of one size whatever the
-gradient.
+The step of an object is proportional to its share of the pixels (docs/method/numerics.md#small-objects-under-a-mean-loss);
+`adam`, which is not in the paper, takes steps of one size whatever the gradient.
 """
 
 from __future__ import annotations

@@ -1,11 +1,7 @@
-"""The curve that residuals are measured in, as tables that the compiled loops read.
+"""The curve that residuals are measured in, as tables that the compiled loops read: the response (LDR) or Eq. M.3 (HDR).
 
-LDR: the sensor value f(e L). HDR: a logarithmic curve of the radiance (Eq. M.3), in which an error counts relative to the
-brightness down to a knee.
-
-On [0, 1] a response is tabulated at the nodes u_i = i / NODES of u = x^(1/4), where powers are smooth. Values are read with a
-cubic Hermite polynomial in u, exact at the nodes; the error between them is about 5e-9, and 2e-6 next to the knee of sRGB.
-Derivatives by the parameters are read linearly. Above 1 the curve is a straight line (Eq. C.16).
+Values are read with a cubic Hermite polynomial in u = x^(1/4), derivatives by the parameters linearly; above 1 it is a straight
+line (Eq. C.16).
 """
 
 from __future__ import annotations

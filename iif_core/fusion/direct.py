@@ -1,23 +1,9 @@
 """Direct solver: alternating closed forms on surface cells (docs/method/fusion.md#direct).
 
-A sweep is one pass over the views. For each view it
-
-1. fits the affine maps of every segment and prediction to the texture of the previous sweep by least squares with a ridge
-   towards the identity (Eq. F.25); pixels count by the number of viewpoints that see their cell (Eq. F.24);
-2. sets the selection weights from the mean squared errors of the segment at a temperature that falls from sweep to sweep
-   (Eqs. F.27 to F.29);
-3. forms the mixture of the corrected predictions, whose weighted mean (or M-estimate) in each cell is the new texture
-   (Eq. F.30).
-
-After the sweep the level of each part returns to that of the median prediction (Eq. F.40). The ridge holds the contrast,
-whose mean gain is in `history`. At the end, seams between the parts of an object are closed (gauge.seam_shifts), and the
-Laplace scales of the cells follow in closed form (Eq. F.31). `objective="distribution"` instead continues with the paper's
-loss for the selection found (polish.py).
-
-Errors follow from sums over the segment, without another pass over the pixels. A segment lies in one view, so the maps and
-the mixture of a view need only the previous texture: memory holds the predictions of one view per thread, the sums, and
-what `memory` allows to keep. The bytes of the result do not depend on the number of threads; the order of the predictions
-changes it by rounding only.
+A sweep is one pass over the views, which fits the affine maps to the texture of the previous sweep (Eq. F.25), sets the
+selection weights (Eqs. F.27 to F.29) and averages the mixture in each cell (Eq. F.30). Levels are fixed after every sweep
+(Eq. F.40). Memory holds the predictions of one view per thread, the sums, and what `memory` allows to keep. The bytes of the
+result do not depend on the number of threads; the order of the predictions changes it by rounding only.
 """
 
 from __future__ import annotations

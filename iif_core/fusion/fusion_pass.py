@@ -48,14 +48,10 @@ class FusionPass:
 
 
 def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> tuple[FusionPass, NDArray]:
-    """Read every view: Gram matrices, counts, parts and the first texture.
+    """Read every view: Gram matrices, counts, parts and the first texture (n_cells, 5) float32.
 
-    Args:
-        problem: predictions on cells; options: how to solve; threads: views at a time.
-
-    Returns:
-        The pass, with identity maps and equal selection weights, and the first texture (n_cells, 5) float32: cell means of
-        the median of the predictions (Eq. F.23), or of their mean for the variants `texel_mean` and `object_mean`.
+    The texture is the cell means of the median of the predictions (Eq. F.23), or of their mean for the variants `texel_mean` and
+    `object_mean`. The pass has identity maps and equal selection weights.
 
     Raises:
         InputError: shapes that do not match, ids out of range, a segment in two views.

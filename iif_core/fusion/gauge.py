@@ -1,10 +1,7 @@
 """Levels that the predictions leave open, and how they are fixed (docs/method/fusion.md#gauge).
 
-A shift of the texture and the opposite shift of every affine map cancel (Eq. F.37). Segments are tied to one another only
-through the cells that they share: a *part* is a connected component of the graph of segments and cells, and every part has
-a level of its own. `anchor_shifts` holds each part at the level of its predictions. An object of which no two photographs
-share a cell, such as the two sides of a cupboard, falls into several parts whose levels differ by the error of the
-predictions. The difference draws an edge through the object that no later map per object can undo; `seam_shifts` removes it.
+A *part* is a connected component of the graph of segments and cells, and has a level of its own (Eq. F.37). `anchor_shifts` holds
+it at the level of its predictions; `seam_shifts` removes the difference between the parts of an object.
 """
 
 from __future__ import annotations
@@ -71,9 +68,7 @@ def anchor_shifts(parts: Parts, level: NDArray, texture: NDArray, weight: NDArra
     return sums / np.where(total > 0, total, np.inf)[:, None]
 
 
-def seam_shifts(
-    parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDArray, spread: NDArray, ridge: float = SEAM_RIDGE_PAIRS
-) -> tuple[NDArray, NDArray]:
+def seam_shifts(parts: Parts, texture: NDArray, weight: NDArray, neighbours: NDArray, spread: NDArray) -> tuple[NDArray, NDArray]:
     """Shift the parts of each object so that the jumps across their common seams vanish (Eqs. F.41, F.42).
 
     A seam between two parts is left unchanged in a property whose mean jump exceeds `MAX_LEVEL_JUMP` times the spread of
@@ -84,7 +79,6 @@ def seam_shifts(
         texture: (n_cells, 5); weight: (n_cells,) summed pixel weight of each cell.
         neighbours: (m, 2) pairs of neighbouring cells of one object.
         spread: (parts, 5) standard deviation over the predictions of the part's mean.
-        ridge: strength of the ridge towards no shift, in seam pairs.
 
     Returns:
         (parts, 5) shifts and (parts,) number of seam pairs of each part.
@@ -108,12 +102,12 @@ def seam_shifts(
     for channels in (slice(0, 3), slice(3, 4), slice(4, 5)):
         used = plausible[of_pair, channels.start]
         if used.any():
-            shift[:, channels], touched = _solve_shifts(parts, a[used], b[used], jump[used, channels], weight, ridge)
+            shift[:, channels], touched = _solve_shifts(parts, a[used], b[used], jump[used, channels], weight)
             count = np.maximum(count, touched)
     return shift, count
 
 
-def _solve_shifts(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: NDArray, ridge: float) -> tuple[NDArray, NDArray]:
+def _solve_shifts(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: NDArray) -> tuple[NDArray, NDArray]:
     """Solve Eq. F.43: shifts (parts, C) for seam pairs between parts a and b with jumps (m, C), and pairs of each part."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import splu
@@ -125,7 +119,7 @@ def _solve_shifts(parts: Parts, a: NDArray, b: NDArray, jump: NDArray, weight: N
     size = np.bincount(parts.of_cell[seen], weight[seen], n)
     share = size / np.maximum(np.bincount(group, size)[group], 1e-30)
     matrix = coo_matrix((np.concatenate([-ones, -ones]), (np.r_[a, b], np.r_[b, a])), (n, n)).tocsc()
-    solver = splu(matrix + coo_matrix((count + ridge * share + 1e-9, (np.arange(n),) * 2)).tocsc())
+    solver = splu(matrix + coo_matrix((count + SEAM_RIDGE_PAIRS * share + 1e-9, (np.arange(n),) * 2)).tocsc())
     right = [np.bincount(a, jump[:, c], n) - np.bincount(b, jump[:, c], n) for c in range(jump.shape[1])]
     shift = np.stack([solver.solve(r) for r in right], 1)
     shift[count == 0] = 0

@@ -1,14 +1,9 @@
 """Compiled loops of the direct solver over the pixels of one view; every loop is single-threaded.
 
 `values` (K, 5, n) holds the predictions of pixels in segment order: segment s is pixels start[s] ... start[s + 1] - 1. The
-numbers are float32, or half precision as its bits in uint16 (the compiler has no half type), which are widened piece by
-piece. A loop runs over the pixels of one plane, which the compiler turns into vector instructions, and reads each
-prediction once.
-
-Sums over pixels are float32 within pieces of `PIECE` pixels and float64 beyond
-(docs/method/numerics.md#sums-in-single-precision), so their error does not grow with the size of the segment. `reassoc`
-lets the compiler add a piece in lanes; the order is fixed when the code is compiled, so a machine gives the same bytes
-every time.
+numbers are float32, or half precision as its bits in uint16 (the compiler has no half type). Sums over pixels are float32
+within pieces of `PIECE` pixels and float64 beyond (docs/method/numerics.md#sums-in-single-precision). `reassoc` lets the
+compiler add a piece in lanes, in an order that is fixed when the code is compiled.
 """
 
 from __future__ import annotations

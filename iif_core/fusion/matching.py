@@ -1,13 +1,7 @@
-"""Affine maps that minimise the paper's loss for a given selection (docs/method/fusion.md#distribution).
+"""Affine maps that minimise the paper's loss for a given selection (docs/method/fusion.md#distribution, Eqs. F.34, F.35).
 
-With one prediction chosen per segment and property, data term and identity regulariser are minimised by majorisation: the
-divergence of two Laplace distributions lies below a quadratic of weight `laplace.kl_weight` (Eq. F.32) that touches it at
-the present distance. The maps then follow from one linear system per segment (Eqs. F.34, F.35), the texture is a weighted
-mean (Eq. F.36) and the Laplace scale of a cell has a closed form (Eq. F.31).
-
-Each step lowers the loss for the reference scale b_ref of the sweep. b_ref depends on the maps and is computed again every
-sweep, but neither its derivative (docs/method/numerics.md#median-subgradient) nor clamps are followed, so the loss may rise
-a little from sweep to sweep. Predictions that are not chosen stay at the identity, where the regulariser has its minimum.
+Each step lowers the loss for the reference scale b_ref of the sweep, which is computed again every sweep. Neither its derivative
+(docs/method/numerics.md#median-subgradient) nor clamps are followed, so the loss may rise a little between sweeps.
 """
 
 from __future__ import annotations

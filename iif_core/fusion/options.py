@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from iif_core.errors import InputError
 from iif_core.numerics import laplace
-
-VARIANTS = ("full", "uniform", "texel_mean", "object_mean")
-OBJECTIVES = ("least_squares", "distribution")
 
 
 @dataclass(frozen=True)
@@ -51,19 +47,3 @@ class FusionOptions:
     polish: int = 25
     seams: bool = True
     single_view_weight: float = 0.01
-
-    def __post_init__(self) -> None:
-        if self.variant not in VARIANTS:
-            raise InputError(f"base variant {self.variant!r}; allowed: {', '.join(VARIANTS)}")
-        if self.objective not in OBJECTIVES:
-            raise InputError(f"base objective {self.objective!r}; allowed: {', '.join(OBJECTIVES)}")
-        if self.final_temperature < 0 or self.temperature < self.final_temperature or self.polish < 1:
-            raise InputError(
-                f"base options: temperature {self.temperature} must not be below final_temperature {self.final_temperature}"
-                f" (>= 0), polish {self.polish} must be >= 1"
-            )
-        if self.sweeps < 1 or not self.ridge > 0 or not 0 < self.anneal < 1 or not self.single_view_weight > 0:
-            raise InputError(
-                f"base options: sweeps {self.sweeps} (>= 1), ridge {self.ridge} (> 0), anneal {self.anneal} (between 0 and 1),"
-                f" single_view_weight {self.single_view_weight} (> 0)"
-            )

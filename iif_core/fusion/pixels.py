@@ -14,14 +14,9 @@ MAX_STEP = 5.0
 
 
 def relative_footprints(views: Iterable[tuple[NDArray, NDArray, NDArray, float]]) -> list[NDArray]:
-    """Return the size of each pixel on the surface relative to the median of all pixels (Eq. F.20).
+    """Return per view the size (H, W) of each pixel on the surface relative to the median of all; 1 without surface (Eq. F.20).
 
-    Args:
-        views: per view the z-depth (H, W) in m, 0 = no surface, the viewing directions (H, W, 3), the unit normals
-            (H, W, 3) of the faces, and the focal length in pixels.
-
-    Returns:
-        Per view (H, W) float64; 1 where there is no surface.
+    A view is z-depth (H, W) in m (0 = none), viewing directions and unit normals (H, W, 3), and the focal length in pixels.
     """
     sizes = []
     for depth, direction, normal, focal in views:
@@ -55,16 +50,11 @@ def pixel_weights(
 
 
 def surface_tangents(depth: NDArray, direction: NDArray, normal: NDArray) -> NDArray:
-    """Return the displacement of the surface point over one pixel, in the plane of its face (Eq. F.60).
+    """Return the displacement (H, W, 2, 3) float32 in m of the surface point over one pixel right and down, in its plane (Eq.
+    F.60).
 
-    Args:
-        depth: (H, W) z-depth in m, 0 = no surface.
-        direction: (H, W, 3) directions with which point = camera + depth * direction.
-        normal: (H, W, 3) normals of the faces.
-
-    Returns:
-        (H, W, 2, 3) float32 displacement over one pixel to the right and down, m, at grazing angles limited to `MAX_STEP`
-        times that across the line of sight; 0 where there is no surface.
+    With point = camera + depth * direction; at grazing angles limited to `MAX_STEP` times that across the line of sight, 0 where
+    there is no surface.
     """
     direction = direction.astype(np.float64)
     across = np.einsum("hwi,hwi->hw", normal, direction)

@@ -32,14 +32,10 @@ def cell_scales(run: FusionPass, texture: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def reference_distribution(run: FusionPass, block: Block, target: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    """Return location and scale of the reference distributions of a view's pixels under the present maps.
+    """Return the reference distributions of a view's pixels under the present maps: mixture (5, n) of Eq. F.30, scale (5, n) of
+    Eq. F.4.
 
-    Args:
-        run: state of the solver; block: pixels of the view; target: (5, n) texture at the pixels.
-
-    Returns:
-        Mixture (5, n) of Eq. F.30, reference scale (5, n) of Eq. F.4, and votes (s, K, 3): weight of the pixels of each
-        segment at which prediction k is the nearest to the texture.
+    Also returns votes (s, K, 3): weight of the pixels of each segment at which prediction k is the nearest to `target` (5, n).
     """
     rows, state = block.segments, run.state
     affine = state.affine[rows].astype(np.float32)

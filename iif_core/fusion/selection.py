@@ -7,16 +7,11 @@ from numpy.typing import NDArray
 
 
 def selection_weights(error: NDArray, temperature: float, usable: NDArray | None = None) -> NDArray:
-    """Return the weights of K predictions by their errors (Eq. F.28).
+    """Return the weights (..., K) float64 of K predictions by their errors >= 0 (Eq. F.28), with sum 1, or 0 where none is
+    usable.
 
-    Temperature 0 is the limit: the smallest error takes all weight, and errors that are equal (to an rms of 1e-6) share it,
-    so the result does not depend on the order.
-
-    Args:
-        error: (..., K) >= 0; temperature: in units of the median error; usable: (..., K) bool, None = all.
-
-    Returns:
-        (..., K) float64; sum 1 over the last axis, or 0 where nothing is usable.
+    `temperature` is in units of the median error. Temperature 0 is the limit: the smallest error takes all weight, and errors
+    that are equal (to an rms of 1e-6) share it, so the result does not depend on the order.
 
     Example:
         >>> selection_weights([0.1, 0.4, 0.1], 0.0).tolist()

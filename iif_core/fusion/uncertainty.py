@@ -1,19 +1,7 @@
-"""Calibrated uncertainty of the base texture per cell and property (docs/method/fusion.md#uncertainty).
+"""Calibrated uncertainty of the base texture per cell and property (docs/method/fusion.md#uncertainty, Eqs. F.44, F.45).
 
-The Laplace scale b of a cell measures the disagreement of the corrected predictions and of the views. It is the scale of
-one observation, not the error of the cell's location, over which the views are averaged. The error of the location has the
-standard deviation
-
-    s = c b^g V^-h K^-q P^-p          V viewpoints, K predictions, P pixels of the cell per viewpoint     (Eq. F.45)
-
-and an exponential power distribution of shape beta (1 = Laplace, 2 = normal) that tends to the normal as K grows.
-
-The error is that of the location *after the affine gauge of its object* (Eq. F.44). The photographs decide that gauge
-later; no disagreement between predictions can reveal an error that all of them share.
-
-The law is valid for `direct`, `variant: full`, least squares, and for predictions whose errors resemble those of the
-simulated prior at strength 1. Other variants and solvers use the same formula, which then ranks cells but does not give
-calibrated intervals.
+The law is valid for `direct`, `variant: full`, least squares, and for predictions whose errors resemble those of the simulated
+prior at strength 1. Elsewhere the same formula ranks cells but does not give calibrated intervals.
 """
 
 from __future__ import annotations
@@ -69,7 +57,7 @@ CALIBRATION = {
     "roughness": Calibration(0.4715, 0.496, 0.602, 0.592, -0.131, 0.8, 0.15),
     "metallic": Calibration(0.4884, 0.502, 0.602, 0.596, -0.133, 0.8, 0.15),
 }
-"""Fitted by `fit_calibration` to one scene with ground truth; data and check on another scene: docs/results/fusion.md."""
+"""Fitted to one scene with ground truth; data and check on another scene: docs/results/fusion.md."""
 
 MIN_OBJECT_CELLS = 100
 """Fewest cells of an object that is judged; with fewer, the affine gauge follows the errors themselves."""
@@ -146,36 +134,3 @@ def coverage(error: NDArray, deviation: NDArray, beta: float = 1.0, levels: tupl
         raise InputError("coverage of no errors; give at least one")
     ratio = np.abs(error) / deviation
     return [float((ratio <= interval(level, beta)).mean()) for level in levels]
-
-
-def fit_calibration(samples: list[tuple[NDArray, NDArray, NDArray, NDArray, int]]) -> Calibration:
-    """Fit the law of one property to several runs, each (error, b, viewpoints, pixels, predictions) with arrays (n,).
-
-    The exponents maximise the likelihood for beta = 1 (Eq. F.48) by Nelder-Mead. Then c and beta minimise the largest
-    deviation of the observed coverage from `NOMINAL_COVERAGES` over all runs.
-    """
-    from scipy.optimize import minimize
-
-    errors = [np.abs(np.asarray(sample[0], np.float64)) for sample in samples]
-    features = [_features(*sample[1:]) for sample in samples]
-    e, x = np.concatenate(errors), np.concatenate(features)
-
-    def cost(exponents: NDArray) -> float:
-        log_s = x @ exponents
-        return float(np.log(np.mean(e * np.exp(-log_s)) + 1e-30) + log_s.mean())
-
-    exponents = minimize(cost, [0.6, 0.6, 0.3, 0.1], method="Nelder-Mead", options={"maxiter": 2000, "xatol": 1e-3}).x
-    ratios = [np.sort(a * np.exp(-(b @ exponents))) for a, b in zip(errors, features, strict=True)]
-    k = np.log2([sample[4] for sample in samples])
-    around = np.sqrt(np.mean(np.concatenate(ratios) ** 2)) * np.linspace(0.7, 1.4, 71)
-    best = (np.inf, 0.0, 1.0, 0.0)
-    for beta_1 in np.linspace(0.7, 2.2, 16):
-        for beta_2 in np.linspace(0, 0.35, 8) if np.ptp(k) > 0 else [0.0]:
-            worst = np.zeros(len(around))
-            for ratio, log_k in zip(ratios, k, strict=True):
-                widths = around[:, None] * interval(np.float64(NOMINAL_COVERAGES), beta_1 + beta_2 * log_k)
-                off = np.abs(np.searchsorted(ratio, widths, "right") / len(ratio) - NOMINAL_COVERAGES).max(1)
-                worst = np.maximum(worst, off)
-            i = int(worst.argmin())
-            best = min(best, (float(worst[i]), float(around[i]), float(beta_1), float(beta_2)))
-    return Calibration(best[1], *(float(v) for v in exponents), best[2], best[3])

@@ -1,7 +1,6 @@
 """A latitude-longitude map of the light around a scene: directions, texels and solid angles (Eq. L.6, L.7).
 
-Row 0 is up (+z); radiance is constant in a texel. A direction drawn in texel e with probability p(e), uniform in z and in
-azimuth, has the density p(e) / Omega_e per steradian, Omega_e the solid angle of the texel.
+Row 0 is up (+z); radiance is constant in a texel.
 """
 
 from __future__ import annotations

@@ -1,12 +1,6 @@
 """Irradiance of surface, estimated from what the photographs show of everything that the surface sees
 (docs/method/light.md#irradiance-from-photographs).
 
-The light on a surface cell is the photographed radiance of what its rays meet plus that of unknown sources: lamps (surface whose
-photographs are saturated), sky (directions that leave the mesh) and surface that no photograph shows (Eq. L.49). Every group of
-cells (an object, a piece of the mesh) is taken to have one albedo up to texture; sources and albedos are found by iteratively
-reweighted Gauss-Newton steps with Cauchy weights (Eq. L.51), since texture is sparse and light is not. What is left of the log
-radiance inside a group and changes slowly is counted as light too (`residual_light`).
-
 Radiance is taken as diffuse, and exposures and response as known; errors of either stay in the albedo.
 """
 

@@ -1,7 +1,6 @@
 """Colour at the border of the project: the sRGB transfer curve, luminance, and colours of pictures for people.
 
-All colour inside the project is linear. The sRGB curve as a camera response, with its derivatives, is `response("srgb")`
-of `iif_core.camera.response`.
+All colour inside the project is linear; as a camera response, sRGB is `response("srgb")` of `iif_core.camera.response`.
 """
 
 from __future__ import annotations
@@ -57,15 +56,7 @@ def luminance(rgb: ArrayLike) -> Array:
 def key_exposure(radiance: ArrayLike, valid: Array | None = None, key: float = 0.18) -> float:
     """Compute the factor that brings the log-average of the luminance, exp(mean(ln Y)), to `key` (Reinhard et al. 2002).
 
-    Luminance below 1e-6 of the mean is raised to that value, so that black pixels do not dominate the average.
-
-    Args:
-        radiance: (..., 3) linear.
-        valid: (...) bool, pixels that are used; all if None.
-        key: log-average to reach.
-
-    Returns:
-        Factor > 0; 1 for a picture without light.
+    Luminance of linear radiance (..., 3) below 1e-6 of the mean is raised to that value. 1 for a picture without light.
     """
     y = luminance(radiance).astype(np.float64)
     y = y[np.isfinite(y) if valid is None else np.isfinite(y) & valid]

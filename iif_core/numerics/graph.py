@@ -7,14 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def component_labels(n_nodes: int, first: ArrayLike, second: ArrayLike) -> NDArray:
-    """Label the connected components of an undirected graph.
+    """Label the connected components of an undirected graph with edges (first, second), which may repeat.
 
-    Args:
-        n_nodes: number of nodes; a node without edges is a component of its own.
-        first, second: (m,) integers, the two nodes of every edge; repeated edges are allowed.
-
-    Returns:
-        (n_nodes,) int32 labels 0, 1, ..., numbered by the lowest node of each component.
+    Returns (n_nodes,) int32 labels 0, 1, ..., numbered by the lowest node of each component.
 
     Example:
         >>> component_labels(5, [0, 3], [2, 4]).tolist()

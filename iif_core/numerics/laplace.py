@@ -1,13 +1,7 @@
-"""Laplace distributions: divergence, weights and closed-form scales of the fusion (docs/method/fusion.md).
+"""Laplace distributions: divergence, weights and closed-form scales of the fusion (docs/method/fusion.md, Eqs. F.7, F.31, F.32).
 
-Every texture value is a Laplace distribution (location mu, scale b). The predictions of one pixel make a reference
-distribution, and the surface cell has the texture distribution. Their Kullback-Leibler divergence (Eq. F.7) depends on the
-distance d = |mu_ref - mu_pred| and the two scales only. Therefore the scale of a cell has a closed form (Eq. F.31), and its
-location is an M-estimate with the weight `kl_weight` (Eq. F.32).
-
-All functions floor the scales that they are given, because predictions that agree exactly have scale 0 and an infinite
-divergence (docs/method/numerics.md#laplace-scale-at-zero). Arrays may have any shapes that broadcast, float32 or float64;
-distances and scales have the unit of the texture values.
+Given scales are floored (docs/method/numerics.md#laplace-scale-at-zero). Arrays may have any shapes that
+broadcast, float32 or float64; distances and scales have the unit of the texture values.
 """
 
 from __future__ import annotations
@@ -71,24 +65,24 @@ def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float =
     return ratio / (b_r * b_p)
 
 
-def lower_median(values: NDArray, axis: int = 0) -> NDArray:
-    """Return the median that is one of the values: for an even count the smaller of the two in the middle.
+def lower_median(values: NDArray) -> NDArray:
+    """Return the median along axis 0 that is one of the values: for an even count the smaller of the two in the middle.
 
     See docs/method/numerics.md#median-subgradient.
     """
-    count = values.shape[axis]
+    count = len(values)
     if count == 0:
         raise InputError("lower median of no values; give at least one along the axis")
     rank = (count - 1) // 2
-    return np.take(np.partition(values, rank, axis=axis), rank, axis=axis)
+    return np.partition(values, rank, axis=0)[rank]
 
 
-def reference_scale(mu_ref: NDArray, predictions: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
+def reference_scale(mu_ref: NDArray, predictions: NDArray) -> NDArray:
     """Compute the scale of the reference, b_ref = lower median over k of |mu_ref - v_k|, floored (Eq. F.4).
 
     `predictions` has shape (K, ...), `mu_ref` and the result (...).
     """
-    return floored(lower_median(np.abs(predictions - mu_ref[None]), axis=0), floor)
+    return floored(lower_median(np.abs(predictions - mu_ref[None])))
 
 
 def scale_contribution(distance: NDArray, b_ref: NDArray, floor: float = SCALE_FLOOR) -> NDArray:

@@ -1,8 +1,6 @@
 """Array namespaces: one set of elementwise functions for NumPy, Dr.Jit and torch.
 
-A formula that takes a `Namespace` is written once and tested in all three libraries. `NUMPY`, `DRJIT` and `TORCH` are
-attributes of this module; each library is imported when its namespace is first used. Arithmetic and comparisons are the
-operators of the arrays.
+`NUMPY`, `DRJIT` and `TORCH` are attributes of this module; each library is imported when its namespace is first used.
 """
 
 from __future__ import annotations

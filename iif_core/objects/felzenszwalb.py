@@ -1,13 +1,7 @@
-"""Objects from shape alone: the graph segmentation of Felzenszwalb and Huttenlocher on the faces of a mesh.
+"""Objects from shape alone: the graph segmentation of Felzenszwalb and Huttenlocher (IJCV 59(2), 2004) on the faces of a mesh.
 
-The nodes of the graph are faces, its edges are shared edges, and the weight w of an edge says how much the two faces look
-like different things (Eq. O.5). Edges are taken from the lightest on; the two regions at its ends merge if
-
-    w <= min(Int(A) + k / |A|, Int(B) + k / |B|)                                                        (Eq. O.6)
-
-with Int the heaviest edge merged so far inside a region and |.| its number of faces (IJCV 59(2), 2004, Eq. 4 and 5).
-Small regions then join the neighbour across their lightest edge. In all functions `pairs` is (e, 2) int, the result of
-`face_adjacency`, and m is the number of faces.
+Edges of the graph are shared edges of the mesh (Eq. O.5), taken from the lightest on (Eq. O.6). In all functions `pairs` is
+(e, 2) int, the result of `face_adjacency`, and m is the number of faces.
 """
 
 from __future__ import annotations

@@ -1,14 +1,5 @@
 """Objects from 2D masks of many views by view consensus (docs/method/objects.md#masks, Eq. O.7 to O.12).
 
-A mask is the set of surface points that lie in one region of one view. View f *contains* mask m if most of what f sees of m
-lies in one mask of f, and *splits* m otherwise. A mask that too many views split covers several things and is dropped. Two
-masks belong together if nearly every view that contains both contains them in one mask:
-
-    consensus(i, j) = |C_i and C_j| / |V_i and V_j|                    (supporters over observers)
-
-with V_i the views that contain i, and C_i the masks that contain it. Pairs with many observers are joined first. Joined masks
-are one node with the unions of V and C, and the required number of observers is lowered step by step.
-
 Points represent equal pieces of surface. The rows of the sparse matrices are handled in blocks of `BLOCK_MASKS`, so no dense
 mask-by-mask matrix is made.
 """
@@ -132,15 +123,8 @@ class MaskPoints:
 
 
 def gather_masks(seen: Sequence[tuple[Array, Array]], count: int, min_points: int) -> MaskPoints:
-    """Collect the results of `masks_at` of all views.
-
-    Args:
-        seen: rows and labels of every view; a label of 0 or less = no mask.
-        count: number of points, E.
-        min_points: masks of fewer points are left out.
-
-    Returns:
-        Masks as sets of points.
+    """Collect rows and labels (0 or less = no mask) of `masks_at` of all views as sets of points; masks below `min_points` are
+    left out.
     """
     from scipy.sparse import csr_matrix, vstack
 

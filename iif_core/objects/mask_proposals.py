@@ -1,8 +1,4 @@
-"""Choice among the masks that a promptable model proposes (docs/method/objects.md#proposals).
-
-The rules are those of the automatic mask generator of Segment Anything (Kirillov et al. 2023, appendix B): stability under
-the threshold, and suppression of masks that overlap one of higher confidence.
-"""
+"""Choice among the masks of a promptable model, by the rules of Segment Anything (docs/method/objects.md#proposals)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""From clusters of masks to objects on faces (docs/method/objects.md#from-clusters-to-faces, Eq. O.13 to O.17).
-
-Parts of a cluster that lie apart are separated, the pixels of every face vote, and objects are parted or joined according to
-the masks in which the views show them.
-"""
+"""From clusters of masks to objects on faces (docs/method/objects.md#from-clusters-to-faces, Eq. O.13 to O.17)."""
 
 from __future__ import annotations
 

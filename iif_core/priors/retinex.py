@@ -1,14 +1,7 @@
 """Prior `retinex`: albedo from the photographs and the mesh alone, without learned weights (docs/method/priors.md#retinex).
 
-The light at every piece of surface is estimated from all photographs (`iif_core.light.irradiance`) and divided out. What the
-division leaves, which is fine shadow, gloss and errors of the mesh, is separated by colour retinex (Horn 1974; Grosse et al.
-2009): in the logarithm of the image, strong steps are material and weak steps are light. Each of the K hypotheses keeps the
-steps above its threshold and finds the image whose gradient is nearest to them and which stays near the input y (Eq. P.14):
-
-    min_a  sum |grad a - kept steps|^2 + STAY_WEIGHT sum |a - y|^2.
-
-Across a border of objects every step is material; within an object, a grey step where the normal turns is light. Roughness
-and metallic are not estimated: they are drawn once per object and hypothesis from a weak prior.
+The estimated light is divided out; colour retinex (Horn 1974; Grosse et al. 2009) parts what is left into material and light
+(Eq. P.14). Roughness and metallic are not estimated but drawn once per object and hypothesis from a weak prior.
 """
 
 from __future__ import annotations

@@ -1,15 +1,7 @@
-"""Prior `simulated`: ground truth with the errors of a single-view diffusion model (docs/method/priors.md#simulated).
+"""Prior `simulated`: ground truth with the errors of a single-view model (docs/method/priors.md#simulated, Eq. P.3 to P.9).
 
-The model reproduces the kinds of error, not their cause (Eq. P.3 to P.9):
-
-* every object has a *bias* that all views and samples share, so averaging over predictions does not remove it;
-* every (view, object) and every (view, object, sample) has affine errors of its own;
-* a share of the samples of each (view, object) is *good*, nearly an affine map of the truth. The other samples also have a
-  hallucinated pattern, leaked shading and blur, which no affine map repairs.
-
-Every random number is a hash of (seed, name, object, view, sample) (Eq. P.2), so it does not depend on the order of
-evaluation, on the size of the image, or on which other objects are in view. `strength` multiplies every error; 0 returns
-the truth exactly. The default sizes give, at strength 1, the raw errors that the paper reports for RGB-X.
+Every random number is a hash of (seed, name, object, view, sample) (Eq. P.2), so it does not depend on the order of evaluation,
+on the size of the image, or on which other objects are in view. `strength` multiplies every error; 0 returns the truth exactly.
 """
 
 from __future__ import annotations

@@ -1,13 +1,9 @@
-"""The Cook-Torrance reflectance of the method, written once for NumPy, Dr.Jit and torch (Eq. R.1 to R.13).
+"""The Cook-Torrance reflectance of the method, written once for NumPy, Dr.Jit and torch (Eq. R.1 to R.13), in forms that keep
+their digits in float32 (docs/method/reflectance.md#forms-that-hold-in-single-precision).
 
-    f cos = k_d NoL / pi + (k_s + (1 - k_s) F_c) spec          spec = D G NoL / (4 NoL NoV)
-    k_d = (1 - m) a      k_s = 0.04 (1 - m) + m a      F_c = (1 - VoH)^5
-
-The formulae have forms that keep their digits in float32 down to r = 0.02
-(docs/method/reflectance.md#forms-that-hold-in-single-precision). In all functions `xp` is a namespace of
-`iif_core.numerics.xp`; a vector is a sequence (x, y, z) of arrays; r is the perceptual roughness, alpha = r^2; colours and
-reflectances are linear. All functions are elementwise and broadcast. The cosines NoL, NoV, NoH, VoH and sin2_h are those of
-`half_angles`.
+In all functions `xp` is a namespace of `iif_core.numerics.xp`; a vector is a sequence (x, y, z) of arrays; r is the perceptual
+roughness, alpha = r^2; colours and reflectances are linear. All functions are elementwise and broadcast. The cosines NoL, NoV,
+NoH, VoH and sin2_h are those of `half_angles`.
 """
 
 from __future__ import annotations

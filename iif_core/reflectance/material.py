@@ -1,11 +1,7 @@
 """The material of a surface point and the affine map that corrects it: order, limits and special values, defined once.
 
-A material is the five linear numbers of `CHANNELS`. An affine map is sixteen numbers theta (Eq. R.15): A and b of the albedo
-row by row (A00 A01 A02 b0 A10 ...), then gain and bias of roughness and of metallic,
-
-    a = A a~ + b,    r = g_r r~ + h_r,    m = g_m m~ + h_m    (Eq. R.14).
-
-Constants are float64; compiled loops in single precision take `np.float32` of them.
+A material is the five linear numbers of `CHANNELS`. An affine map is sixteen numbers theta (Eq. R.14, R.15): A and b of the
+albedo row by row (A00 A01 A02 b0 A10 ...), then gain and bias of roughness and of metallic. Constants are float64.
 """
 
 from __future__ import annotations
@@ -47,15 +43,9 @@ def unclamped_material(affine: NDArray, base: NDArray) -> NDArray:
 
 
 def apply_affines(affine: NDArray, object_id: NDArray, base: ArrayLike) -> NDArray:
-    """Apply the affine map of each point's object (Eq. R.14).
+    """Apply the (O, 16) affine maps of the objects to materials (n, 5) of the base texture (Eq. R.14); object -1 keeps the base.
 
-    Args:
-        affine: (O, 16) numbers of the objects.
-        object_id: (n,) int; -1 keeps the base.
-        base: (n, 5) materials of the base texture.
-
-    Returns:
-        (n, 5) float64 materials: albedo and metallic within [0, 1], roughness within [0.02, 1].
+    Returns (n, 5) float64: albedo and metallic within [0, 1], roughness within [0.02, 1].
 
     Example:
         >>> double = 2 * IDENTITY

@@ -61,15 +61,10 @@ def smallest_edge(corners: NDArray) -> float:
 
 
 def build_cell_grid(views: Iterable[tuple[NDArray, NDArray]], corners: NDArray, edge: float) -> tuple[CellGrid, list[NDArray]]:
-    """Find the cells that the pixels of all views fall into.
+    """Find the cells of edge `edge` (m) that the pixels of all views fill; `corners` (n, 3) are the vertices of the mesh.
 
-    Args:
-        views: surface points (m, 3) in world coordinates and object ids (m,) of the pixels of each view.
-        corners: (n, 3) vertices of the mesh, around which the grid is laid.
-        edge: of a voxel, m.
-
-    Returns:
-        The grid and, per view, the cell (m,) of every pixel. The grid is empty if no view has pixels.
+    A view is surface points (m, 3) and object ids (m,). Returns the grid, which is empty if no view has pixels, and the cells of
+    the pixels of each view.
 
     Raises:
         InputError: an edge that is not positive or too small, points that are not finite.
@@ -101,15 +96,10 @@ class CellValues:
         self._coarse_keys = pack_keys(ijk, objects)
 
     def at(self, points: NDArray, objects: NDArray, fallback: NDArray) -> tuple[NDArray, NDArray]:
-        """Read the values at surface points.
+        """Read values (m, c) and cells (m,) int64 at surface points (m, 3); -1 for points in no cell.
 
-        Args:
-            points: (m, 3) world coordinates, m; objects: (m,) object ids.
-            fallback: (m, c) values of points in no cell and no coarse cell; it is overwritten.
-
-        Returns:
-            (m, c) values: of the cell, or the mean of the cells of the same object in the block of 4 x 4 x 4 voxels
-            around, or `fallback`; and (m,) int64 cells, -1 for points in no cell.
+        A point in no cell takes the mean of the cells of its object in the block of 4 x 4 x 4 voxels around, or its row of
+        `fallback`, which is overwritten.
         """
         ijk = voxel_indices(points, self.grid.edge, self.grid.origin)
         row, known = _rows_of(self.grid.keys, pack_keys(ijk, objects))

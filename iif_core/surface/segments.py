@@ -1,7 +1,6 @@
-"""Objects on faces, and segments in views (docs/method/objects.md).
+"""Objects on faces, and segments in views: one object in one view, numbered view by view (docs/method/objects.md, Eq. O.1).
 
-A *segment* is one object in one view, the unit that shares one affine correction (Eq. O.1). Segments are numbered view by
-view, and within a view by ascending object id. Ids are int32, -1 = none.
+Ids are int32, -1 = none.
 """
 
 from __future__ import annotations
@@ -29,14 +28,9 @@ class SegmentTable:
 
 
 def view_segments(object_map: NDArray, first_segment: int = 0) -> tuple[NDArray, NDArray, NDArray]:
-    """Number the segments of one view (Eq. O.1).
+    """Number the segments of one view (Eq. O.1) from `first_segment` on; negative objects of the (H, W) map = none.
 
-    Args:
-        object_map: (H, W) integer; negative = none.
-        first_segment: id of the first segment.
-
-    Returns:
-        Segment ids (H, W) int32 with -1 = none, and object and number of pixels of each segment, (s,) int32.
+    Returns segment ids (H, W) int32 with -1 = none, and object and number of pixels of each segment, (s,) int32.
 
     Example:
         >>> view_segments(np.array([[7, -1], [3, 7]]))[0].tolist()
@@ -51,14 +45,7 @@ def view_segments(object_map: NDArray, first_segment: int = 0) -> tuple[NDArray,
 
 
 def segment_table(object_maps: Iterable[NDArray]) -> tuple[list[NDArray], SegmentTable]:
-    """Number the segments of all views.
-
-    Args:
-        object_maps: one (H, W) integer map per view, negative = none; views may differ in size.
-
-    Returns:
-        Segment id maps, and the table, in which `view` is the position in the sequence.
-    """
+    """Number the segments of all views, (H, W) maps with negative = none; `view` in the table is the position in the sequence."""
     maps, views, objects, pixels, first = [], [], [], [], 0
     for view, object_map in enumerate(object_maps):
         segment_map, ids, counts = view_segments(object_map, first)
@@ -91,15 +78,10 @@ def interior(object_map: NDArray, border: int) -> NDArray:
 
 
 def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
-    """Find pairs of faces that share an edge: (M, 2) int32, lower face first, sorted.
+    """Find pairs of faces that share an edge: (M, 2) int32, lower face first, sorted; n > 2 faces at an edge give a chain of
+    pairs.
 
-    Args:
-        faces: (F, 3) vertex indices.
-        vertices: (N, 3); if given, vertices at identical positions count as one, so that seams of texture coordinates or
-            normals do not separate faces.
-
-    Returns:
-        Pairs; an edge of n > 2 faces gives a chain of n - 1 pairs.
+    If vertices are given, those at identical positions count as one, so that seams do not separate faces.
     """
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3:
@@ -157,7 +139,6 @@ def vote_faces(
     instance_id: NDArray,
     n_faces: int,
     faces_adjacency: NDArray | None = None,
-    background: int | None = None,
 ) -> FaceVotes:
     """Label every face by the majority of the pixels that see it (Eq. O.3).
 
@@ -168,7 +149,6 @@ def vote_faces(
         face_id, instance_id: integer arrays of one shape, the pixels of all views; negative = miss or not labelled.
         n_faces: number of faces, F.
         faces_adjacency: (M, 2) of `face_adjacency`.
-        background: label of faces that no other label reaches; one more than the highest instance id if None.
 
     Returns:
         Labels of the faces, and how far the votes agree.
@@ -196,8 +176,7 @@ def vote_faces(
     if faces_adjacency is not None and len(faces_adjacency):
         label = _spread(label, np.asarray(faces_adjacency))
     unreached = label < 0
-    if background is None:
-        background = span if instance.size else 0
+    background = span if instance.size else 0
     label[unreached] = background
 
     object_id = np.unique(label)
@@ -214,7 +193,7 @@ def vote_faces(
         object_id.astype(np.int32),
         pixels.astype(np.int64),
         (agreeing / np.maximum(pixels, 1)).astype(np.float32),
-        int(background) if unreached.any() else None,
+        background if unreached.any() else None,
     )
 
 
@@ -244,15 +223,9 @@ def fill_within(label: NDArray, piece: NDArray, closed: NDArray, adjacency: NDAr
 
 
 def partition_agreement(a: NDArray, b: NDArray, weight: NDArray) -> tuple[float, NDArray]:
-    """Compare two partitions of a set by the weighted adjusted Rand index (Eq. O.20).
+    """Compare two partitions, labels (n,) from 0, by the weighted adjusted Rand index (Eq. O.20): 1 = equal, about 0 = by chance.
 
-    Args:
-        a, b: (n,) int labels from 0.
-        weight: (n,) >= 0.
-
-    Returns:
-        The index: 1 for equal partitions, about 0 for partitions that agree no more than by chance. And (max(a) + 1,) float64,
-        the best overlap over union of every label of `a` with a label of `b` (Eq. O.21); NaN for labels without weight.
+    Also returns the best overlap over union of every label of `a` with a label of `b` (Eq. O.21); NaN for labels without weight.
 
     Raises:
         InputError: shapes that differ, or no weight at all.

@@ -1,8 +1,6 @@
-"""Diffuse shading per surface cell, computed once for all views because it does not depend on the viewer.
+"""Diffuse shading per surface cell, computed once for all views because it does not depend on the viewer (Eq. S.17).
 
-A cell is a triple of object, voxel and direction of the normal (Eq. S.17). Paths start at a few of the pixels that see the
-cell, in any view, and are added until the measured noise is small enough. Two independent halves are kept
-(docs/method/shading.md#surface-cells).
+Paths are added until the measured noise is small enough; two independent halves are kept (docs/method/shading.md#surface-cells).
 """
 
 from __future__ import annotations

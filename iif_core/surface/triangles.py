@@ -1,7 +1,6 @@
-"""Geometry of triangle meshes: normals, areas, welding, subdivision.
+"""Geometry of triangle meshes in float64: normals (right-hand rule), areas, welding, subdivision.
 
-A mesh is `vertices` (n, 3) in metres and `faces` (m, 3) of vertex indices; normals follow the right-hand rule. Everything is
-computed in float64.
+A mesh is `vertices` (n, 3) in metres and `faces` (m, 3) of vertex indices.
 """
 
 from __future__ import annotations

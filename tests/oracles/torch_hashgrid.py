@@ -22,7 +22,7 @@ class TorchTexture(HashGridTexture):
         """Copies of the gradients of the last backward pass, by the names of `levels.initial`."""
         table = np.zeros_like(self.table)
         for number in range(len(self.levels)):
-            self.scatter(number, *self.pending, table[self.rows(number)])
+            self._scatter(number, *self.pending, table[self.rows(number)])
         return {"table": self._unpacked(table), **_copies("", self.network_gradient)}
 
     def state(self) -> dict[str, NDArray]:

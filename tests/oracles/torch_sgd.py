@@ -53,7 +53,7 @@ class TorchEngine:
         s, k = pool.usable.shape
         self.values = torch.from_numpy(pool.values.view(np.float16) if pool.values.dtype == np.uint16 else pool.values)
         self.segment, self.cell = (torch.from_numpy(a.astype(np.int64)) for a in (pool.segment, pool.cell))
-        self.usable, self.weight = torch.from_numpy(pool.usable), torch.from_numpy(pool.weight)
+        self.usable = torch.from_numpy(pool.usable)
         self.table, self.affine = start_values(pool, n_cells, options), np.tile(IDENTITY, (s, k, 1))
         self.z = torch.zeros((s, k, 3), requires_grad=True)
         self.fixed = None
@@ -66,11 +66,9 @@ class TorchEngine:
 
     def losses(self, pixels: torch.Tensor, raw: torch.Tensor, temperature: float) -> dict[str, torch.Tensor]:
         segment = self.segment[pixels]
-        share = self.weight[pixels] if self.options.weighted else torch.ones_like(self.weight[pixels])
-        divisor = temperature if self.options.logits == "scaled" else 1.0
-        batch = TorchBatch(raw, self.values[pixels].to(torch.float32), segment, share / share.sum())
+        batch = TorchBatch(raw, self.values[pixels].to(torch.float32), segment, torch.full((len(pixels),), 1 / len(pixels)))
         tables = TorchTables(self.maps, self.z, self.usable, self.fixed)
-        found = torch_losses(batch, tables, temperature, divisor, self.options)
+        found = torch_losses(batch, tables, temperature, temperature, self.options)
         if self.fixed is not None:
             found["label"] = torch.zeros_like(found["label"])  # a fixed selection has no label loss
         return found
@@ -99,8 +97,7 @@ class TorchEngine:
         if self.fixed is not None:
             alpha = self.fixed.numpy()
             return alpha, np.log(alpha, out=np.zeros_like(alpha), where=alpha > 0)
-        divisor = temperature if self.options.logits == "scaled" else 1.0
-        return softmax(self.z.detach().numpy(), divisor, self.pool.usable)
+        return softmax(self.z.detach().numpy(), temperature, self.pool.usable)
 
     def fix(self, alpha: NDArray) -> None:
         self.fixed = torch.from_numpy(np.asarray(alpha, np.float32))

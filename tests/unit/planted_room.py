@@ -111,7 +111,7 @@ class PlantedScene:
     def __init__(self, room: Room, views: int = 8, size: int = 48):
         from iif_core.light.transport.emitters import Emitters
         from iif_core.light.transport.geometry import build_geometry, trace
-        from iif_core.light.transport.materials import FaceMaterials
+        from tests.oracles.face_materials import FaceMaterials
 
         self.room, self.size = room, size
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)

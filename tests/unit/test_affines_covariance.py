@@ -1,5 +1,7 @@
 """Claimed errors of the material fit, and parts of a system that are summed on their own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -155,7 +157,7 @@ def test_objects_and_their_prior_follow_the_response():
     ends = []
     for moved in (-step, 0.0, step):
         start = DescentState(truth, free, np.array([2.0 + moved]), np.full(3, 1e-3))
-        ends.append(descend(px, start, prior_at(moved), tone, options, None, False))
+        ends.append(descend(px, start, prior_at(moved), tone, replace(options, free_response=False)))
     state, terms = ends[1]
     curve_prior = make_response_prior(options, len(px.obj), state.params)
     blocks = decompose_objects(terms.h, free, prior_at(0.0))

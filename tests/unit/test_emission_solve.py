@@ -21,7 +21,7 @@ def _rows(a1, a2, y, weight=None, bound=None):
 def _gains(rows, owner, identifiable=True, rounds=15, shrinkage=0.05, initial=None, **options):
     """Gains of rows of three groups."""
     initial = np.ones((3, 3)) if initial is None else initial
-    return estimate_object_gains(rows, owner, initial, identifiable, options=GainOptions(True, rounds, shrinkage), **options)
+    return estimate_object_gains(rows, owner, initial, identifiable, options=GainOptions(rounds, shrinkage), **options)
 
 
 def _light(rows, owner, found, **options):
@@ -204,7 +204,7 @@ def _pruning(shown, seen, matrix, area, noise=0.05, seed=9):
     y = np.einsum("ngc,gc->nc", a, np.asarray(shown)[:, None] * np.ones(3)) * (1 + noise * rng.standard_normal((2000, 3)))
     everywhere, last = np.ones(2000, bool), np.arange(groups) == groups - 1
     rows = _rows(a, a, y)
-    return prune_groups(rows, np.ones((groups, 3)), np.asarray(area, float), _white(seen, matrix), everywhere, last, cross=False)
+    return prune_groups(rows, np.ones((groups, 3)), np.asarray(area, float), _white(seen, matrix), everywhere, last)
 
 
 def test_pruning_keeps_what_shines():

@@ -368,9 +368,9 @@ def own_render(parts, camera, samples):
     """The same parts in the workflow's renderer, one material a face."""
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry
-    from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
+    from tests.oracles.face_materials import FaceMaterials
 
     offset, vertices, faces, values, radiance = 0, [], [], [], []
     for part in parts:

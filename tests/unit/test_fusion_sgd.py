@@ -12,13 +12,14 @@ from iif_core.fusion.hashgrid.levels import HashGridOptions
 from iif_core.fusion.kernels import IDENTITY, as_words
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, FusionProblem
-from iif_core.fusion.reference_loss import loss_of_result, reference_loss
+from iif_core.fusion.reference_loss import loss_of_result
 from iif_core.fusion.sgd import engine, kernels, solve
 from iif_core.fusion.sgd import pool as sgd_pool
 from iif_core.fusion.sgd.options import SgdOptions, sgd_options
 from iif_core.fusion.sgd.solve import converged, solve_sgd
 from iif_core.reflectance.material import unclamped_material
 from tests.oracles import torch_sgd
+from tests.oracles.label_loss import label_loss
 from tests.unit.test_fusion_direct import OBJECTS, SIZE, oracle_psnr, planted, problem_of, seen, simulated, surface
 
 TERMS = ("data", "label", "regulariser", "entropy", "gain")
@@ -294,7 +295,6 @@ def test_good_predictions_are_selected_and_the_texture_found():
     )
     assert (fit.alpha.argmax(1) == good[view_of_segment][:, None]).mean() > 0.95
     assert oracle_psnr(problem, fit.value, truth) > 38
-    assert fit.error.shape == (problem.n_segments, 5, 3) and (fit.error.argmin(1) == fit.alpha.argmax(1)).mean() > 0.95
 
 
 @pytest.mark.parametrize("preset", ["safe", "paper"])
@@ -302,21 +302,17 @@ def test_loss_of_the_solver_is_the_reference_loss(preset, monkeypatch):
     """With all pixels in one batch and steps of size 0, the first history entry is the loss of the result."""
     problem, _ = simulated()
     options = sgd_options(preset, texture="cells", init="mean", iterations=1, batch=1 << 20, learning_rate=1e-30)
+    used = []
     for each in (engine.Engine, torch_sgd.TorchEngine):
-        monkeypatch.setattr(solve, "Engine", each)
+        monkeypatch.setattr(solve, "Engine", lambda *arguments, make=each: used.append(make(*arguments)) or used[-1])
         fit = solve_sgd(problem, replace(options, choice="soft"))
-        expected = reference_loss(
-            problem,
-            *(fit.value, fit.scale, (fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
-            log_weight=fit.log_alpha,
-            temperature=fit.temperature,
-        )
-        assert fit.history[0]["total"] == pytest.approx(expected.total, rel=1e-5)
-        assert fit.history[0]["data"] == pytest.approx(expected.data, rel=1e-5)
-        assert fit.history[0]["label"] == pytest.approx(expected.label, rel=1e-5)
-    monkeypatch.undo()
-    weighted = solve_sgd(problem, replace(options, weighted=True))
-    assert weighted.history[0]["data"] == pytest.approx(loss_of_result(problem, weighted, weighted=True).data, rel=1e-5)
+        first, temperature = fit.history[0], fit.history[-1]["temperature"]
+        expected = loss_of_result(problem, fit)
+        corrections = (fit.affine_albedo, fit.affine_roughness, fit.affine_metallic)
+        label = label_loss(problem, fit.value, corrections, used[-1].weights(temperature)[1], temperature)
+        assert first["total"] == pytest.approx(expected.total + label, rel=1e-5)
+        assert first["data"] == pytest.approx(expected.data, rel=1e-5)
+        assert first["label"] == pytest.approx(label, rel=1e-5)
 
 
 def test_loss_with_moved_corrections_is_the_reference_loss():
@@ -352,7 +348,7 @@ def test_same_bytes_again_streamed_and_with_threads():
     first = solve_sgd(problem, options, threads=1)
     streamed = replace(problem, predictions=lambda view: simulated()[0].predictions[view])
     for other in (solve_sgd(problem, options, threads=2), solve_sgd(streamed, options, threads=3)):
-        for name in ("value", "scale", "corrections", "alpha", "error"):
+        for name in ("value", "scale", "corrections", "alpha"):
             assert getattr(first, name).tobytes() == getattr(other, name).tobytes()
         assert first.history == other.history
     other = solve_sgd(problem, replace(options, seed=1))
@@ -397,10 +393,8 @@ def test_predictions_that_are_not_finite_are_dropped_as_in_the_direct_solver(val
     predictions[0][:] = value
     problem = replace(problem, predictions=predictions)
     fit, direct = solve_sgd(problem, replace(QUICK, iterations=30)), solve_direct(problem)
-    assert fit.dropped == direct.dropped
-    np.testing.assert_array_equal(fit.observations, direct.observations)
-    np.testing.assert_array_equal(fit.views, direct.views)
-    for name in ("value", "scale", "corrections", "alpha", "error"):
+    np.testing.assert_array_equal(sgd_pool.gather(problem, QUICK).observations, direct.observations)
+    for name in ("value", "scale", "corrections", "alpha"):
         assert np.isfinite(getattr(fit, name)).all()
     segments = np.unique(problem.segment_of_pixel[2])
     assert (fit.alpha[segments, 3] == 0).all()
@@ -421,13 +415,6 @@ def test_coldest_temperatures_stay_finite():
     assert frozen.history[-1]["temperature"] == 1e-30 and np.isfinite(frozen.value).all()
 
 
-def test_logits_that_are_not_scaled_tend_to_vote_shares():
-    problem, _ = simulated()
-    options = replace(QUICK, logits="direct", choice="soft", learning_rate=0.05)
-    fit = solve_sgd(problem, options)
-    assert 0.01 < fit.history[-1]["entropy"] < np.log(6) - 0.05
-
-
 def test_unseen_cells_and_objects_of_one_pixel():
     obj = np.array([0, 0, 1, 2, 2])
     problem = problem_of([np.array([[0, 2, -1]])], [np.full((2, 1, 3, 5), 0.3)], obj, 0)
@@ -435,7 +422,7 @@ def test_unseen_cells_and_objects_of_one_pixel():
     np.testing.assert_allclose(fit.value[[0, 1, 2]], 0.3, atol=0.03)
     np.testing.assert_array_equal(fit.value[1], fit.value[0])
     np.testing.assert_array_equal(fit.value[3:], [NEUTRAL] * 2)
-    assert fit.observations.tolist() == [1, 0, 1, 0, 0] and np.isfinite(fit.scale).all()
+    assert np.isfinite(fit.scale).all()
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
@@ -481,18 +468,8 @@ def test_hash_grid_texture(preset):
     assert fit.history[-1]["data"] < 0.8 * fit.history[0]["data"]
     cells = seen(problem)
     assert np.abs(fit.value - truth)[cells, :3].mean() < 0.2 and np.isfinite(fit.scale).all()
-    value, scale = fit.at_pixels(3)
-    cell = np.ravel(problem.cell_of_pixel[3])
-    np.testing.assert_allclose(value, fit.value[cell], atol=1e-5)
-    assert scale.shape == (SIZE * SIZE, 5)
     other = solve_sgd(problem, options, threads=1)
     assert fit.value.tobytes() == other.value.tobytes()
-    by_pixel = reference_loss(
-        problem,
-        *(lambda view: fit.at_pixels(view)[0], lambda view: fit.at_pixels(view)[1]),
-        *((fit.affine_albedo, fit.affine_roughness, fit.affine_metallic), fit.alpha),
-    )
-    assert by_pixel.data == pytest.approx(loss_of_result(problem, fit).data, rel=1e-3)
 
 
 def test_points_are_normalised_by_a_cube():
@@ -520,34 +497,10 @@ def test_jitter_moves_the_points():
 # ---------------------------------------------------------------------------------------------------------------- errors
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"texture": "voxels"}, "allowed: cells, hashgrid"),
-        ({"choice": "best"}, "argmin"),
-        ({"batch": 0}, "batch"),
-        ({"iterations": 0}, "epochs"),
-        ({"learning_rate": 0.0}, "positive"),
-        ({"temperature": float("nan")}, "positive"),
-        ({"temperature_floor": -1.0}, "0 or a positive"),
-        ({"anneal": 0.0}, "anneal"),
-        ({"choose_at": 1.5}, "choose_at"),
-        ({"texture": "hashgrid", "grid": HashGridOptions(outputs=4)}, "10 are needed"),
-    ],
-)
-def test_bad_options_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        SgdOptions(**options)
-
-
 def test_bad_calls_are_refused():
     problem, _ = simulated()
-    with pytest.raises(InputError, match="preset"):
-        sgd_options("fast")
     with pytest.raises(InputError, match="surface points"):
         solve_sgd(problem, sgd_options("paper"))
-    with pytest.raises(InputError, match="threads"):
-        solve_sgd(problem, QUICK, threads=0)
     with pytest.raises(InputError, match="no pixel"):
         solve_sgd(FusionProblem([], [], [], 3, np.zeros(3, int), np.zeros(0, int)), QUICK)
     with pytest.raises(InputError, match="MiB"):

@@ -9,7 +9,8 @@ from iif_core.errors import InputError
 from iif_core.fusion import uncertainty
 from iif_core.fusion.direct import solve_direct
 from iif_core.fusion.selection import effective_number, margin
-from iif_core.fusion.uncertainty import NOMINAL_COVERAGES, Calibration, coverage, fit_calibration, gauge_free_error, interval
+from iif_core.fusion.uncertainty import NOMINAL_COVERAGES, Calibration, coverage, gauge_free_error, interval
+from tests.oracles.calibration import fit_calibration
 from tests.unit.test_fusion_direct import simulated
 
 

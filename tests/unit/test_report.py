@@ -78,9 +78,9 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     """Every artefact that the last stages read, of a room with a box and a lamp; the base is 20 % too dark."""
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry, trace
-    from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
+    from tests.oracles.face_materials import FaceMaterials
 
     rng = np.random.default_rng(0)
     quad = np.array([[1.0, 0.7, 2.4], [2.0, 0.7, 2.4], [2.0, 1.3, 2.4], [1.0, 1.3, 2.4]])

@@ -149,9 +149,9 @@ def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
     """A floor under a lamp: the mean over a cell's pixels, traced from a few of them."""
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry
-    from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.scene import PathOptions, Scene
     from iif_core.light.transport.shading import shading_caches
+    from tests.oracles.face_materials import FaceMaterials
 
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     vertices = np.concatenate([square * 2, square * 0.6 + np.float32([0.5, 0.5, 1.0])])

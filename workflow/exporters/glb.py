@@ -1,8 +1,6 @@
-"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part.
+"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part, albedo as linear `COLOR_0`.
 
-There is no UV atlas: `baseColorFactor` is white and `COLOR_0` (linear, 16 bits) holds the albedo; roughness and metallic are the
-means of the part. trimesh is not used because it stores vertex colours in 8 bits, in which a linear albedo of 0.04 has steps of
-10 % (docs/method/numerics.md#albedo-in-eight-bits).
+trimesh is not used because it stores vertex colours in 8 bits (docs/method/numerics.md#albedo-in-eight-bits).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Writes mitsuba/scene.xml, the recovered scene for Mitsuba 3; `mitsuba -m scalar_rgb scene.xml` renders it.
 
-Meshes are PLY files with the material as vertex attributes, in world coordinates and metres. All values are linear, all paths
-relative.
+Meshes are PLY files with the material as vertex attributes, in world coordinates and metres; paths are relative.
 """
 
 from __future__ import annotations

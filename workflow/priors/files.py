@@ -1,7 +1,7 @@
 """Prior `files`: predictions of any model in `predictions/{albedo,roughness,metallic}/<view>_<kkk>.png|exr`.
 
-`<view>` is the name of the view and `<kkk>` = 000, 001, ... . PNG files (8 or 16 bit) hold [0, 1], EXR files the values. The
-settings state how albedo and roughness are encoded. A map of another size is resized if it has the photograph's aspect ratio.
+PNG files (8 or 16 bit) hold [0, 1], EXR files the values. A map of another size is resized if it has the photograph's aspect
+ratio.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Prior `marigold`: Marigold-IID appearance (Ke et al. 2025), a diffusion model that predicts all maps in one pass.
 
-Users provide the checkpoint (docs/guide/priors.md, docs/method/priors.md#diffusion). The model reads display-encoded pictures;
-meaning and encoding of its outputs are read from the checkpoint's `target_properties`.
+The model reads display-encoded pictures; meaning and encoding of its outputs are read from the checkpoint's `target_properties`
+(docs/method/priors.md#diffusion).
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
 
     Args:
         view: of the capture.
-        settings: section `prior`.
+        settings: what stage `prior` may read (sections `prior` and `source`).
         capture: the normal form.
         seed: of the random numbers.
 

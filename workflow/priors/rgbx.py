@@ -1,8 +1,7 @@
 """Prior `rgbx`: RGB-X (Zeng et al., SIGGRAPH 2024), a diffusion model that predicts one map per prompt.
 
-Users provide the checkpoint (docs/guide/priors.md, docs/method/priors.md#diffusion); this module follows the published facts
-about it. The model reads linear pictures and predicts linear albedo, perceptual roughness and metallic (the first channel of a
-picture each). According to its authors the published weights differ from the paper's in metallic.
+The model reads linear pictures and predicts linear albedo, perceptual roughness and metallic (the first channel of a picture
+each). The published weights differ from the paper's in metallic (docs/method/priors.md#diffusion).
 """
 
 from __future__ import annotations

@@ -57,15 +57,7 @@ class BaseScene:
     def traceable(
         self, black: np.ndarray | None = None, extra: tuple[np.ndarray, np.ndarray] | None = None
     ) -> tuple[Geometry, CellMaterials]:
-        """Build geometry and materials on the device.
-
-        Args:
-            black: (m,) bool, faces that reflect nothing.
-            extra: vertices (v, 3) and faces (f, 3) of a black object to add; its faces come last.
-
-        Returns:
-            What the light transport needs: geometry and materials.
-        """
+        """Build geometry and materials on the device; faces of `black` reflect nothing, those of `extra` come last, black."""
         material = self.materials()
         from iif_core.light.transport.geometry import build_geometry
 
@@ -315,13 +307,12 @@ def pixel_gains(gains: CameraGains, number: int, view: View, index: np.ndarray) 
     return gains.factor(number, radius_squared(index, view.width, view.height))
 
 
-def read_radiance_cache(job: Job, with_bounds: bool = True) -> RadianceCache:
-    """Read the radiance cache onto the device; `with_bounds` includes voxels that only saturated pixels show."""
+def read_radiance_cache(job: Job) -> RadianceCache:
+    """Read the radiance cache onto the device, voxels that only saturated pixels show included."""
     from iif_core.light.transport.cache import RadianceCache
 
     reader = job.read("emission")
     table, facts = reader.table("radiance_cache.parquet"), reader.json("emission.json")
-    use = np.ones(len(table["i"]), bool) if with_bounds else ~table["censored"].astype(bool)
-    ijk = np.stack([table[c] for c in "ijk"], 1)[use].astype(np.int32)
-    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)[use].astype(np.float32)
+    ijk = np.stack([table[c] for c in "ijk"], 1).astype(np.int32)
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float32)
     return RadianceCache(facts["cache_edge_m"], np.asarray(facts["cache_origin"], np.float32), ijk, radiance)

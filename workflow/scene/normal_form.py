@@ -200,11 +200,6 @@ class CaptureReader:
         """Return the columns of faces.parquet, among them instance ids and true emission."""
         return self.reader.table("faces.parquet")
 
-    def true_emission(self) -> np.ndarray | None:
-        """Return the radiance (m, 3) of the front side of every face, or None where it is not known."""
-        f = self.faces()
-        return np.stack([f[f"emission_{c}"] for c in "rgb"], 1) if "emission_r" in f else None
-
     @property
     def used(self) -> list[View]:
         """The views that are not held out: no estimate may read any other photograph."""

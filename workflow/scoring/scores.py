@@ -175,14 +175,10 @@ def interval_scores(
 ) -> Iterator[tuple[str, list[Score]]]:
     """Compute the share of the cells whose error lies within the interval that the base claims (Eq. E.11 to E.13).
 
-    The columns `uncertainty_*` are standard deviations of the error that remains when each object's truth is mapped to the base
-    by its nearest affine, over all views together: protocol `oracle_affine`. Protocol `raw` does without the affine, whose error
-    these columns cannot contain. Objects of few cells are left out, because their affine follows the errors. `psnr_3d` is
-    computed over cells with one affine per object for all views; unlike the scores of single views it includes levels that differ
-    between views.
-
-    Args:
-        cells: table base/cells.parquet; truth: of `cell_truth`; predictions: K.
+    `cells` is the table base/cells.parquet, `truth` that of `cell_truth`, `predictions` K. The columns `uncertainty_*` are
+    standard deviations of the error under one affine per object over all views (protocol `oracle_affine`); protocol `raw` does
+    without the affine. Objects of few cells are left out, because their affine follows the errors. `psnr_3d` is over cells, with
+    one affine per object for all views.
     """
     for quantity, names in _CHANNELS_OF.items():
         labels = [f"coverage_{round(100 * level)}" for level in NOMINAL_COVERAGES]

@@ -1,8 +1,6 @@
-"""Reads mask files (docs/guide/segmentation.md).
+"""Reads mask files `masks/<view>.png|exr` (label maps) or `masks/<view>/*.png` (docs/guide/segmentation.md); 0 is no mask.
 
-A view has a label map `masks/<view>.png|exr`, or binary masks `masks/<view>/*.png` that may overlap. Masks belong to the
-photographs as they are stored, at any size of the same aspect ratio; lens distortion is removed as it is from the photographs.
-0 is no mask.
+Masks belong to the photographs as they are stored, at any size of the same aspect ratio.
 """
 
 from __future__ import annotations
@@ -103,13 +101,7 @@ class MaskFiles:
 
 
 def mask_files(own: dict[str, Any], source: dict[str, Any], capture: dict[str, Any]) -> MaskFiles:
-    """Find the mask files of a scene and check their names and headers.
-
-    Args:
-        own, source, capture: the dumped settings sections `segmentation`, `source` and `capture`.
-
-    Returns:
-        The files of the views that the capture uses.
+    """Find the mask files of the views that the capture uses, and check their names and headers.
 
     Raises:
         InputError: see `raw_inputs` of segmentation `masks`.

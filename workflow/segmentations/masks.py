@@ -126,17 +126,9 @@ def cluster_views(surface: Surface, views: list[View], load: Load, options: Cons
 def _with_origin(
     label: np.ndarray, home: np.ndarray, elected: np.ndarray, agreeing: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Renumber labels and find the origin of every object.
+    """Renumber the final labels (F,) from 0; `home` are the objects before the views parted or joined them.
 
-    Args:
-        label: (F,) final objects.
-        home: (F,) objects before the views parted or joined them.
-        elected: those of `home` that come from masks.
-        agreeing: agreement of the pixels for each of `home`.
-
-    Returns:
-        (F,) labels from 0; (objects,) bool, whether masks made the object; (objects,) mean agreement over its faces, 1 without
-        masks.
+    Returns the labels, for each object whether masks made it (it is of `elected`), and the mean agreement over its faces.
     """
     label = np.unique(label, return_inverse=True)[1]
     by_masks = np.isin(home, elected)
@@ -149,15 +141,7 @@ def _part_and_join(
 ) -> tuple[np.ndarray, int, int]:
     """Part objects that the views see as several and join those that they see as one (docs/method/objects.md#part-and-join).
 
-    Args:
-        surface: mesh and photographs.
-        views: to use.
-        load: view -> (H, W) int label map, 0 = no mask.
-        label: (F,) objects.
-        piece: (F,) pieces of the mesh.
-
-    Returns:
-        (F,) new objects, and the numbers of objects that parting added and joining removed.
+    Returns (F,) new objects, and the numbers of objects that parting added and joining removed.
     """
     pieces_in_all = int(piece.max()) + 1
     code, fragment = np.unique(label.astype(np.int64) * pieces_in_all + piece, return_inverse=True)

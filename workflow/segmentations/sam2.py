@@ -1,9 +1,7 @@
 """Masks by SAM 2 (Ravi et al. 2024) for segmentation `masks`, through transformers; users provide the weights.
 
-The model receives a grid of points and returns three masks for each: an object, a part of it, and a smaller part. Confident masks
-that do not depend on the exact threshold are kept, and of nearly equal ones the most confident; small masks lie on large ones
-(docs/method/objects.md#proposals). transformers' own image processor and mask pipeline need torchvision, which the environment
-does not have; scaling and selection are therefore done here and in `iif_core.objects.mask_proposals`.
+transformers' own image processor and mask pipeline need torchvision, which the environment does not have; scaling and selection
+(docs/method/objects.md#proposals) are therefore done here and in `iif_core.objects.mask_proposals`.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class Export(Section):
     """Files for other programs."""
 
     max_faces_glb: int = Field(2_000_000, ge=1000)
-    """Largest number of faces in scene.glb; for larger meshes the file is left out with a note."""
+    """Largest number of faces of the mesh; a larger one ends stage `export` with an error."""
 
 
 class Report(Section):

@@ -245,7 +245,7 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
     """Return the derived scenes whose folders may hold results that `name` shares, the most general first.
 
     These are what all studies share, then the variants of its own study up to itself, with the first seed and with its own. A
-    variant that differs late, such as a baseline of the last fit, thus finds everything before that stage in the folder of the
+    variant that differs late, such as a baseline of the material fit, thus finds everything before it in the folder of the
     first variant.
     """
     parts = derived(name, root)

@@ -1,7 +1,6 @@
 """Source `builtin`: photographs, cameras, mesh and ground truth of a room that the project makes itself.
 
-The photographs are path traced with the workflow's own reflectance model and with the textures of the truth maps. Model and data
-therefore differ only by Monte Carlo noise, quantisation to eight bits and a camera response that the solver does not know.
+The photographs are path traced with the workflow's own reflectance model and with the textures of the truth maps.
 """
 
 from __future__ import annotations

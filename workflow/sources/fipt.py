@@ -50,11 +50,7 @@ class Listed:
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """List the files that the capture reads, after checking everything that can be checked without pixels.
-
-    Raises:
-        InputError: missing or inconsistent files, by name.
-    """
+    """List the files that the capture reads, after the checks that need no pixels; raises InputError."""
     return find_inputs(document["source"], document["capture"]).files()
 
 

@@ -1,7 +1,6 @@
 """Source `folder`: the user's own scene, in the form that common tools write (docs/guide/own-data.md).
 
-`raw_inputs` checks everything that headers and JSON can show, while Snakemake plans. `capture` removes distortion, reduces the
-photographs, traces the mesh and measures whether the two belong together.
+`raw_inputs` checks everything that headers and JSON can show, while Snakemake plans.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Source `mitsuba`: photographs, cameras, mesh and ground truth of any Mitsuba 3 scene.
 
-Mitsuba path traces the photographs from the scene as it is, with its own BSDFs, glass and bump maps. Mesh and material truth are
-the approximation of the scene by the workflow's model (`mitsuba_scene.materials`); `capture.json` notes every difference.
+Mesh and material truth approximate the scene by the workflow's model (`mitsuba_scene.materials`); `capture.json` notes every
+difference.
 """
 
 from __future__ import annotations

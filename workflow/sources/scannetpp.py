@@ -34,11 +34,7 @@ MAX_DISTANCE, MAX_ANGLE = 0.01, 0.01  # metres and radians by which two pose fil
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
-    """List the files that the capture reads, after checking everything that can be checked without pixels.
-
-    Raises:
-        InputError: missing or inconsistent files, by name.
-    """
+    """List the files that the capture reads, after the checks that need no pixels; raises InputError."""
     return find_inputs(document["source"], document["capture"]).files()
 
 
@@ -50,12 +46,7 @@ def capture(job: Job) -> None:
 def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool = False) -> Inputs:
     """Find and check the cameras of a scene, in the frame of the mesh, and the files that belong to them.
 
-    Args:
-        source, settings: the dumped settings sections `source` and `capture`.
-        points: also read the sparse points of colmap/, which is slow, for the check of the mesh.
-
-    Returns:
-        The checked scene.
+    `points`: also read the sparse points of colmap/, which is slow, for the check of the mesh.
 
     Raises:
         InputError: missing or inconsistent files, by name.
@@ -145,19 +136,9 @@ def _masks(entries: list[dict[str, Any]], masks: Path) -> list[str]:
 def _compared_with_colmap(
     listed: transforms.Transforms, model: Path, world: str, points: bool
 ) -> tuple[transforms.Transforms, list[Path]]:
-    """Compare the poses with colmap/, which is in the frame of the mesh.
+    """Compare the poses with colmap/ (which may be missing), which is in the frame of the mesh; refuse poses that differ.
 
-    Args:
-        listed: the frames.
-        model: folder of the COLMAP model, which may be missing.
-        world: `source.world`.
-        points: whether the frames get the sparse points that they see.
-
-    Returns:
-        The frames, and the files of the model.
-
-    Raises:
-        InputError: the poses differ; the message names `source.world` where that explains it.
+    Returns the frames, with their sparse points if `points`, and the files of the model.
     """
     if not colmap.is_model(model):
         return listed, []

@@ -8,7 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.calibration.likelihood import maximise
-from iif_core.camera.calibration.rows import MAX_ROWS, MIN_VALUE, Channel, channel_rows, concatenate_channels, log_factor
+from iif_core.camera.calibration.rows import (
+    MAX_ROWS,
+    MIN_STOPS,
+    MIN_VALUE,
+    Channel,
+    channel_rows,
+    concatenate_channels,
+    log_factor,
+)
 from iif_core.camera.gains import CameraGains, GainRows, choose_gains, estimate
 from iif_core.camera.overlap import PatchRows
 from iif_core.camera.response import START, Response, response
@@ -20,6 +28,7 @@ GAUGE = (
     " the power is the one of a curve near sRGB"
 )
 _SIGNIFICANT = 2.0  # standard errors
+_MIN_ROWS = 200  # to fit a curve
 _SIGMA = 1.0  # standard deviation of a parameter around its start
 _CHANNEL_SIGMA = 0.05  # standard deviation of a parameter of one channel around that of all channels
 
@@ -78,8 +87,6 @@ def calibrate_response(
     exposure: np.ndarray,
     families: Sequence[str] = CANDIDATES,
     saturation: float = 0.99,
-    min_stops: float = 1.0,
-    min_rows: int = 200,
     given: bool = True,
 ) -> CalibratedResponse:
     """Fit all families and choose the smallest one that no other beats significantly (Eq. C.24).
@@ -89,7 +96,6 @@ def calibrate_response(
         exposure: (V,) of the views, known up to one factor; only their mean is used unless `given`.
         families: candidates, smallest first. Families without parameters are compared as they are.
         saturation: sensor values from here on are bounds.
-        min_stops, min_rows: exposure range and number of rows that are needed to fit a curve.
         given: exposures are known; otherwise they are estimated together with each candidate.
 
     Returns:
@@ -102,13 +108,13 @@ def calibrate_response(
     gains = CameraGains.plain(exposure)
     if not given:
         gains = _gains(rows, response(families[0]), gains)
-    channels = [channel_rows(rows, c, gains, saturation, min_stops) for c in range(3)]
-    enough = [c for c in range(3) if len(channels[c].cell) >= min_rows]
+    channels = [channel_rows(rows, c, gains, saturation) for c in range(3)]
+    enough = [c for c in range(3) if len(channels[c].cell) >= _MIN_ROWS]
     stops = max(channel.stops for channel in channels)
     if not enough:
         gains = gains if given else _gains(rows, response(families[0]), CameraGains.plain(exposure), choose=True)
-        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), min_stops, min_rows, gains, given)
-    common = concatenate_channels([channel_rows(rows, c, gains, saturation, min_stops, MAX_ROWS // len(enough)) for c in enough])
+        return _unknown(families[0], stops, sum(len(c.cell) for c in channels), gains, given)
+    common = concatenate_channels([channel_rows(rows, c, gains, saturation, MAX_ROWS // len(enough)) for c in enough])
     if not given:
         # The terms of the gains are chosen under the richest curve, fitted with one gain per view: under a wrong curve,
         # channels of different brightness seem to need gains of their own.
@@ -202,15 +208,13 @@ def _without_powers(gain: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return np.exp(level + chroma - x * (x * chroma).sum(0) / max(float((x**2).sum()), 1e-12))
 
 
-def _unknown(
-    family: str, stops: float, rows: int, min_stops: float, min_rows: int, gains: CameraGains, given: bool
-) -> CalibratedResponse:
+def _unknown(family: str, stops: float, rows: int, gains: CameraGains, given: bool) -> CalibratedResponse:
     start = response(family)
     start = start.with_params(np.tile(start.params, (3, 1)))
-    if stops < min_stops:
-        reason = f"exposures differ by less than {min_stops:g} stop where photographs overlap: taken as {family}"
+    if stops < MIN_STOPS:
+        reason = f"exposures differ by less than {MIN_STOPS:g} stop where photographs overlap: taken as {family}"
     else:
-        reason = f"{rows} rows of surface under different exposures, {min_rows} needed: taken as {family}"
+        reason = f"{rows} rows of surface under different exposures, {_MIN_ROWS} needed: taken as {family}"
     covariance = _SIGMA**2 * np.eye(start.params.size)
     return CalibratedResponse(start, covariance, stops, 0, 0.0, 0.0, [], reason, gains.exposure, gains=None if given else gains)
 

@@ -14,6 +14,7 @@ MIN_VALUE = 4.0 / 255.0
 """Smallest sensor value that is used (docs/method/numerics.md#logarithm-of-zero)."""
 MAX_ROWS = 8_000
 """Number of rows per channel that are fitted."""
+MIN_STOPS = 1.0  # exposure range that a patch needs
 KNOTS = np.linspace(0.1, 1.0, 257) ** 2  # sensor values where log x and the gain are tabulated
 
 
@@ -79,9 +80,7 @@ class Channel:
         return np.bincount(self.knot, row * (1.0 - self.part), size) + np.bincount(self.knot + 1, row * self.part, size)
 
 
-def channel_rows(
-    rows: PatchRows, c: int, gains: CameraGains, saturation: float, min_stops: float, budget: int = MAX_ROWS
-) -> Channel:
+def channel_rows(rows: PatchRows, c: int, gains: CameraGains, saturation: float, budget: int = MAX_ROWS) -> Channel:
     """Select the rows of one channel, on patches whose exposures differ enough and that some view shows unsaturated.
 
     Args:
@@ -89,7 +88,6 @@ def channel_rows(
         c: channel.
         gains: gains of the views.
         saturation: sensor value from which on rows are bounds.
-        min_stops: exposure range, in stops, that a patch needs.
         budget: approximate number of rows.
 
     Returns:
@@ -104,7 +102,7 @@ def channel_rows(
     np.minimum.at(low, owner, log_e[use])
     np.maximum.at(high, owner, log_e[use])
     span = (high - low) / np.log(2.0)
-    kept = np.flatnonzero((span >= min_stops - 1e-9) & (np.bincount(owner, ~clipped[use], size) > 0))
+    kept = np.flatnonzero((span >= MIN_STOPS - 1e-9) & (np.bincount(owner, ~clipped[use], size) > 0))
     stops = float(span.max(initial=0.0))
     index = use[_thinned(owner, value[use], clipped[use], kept, budget)[owner]]
     cell = np.unique(rows.patch[index], return_inverse=True)[1]

@@ -1,7 +1,6 @@
 """Camera response with a free albedo in every cell: Gauss-Newton on the response, the albedos eliminated.
 
-The response is determined by what no albedo explains: the same cell under different light or exposure, and the prior albedo of
-the objects. Roughness and metallic are solved again between the steps.
+Roughness and metallic are solved again between the steps.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""Free cells solved by search: albedo in closed form, roughness and metallic from candidates, parts by fixed point.
+"""Free cells solved by search: albedo in closed form, roughness and metallic from candidates, parts by fixed point (Eq. M.48).
 
-For given r and m the albedo of a cell is a ratio in each channel (Eq. M.48). Between two levels the loss is linear in r, so its
-minimum over the albedo is concave there, and the best r is a level or the mean of the part, where |r - r_o| has its kink. The
-search over the levels and that mean is therefore exact. Metallic is searched on a grid and at the mean of the part.
+The search over the levels of roughness and the mean of the part is exact, because the minimum over the albedo is concave between.
 """
 
 from __future__ import annotations

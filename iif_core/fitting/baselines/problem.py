@@ -1,12 +1,6 @@
 """The loss of a free material in every surface cell, reduced to sums over the pixels of the cell (Eq. M.1, M.45).
 
-With the slope w = e f'(e y) of the sensor at the observed radiance y = f^-1(I) / e, the squared error of the sensor value is to
-first order w^2 (L - y)^2. At roughness level j, with Z = y - S1_j, it is in each channel
-
-    loss_j(a, m) = k_d^2 DD + k_s^2 SS + 2 k_d k_s SD - 2 k_d DZ - 2 k_s SZ + ZZ,
-
-where DD, SS, ... are sums of w^2 D D, w^2 S0 S0, ... over the pixels of the cell. A cell is 15 J + 3 numbers, whatever the number
-of photographs. Between levels the loss, not the shading, is interpolated.
+A cell is 15 J + 3 numbers, whatever the number of photographs. Between levels the loss, not the shading, is interpolated.
 """
 
 from __future__ import annotations

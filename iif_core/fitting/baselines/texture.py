@@ -1,8 +1,4 @@
-"""Albedo of surface cells, once roughness and metallic are known for blocks of cells (Eq. M.49).
-
-A surface cell of the base is smaller than a pixel and seen once or twice, which is enough for a colour but not for five numbers.
-The cells of a block therefore share roughness, metallic and diffuse light, which vary slowly, and each has its own albedo.
-"""
+"""Albedo of surface cells, once roughness and metallic are known for blocks of cells, which share their light (Eq. M.49)."""
 
 from __future__ import annotations
 

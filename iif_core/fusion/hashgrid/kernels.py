@@ -3,12 +3,10 @@
 Every call writes arrays that no other call writes, so a pool of any size gives the same bytes. Layouts, all float32:
 
 * coordinates (3, N): a batch in Morton order, inside [0, 1 - 1e-6];
-* a block holds `BLOCK` consecutive samples in its last axis: `encoded` (blocks, inputs, BLOCK) is what the encoder writes
-  and the first layer reads; `hidden` (blocks, layers, width, BLOCK). The last block is filled up with zeros;
-* the widths of the network are multiples of `TILE`, filled up with zero weights.
+* a block holds `BLOCK` consecutive samples in its last axis, the last one filled up with zeros: `encoded` (blocks, inputs,
+  BLOCK), `hidden` (blocks, layers, width, BLOCK); the widths of the network are multiples of `TILE`, filled up with zeros.
 
-Indices are unsigned, or rows are taken out as views first: numba then drops the test for negative indices, which lets LLVM
-vectorise. `error_model="numpy"` does the same for division.
+Indices are unsigned, or rows are taken out as views first, so that numba drops the test for negative indices and LLVM vectorises.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class _TableUpdate(NamedTuple):
         largest = max(level.entries for level in texture.levels)
         scratch = texture.scratch.pop() if texture.scratch else np.zeros_like(texture.table[:largest])
         gradient = scratch[: texture.levels[number].entries]
-        texture.scatter(number, self.coordinates, self.slopes, gradient)
+        texture._scatter(number, self.coordinates, self.slopes, gradient)
         arrays = (texture.table[rows], texture.first[rows], texture.second[rows], gradient)
         texture.kernels.adam(*(array.reshape(-1) for array in arrays), texture.live[number], self.factors)
         texture.scratch.append(scratch)
@@ -206,7 +206,7 @@ class HashGridTexture:
         level = self.levels[number]
         return slice(level.start, level.start + level.entries)
 
-    def scatter(self, number: int, coordinates: NDArray, slopes: NDArray, gradient: NDArray) -> None:
+    def _scatter(self, number: int, coordinates: NDArray, slopes: NDArray, gradient: NDArray) -> None:
         level = self.levels[number]
         self.kernels.scatter_level(coordinates, level.resolution, level.hashed, slopes, 2 * number, gradient)
 

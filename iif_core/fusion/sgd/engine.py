@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from iif_core.fusion.hashgrid.texture import HashGridTexture
 from iif_core.fusion.kernels import IDENTITY
 from iif_core.fusion.sgd.options import SgdOptions
-from iif_core.fusion.sgd.pool import Pool, Step, runs, shares, softmax, start_values
+from iif_core.fusion.sgd.pool import Pool, Step, runs, softmax, start_values
 from iif_core.numerics.adam import adam_factors
 
 if TYPE_CHECKING:
@@ -83,8 +83,7 @@ class Engine:
         """Return alpha and log alpha (S, K, 3) float32."""
         if self.fixed is not None:
             return self.fixed, np.log(self.fixed, out=np.zeros_like(self.fixed), where=self.fixed > 0)
-        divisor = temperature if self.options.logits == "scaled" else 1.0
-        return softmax(self.z, divisor, self.pool.usable)
+        return softmax(self.z, temperature, self.pool.usable)
 
     def losses(self, step: Step, raw: NDArray, share: NDArray, error: NDArray) -> tuple[NDArray, NDArray]:
         """Add gradients to the optimisers' arrays, `d_alpha` and `votes`; return d_raw (N, 10) and the sums (SUMS,).
@@ -116,8 +115,8 @@ class Engine:
 
         self.run(work, list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)))
         if self.fixed is None and pool.usable.shape[1] > 1:
-            divisor = step.temperature if options.logits == "scaled" else 1.0
-            slope = logit_slope(alpha[segment], self.d_alpha[segment], self.votes[segment], options.label_weight, divisor)
+            parts = alpha[segment], self.d_alpha[segment], self.votes[segment]
+            slope = logit_slope(*parts, options.label_weight, step.temperature)
             self.adam_z.gradient.reshape(self.z.shape)[segment] = slope
         else:
             sums[:, 1] = 0  # a fixed selection has no label loss
@@ -125,7 +124,7 @@ class Engine:
 
     def step(self, step: Step) -> NDArray:
         """Update texture, maps and logits once; return the sums (SUMS,)."""
-        share = shares(self.pool, step.pixels, self.options)
+        share = np.full(len(step.pixels), 1 / len(step.pixels), np.float32)
         error = np.zeros((*self.pool.usable.shape, 3))
         rows = self.pool.cell[step.pixels]
         raw, kept = (self.table[rows], None) if self.grid is None else self.grid.forward(step.coordinates)

@@ -1,10 +1,7 @@
-"""Compiled loss of a batch and its gradient in closed form: what automatic differentiation would give, in one pass.
+"""Compiled loss of a batch and its gradient in closed form (Eqs. F.1 to F.15 and F.50 to F.54).
 
-A batch is sorted by segment. A tile is up to `TILE` pixels of one segment: its affine maps are a few numbers, and loops
-run over the pixels of a plane, which the compiler turns into vector instructions. The real type is that of the raw
-outputs: float32 to solve, float64 to check. Formulae: Eqs. F.1 to F.15 and F.50 to F.54.
-
-The sums of a segment are made by one thread, so the bytes do not depend on the number of threads.
+A batch is sorted by segment; a tile is up to `TILE` pixels of one segment. The real type is that of the raw outputs: float32 to
+solve, float64 to check. One thread makes the sums of a segment, so the bytes do not depend on the number of threads.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion.kernels import as_floats, as_words
-from iif_core.fusion.problem import LOWEST, Dropped, FusionProblem, usable_pixels
+from iif_core.fusion.problem import LOWEST, FusionProblem, usable_pixels
 from iif_core.fusion.sgd.kernels import LOCATION, SCALE
 from iif_core.fusion.sgd.options import SgdOptions
 
@@ -28,14 +28,11 @@ class Pool:
     values: NDArray  # (P, K, 5) words
     cell: NDArray  # (P,) int32
     segment: NDArray  # (P,) int32
-    weight: NDArray  # (P,) float32
     coordinates: NDArray | None  # (P, 3) float32 in [0, 1]
     tangent: NDArray | None  # (P, 2, 3) float32, in units of the coordinates
     box: tuple[float, float]  # world coordinates that are mapped to 0 and 1, for all axes, m
     usable: NDArray  # (S, K) bool
     observations: NDArray  # (n_cells,) int32 pixels
-    views: NDArray  # (n_cells,) int32
-    dropped: list[Dropped]
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -57,9 +54,8 @@ def gather(problem: FusionProblem, options: SgdOptions) -> Pool:
     jitter = spatial and options.jitter and problem.tangent is not None
     if spatial and problem.point is None:
         raise InputError("base sgd: the hash grid needs the surface points of the pixels (FusionProblem.point), there are none")
-    observations, views = (np.zeros(problem.n_cells, np.int32) for _ in range(2))
-    parts: dict[str, list[NDArray]] = {name: [] for name in ("values", "cell", "segment", "weight", "point", "tangent")}
-    dropped: list[Dropped] = []
+    observations = np.zeros(problem.n_cells, np.int32)
+    parts: dict[str, list[NDArray]] = {name: [] for name in ("values", "cell", "segment", "point", "tangent")}
     usable, view_of_segment = None, np.full(problem.n_segments, -1)
     size = 0
     for view in range(len(problem.cell_of_pixel)):
@@ -71,7 +67,6 @@ def gather(problem: FusionProblem, options: SgdOptions) -> Pool:
                 f"view {view} has {len(maps)} predictions, view 0 has {usable.shape[1]}; give every view the same number"
             )
         found = usable_pixels(problem, view, maps)
-        dropped += found.dropped
         segments = np.unique(found.segment)
         if (view_of_segment[segments] >= 0).any():
             segment = segments[np.argmax(view_of_segment[segments] >= 0)]
@@ -90,13 +85,11 @@ def gather(problem: FusionProblem, options: SgdOptions) -> Pool:
         parts["values"].append(values)
         parts["cell"].append(found.cell.astype(np.int32))
         parts["segment"].append(found.segment.astype(np.int32))
-        parts["weight"].append(found.weight.astype(np.float32))
         if spatial:
             parts["point"].append(of_view(problem.point, view).reshape(-1, 3)[found.pixel])
         if jitter:
             parts["tangent"].append(of_view(problem.tangent, view).reshape(-1, 2, 3)[found.pixel])
         observations += np.bincount(found.cell, minlength=problem.n_cells).astype(np.int32)
-        views[np.unique(found.cell)] += 1
     if not size:
         raise InputError("base sgd: no pixel has a cell, a segment, weight and finite predictions; check the problem")
     pool = {name: np.concatenate(parts.pop(name)) for name in list(parts) if parts[name]}
@@ -114,14 +107,11 @@ def gather(problem: FusionProblem, options: SgdOptions) -> Pool:
         _half_in_range(pool["values"]),
         pool["cell"],
         pool["segment"],
-        pool["weight"],
         coordinates,
         tangent,
         box,
         usable,
         observations,
-        views,
-        dropped,
     )
 
 
@@ -151,14 +141,6 @@ def runs(segment: NDArray) -> tuple[NDArray, NDArray]:
     """Return start (R + 1,) and segment (R,) of the runs of equal segments."""
     start = np.flatnonzero(np.r_[True, segment[1:] != segment[:-1]])
     return np.append(start, len(segment)), segment[start]
-
-
-def shares(pool: Pool, pixels: NDArray, options: SgdOptions) -> NDArray:
-    """Return the weights (N,) float32 of the pixels of a batch, which sum to 1."""
-    if not options.weighted:
-        return np.full(len(pixels), 1 / len(pixels), np.float32)
-    weight = pool.weight[pixels]
-    return weight / weight.sum()
 
 
 # ---------------------------------------------------------------------------------------------------------- schedules

@@ -1,25 +1,20 @@
-"""The paper's optimiser: stochastic gradient descent on texture, affine maps and selection together.
+"""The paper's optimiser: stochastic gradient descent on texture, affine maps and selection together (Eq. F.16).
 
-It reads the same problem as the direct solver, its result is described in the same way (`direct.describe_fit`), and
-`reference_loss.reference_loss` judges both. The loss of a batch of pixels is Eq. F.16, minimised by one Adam over the
-texture, the maps and the logits, with gradients in closed form (kernels.py). Every choice of the published behaviour that is
-numerically fragile is an option: docs/method/fusion.md#schedules compares the presets `safe` and `paper`.
-
-The same problem, options and seed give the same bytes for any number of threads; the order of the predictions changes the
-result by rounding only. All predictions stay in memory (in half precision if they come so), since a batch draws from every
-view.
+Every choice of the published behaviour that is numerically fragile is an option: docs/method/fusion.md#schedules compares the
+presets `safe` and `paper`. The same problem, options and seed give the same bytes for any number of threads. All predictions stay
+in memory (in half precision if they come so), since a batch draws from every view.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
-from iif_core.fusion.problem import Dropped, FusionProblem, object_means
+from iif_core.fusion.problem import FusionProblem, object_means
 from iif_core.fusion.selection import selection_weights
 from iif_core.fusion.sgd.engine import Engine
 from iif_core.fusion.sgd.options import SgdOptions
@@ -31,9 +26,7 @@ from iif_core.fusion.sgd.pool import (
     batches,
     gather,
     learning_rate_at,
-    of_view,
     temperature_at,
-    unit_coordinates,
 )
 
 
@@ -46,29 +39,16 @@ class SgdFit:
             cell. Cells without observations take the mean of their object and the 0.9 quantile of the scales.
         corrections: (S, K, 16) float32 affine maps: albedo 3 x 4 (row = output), roughness 2, metallic 2 (gain, bias).
         alpha: (S, K, 3) float32 selection weights; 0 where the segment has no usable pixel.
-        log_alpha, temperature: (S, K, 3) float32 log softmax and temperature of the last step, for the label loss.
-        error: (S, K, 3) float32 mean L1 error of each corrected prediction against the texture at the end.
-        observations, views: (n_cells,) int32 pixels and views that saw the cell.
-        dropped: predictions that were not used.
         history: step; data, label, regulariser (without weights), label_part (with its weight) and total, as means over the
             steps since the last entry; temperature, learning_rate, entropy (nats), gain (mean of tr(A) / 3). The label
             loss is 0 once the selection is fixed, and for K = 1.
-        at_pixels: view -> (location, scale) of the texture at its pixels, (N, 5) float32 each, with any value where a
-            pixel is not used.
     """
 
     value: NDArray
     scale: NDArray
     corrections: NDArray
     alpha: NDArray
-    log_alpha: NDArray
-    temperature: float
-    error: NDArray
-    observations: NDArray
-    views: NDArray
-    dropped: list[Dropped]
     history: list[dict[str, float]]
-    at_pixels: Callable[[int], tuple[NDArray, NDArray]] = field(repr=False)
 
     @property
     def affine_albedo(self) -> NDArray:
@@ -128,8 +108,6 @@ def solve_sgd(
             a hash grid without surface points, a loss that is not finite.
     """
     options = options or SgdOptions()
-    if threads < 1:
-        raise InputError(f"base sgd: {threads} threads; at least 1")
     pool = gather(problem, options)
     engine = Engine(pool, options, problem.n_cells, threads)
     try:
@@ -181,10 +159,9 @@ def _solve(
             if progress is not None:
                 progress(step + 1, steps)
     temperature = temperature_at(options, steps - 1, steps)
-    total = engine.errors(temperature)
     if choose and choose_at >= steps:
-        engine.fix(_chosen(total, pool))
-    return _fit(problem, options, pool, engine, total, temperature, history)
+        engine.fix(_chosen(engine.errors(temperature), pool))
+    return _fit(problem, options, pool, engine, temperature, history)
 
 
 def _chosen(error: NDArray, pool: Pool) -> NDArray:
@@ -216,7 +193,6 @@ def _fit(
     options: SgdOptions,
     pool: Pool,
     engine: Engine,
-    total: NDArray,
     temperature: float,
     history: list[dict[str, float]],
 ) -> SgdFit:
@@ -231,28 +207,12 @@ def _fit(
     object_value, _ = object_means(value, problem.object_of_cell, pool.observations)
     value[~seen] = object_value[problem.object_of_cell[~seen]]
     scale[~seen] = np.quantile(scale[seen], 0.9, axis=0)
-    alpha, log_alpha = engine.weights(temperature)
+    alpha, _ = engine.weights(temperature)
     count = np.bincount(pool.segment, minlength=problem.n_segments)[:, None, None]
-
-    def at_pixels(view: int) -> tuple[NDArray, NDArray]:
-        if pool.coordinates is None:
-            cell = np.maximum(np.ravel(problem.cell_of_pixel[view]), 0)
-            return value[cell], scale[cell]
-        point = of_view(problem.point, view).reshape(-1, 3)
-        point = np.where(np.isfinite(point), point, np.float32(pool.box[0]))
-        return activated(engine.grid.evaluate(unit_coordinates(point, pool.box)), options)
-
     return SgdFit(
         value=value,
         scale=scale,
         corrections=engine.affine.copy(),
         alpha=np.where(count > 0, alpha, 0).astype(np.float32),
-        log_alpha=log_alpha,
-        temperature=temperature,
-        error=(total / np.maximum(count, 1)).astype(np.float32),
-        observations=pool.observations,
-        views=pool.views,
-        dropped=pool.dropped,
         history=history,
-        at_pixels=at_pixels,
     )

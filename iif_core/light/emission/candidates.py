@@ -1,8 +1,6 @@
 """Faces that may shine by themselves (docs/method/light.md#emitter-candidates).
 
-A face is a candidate when nearly all of its pixels in all views are far brighter than the room, or saturated at every
-exposure. The test accepts too many faces on purpose: surfaces that merely reflect are recognised by the solve that follows
-(`pruning`).
+The test accepts too many on purpose, because the solve that follows recognises surfaces that merely reflect (`pruning`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Emission from photographs by non-negative least squares (docs/method/light.md#least-squares).
 
-With materials and geometry held fixed, radiance is linear in emission: y = A E + h in each colour channel (Eq. L.11). A is
-traced, so it is noisy, and the plain normal matrix E[A'A] = A'A + noise attenuates the answer (errors in variables, Eq. L.18).
-Two independent traces remove that: H = (A1' W A2 + A2' W A1) / 2 (Eq. L.19). H may be indefinite; directions whose reliability
-relative to M = mean(A)' W mean(A) is lost in noise are lifted, and the lifted part goes to the prior (Eq. L.21).
+Two independent traces of the transport remove the bias of its noise (Eq. L.18, L.19); directions whose reliability is lost in
+noise go to the prior (Eq. L.21).
 """
 
 from __future__ import annotations
@@ -116,14 +114,14 @@ OUTSIDE_WIDTH = 0.5
 
 
 def solve_families(
-    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, cross: bool = True, width: float | np.ndarray = FAMILY_WIDTH
+    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, width: float | np.ndarray = FAMILY_WIDTH
 ) -> EmissionSolution:
     """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.27).
 
     The triangles of a window light the room almost alike, so only their sum is well known.
 
     Args:
-        rows, initial, cross: as in `solve_emission`.
+        rows, initial: as in `solve_emission`.
         family: (G,) int, groups with the same number are parts of one object.
         width: number or (G,), relative standard deviation of groups around the radiance that they share.
 
@@ -133,7 +131,7 @@ def solve_families(
     number, members = np.unique(family, return_inverse=True)
     size = np.bincount(members, minlength=len(number))
     if not len(family) or size.max() == 1:
-        return solve_emission(rows, initial, cross)
+        return solve_emission(rows, initial)
     joint = np.zeros((len(number), 3))
     np.add.at(joint, members, initial)
     joint /= size[:, None]
@@ -141,10 +139,10 @@ def solve_families(
     for group, member in enumerate(members):
         matrix[:, :, :, member] += rows.matrix[:, :, :, group]
     shared = replace(rows, matrix=matrix)
-    start = solve_emission(shared, joint, cross).radiance[members]
+    start = solve_emission(shared, joint).radiance[members]
     together = size[members] > 1
     start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
-    return solve_emission(rows, start, cross, prior_width=np.where(together, width, 5.0), family=family)
+    return solve_emission(rows, start, prior_width=np.where(together, width, 5.0), family=family)
 
 
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:

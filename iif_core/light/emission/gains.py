@@ -14,8 +14,7 @@ from iif_core.light.emission.rows import EmissionRows
 PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
 SHARED_LEVEL_ERROR = 0.1
-"""Error of the logarithm of the level that no object tells from another's: light that geometry, cache and materials lose
-everywhere."""
+"""Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried (Eq. L.35)."""
 GAIN_BOUNDS = (0.1, 10.0)
@@ -32,12 +31,10 @@ class GainOptions:
     """How gains are estimated.
 
     Attributes:
-        cross: cross the two traces in all moments (unbiased); False = use their mean.
         rounds: most alternations between emission and gains.
         shrinkage: weight of the common gain relative to the rows of an object (mu of Eq. L.31).
     """
 
-    cross: bool = True
     rounds: int = 15
     shrinkage: float = 0.05
 
@@ -107,7 +104,7 @@ def estimate_object_gains(
     for _ in range(options.rounds):
         of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
         scaled = replace(rows, weight=weight).scaled(of_row, gloss_of_row)
-        radiance = solve_emission(scaled, initial, options.cross, max_rounds=5).radiance
+        radiance = solve_emission(scaled, initial, max_rounds=5).radiance
         predicted = np.einsum("ngc,gc->nc", scaled.matrices.mean(0), radiance) + (rows.observed - scaled.mean_target)
         weight = _relative_to(rows, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
@@ -215,8 +212,6 @@ class _ObjectRows:
             emitted, constant = np.stack([np.einsum("ngc,gc->nc", a, radiance) for a in matrices]), cached
             if known is not None:
                 constant = constant + np.stack([np.einsum("ngc,gc->nc", a, known) for a in matrices])
-            if not self.options.cross:
-                emitted, constant = (np.broadcast_to(part.mean(0), part.shape) for part in (emitted, constant))
             return emitted, constant
 
         def sums(values: np.ndarray) -> np.ndarray:

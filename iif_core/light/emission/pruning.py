@@ -1,10 +1,6 @@
-"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect).
+"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect, Eq. L.28).
 
-What a white surface would show in place of a group is known from the same transport (Eq. L.28). A group that is clearly
-brighter than that shines, whatever its albedo. Any other group may be a bright surface near a lamp, and one with little power
-something that shines through; such groups stay only if the rest of the scene needs their light. The least credible group goes
-first, because the light of a false emitter makes its neighbours look like reflectors. A dropped group continues to light the
-scene with the radiance that was seen on it, which the radiance cache will hold.
+A dropped group continues to light the scene with the radiance that was seen on it, which the radiance cache will hold.
 """
 
 from __future__ import annotations
@@ -71,31 +67,28 @@ def prune_groups(
     protected: np.ndarray,
     share: float = 0.01,
     certain: float = CERTAIN_EXCESS,
-    max_growth: float = MAX_RESIDUAL_GROWTH,
-    cross: bool = True,
 ) -> PrunedEmission:
     """Solve, then drop groups that do not shine, the least credible first, and solve again.
 
-    A group is dropped when no emission is left for it; and, unless the residual elsewhere grows by more than `max_growth`
-    without it (Eq. L.29), when it is not brighter than `certain` white surfaces or has less than `share` of the total power
-    area x sum E.
+    A group is dropped when no emission is left for it; and, unless the residual elsewhere grows by more than
+    `MAX_RESIDUAL_GROWTH` without it (Eq. L.29), when it is not brighter than `certain` white surfaces or has less than `share` of
+    the total power area x sum E.
 
     Args:
-        rows, initial, cross: as in `solve_emission`.
+        rows, initial: as in `solve_emission`.
         area: (G,) m^2.
         white: what the groups show, and what a white surface would show.
         elsewhere: (n,) bool, rows that are not a group's own pixels: what its light does, not what it looks like.
         protected: (G,) bool, never dropped (environment).
         share: of the total power.
         certain: brightness relative to a white surface from which a group shines for certain.
-        max_growth: relative growth of the residual from which a group is needed.
 
     Returns:
         The solution with the groups that remain.
     """
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
-    solution = solve_emission(rows, initial, cross, max_rounds=_TRIAL_ROUNDS)
+    solution = solve_emission(rows, initial, max_rounds=_TRIAL_ROUNDS)
     while True:
         emission = solution.radiance.sum(1)
         power = area * emission * ~protected
@@ -115,10 +108,10 @@ def prune_groups(
             break
         if singly and not dark.any():
             drop &= power <= power[drop].min()
-        trial = _solve_subset(rows, initial, kept & ~drop, white.seen, cross)
+        trial = _solve_subset(rows, initial, kept & ~drop, white.seen)
         before = _misfit(rows, shown, elsewhere)
         after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
-        if not dark.any() and after > before * (1 + max_growth) + 1e-12:
+        if not dark.any() and after > before * (1 + MAX_RESIDUAL_GROWTH) + 1e-12:
             # One lamp that is needed must not keep the groups that were tried together with it.
             if drop.sum() > 1 and not singly:
                 singly = True
@@ -147,9 +140,9 @@ def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float
     return float(np.sqrt((counted * difference**2).sum()))
 
 
-def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray, cross: bool) -> EmissionSolution:
+def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray) -> EmissionSolution:
     """Solution over all groups, 0 outside `kept`; the others light the scene with what they show, as the cache will."""
-    part = solve_emission(_without(rows, kept, shown), initial[kept], cross, max_rounds=_TRIAL_ROUNDS)
+    part = solve_emission(_without(rows, kept, shown), initial[kept], max_rounds=_TRIAL_ROUNDS)
     radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
     determined = np.zeros(len(initial))
     radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined

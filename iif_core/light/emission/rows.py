@@ -104,16 +104,10 @@ class EmissionRows:
 
 
 def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.ndarray]:
-    """Average the rows of each block: the answer stays the same, and the noise of A falls with the size of the block.
+    """Average the rows of each block (n,) int: the answer stays the same, and the noise of A falls with the size of the block.
 
-    Args:
-        rows: pixel rows.
-        block: (n,) int. Pixels of one block should see one object in one small tile of one view; rows of different objects
-            must not be averaged. Lower bounds and equalities are never mixed.
-
-    Returns:
-        Rows in the order of the block numbers - weights are sums, the other values weighted means for each channel - and for
-        each of them the index of a pixel row of its block.
+    Pixels of one block should see one object in one small tile of one view. Lower bounds and equalities are never mixed. Returns
+    the rows in the order of the block numbers (weights are sums) and for each of them the index of a pixel row of its block.
     """
     if not len(block):
         return rows, np.zeros(0, np.int64)

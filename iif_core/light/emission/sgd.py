@@ -1,10 +1,5 @@
 """Emission by stochastic gradient descent on traced pixels, the paper's kind of optimiser, as a twin of `direct`
-(docs/method/light.md#stochastic-gradient-descent).
-
-The paper traces fresh paths for every batch. Here every row of a batch takes one of its two traces at random, which has the
-same expectation and the same noise bias without tracing again. Preset `safe` scales steps by the diagonal of the normal matrix
-(Eq. L.43); preset `paper` descends at rate 100 (Eq. L.44) and clamps both sides of the difference at `ceiling`
-(docs/method/numerics.md#clamped-loss). Neither removes the bias that the noise of A puts into E[A'A]; `direct` does.
+(docs/method/light.md#stochastic-gradient-descent, Eq. L.43, L.44).
 """
 
 from __future__ import annotations
@@ -27,7 +22,7 @@ class SgdOptions:
     """How to descend.
 
     Attributes:
-        preset: `safe` or `paper`, see the head of this module.
+        preset: `safe` scales steps by the diagonal of the normal matrix (Eq. L.43), `paper` descends at rate 100 (Eq. L.44).
         steps: batches.
         batch: rows of a batch.
         prune: ((step, share), ...): after that step groups whose sum of channels is at most `share` of the largest are switched
@@ -42,16 +37,13 @@ class SgdOptions:
     seed: int = 0
 
 
-def solve_emission_sgd(
-    rows: EmissionRows, initial: np.ndarray, options: SgdOptions | None = None, ceiling: np.ndarray | None = None
-) -> EmissionSolution:
+def solve_emission_sgd(rows: EmissionRows, initial: np.ndarray, options: SgdOptions | None = None) -> EmissionSolution:
     """Solve for the radiance of every group by projected stochastic gradient descent.
 
     Args:
         rows: as in `solve_emission`.
         initial: (G, 3) radiance of groups to which no row responds; the descent starts at 0.01.
         options: None = defaults.
-        ceiling: (n, 3) target at which `paper` clamps (sensor value 0.9); None = nowhere.
 
     Returns:
         The solution; `error` and `determined` are 0, since there is no covariance; `converged` is False when the descent left
@@ -79,14 +71,9 @@ def solve_emission_sgd(
         half = rng.random(len(pick)) < 0.5
         a = np.where(half[:, None, None], first[pick], second[pick])
         t = np.where(half[:, None], *targets[:, pick])
-        predicted = np.einsum("ngc,gc->nc", a, radiance)
-        residual = predicted - t
+        residual = np.einsum("ngc,gc->nc", a, radiance) - t
         if options.preset == "safe":
             residual = np.where(rows.lower_bound[pick], np.minimum(residual, 0.0), residual)
-        elif ceiling is not None:
-            residual = np.where(
-                predicted > ceiling[pick], 0.0, np.minimum(predicted, ceiling[pick]) - np.minimum(t, ceiling[pick])
-            )
         gradient = np.einsum("ngc,nc->gc", a, rows.weight[pick] * residual) / len(pick)
         if options.preset == "safe":
             # The largest eigenvalue of a matrix of unit diagonal is at most its size.

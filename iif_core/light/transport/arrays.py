@@ -1,8 +1,6 @@
 """Arrays between NumPy and the device, checks of their shapes, and work cut into lanes with a random stream each.
 
-A lane computes a few samples of one point and adds them up itself; the lanes of a point are added in a fixed order. How a
-point is cut depends on the number of samples alone, so its result does not depend on its neighbours, on the chunks or on the
-threads.
+How a point is cut depends on the number of samples alone; the lanes of a point are added in a fixed order.
 """
 
 from __future__ import annotations

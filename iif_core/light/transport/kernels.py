@@ -1,8 +1,7 @@
 """One path: its vertices, the light that is drawn at them, and the loop that follows it (docs/method/shading.md#paths).
 
-Everything here works on device types inside a kernel. Directions have unit length; `wo` points to where the light goes, `wi`
-to where it comes from. Surfaces reflect on both sides. Every vertex is lit twice, by a point drawn on an emitter and by the
-direction in which the path continues; the two are weighted with the power heuristic (Eq. S.6), both densities per solid angle
+Everything here works on device types inside a kernel. Directions have unit length; `wo` points to where the light goes, `wi` to
+where it comes from. The two ways to draw light are weighted with the power heuristic (Eq. S.6), both densities per solid angle
 (docs/method/numerics.md#densities-in-two-measures).
 """
 

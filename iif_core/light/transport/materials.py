@@ -19,8 +19,6 @@ from iif_core.reflectance.brdf import R_MIN
 from iif_core.reflectance.material import LOWEST
 from iif_core.surface.cells import COARSE, coarse_cells
 
-Array = np.ndarray
-
 
 class _Rows:
     """Device table of material rows, padded to 8 floats so that two aligned reads fetch a row."""
@@ -37,16 +35,6 @@ class _Rows:
         metallic = dr.gather(mi.Float, self._table, row * 8 + 4, active)
         # A masked read gives 0, which is no valid roughness.
         return mi.Color3f(first.x, first.y, first.z), dr.maximum(first.w, R_MIN), metallic
-
-
-class FaceMaterials:
-    """One material for each face: face_values (m, 5)."""
-
-    def __init__(self, face_values: ArrayLike):
-        self._rows = _Rows(face_values, "face_values")
-
-    def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
-        return self._rows.read(face, active & (face < self._rows.count))
 
 
 class CellMaterials:

@@ -1,7 +1,5 @@
-"""Measures whether photographs, poses and mesh belong together.
-
-With depth images or sparse points, the mesh's depth in the camera of the photograph is compared with the measured depth. In any
-case, edges of the photograph are correlated with edges of the mesh, also after shifts by a few pixels.
+"""Measures whether photographs, poses and mesh belong together, by measured depth or sparse points and by edges after shifts of a
+few pixels.
 """
 
 from __future__ import annotations

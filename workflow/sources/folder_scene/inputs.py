@@ -56,14 +56,8 @@ class Inputs:
 
 
 def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = False) -> Inputs:
-    """Find and check the cameras of a scene and the files that belong to them.
-
-    Args:
-        source, capture: the dumped settings sections.
-        points: also read the sparse points of a COLMAP model, which is slow.
-
-    Returns:
-        The checked scene.
+    """Find and check the cameras of a scene and its files; `points`: also read the sparse points of a COLMAP model, which is
+    slow.
 
     Raises:
         InputError: missing or unusable files, by name.

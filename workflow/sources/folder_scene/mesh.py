@@ -84,15 +84,10 @@ class VertexIds:
 
 
 def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mesh:
-    """Read a mesh, merge its nodes, scale it to metres, remove faces without area, keep `instance` of the faces.
+    """Read a mesh (PLY, OBJ or GLB), merge its nodes, scale it to metres, remove faces without area, keep `instance` of the
+    faces.
 
-    Args:
-        path: PLY, OBJ or GLB.
-        metres: per unit of the file.
-        of_vertices: ids from another file, which replace those of the mesh.
-
-    Returns:
-        The mesh.
+    `metres` is the unit of the file; `of_vertices` are ids from another file, which replace those of the mesh.
 
     Raises:
         InputError: unreadable, no triangles, none with an area, or instance ids that do not fit.

@@ -1,8 +1,7 @@
-"""Reads and checks cameras in the form of `transforms.json` of nerfstudio and instant-ngp.
+"""Reads and checks cameras in the form of `transforms.json` of nerfstudio and instant-ngp, from JSON and image headers only.
 
-The checks read JSON and image headers only, because they run while Snakemake plans. Every message names the file, the frame, the
-value found, the values allowed and the remedy. Other camera files (COLMAP, ScanNet++, FIPT) are converted to the same entries and
-pass the same checks (`frames_of`).
+Every message names the file, the frame, the value found, the values allowed and the remedy. Other camera files (COLMAP,
+ScanNet++, FIPT) are converted to the same entries and pass the same checks (`frames_of`).
 """
 
 from __future__ import annotations
@@ -158,12 +157,6 @@ def folder_at(source: dict[str, Any], holds: str) -> Path:
 
 def read(source: dict[str, Any], capture: dict[str, Any]) -> Transforms:
     """Read the frames of a folder that `source.frames` and `capture.views` choose, and check everything about them.
-
-    Args:
-        source, capture: the dumped settings sections.
-
-    Returns:
-        The checked frames.
 
     Raises:
         InputError: at the first fault; of a list of faulty files the message names the first few.

@@ -1,11 +1,7 @@
 """Chooses camera positions and views of a room that together see as much of it as possible, from the mesh and one pose.
 
-    free space    positions at eye height with clearance all around that are connected to the starting pose by lines of sight
-    surface       points drawn uniformly over the area; a point is reachable if some free position sees it
-    selection     greedy: the view of the largest gain; a point counts 1, 0.6, 0.4 for its first, second and third view and
-                  nearly nothing afterwards (gains can only shrink, so that a lazy queue makes the exact greedy choice)
-
-Lengths are scene units (metres); limits shrink with rooms that are too small for them. The result is a function of the seed.
+Positions lie at eye height in free space that is connected to the pose; views are chosen greedily by the surface points that they
+add (1, 0.6, 0.4 for the first, second and third view of a point). Lengths are metres. The result is a function of the seed.
 """
 
 from __future__ import annotations

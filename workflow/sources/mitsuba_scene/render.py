@@ -1,7 +1,6 @@
 """Photographs of the original scene by Mitsuba's own path tracer, along the rays of the capture's cameras.
 
-Every pixel is the mean of paths through uniformly jittered points of its square (a box filter). A launch holds several samples of
-some pixels side by side; the samples of a pixel are summed in order, so that the image does not depend on the number of threads.
+The samples of a pixel (a box filter) are summed in order, so that the image does not depend on the number of threads.
 """
 
 from __future__ import annotations

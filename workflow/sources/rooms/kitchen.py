@@ -1,14 +1,8 @@
 """The kitchen: fitted furniture and lamps here, walls in `kitchen_shell`, loose things in `kitchen_things` and `kitchen_decor`.
 
-Plan (x east, y north, z up, metres; the room is 5 x 4 x 2.7):
-
-    north wall   fridge | drawers, doors, oven with hob and hood, doors | corner; open shelves on the right
-    east wall    worktop with a ceramic sink under the window
-    south wall   sideboard under a shelf of books, door
-    west wall    picture, clock
-    middle       table with four chairs on a rug, under a hanging lamp
-
-Parts that touch keep a gap of 1 to 2 mm or pass through each other, so that no two surfaces lie in one plane.
+Plan (x east, y north, z up, metres; the room is 5 x 4 x 2.7): units and cooker along the north wall, worktop and sink under the
+window in the east, sideboard and door in the south, pictures in the west, a table with four chairs in the middle. Parts that
+touch keep a gap of 1 to 2 mm or pass through each other, so that no two surfaces lie in one plane.
 """
 
 from __future__ import annotations
@@ -41,7 +35,7 @@ from workflow.sources.rooms.palette import (
     wood,
 )
 from workflow.sources.rooms.room import Room, RoomBuilder
-from workflow.sources.rooms.shapes import Shape, arc, box, cylinder, lathe, mm, move, ring, sheet, sphere, tub, tube, wedge
+from workflow.sources.rooms.shapes import Shape, box, cylinder, lathe, mm, move, ring, sheet, sphere, tub, tube, wedge
 
 LAMP = (1.75, 1.75)
 GREEN = plain("#5c7d70", 0.40, "#557669", grain=2.0)
@@ -193,7 +187,8 @@ def _grate(x: float, y: float) -> list[Shape]:
 def _sink(room: RoomBuilder) -> None:
     room.add("sink", WHITE_GLAZE, tub((4.372, 1.932, 0.622), (4.868, 2.568, 0.896), 0.028, 0.035))
     room.add("drain", CHROME, lathe(mm("0,0 35,0 32,4 0,3"), (4.62, 2.25, 0.658)))
-    bend = arc((4.84, 2.25, 1.16), 0.09, 15, 180, EAST, UP)
+    turn = np.radians(np.linspace(15, 180, 8))[:, None]
+    bend = np.array([4.84, 2.25, 1.16]) + 0.09 * (np.cos(turn) * np.array(EAST, float) + np.sin(turn) * np.array(UP, float))
     spout = tube([(4.93, 2.25, 0.90), (4.93, 2.25, 1.16), *bend, (4.75, 2.25, 1.10)], 0.013)
     path = (0.02, 0.955), (0.06, 0.96), (0.075, 1.0)
     levers = [tube([(4.93, 2.25 + s * out, z) for out, z in path], 0.008) for s in (-1, 1)]
@@ -201,16 +196,7 @@ def _sink(room: RoomBuilder) -> None:
 
 
 def _chair(x: float, y: float, sign: float, turn: float) -> tuple[list[Shape], Shape]:
-    """Make the parts of a chair and its cushion.
-
-    Args:
-        x, y: middle of the seat, metres.
-        sign: +1 or -1, the side of y on which the back stands before the turn.
-        turn: degrees about the vertical.
-
-    Returns:
-        The shapes of the frame, and the cushion.
-    """
+    """Make the frame of a chair and its cushion at (x, y), the back on the side `sign` of y before a turn by `turn` degrees."""
     parts = [box((-0.20, -0.20, 0.425), (0.20, 0.20, 0.452), 0.006)]
     for u in (-0.17, 0.17):
         back = [(1.08 * u, 0.20 * sign, 0.002), (u, 0.178 * sign, 0.44), (0.97 * u, 0.225 * sign, 0.86)]

@@ -4,9 +4,7 @@ The material of an object is a row of numbers. A pattern computes two blend weig
 
     albedo = mix(mix(first, second, t), third, s)      roughness = r0 + r_t t + r_s s      metallic = m
 
-Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 represents exactly, so that both
-libraries see the same texture. The finest features measure about 1.5 cm (seams and grout 0.8 cm), more than the footprint of a
-pixel at the distances of the cameras, so that photographs do not alias.
+Randomness is value noise over a permutation polynomial of integers below 2^24, which float32 represents exactly.
 """
 
 from __future__ import annotations

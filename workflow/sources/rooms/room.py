@@ -47,13 +47,6 @@ class Room:
     shots: np.ndarray
     field_of_view: float = 72.0
 
-    @property
-    def is_emitter(self) -> np.ndarray:
-        """(objects,) bool."""
-        shining = np.zeros(len(self.names), bool)
-        shining[self.object_id[self.emission.any(1)]] = True
-        return shining
-
     def is_free(self, position: Sequence[float], margin: float = CAMERA_MARGIN) -> bool:
         """Return whether a camera may stand at `position`: inside the room and `margin` metres away from all furniture."""
         p = np.asarray(position, float)

@@ -268,24 +268,6 @@ def tube(path: Sequence[Point], radius: float | Sequence[float], segments: int =
     return vertices, np.concatenate(faces)
 
 
-def arc(centre: Point, radius: float, start: float, stop: float, axis_u: Point, axis_v: Point, count: int = 8) -> list:
-    """Return points on a circle.
-
-    Args:
-        centre: (3,) metres.
-        radius: metres.
-        start, stop: degrees from `axis_u` towards `axis_v`.
-        axis_u, axis_v: (3,) unit vectors, square to each other.
-        count: of the points.
-
-    Returns:
-        A list of (3,) arrays.
-    """
-    angle = np.radians(np.linspace(start, stop, count))
-    centre, u, v = (np.asarray(p, float) for p in (centre, axis_u, axis_v))
-    return list(centre + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v))
-
-
 def ring(centre: Point, radius: float, thickness: float, axis_u: Point, axis_v: Point, segments: int = 28) -> Shape:
     """Make a torus.
 
