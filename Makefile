@@ -36,12 +36,14 @@ scenes verify: setup
 
 always:
 
+# A file's tests stay in one process, because they share what its fixtures made.
+IN_PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 # The quick proofs, at most 12 minutes on two cores; test-all adds large scenes and long studies (docs/development/testing.md).
 test: setup validator
-	$(PYTHON_BIN) -m pytest -n 2 --dist loadfile -m "not long" $(PYTEST_ARGS)
+	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -m "not long" $(PYTEST_ARGS)
 
 test-all: setup validator
-	$(PYTHON_BIN) -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)
+	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) $(PYTEST_ARGS)
 
 # Khronos' validator of glTF, for the tests of scene.glb; machines without npm test the file's structure alone.
 GLTF_VALIDATOR := .node/node_modules/gltf-validator
