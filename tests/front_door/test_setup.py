@@ -206,8 +206,11 @@ class TestMake:
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")
         assert lines[0] == "bash envs/setup.sh"
-        assert lines[-1] == '.venv/bin/python -m pytest -n 2 --dist loadfile -m "not long"'
-        assert self.commands(repository, clean_environment, "test-all")[-1] == ".venv/bin/python -m pytest -n 2 --dist loadfile"
+        assert lines[-1] == '.venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"'
+        assert (
+            self.commands(repository, clean_environment, "test-all")[-1]
+            == ".venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder"
+        )
         assert {"make lint", "make test"} <= set((repository / ".ci" / "run").read_text().splitlines())
 
     def test_no_goal_prints_help_and_does_nothing(self, repository, clean_environment):

@@ -421,6 +421,7 @@ TABLE = """<shape type="cube" id="table"><transform name="to_world"><scale x="0.
   <translate x="2.5" y="1.5" z="0.4"/></transform></shape>"""
 
 
+@pytest.mark.long
 def test_the_camera_path_stays_inside_with_clearance_and_sees_the_room(load):
     from workflow.sources.mitsuba_scene.path import fibonacci_sphere
 
@@ -445,6 +446,7 @@ def test_the_camera_path_stays_inside_with_clearance_and_sees_the_room(load):
     assert not np.array_equal(other.poses, found.poses)
 
 
+@pytest.mark.long
 def test_more_views_see_no_less(load):
     _, mesh, _ = load(ROOM + TABLE)
     seen = [plan(mesh, count)[0].facts for count in (1, 4, 12)]

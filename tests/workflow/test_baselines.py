@@ -150,7 +150,7 @@ def test_the_camera_of_iris_comes_closer(ldr):
     assert (np.diff(curve["value"][green]) > 0).all()
 
 
-@pytest.mark.parametrize(("dynamic_range", "brightness"), [("ldr", 0.0), ("ldr", 1000.0)])
+@pytest.mark.parametrize(("dynamic_range", "brightness"), [("ldr", 0.0), pytest.param("ldr", 1000.0, marks=pytest.mark.long)])
 def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, dynamic_range, brightness):
     curve = "srgb" if dynamic_range == "ldr" else None
     build(tmp_path, views=2, size=20, samples=8, dynamic_range=dynamic_range, curve=curve, brightness=brightness)

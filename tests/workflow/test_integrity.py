@@ -34,28 +34,28 @@ def test_failed_run_does_not_leave_the_old_deliverable_as_up_to_date(workflow):
     """A parameter changes, the first affected job fails, the same command comes again: everything below must be rebuilt."""
     path = workflow.folder / "config/scenes/tiny.yaml"
     before = json.loads((workflow.folder / "scenes/tiny/manifest.json").read_text())
-    path.write_text(path.read_text() + "base: {sweeps: 3}\n")
-    prior = workflow.folder / "results/tiny/prior/manifest.json"
-    kept = prior.read_bytes()
-    prior.write_bytes(kept.replace(b'"iif.stage/1"', b'"iif.stage/0"'))  # base cannot read its input
-    stamp = prior.stat()
+    path.write_text(path.read_text().replace("affines: {pixels: 8000", "affines: {pixels: 7000"))
+    shading = workflow.folder / "results/tiny/shading/manifest.json"
+    kept = shading.read_bytes()
+    shading.write_bytes(kept.replace(b'"iif.stage/1"', b'"iif.stage/0"'))  # affines cannot read its input
+    stamp = shading.stat()
     failed = workflow.run("scenes/tiny")
     assert failed.returncode != 0 and "iif.stage/0" in failed.stderr
-    prior.write_bytes(kept)
-    os.utime(prior, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    shading.write_bytes(kept)
+    os.utime(shading, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
     again = workflow.run("scenes/tiny")
     assert again.returncode == 0 and NOTHING not in again.stderr, again.stderr[-2000:]
     after = json.loads((workflow.folder / "scenes/tiny/manifest.json").read_text())
     assert after != before
-    for stage in ("base", "emission", "shading", "affines", "render"):
+    for stage in ("affines", "render", "metrics", "export"):
         manifest = json.loads((workflow.folder / f"results/tiny/{stage}/manifest.json").read_text())
         assert manifest["fingerprint"] != "" and manifest["stage"] == stage
-    base = json.loads((workflow.folder / "results/tiny/base/manifest.json").read_text())
-    assert base["settings"]["base"]["sweeps"] == 3
+    affines = json.loads((workflow.folder / "results/tiny/affines/manifest.json").read_text())
+    assert affines["settings"]["affines"]["pixels"] == 7000
 
 
 def test_damage_with_unchanged_time_stamp_is_found_named_and_rebuilt(workflow):
-    victim = workflow.folder / "results/tiny/base/cells.parquet"
+    victim = workflow.folder / "results/tiny/affines/cells.parquet"
     status, data = victim.stat(), bytearray(victim.read_bytes())
     whole = bytes(data)
     data[len(data) // 2] ^= 1
@@ -63,10 +63,10 @@ def test_damage_with_unchanged_time_stamp_is_found_named_and_rebuilt(workflow):
     os.utime(victim, ns=(status.st_atime_ns, status.st_mtime_ns))
     verify = workflow.run("verify")
     assert verify.returncode != 0
-    assert "results/tiny/base/cells.parquet" in verify.stdout + verify.stderr
-    refused = workflow.run("scenes/tiny", "--forcerun", "shading")
-    assert refused.returncode != 0 and "cells.parquet" in refused.stderr and "--forcerun base" in refused.stderr
-    rebuilt = workflow.run("scenes/tiny", "--forcerun", "base")
+    assert "results/tiny/affines/cells.parquet" in verify.stdout + verify.stderr
+    refused = workflow.run("scenes/tiny", "--forcerun", "render")
+    assert refused.returncode != 0 and "cells.parquet" in refused.stderr and "--forcerun affines" in refused.stderr
+    rebuilt = workflow.run("scenes/tiny", "--forcerun", "affines")
     assert rebuilt.returncode == 0, rebuilt.stderr[-2000:]
     assert victim.read_bytes() == whole
     assert workflow.run("verify").returncode == 0

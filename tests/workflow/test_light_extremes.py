@@ -158,6 +158,7 @@ def test_hard_room(tmp_path, llvm):
     assert _fitted(found, room, "inside")[1].startswith(("population", "identity"))
 
 
+@pytest.mark.long
 def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
     """Walls of albedo 0.98, 8-bit photographs: long paths, hardly any contrast; two views say next to nothing."""
     walls = dict.fromkeys(("floor", "ceiling", "wall_a", "wall_b", "wall_c", "wall_d"), ((0.98, 0.98, 0.98), 0.9, 0))
@@ -189,6 +190,7 @@ def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
     assert "taken as srgb" in _said(found) and "as it was found" in _said(found)
 
 
+@pytest.mark.long
 def test_environment_alone_through_a_hole(tmp_path, llvm):
     build(
         tmp_path,
@@ -224,7 +226,7 @@ def test_lamp_that_nobody_sees(tmp_path, llvm):
     assert "candidates dropped" in _said(found)
 
 
-@pytest.mark.parametrize("objects", [1, 5000])
+@pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])
 def test_one_object_and_five_thousand(tmp_path, llvm, objects):
     room = Room(n=19)
     if objects == 1:

@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from support import treatment
 
 
@@ -15,6 +16,7 @@ def test_no_emitter_seen(workflow):
     assert treatment("no emitter seen") in notes
 
 
+@pytest.mark.long
 def test_one_view_only_and_one_prediction(workflow):
     """V = 1, K = 1: no overlap between views, no choice between predictions."""
     path = workflow.folder / "config/scenes/tiny.yaml"
@@ -24,6 +26,7 @@ def test_one_view_only_and_one_prediction(workflow):
     assert len(list((workflow.folder / "scenes/tiny/maps").glob("*.exr"))) == 1
 
 
+@pytest.mark.long
 def test_low_dynamic_range(workflow):
     """The same room as 8-bit photographs: a response is fitted and published."""
     path = workflow.folder / "config/scenes/tiny.yaml"
