@@ -8,6 +8,9 @@ SNAKEMAKE := .venv/bin/snakemake
 # QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
 CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 
+# A run starts some hundred processes; without kept byte code each of them would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always
 
 help:
