@@ -18,7 +18,7 @@ help:
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make verify           re-hash every artefact against its manifest'
-	@echo 'make test             the quick proofs, 12 minutes (PYTEST_ARGS="-k laplace" for a part)'
+	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
 	@echo 'make test-all         every test, also those on large scenes'
 	@echo 'make doctor           what this machine offers and lacks'
 	@echo 'make setup            only the environment, .venv'
@@ -41,7 +41,7 @@ always:
 
 # A file's tests stay in one process, because they share what its fixtures made.
 IN_PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
-# The quick proofs, at most 12 minutes on two cores; test-all adds large scenes and long studies (docs/development/testing.md).
+# All tests but those marked `long`, which test-all adds; times are in docs/development/testing.md.
 test: setup validator
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -m "not long" $(PYTEST_ARGS)
 
