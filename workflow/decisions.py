@@ -71,7 +71,7 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     if not leaves:
         reason = f"the mesh is closed: {primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
     elif dark:
-        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: nothing shines in from outside"
+        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: no light comes in from outside"
     else:
         reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
     return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
@@ -97,8 +97,8 @@ def registration(accepted: bool, gain: float, error: float, moved: float, left_o
         if accepted
         else f"moving them by {moved:.1f} pixels would not pay"
     )
-    by = "texture" if gain > SIGNIFICANT * error else "edges of the mesh"
-    reason = f"{done}{f', which {by} spoke for' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
+    by = "the texture" if gain > SIGNIFICANT * error else "the fit of edges of the mesh"
+    reason = f"{done}{f', as {by} supports' if accepted else ''}; {left_out} of {views} left out as blurred or badly posed"
     return _decision("registration", accepted, measure, value, SIGNIFICANT, reason)
 
 
@@ -127,9 +127,9 @@ def segmentation(kind: str, objects: int, stability: float | None, perturbed: st
 def emitters(groups: int, dropped: int, candidates: int) -> Decision:
     """Decide about emitters: groups of faces that were found and kept by the solver."""
     if groups:
-        reason = f"{groups} groups shine ({dropped} candidates dropped)"
+        reason = f"{groups} groups emit light ({dropped} candidates dropped)"
     elif candidates:
-        reason = f"none of the {candidates} candidate groups shines by itself; light comes from cache and environment"
+        reason = f"none of the {candidates} candidate groups emits light; light comes from cache and environment"
     else:
         reason = "no face was seen saturated often enough; light comes from cache and environment"
     return _decision("emitters", groups > 0, "emitter groups", groups, 1, reason)

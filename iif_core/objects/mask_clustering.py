@@ -43,7 +43,7 @@ class ConsensusOptions:
     Attributes:
         visible: share of a mask that a view must see (Eq. O.8).
         contained: share of the points that one mask must hold to contain them (Eq. O.9).
-        split: share of the views with an opinion above which a split mask is dropped (Eq. O.10).
+        split: share of the views that can judge a mask above which a split mask is dropped (Eq. O.10).
         consensus: smallest ratio of supporters to observers (Eq. O.11).
         min_points: masks of fewer points are ignored.
     """
@@ -186,7 +186,7 @@ def containment(masks: MaskPoints, options: ConsensusOptions) -> Containment:
 
 
 def undersegmented(votes: Containment, limit: float) -> Array:
-    """Find masks that more than the share `limit` of the views with an opinion split (Eq. O.10); (M,) bool."""
+    """Find masks that more than the share `limit` of the views that can judge them split (Eq. O.10); (M,) bool."""
     broken, whole = votes.split.sum(1), (votes.container >= 0).sum(1)
     return broken > limit * (broken + whole)
 

@@ -6,8 +6,8 @@ from iif_core.light.emission.rows import EmissionRows, TracedTransport
 
 
 def rows_of(*lobes, observed, cached=(0.0, 0.0), weight=None, bound=None):
-    """Rows of everything that is reflected and, as a second lobe, its specular part: each (n, G, 3), or a pair of such arrays,
-    one for each trace; `cached`: the same of h, (n, 3) or pairs."""
+    """Rows of one or two lobes, each (n, G, 3) or a pair of such arrays, one for each trace; `cached`: of each lobe, (n, 3) or a
+    pair."""
     observed = np.asarray(observed, float)
     matrix = np.stack([_traces(lobe) for lobe in lobes], 1).astype(np.float32)
     light = [_traces(h, observed.shape) for h, _ in zip(cached, lobes, strict=False)]

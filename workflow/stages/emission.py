@@ -128,7 +128,7 @@ def run(job: Job) -> None:
 def _trial(
     photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float
 ) -> tuple[PrunedEmission, np.ndarray]:
-    """Find which groups shine, and the albedo gains of objects (n_objects, 3), from half of the rows."""
+    """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
     pixels, base, rows = choose_rows(photos, groups, 2)
     own = rows.group >= 0
     transport = _trace(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
@@ -183,7 +183,7 @@ def _solve(
         family[groups.size :], width[groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
     settings = photos.job.settings.emission
     if settings.solver == "sgd":
-        # Which groups shine is known by now, so `safe` has nothing to prune.
+        # Which groups emit is known by now, so `safe` has nothing to prune.
         prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
         options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
@@ -226,15 +226,16 @@ def _trace(
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
         found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half))
-        halves.append([_all_and_gloss(values, metallic == 0) for values in found])
+        halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
 
 
-def _all_and_gloss(values: np.ndarray, dielectric: np.ndarray) -> np.ndarray:
-    """(2, n, ...) of (n, 2, ...) values by diffuse and specular lobe: their sum, and the specular part of dielectrics, which is
-    not proportional to the albedo."""
-    return np.stack([values.sum(1), np.where(dielectric.reshape(-1, *[1] * (values.ndim - 2)), values[:, 1], 0.0)])
+def _albedo_and_gloss(values: np.ndarray, dielectric: np.ndarray) -> np.ndarray:
+    """(2, n, ...) of (n, 2, ...) values by diffuse and specular lobe: what is proportional to the albedo, the specular lobe of
+    metals included, and the gloss of dielectrics."""
+    gloss = np.where(dielectric.reshape(-1, *[1] * (values.ndim - 2)), values[:, 1], 0.0)
+    return np.stack([values[:, 0] + (values[:, 1] - gloss), gloss])
 
 
 # ------------------------------------------------------------------------------------------------------------ writing

@@ -105,7 +105,7 @@ def estimate_object_gains(
         of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
         scaled = replace(rows, weight=weight).scaled(of_row, gloss_of_row)
         radiance = solve_emission(scaled, initial, max_rounds=5).radiance
-        predicted = np.einsum("ngc,gc->nc", scaled.matrices.mean(0), radiance) + (rows.observed - scaled.mean_target)
+        predicted = np.einsum("ngc,gc->nc", scaled.matrices.mean(0), radiance) + scaled.cached.sum(1).mean(0)
         weight = _relative_to(rows, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
         if rows.has_lobes:  # mean weighted square of what an object's rows leave unexplained
@@ -207,11 +207,12 @@ class _ObjectRows:
     ) -> _Moments:
         """Sums for the light `radiance` (G, 3) at any level, beside light `known` (G, 3) whose level is known; weight (n, 3)."""
 
-        def light(matrices: np.ndarray, cached: np.ndarray) -> tuple[_Traces, _Traces]:
+        def lobe(number: int) -> tuple[_Traces, _Traces]:
             """Light at level 1, and light that does not follow the level."""
-            emitted, constant = np.stack([np.einsum("ngc,gc->nc", a, radiance) for a in matrices]), cached
+            emitted = np.einsum("kngc,gc->knc", self.rows.matrix[:, number], radiance)
+            constant = self.rows.cached[:, number]
             if known is not None:
-                constant = constant + np.stack([np.einsum("ngc,gc->nc", a, known) for a in matrices])
+                constant = constant + np.einsum("kngc,gc->knc", self.rows.matrix[:, number], known)
             return emitted, constant
 
         def sums(values: np.ndarray) -> np.ndarray:
@@ -223,12 +224,11 @@ class _ObjectRows:
         def seen(a: _Traces) -> np.ndarray:
             return sums(self.rows.observed * 0.5 * (a[0] + a[1]))
 
-        d, h = light(self.rows.matrix[:, 0], self.rows.cached[:, 0])
+        d, h = lobe(0)
         zero = np.zeros((self.count, 3))
         gloss = _Linear(zero, zero), _Quadratic(zero, zero, zero), _Quadratic(zero, zero, zero)
         if self.rows.has_lobes:
-            e, k = light(self.rows.matrix[:, 1], self.rows.cached[:, 1].astype(np.float32))
-            d, h = d - e, h - k
+            e, k = lobe(1)
             across = _Quadratic(crossed(d, e), crossed(d, k) + crossed(h, e), crossed(h, k))
             gloss = _Linear(seen(e), seen(k)), across, _Quadratic(crossed(e, e), 2 * crossed(e, k), crossed(k, k))
         return _Moments(

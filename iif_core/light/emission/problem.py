@@ -35,7 +35,7 @@ class EmissionProblem:
     def scale_is_identifiable(self) -> bool:
         """Photographed light (h) shares in what is reflected, or an emitter is seen unsaturated in all channels: the light then
         has a scale in the units of the photographs."""
-        return bool((self.rows.cached[:, 0] > 0).any()) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
+        return bool((self.rows.cached > 0).any()) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
 
     def solve_object_gains(
         self, initial: np.ndarray, albedo: np.ndarray | None = None, n_objects: int = 0
@@ -66,7 +66,7 @@ def assemble(
     """Average pixels over (view, tile, object) with their weights (Eq. L.13), and add rows for the sky.
 
     A pixel on an emitter shows its emission alone (kept emitters are black): an anchor that outweighs the other rows. With
-    `white`, while it is still open which groups shine, it may as well reflect, up to a white surface (Eq. L.15):
+    `white`, while it is still open which groups emit, it may as well reflect, up to a white surface (Eq. L.15):
     y - (A_w E + h_w) <= E_g <= y, the upper end only where y is not saturated.
 
     Args:
@@ -82,16 +82,14 @@ def assemble(
     own = pixels.group >= 0
     direct = np.zeros((len(own), n_groups, 3), np.float32)
     direct[np.flatnonzero(own), pixels.group[own]] = 1.0
-    matrix, cached = np.array(transport.matrix), np.array(transport.cached)
+    matrix, cached = np.array(transport.matrix), np.array(transport.cached, np.float64)
     matrix[:, :, own], cached[:, :, own] = 0.0, 0.0
     if white is not None:
         matrix[:, :1, own], cached[:, :1, own] = white.matrix, white.cached
     matrix[:, 0] += direct
     bound = pixels.bound if white is None else pixels.bound | own[:, None]
-    observed, key = (
-        pixels.radiance,
-        np.stack([np.where(own, -1, pixels.object_id), pixels.group, pixels.view, pixels.tile], 1),
-    )
+    observed = np.array(pixels.radiance, np.float64)
+    key = np.stack([np.where(own, -1, pixels.object_id), pixels.group, pixels.view, pixels.tile], 1)
     if white is not None:  # the upper ends, as bounds of the negated rows
         clear = own & ~pixels.bound.any(1)
         upper = np.zeros((*matrix.shape[:2], int(clear.sum()), n_groups, 3), matrix.dtype)
@@ -103,8 +101,6 @@ def assemble(
     problem = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
     if sky is not None and sky.pixels.any():
         problem = _with_sky(problem, n_groups, sky)
-    rows = replace(problem.rows, cached=problem.rows.cached.astype(problem.rows.observed.dtype))  # as precise as y
-    problem = replace(problem, rows=rows)
     return problem if white is not None else replace(problem, rows=_strengthened(problem.rows, problem.anchor))
 
 

@@ -15,8 +15,8 @@ class TracedTransport:
     """A and h (Eq. L.11) of n points, from two independent traces (first axis).
 
     Attributes:
-        matrix: (2, L, n, G, 3) float32. The second axis is the lobe: 0 = all that is reflected, 1 = the part of it that the
-            specular lobe of dielectrics reflects, which is not proportional to the albedo; L = 1: that part is not known apart.
+        matrix: (2, L, n, G, 3) float32. The second axis is the lobe: 0 = what is proportional to the albedo (the diffuse lobe,
+            and the specular lobe of metals), 1 = the specular lobe of dielectrics; L = 1: both together.
         cached: (2, L, n, 3) radiance that was photographed where it was last reflected.
     """
 
@@ -24,8 +24,8 @@ class TracedTransport:
     cached: np.ndarray
 
     def without_lobes(self) -> TracedTransport:
-        """The same transport with one factor for all that is reflected."""
-        return TracedTransport(self.matrix[:, :1], self.cached[:, :1])
+        """Add the lobes up."""
+        return TracedTransport(self.matrix.sum(1, keepdims=True), self.cached.sum(1, keepdims=True))
 
 
 @dataclass(frozen=True)
@@ -66,18 +66,18 @@ class EmissionRows:
 
     @property
     def has_lobes(self) -> bool:
-        """The specular lobe of dielectrics is known apart."""
+        """The specular lobe of dielectrics is kept apart."""
         return self.matrix.shape[1] == 2
 
     @property
     def matrices(self) -> np.ndarray:
-        """(2, n, G, 3) A of both traces, of all that is reflected."""
-        return self.matrix[:, 0]
+        """(2, n, G, 3) A of both traces, all lobes together."""
+        return self.matrix.sum(1) if self.has_lobes else self.matrix[:, 0]
 
     @property
     def targets(self) -> np.ndarray:
         """(2, n, 3) what emission must explain in both traces: y - h."""
-        return self.observed - self.cached[:, 0]
+        return self.observed - self.cached.sum(1)
 
     @property
     def mean_target(self) -> np.ndarray:
@@ -89,17 +89,15 @@ class EmissionRows:
         return replace(self, matrix=self.matrix[:, :, :, keep])
 
     def without_lobes(self) -> EmissionRows:
-        """The same rows with one factor for all that is reflected."""
-        return replace(self, matrix=self.matrix[:, :1], cached=self.cached[:, :1])
+        """Add the lobes up."""
+        return replace(self, matrix=self.matrix.sum(1, keepdims=True), cached=self.cached.sum(1, keepdims=True))
 
     def scaled(self, gain: np.ndarray, gloss_gain: np.ndarray) -> EmissionRows:
-        """Rows, without lobes, of materials that reflect `gain` (n, 3) > 0 times as much, and whose gloss, where it is known,
-        reflects `gloss_gain` (n,) >= 0 times as much. The observation is not scaled."""
-        matrix, cached = gain[:, None].astype(np.float32) * self.matrix[:, 0], gain * self.cached[:, 0]
-        if self.has_lobes:
-            more = gloss_gain[:, None] - gain
-            matrix = matrix + more[:, None].astype(np.float32) * self.matrix[:, 1]
-            cached = cached + more * self.cached[:, 1]
+        """Rows, lobes added up, of materials whose albedo lobe reflects `gain` (n, 3) > 0 times as much and whose gloss reflects
+        `gloss_gain` (n,) >= 0 times as much; without lobes `gain` holds for everything. The observation is not scaled."""
+        factors = (gain, np.repeat(gloss_gain[:, None], 3, 1))[: self.matrix.shape[1]]
+        matrix = sum(factor[:, None].astype(np.float32) * self.matrix[:, lobe] for lobe, factor in enumerate(factors))
+        cached = sum(factor * self.cached[:, lobe] for lobe, factor in enumerate(factors))
         return replace(self, matrix=matrix[:, None], cached=cached[:, None])
 
 
@@ -125,10 +123,6 @@ def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.
     def mean(values: np.ndarray) -> np.ndarray:
         return np.add.reduceat(values[order] * (share[:, None] if values.ndim == 3 else share), starts, 0)
 
-    observed = mean(rows.observed)
-    matrix = np.array([[mean(lobe) for lobe in trace] for trace in rows.matrix])
-    cached = np.array([[np.zeros(observed.shape), *(mean(lobe) for lobe in trace[1:])] for trace in rows.cached])
-    # mean(h) as mean(y) - mean(y - h): the order of operations decides the last bits of everything that follows.
-    cached[:, 0] = [observed.astype(np.float64) - mean(target) for target in rows.targets]
+    matrix, cached = (np.array([[mean(lobe) for lobe in trace] for trace in both]) for both in (rows.matrix, rows.cached))
     first = order[starts]
-    return EmissionRows(matrix, observed, cached, total, rows.lower_bound[first]), first
+    return EmissionRows(matrix, mean(rows.observed), cached, total, rows.lower_bound[first]), first
