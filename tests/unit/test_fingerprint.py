@@ -83,18 +83,30 @@ def test_unrelated_comment_in_scene_file_changes_nothing(checkout):
 
 
 def test_closure_covers_what_a_stage_really_imports(repository):
-    """Import every stage (with every plug-in) in a fresh interpreter; nothing of ours may be loaded that the digest misses."""
+    """Import every stage (with every plug-in) in a process of its own; nothing of ours may be loaded that the digest misses."""
+    # The processes are forks of one that holds the libraries, which take most of the time.
     probe = textwrap.dedent(
         """
-        import importlib, json, sys
+        import importlib, json, os, sys
         from workflow.runtime import native
         native.prepare()
         import mitsuba as mi
         mi.set_variant("llvm_ad_rgb")
+        import numba, pandas, pyarrow.parquet, scipy.optimize, torch
         import workflow.settings  # takes its defaults from the options of the solvers; their values are in the fingerprint
         before = set(sys.modules)
-        for name in sys.argv[1:]: importlib.import_module(name)
-        print(json.dumps(sorted(m for m in set(sys.modules) - before if m.split(".")[0] in ("iif_core", "workflow"))))
+        for names in json.loads(sys.argv[1]):
+            child = os.fork()
+            if child == 0:
+                status = 1
+                try:
+                    for name in names: importlib.import_module(name)
+                    ours = [m for m in set(sys.modules) - before if m.split(".")[0] in ("iif_core", "workflow")]
+                    os.write(1, (json.dumps(sorted(ours)) + "\\n").encode())
+                    status = 0
+                finally:
+                    os._exit(status)
+            assert os.waitpid(child, 0)[1] == 0, names
         """
     )
     plugins = {
@@ -102,17 +114,18 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         "prior": ("prior", ("simulated", "files", "retinex", "rgbx", "marigold")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }
+    cases, roots = [], []
     for stage in STAGES:
         section, kinds = plugins.get(stage, (None, (None,)))
         for kind in kinds:
-            document = {section: {"kind": kind}} if section else {}
-            modules = fp.stage_modules(stage, document)
-            roots = [STAGES[stage].module] + [p.format(kind) for _, _, p in fp.PLUGINS.get(stage, ())]
-            out = subprocess.run([sys.executable, "-c", probe, *roots], cwd=repository, capture_output=True, text=True)
-            assert out.returncode == 0, out.stderr
-            loaded = json.loads(out.stdout.splitlines()[-1])
-            missed = [m for m in loaded if m not in modules and not fp.is_infrastructure(m)]
-            assert not missed, (stage, kind, missed)
+            cases.append((stage, kind, fp.stage_modules(stage, {section: {"kind": kind}} if section else {})))
+            roots.append([STAGES[stage].module] + [p.format(kind) for _, _, p in fp.PLUGINS.get(stage, ())])
+    command = [sys.executable, "-c", probe, json.dumps(roots)]
+    out = subprocess.run(command, cwd=repository, capture_output=True, text=True)
+    assert out.returncode == 0, out.stderr
+    for (stage, kind, modules), line in zip(cases, out.stdout.splitlines(), strict=True):
+        missed = [m for m in json.loads(line) if m not in modules and not fp.is_infrastructure(m)]
+        assert not missed, (stage, kind, missed)
 
 
 def test_function_level_imports_are_in_the_closure():

@@ -168,9 +168,16 @@ def test_measured_response_is_used_as_it_is(tmp_path, llvm, monkeypatch):
     assert decision["component"] == "camera_response" and "crf.npy" in decision["reason"]
 
 
-@pytest.mark.parametrize("brightness", [0.0, 1000.0])
-@pytest.mark.parametrize("dynamic_range", ["hdr", "ldr"])
-def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, brightness, dynamic_range):
+@pytest.mark.parametrize(
+    ("dynamic_range", "brightness"),
+    [
+        ("ldr", 0.0),
+        ("hdr", 1000.0),
+        pytest.param("hdr", 0.0, marks=pytest.mark.long),
+        pytest.param("ldr", 1000.0, marks=pytest.mark.long),
+    ],
+)
+def test_dark_and_blinding_rooms_run_to_the_end(tmp_path, llvm, caplog, dynamic_range, brightness):
     caplog.set_level(logging.INFO)
     curve = "srgb" if dynamic_range == "ldr" else None
     build(tmp_path, views=3, size=24, samples=16, dynamic_range=dynamic_range, curve=curve, brightness=brightness)

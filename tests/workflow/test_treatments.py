@@ -6,14 +6,24 @@ import pytest
 from support import treatment
 
 
-def test_no_emitter_seen(workflow):
-    """Nothing counts as an emitter: light comes from the radiance cache alone, and the run says so."""
+def _without_emitters(workflow, target):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text().replace("rows: 2000", "rows: 2000, min_observations: 1000000"))
-    result = workflow.run("scenes/tiny")
+    result = workflow.run(target)
     assert result.returncode == 0, result.stderr[-2000:]
-    notes = json.loads((workflow.folder / "results/tiny/emission/emission.json").read_text())["notes"]
-    assert treatment("no emitter seen") in notes
+    return json.loads((workflow.folder / "results/tiny/emission/emission.json").read_text())["notes"]
+
+
+def test_no_emitter_seen(workflow):
+    """Nothing counts as an emitter: light comes from the radiance cache alone, and the stage says so."""
+    assert treatment("no emitter seen") in _without_emitters(workflow, "results/tiny/affines/manifest.json")
+
+
+@pytest.mark.long
+def test_a_room_without_emitters_is_delivered(workflow):
+    """The same room to the end of the run."""
+    _without_emitters(workflow, "scenes/tiny")
+    assert (workflow.folder / "scenes/tiny/scene.glb").is_file()
 
 
 @pytest.mark.long
