@@ -14,8 +14,11 @@ class BuiltinSource(Section):
     """A room that the project makes itself; nothing from outside is needed."""
 
     kind: Literal["builtin"]
-    scene: Literal["kitchen", "tiny"] = "kitchen"
-    """`kitchen`: a furnished room; `tiny`: a few boxes, for tests."""
+    scene: Literal[
+        "kitchen", "tiny", "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening"
+    ] = "kitchen"
+    """`kitchen`: a furnished room; `tiny`: a few boxes, for tests; the others: rooms of the test bed, which differ in how light
+    enters them (docs/development/rooms.md)."""
 
 
 class MitsubaSource(Section):

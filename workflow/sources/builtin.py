@@ -60,13 +60,16 @@ class _Capture:
         self.writer = CaptureWriter(job.writer)
         self.geometry = build_geometry(room.vertices, room.faces, room.object_id)
         front = np.ones(len(room.faces), np.int8)
-        self.emitters = Emitters(self.geometry, room.emission, front)
+        outside = {} if room.environment is None else {"environment": room.environment}
+        self.emitters = Emitters(self.geometry, room.emission, front, **outside)
+        self.scan = room.scan
+        self.surface = build_geometry(self.scan.vertices, self.scan.faces, self.scan.material_id)
         self.material = room.materials.drjit()
 
     def run(self) -> None:
         views = self._plan()
-        room = self.room
-        self.writer.mesh(room.vertices, room.faces, room.object_id, list(room.names), room.emission)
+        scan = self.scan
+        self.writer.mesh(scan.vertices, scan.faces, scan.object_id, list(scan.names), scan.emission)
         with tempfile.TemporaryFile() as scratch:
             shape = (len(views), self.settings.height, self.settings.width, 3)
             radiance = np.memmap(scratch, np.float32, "w+", shape=shape)
@@ -103,20 +106,20 @@ class _Capture:
         shape = (view.height, view.width)
         origin = view.world_from_camera[:3, 3]
         rays = view.directions().reshape(-1, 3)
-        face, depth = trace(self.geometry, origin, rays)
+        face, depth = trace(self.surface, origin, rays)
         hit = face >= 0
         depth = np.where(hit, depth, 0).astype(np.float32)
         on = np.maximum(face, 0)
-        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.room.object_id[on])
-        cosine = (self.geometry.normals[on] * rays).sum(1)
-        emission = np.where((hit & (cosine < 0))[:, None], self.room.emission[on], 0)
+        albedo, roughness, metallic = self.room.materials.numpy(origin + depth[:, None] * rays, self.scan.material_id[on])
+        cosine = (self.surface.normals[on] * rays).sum(1)
+        emission = np.where((hit & (cosine < 0))[:, None], self.scan.emission[on], 0)
 
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
         scene = Scene(self.geometry, self.material, self.emitters)
         image = render(scene, origin, rays, PathOptions(self.settings.samples, MAX_BOUNCES, seed), jitter=steps)
         if self.settings.denoise:
-            normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.geometry.normals[on], 0)
+            normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
             image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
         radiance[:] = image.reshape(*shape, 3)
 
@@ -164,7 +167,7 @@ class _Capture:
         reachable = (views_of_point > 0) | (count(self.room.cameras(len(self.room.shots)), 1.0) > 0)
         once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
         self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
-        notes = [f"{len(self.room.names)} objects, {len(self.room.faces)} faces; up to {MAX_BOUNCES} bounces"]
+        notes = [f"{len(self.scan.names)} objects, {len(self.scan.faces)} faces; up to {MAX_BOUNCES} bounces"]
         if self.response is not None:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:

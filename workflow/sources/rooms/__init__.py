@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from iif_core.errors import InputError
-from workflow.sources.rooms import kitchen, tiny
+from workflow.sources.rooms import bed, kitchen, tiny
 from workflow.sources.rooms.room import Room
 
-ROOMS: dict[str, Callable[[], Room]] = {"kitchen": kitchen.build, "tiny": tiny.build}
+ROOMS: dict[str, Callable[[], Room]] = {"kitchen": kitchen.build, "tiny": tiny.build, **bed.ROOMS}
 
 
 def build(name: str) -> Room:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,8 +18,28 @@ _STEP = np.array([0.8191725, 0.6710436, 0.5497005])  # generator of the R3 seque
 
 
 @dataclass(frozen=True)
+class Scan:
+    """The mesh of a room that is delivered beside its photographs.
+
+    Attributes:
+        vertices: (n, 3) float32 metres; faces: (m, 3) int32.
+        object_id: (m,) int32 rows of `names`.
+        material_id: (m,) int32 rows of the room's materials.
+        names: one per object.
+        emission: (m, 3) float32 radiance of the front side.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    object_id: np.ndarray
+    material_id: np.ndarray
+    names: tuple[str, ...]
+    emission: np.ndarray
+
+
+@dataclass(frozen=True)
 class Room:
-    """A closed, furnished room; metres, z up, right-handed.
+    """A furnished room; metres, z up, right-handed.
 
     Attributes:
         name: scene name.
@@ -33,6 +53,9 @@ class Room:
         parts: (p, 2, 3) bounding boxes of the separate pieces of furniture; cameras stay out of them.
         shots: (s, 2, 3) hand-chosen positions and targets, ordered so that the first n cover the room well for any n >= 8.
         field_of_view: horizontal, degrees.
+        environment: (H, W, 3) float32 radiance of what surrounds the room (`iif_core.light.environment`); None = nothing.
+        scanned: object id -> shape that the delivered mesh has in place of the object's own.
+        one_object: the delivered mesh tells no objects apart.
     """
 
     name: str
@@ -46,6 +69,22 @@ class Room:
     parts: np.ndarray
     shots: np.ndarray
     field_of_view: float = 72.0
+    environment: np.ndarray | None = None
+    scanned: Mapping[int, Shape] = field(default_factory=dict)
+    one_object: bool = False
+
+    @property
+    def scan(self) -> Scan:
+        """The mesh that is delivered: the room's own but for the objects in `scanned`, which do not emit."""
+        vertices, faces, material, emission = self.vertices, self.faces, self.object_id, self.emission
+        if self.scanned:
+            kept = ~np.isin(self.object_id, list(self.scanned))
+            vertices, faces = merge((vertices, faces[kept]), *self.scanned.values())
+            added = np.repeat(list(self.scanned), [len(shape[1]) for shape in self.scanned.values()])
+            material = np.concatenate([material[kept], added]).astype(np.int32)
+            emission = np.concatenate([emission[kept], np.zeros((len(added), 3), np.float32)])
+        owner, names = (np.zeros_like(material), ("room",)) if self.one_object else (material, self.names)
+        return Scan(vertices.astype(np.float32), faces.astype(np.int32), owner, material, names, emission)
 
     def is_free(self, position: Sequence[float], margin: float = CAMERA_MARGIN) -> bool:
         """Return whether a camera may stand at `position`: inside the room and `margin` metres away from all furniture."""
@@ -81,8 +120,11 @@ class RoomBuilder:
         self.name, self.size = name, np.asarray(size, float)
         self._objects: list[tuple[str, Shape, Material, np.ndarray]] = []
         self._parts: list[np.ndarray] = []
+        self._scanned: dict[int, Shape] = {}
 
-    def add(self, name: str, material: Material, *shapes: Shape, is_part: bool = True) -> None:
+    def add(
+        self, name: str, material: Material, *shapes: Shape, is_part: bool = True, scanned: Sequence[Shape] | None = None
+    ) -> None:
         """Add an object of one or more shapes.
 
         Args:
@@ -90,8 +132,16 @@ class RoomBuilder:
             material: of all its shapes.
             *shapes: merged into one object.
             is_part: False where cameras need not keep their distance (walls, floor).
+            scanned: shapes that the delivered mesh has instead; None = the same.
         """
+        if scanned is not None:
+            self._scanned[len(self._objects)] = merge(*scanned)
         self._add(name, material, shapes, (0.0, 0.0, 0.0), is_part)
+
+    @property
+    def parts(self) -> np.ndarray:
+        """(p, 2, 3) bounding boxes of what cameras keep their distance from."""
+        return np.array(self._parts).reshape(-1, 2, 3)
 
     def add_emitter(self, name: str, *shapes: Shape, radiance: Sequence[Sequence[float]] | Sequence[float]) -> None:
         """Add an emitter; `radiance` is (3,) for all shapes or one row per shape."""
@@ -120,6 +170,7 @@ class RoomBuilder:
             MaterialTable(materials),
             np.concatenate(emission).astype(np.float32),
             self.size,
-            np.array(self._parts).reshape(-1, 2, 3),
+            self.parts,
             np.array(shots.split(), float).reshape(-1, 2, 3),
+            scanned=self._scanned,
         )

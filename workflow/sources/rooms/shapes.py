@@ -98,12 +98,12 @@ def box(low: Point, high: Point, bevel: float = 0.0) -> Shape:
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     centre, half = (low + high) / 2, (high - low) / 2
     if bevel == 0:
-        return _hull(centre + signs * half)
+        return hull(centre + signs * half)
     insets = [np.where(np.arange(3) == axis, 0, bevel) for axis in range(3)]
-    return _hull(np.concatenate([centre + signs * (half - inset) for inset in insets]))
+    return hull(np.concatenate([centre + signs * (half - inset) for inset in insets]))
 
 
-def _hull(points: np.ndarray) -> Shape:
+def hull(points: np.ndarray) -> Shape:
     """Return the convex hull, facing outward, in an order that does not depend on SciPy's version."""
     from scipy.spatial import ConvexHull
 
@@ -138,7 +138,7 @@ def wedge(base_low: Point, base_high: Point, top_low: Point, top_high: Point) ->
     (x0, y0, z0), (x1, y1, _), (u0, v0, z1), (u1, v1, _) = base_low, base_high, top_low, top_high
     base = [[x, y, z0] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
     top = [[x, y, z1] for x, y in ((u0, v0), (u1, v0), (u1, v1), (u0, v1))]
-    return _hull(np.array(base + top, float))
+    return hull(np.array(base + top, float))
 
 
 def tub(low: Point, high: Point, wall: float, floor: float) -> Shape:
