@@ -34,7 +34,7 @@ def main() -> None:
 
     mitsuba.set_variant("llvm_ad_rgb")
     native.limit_threads(1)
-    from iif_core.light.emission.direct import solve_families
+    from iif_core.light.emission.direct import EmissionPrior, solve_families
     from tests.unit.planted_room import PlantedScene, build_room
 
     print("| room | photographs | inside 68 % | inside 95 % | rms of (E - truth) / error | median relative error | cpu s |")
@@ -50,7 +50,7 @@ def main() -> None:
             transport = scene.transport(seed, arguments.samples // 2)
             for kind in ("hdr_hidden", "ldr_one"):
                 problem, initial = scene.problem(photographs, transport, kind)
-                found = solve_families(problem.rows, initial, scene.families())
+                found = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())
                 off = (found.radiance - scene.room.truth)[lit]
                 ratios.setdefault(kind, []).append(off / found.error[lit])
                 relative.setdefault(kind, []).append(np.abs(off) / scene.room.truth[lit])

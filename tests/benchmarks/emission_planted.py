@@ -81,7 +81,7 @@ def main() -> None:
 
     mitsuba.set_variant("llvm_ad_rgb")
     native.limit_threads(1)
-    from iif_core.light.emission.direct import solve_emission, solve_families
+    from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
     from iif_core.light.emission.loss import reference_loss
     from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
     from tests.unit.planted_room import PlantedScene, build_room, relative_errors
@@ -101,7 +101,9 @@ def main() -> None:
             rows = problem.rows
             solvers = {
                 "plain": lambda rows=rows, initial=initial: solve_emission(rows, initial, cross=False),
-                "direct": lambda rows=rows, initial=initial: solve_families(rows, initial, scene.families()),
+                "direct": lambda rows=rows, initial=initial: solve_families(
+                    rows, EmissionPrior.independent(initial), scene.families()
+                ),
             }
             if arguments.sgd:
                 solvers["sgd safe"] = lambda rows=rows, initial=initial: solve_emission_sgd(rows, initial)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from iif_core.light.emission.candidates import emitter_candidates, face_statistics, radiance_threshold
-from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
 from iif_core.light.emission.groups import group_emitters
 from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.pixels import EmissionPixels
@@ -25,7 +25,7 @@ def _matrix(n=300, groups=3, seed=0):
 
 def _solutions(rows, initial):
     yield solve_emission(rows, initial)
-    yield solve_families(rows, initial, np.zeros(len(initial), int))
+    yield solve_families(rows, EmissionPrior.independent(initial), np.zeros(len(initial), int))
     for preset in ("safe", "paper"):
         yield solve_emission_sgd(rows, initial, SgdOptions(preset, 50, 64))
 
@@ -113,7 +113,7 @@ def test_coincident_and_flipped_faces():
     groups = group_emitters(np.ones(8, bool), stats, face_adjacency(both), normals, np.ones(8))
     assert groups.size == 2 and set(groups.side) == {1, -1}
     a = np.repeat(_matrix(300, 1), 2, 1)
-    found = solve_families(_rows(a, 6.0 * a[:, 0]), np.full((2, 3), 9.0), np.array([0, 1]))
+    found = solve_families(_rows(a, 6.0 * a[:, 0]), EmissionPrior.independent(np.full((2, 3), 9.0)), np.array([0, 1]))
     np.testing.assert_allclose(found.radiance.sum(0), 6.0, rtol=0.02)
     assert (found.determined < 0.9).all()
 
@@ -130,7 +130,7 @@ def test_one_object_and_five_thousand(objects):
     y[:200] = truth[group[:200]]
     pixels = EmissionPixels(y, np.zeros((n, 3), bool), owner, np.zeros(n, int), np.arange(n) // 5, group)
     initial = initial_radiance(pixels, np.ones((2, 3)), True)
-    problem, _ = assemble(pixels, transport_of(a), 2).solve_object_gains(initial)
+    problem, _ = assemble(pixels, transport_of(a), 2).solve_object_gains(EmissionPrior.independent(initial))
     np.testing.assert_allclose(solve_emission(problem.rows, initial).radiance, truth, rtol=0.02)
 
 
@@ -145,6 +145,6 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     seen = initial_radiance(pixels, np.full((2, 3), 2.0), True)
     trial = assemble(pixels, transport_of(a.astype(np.float32)), 2, white)
     evidence = white_surface(pixels, seen, white)
-    out = prune_groups(trial.rows, seen, np.ones(2), evidence, ~trial.anchor, np.zeros(2, bool))
+    out = prune_groups(trial.rows, EmissionPrior.independent(seen), np.arange(2), evidence, ~trial.anchor, np.zeros(2, bool))
     assert out.kept.all() and np.isinf(out.excess[1])
     np.testing.assert_allclose(out.solution.radiance, truth, rtol=0.05)

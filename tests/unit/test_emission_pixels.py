@@ -1,7 +1,10 @@
 """Pixels of the linear system, and rows that keep what was observed and what was cached apart."""
 
+from dataclasses import replace
+
 import numpy as np
 
+from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.pixels import EmissionPixels, choose_pixels, tile_of
 from iif_core.light.emission.problem import assemble
 from iif_core.light.emission.rows import TracedTransport
@@ -23,6 +26,27 @@ def test_tiles_are_squares_of_eight_pixels():
     index = np.arange(20 * 17)
     tile = tile_of(index, 20)
     assert np.bincount(tile).tolist() == [64, 64, 32, 64, 64, 32, 8, 8, 4]
+
+
+def test_a_pane_behind_blinds_is_as_bright_as_its_light_and_not_as_its_pixels():
+    """The pane fills a third of its pixels, slats of radiance 2 the rest; taken as equalities they would show 30 / 3 + 4 / 3."""
+    rng = np.random.default_rng(3)
+    n, seen, truth = 900, 60, 30.0
+    a = np.abs(rng.normal(1.0, 0.5, (n, 1, 3)))
+    share = rng.uniform(0.2, 0.5, n).astype(np.float32)
+    group = np.where(np.arange(n) < seen, 0, -1)
+    y = truth * a[:, 0] * np.exp(0.1 * rng.standard_normal((n, 1)))
+    y[:seen] = (share * truth + (1 - share) * 2.0)[:seen, None]
+    coverage = np.where(group >= 0, share, 0.0)[:, None].astype(np.float32)
+    pixels = EmissionPixels(y, np.zeros((n, 3), bool), np.zeros(n, int), np.zeros(n, int), np.arange(n), group, coverage, 5.0)
+    transport = TracedTransport(np.broadcast_to(a.astype(np.float32), (2, 1, n, 1, 3)), np.zeros((2, 1, n, 3)))
+    prior = EmissionPrior.independent(np.full((1, 3), 12.0))
+    bounded = prior.solve(assemble(pixels, transport, 1).rows).radiance
+    whole = prior.solve(assemble(replace(pixels, coverage=None), transport, 1).rows).radiance
+    np.testing.assert_allclose(bounded, truth, rtol=0.05)
+    assert whole.max() < 0.6 * truth
+    rows = assemble(pixels, transport, 1)
+    assert rows.rows.lower_bound[rows.anchor].all() and rows.anchor.sum() == 2 * seen
 
 
 def test_averaged_rows_hold_the_means_of_what_was_observed_and_cached():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
 from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from tests.unit.planted_room import PlantedScene, build_room, relative_errors
@@ -19,7 +19,7 @@ def planted(llvm):
 def test_planted_groups_are_recovered(planted, kind, median):
     scene, photographs, transport = planted
     problem, initial = scene.problem(photographs, transport, kind)
-    found = solve_families(problem.rows, initial, scene.families())
+    found = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())
     assert np.median(relative_errors(scene.room, found.radiance)) < median
     assert found.radiance[~scene.room.truth.any(1)].max() < 1.0  # of up to 20: the distractors
     assert found.converged and np.isfinite(found.error).all()
@@ -29,7 +29,7 @@ def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
     """Single triangles are not told apart by so few paths; the light of each object is."""
     scene, photographs, _ = planted
     problem, initial = scene.problem(photographs, scene.transport(1, 32), "ldr_one")
-    found = solve_families(problem.rows, initial, scene.families())
+    found = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())
     for family in np.unique(scene.families())[:3]:
         own = scene.families() == family
         assert found.radiance[own].sum() / scene.room.truth[own].sum() == pytest.approx(1, abs=0.15)
@@ -41,7 +41,7 @@ def test_what_is_never_seen_unsaturated_is_known_by_its_light(planted):
 def test_twins_are_judged_by_one_loss(planted):
     scene, photographs, transport = planted
     problem, initial = scene.problem(photographs, transport, "hdr_hidden")
-    direct = solve_families(problem.rows, initial, scene.families())
+    direct = solve_families(problem.rows, EmissionPrior.independent(initial), scene.families())
     descent = solve_emission_sgd(problem.rows, initial, SgdOptions(steps=600, prune=()))
     losses = [reference_loss(problem.rows, s.radiance) for s in (direct, descent)]
     assert losses[0] <= losses[1]

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
-from iif_core.light.emission.direct import solve_emission, solve_families
+from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
 from iif_core.light.emission.gains import MAX_SHARE_ABOVE_WHITE, SHARED_LEVEL_ERROR, GainOptions, estimate_object_gains
 from iif_core.light.emission.pruning import WhiteSurface, prune_groups
 from iif_core.light.emission.rows import EmissionRows, block_rows
@@ -21,7 +21,9 @@ def _rows(a1, a2, y, weight=None, bound=None):
 def _gains(rows, owner, identifiable=True, rounds=15, shrinkage=0.05, initial=None, **options):
     """Gains of rows of three groups."""
     initial = np.ones((3, 3)) if initial is None else initial
-    return estimate_object_gains(rows, owner, initial, identifiable, options=GainOptions(rounds, shrinkage), **options)
+    return estimate_object_gains(
+        rows, owner, EmissionPrior.independent(initial), identifiable, options=GainOptions(rounds, shrinkage), **options
+    )
 
 
 def _light(rows, owner, found, **options):
@@ -43,7 +45,7 @@ def test_planted_emission_is_recovered():
 
 
 def test_noise_in_a_attenuates_and_two_estimates_cure_it():
-    """Eq. L.18 and L.19: the attenuated answer (7.27, 9.77, 14.77) follows in closed form for uniform A."""
+    """Eq. L.20 and L.21: the attenuated answer (7.27, 9.77, 14.77) follows in closed form for uniform A."""
     rng = np.random.default_rng(1)
     a, y = _random(200_000, seed=2)
     a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))
@@ -196,33 +198,45 @@ def _white(seen, matrix=None, cached=0.0):
     return WhiteSurface(seen, matrix[:, :, None] * np.ones(3), np.full((groups, 3), cached))
 
 
-def _pruning(shown, seen, matrix, area, noise=0.05, seed=9):
-    """`shown`: radiance that each group sends out, its own or reflected; `seen`: what the photographs say of it."""
+def _pruning(shown, seen, matrix, noise=0.05, seed=9, family=None, reach=None):
+    """`shown`: radiance that each group sends out, its own or reflected; `seen`: what the photographs say of it; `reach`: how
+    much of its light reaches the other rows."""
     rng = np.random.default_rng(seed)
     groups = len(shown)
-    a = rng.random((2000, groups, 3)).astype(np.float32)
+    a = (rng.random((2000, groups, 3)) * (np.ones(groups) if reach is None else np.asarray(reach))[:, None]).astype(np.float32)
+    family = np.arange(groups) if family is None else np.asarray(family)
     y = np.einsum("ngc,gc->nc", a, np.asarray(shown)[:, None] * np.ones(3)) * (1 + noise * rng.standard_normal((2000, 3)))
     everywhere, last = np.ones(2000, bool), np.arange(groups) == groups - 1
     rows = _rows(a, a, y)
-    return prune_groups(rows, np.ones((groups, 3)), np.asarray(area, float), _white(seen, matrix), everywhere, last)
+    return prune_groups(rows, EmissionPrior.independent(np.ones((groups, 3))), family, _white(seen, matrix), everywhere, last)
 
 
 def test_pruning_keeps_what_shines():
     """A lamp; a lit wall beside it; a strip brighter than white but without power; a dark group; the environment."""
     matrix = np.zeros((5, 5))
     matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
-    out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, [1.0, 1.0, 1e-3, 1.0, 0.0])
+    out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, reach=[1.0, 1.0, 1e-3, 1.0, 1.0])
     assert out.kept.tolist() == [True, False, False, False, True]
     assert (out.solution.radiance[~out.kept] == 0).all()
     assert "white surface" in out.reason[1] and out.excess[1] == pytest.approx(2 / 3.2, rel=0.1)
-    assert "power" in out.reason[2] and out.reason[0] == out.reason[4] == ""
+    assert "of the light" in out.reason[2] and out.reason[0] == out.reason[4] == ""
+
+
+def test_a_curtain_of_many_weak_folds_stays_whole():
+    """Each of fifty folds gives a fiftieth of what the curtain gives; they are judged together, and alone each would go."""
+    groups = 51
+    shown, reach = np.r_[np.full(50, 3.0), 8.0], np.r_[np.full(50, 0.01), 1.0]
+    matrix = np.zeros((groups, groups))
+    together = _pruning(shown, shown, matrix, reach=reach, family=np.r_[np.zeros(50), 1])
+    alone = _pruning(shown, shown, matrix, reach=reach)
+    assert together.kept.all() and alone.kept.sum() < 10
 
 
 def test_dim_surface_whose_light_is_missed_stays():
     """Saturated, and its bound is no brighter than a white surface; but the rest of the scene needs more of its light."""
     matrix = np.zeros((3, 3))
     matrix[1, 0] = 0.5
-    out = _pruning([8.0, 3.0, 0.0], [8.0, 1.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    out = _pruning([8.0, 3.0, 0.0], [8.0, 1.0, 0.0], matrix)
     assert out.kept[1] and out.excess[1] < 1
 
 
@@ -230,7 +244,7 @@ def test_wall_that_is_dropped_keeps_reflecting():
     """The wall's light is a third of what arrives: without it the residual would grow, but it is known how bright the wall is."""
     matrix = np.zeros((3, 3))
     matrix[1, 0] = 0.6
-    out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix)
     assert out.kept.tolist() == [True, False, True]
     np.testing.assert_allclose(out.solution.radiance[0], 8.0, rtol=0.02)
 
@@ -238,14 +252,16 @@ def test_wall_that_is_dropped_keeps_reflecting():
 def test_false_emitter_goes_before_the_lamp_it_hides():
     """A shade around a bulb: each makes the other look like a reflector; the less credible one goes."""
     matrix = np.array([[0.0, 0.9, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
-    out = _pruning([8.0, 2.0, 0.0], [8.0, 2.0, 0.0], matrix, [1.0, 1.0, 0.0])
+    out = _pruning([8.0, 2.0, 0.0], [8.0, 2.0, 0.0], matrix)
     assert out.kept.tolist() == [True, False, True] and out.excess[0] > 4
 
 
 def test_pruning_with_nothing():
     rows = _rows(np.zeros((4, 0, 3)), np.zeros((4, 0, 3)), np.ones((4, 3)))
     none = np.zeros((0, 3))
-    out = prune_groups(rows, none, np.zeros(0), _white(np.zeros(0)), np.ones(4, bool), np.zeros(0, bool))
+    out = prune_groups(
+        rows, EmissionPrior.independent(none), np.zeros(0, int), _white(np.zeros(0)), np.ones(4, bool), np.zeros(0, bool)
+    )
     assert out.kept.shape == (0,)
 
 
@@ -258,10 +274,10 @@ def test_parts_of_one_object_share_what_only_their_sum_determines():
     y = np.einsum("ngc,gc->nc", a, true) + 0.05 * rng.standard_normal((300, 3))
     rows = _rows(a, a, y)
     alone = solve_emission(rows, np.ones((3, 3)), prior_width=np.inf, ridge=1e-9).radiance
-    family = solve_families(rows, np.ones((3, 3)), np.array([7, 7, 2])).radiance
+    family = solve_families(rows, EmissionPrior.independent(np.ones((3, 3))), np.array([7, 7, 2])).radiance
     assert np.abs(alone[:2] / true[:2] - 1).max() > 0.5
     assert np.abs(family[:2] / 5.0 - 1).max() < 0.1 and np.abs(family[2] / 3 - 1).max() < 0.02
-    single = solve_families(rows, np.ones((3, 3)), np.arange(3)).radiance
+    single = solve_families(rows, EmissionPrior.independent(np.ones((3, 3))), np.arange(3)).radiance
     np.testing.assert_array_equal(single, solve_emission(rows, np.ones((3, 3))).radiance)
 
 

@@ -21,6 +21,7 @@ from iif_core.camera.calibration.choice import (
 )
 from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
+from iif_core.camera.pinhole import direction_derivatives
 from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
 from iif_core.light.emission.candidates import FaceStatistics, face_statistics, radiance_threshold, with_thin_objects
 from iif_core.light.emission.environment import SkySums, cosine_directions
@@ -42,6 +43,8 @@ VIEW_MEMORY_MB = 1024.0
 """Megabytes of decoded views that are kept in memory; every pass over the photographs decodes the others again."""
 STATISTICS_PIXELS = 20_000_000
 """Photographs are thinned to about this many pixels for the statistics of faces."""
+COVERAGE_RAYS = 31
+"""Rays through a pixel on an emitter, beside that through its middle."""
 SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
 
 
@@ -275,10 +278,13 @@ def escaping_share(photos: Photographs) -> float:
     return float((face < 0).mean())
 
 
-def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
+def choose_rows(
+    photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1
+) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
-    Returns them three times: as surface points, as base materials (n, 5), and as what they show.
+    `rest` is the radiance from which surface may be an emitter. Returns the pixels three times: as surface points, as base
+    materials (n, 5), and as what they show.
     """
     rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
     elsewhere = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
@@ -294,7 +300,8 @@ def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tu
         choice = choose_pixels(group, usable, pixels.interior, elsewhere, per_group, rng)
         part = pixels.take(choice)
         shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
-        rows = EmissionPixels(*shown, part.object_id, number, tile_of(part.index, view.width), group[choice])
+        tile, covered = tile_of(part.index, view.width), _coverage(photos, groups, view, part.index, group[choice], rng)
+        rows = EmissionPixels(*shown, part.object_id, number, tile, group[choice], covered)
         parts.append((part, record.base[choice], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
     joined, everything = _joined(pixels), _joined(rows)
@@ -302,9 +309,30 @@ def choose_rows(photos: Photographs, groups: EmitterGroups, thin: int = 1) -> tu
     group = everything.group
     inner = np.bincount(group[joined.interior & (group >= 0)], minlength=groups.size) > 0
     use = (group < 0) | joined.interior | ~np.append(inner, False)[group]
-    return joined.take(use), np.concatenate(base)[use], EmissionPixels(**{k: v[use] for k, v in everything.__dict__.items()})
+    return joined.take(use), np.concatenate(base)[use], replace(everything.take(use), rest=rest)
+
+
+def _coverage(
+    photos: Photographs, groups: EmitterGroups, view: View, index: np.ndarray, group: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """(n, G) share of rays through each pixel on an emitter that meet each group; 0 for other pixels."""
+    from iif_core.light.transport.geometry import trace
+
+    share, own = np.zeros((len(index), groups.size), np.float32), np.flatnonzero(group >= 0)
+    if not len(own):
+        return share
+    du, dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
+    middle = view.directions().reshape(-1, 3)[index[own]]
+    offset = rng.random((2, len(own), COVERAGE_RAYS, 1)) - 0.5
+    way = middle[:, None] + offset[0] * du + offset[1] * dv
+    face, _ = trace(photos.world[0], view.world_from_camera[:3, 3], way.reshape(-1, 3))
+    met = np.column_stack([group[own], np.append(groups.of_face, -1)[face].reshape(len(own), -1)])
+    pixel, ray = np.nonzero(met >= 0)
+    np.add.at(share, (own[pixel], met[pixel, ray]), np.float32(1.0 / met.shape[1]))
+    return share
 
 
 def _joined(parts: Sequence[Any]) -> Any:
     """Join records of arrays, one after another."""
-    return type(parts[0])(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in parts[0].__dict__})
+    arrays = {name: value for name, value in parts[0].__dict__.items() if isinstance(value, np.ndarray)}
+    return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays})

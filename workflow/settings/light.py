@@ -30,9 +30,9 @@ class Emission(Section):
     samples: int = Field(16, ge=2)
     """Paths per pixel, over two independent halves."""
     prune: float = Field(0.01, ge=0, lt=1)
-    """Groups of faces below this share of the total emitted power are dropped."""
+    """Emitters of objects that give less than this share of the photographed light are dropped, unless it is missed."""
     environment: Literal["auto", "on", "off"] = "auto"
-    """Light from outside the mesh: groups of 16 x 32 texels, or twelve directions where the mesh is open. `auto`: included when
+    """Light from outside the mesh: 42 directions, what is seen apart, or twelve where the mesh is open. `auto`: included when
     enough rays leave the mesh and what they meet is not black."""
     solver: Literal["direct", "sgd"] = "direct"
     """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison."""

@@ -10,13 +10,13 @@ from iif_core.camera.calibration.choice import calibration_facts
 from iif_core.camera.response import response, response_facts
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.candidates import emitter_candidates
-from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionSolution, solve_families
-from iif_core.light.emission.environment import Sky
+from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionPrior, EmissionSolution, solve_families
+from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
 from iif_core.light.emission.loss import reference_loss
 from iif_core.light.emission.pixels import EmissionPixels
-from iif_core.light.emission.problem import assemble, initial_radiance, white_surface
+from iif_core.light.emission.problem import assemble, expected_radiance, initial_radiance, white_surface
 from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN, PrunedEmission, prune_groups
 from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.sensor import Sensor
@@ -74,14 +74,14 @@ def run(job: Job) -> None:
             f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
         )
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
-    pruned, gain = _trial(photos, groups, cache, outside, certain)
+    pruned, gain = _trial(photos, groups, cache, outside, certain, threshold)
     lit = pruned.kept[: groups.size]
     candidates, left_out = groups.size + len(groups.dropped), groups.select(~lit)
     reasons = [reason for reason, keep in zip(pruned.reason, pruned.kept, strict=True) if not keep]
     groups = groups.select(lit)
     if left_out.size:
         cache = radiance_cache(photos, groups)[0]
-    solution, loss, found, gain = _solve(photos, gain, groups, cache, outside)
+    solution, loss, found, gain = _solve(photos, gain, groups, cache, outside, threshold)
     table = _table(groups, left_out, reasons, solution, outside)
     _write(job, groups, table, cache, outside)
     gains = {f"gain_{c}": gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
@@ -126,22 +126,30 @@ def run(job: Job) -> None:
 
 
 def _trial(
-    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float, threshold: float
 ) -> tuple[PrunedEmission, np.ndarray]:
     """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
-    pixels, base, rows = choose_rows(photos, groups, 2)
+    pixels, base, rows = choose_rows(photos, groups, threshold, 2)
     own = rows.group >= 0
     transport = _trace(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
     paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
     white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
-    seen, initial = _initial(photos, groups, rows, sky)
-    n_groups = len(initial)
+    seen, prior = _prior(photos, groups, rows, sky)
+    n_groups = len(prior.initial)
     problem = assemble(rows, transport, n_groups, white, sky)
-    trial, gains = problem.solve_object_gains(initial, _albedo_limit(photos, sky), photos.scene.n_objects)
-    area, protected = np.r_[groups.area, np.zeros(n_groups - groups.size)], np.arange(n_groups) >= groups.size
+    trial, gains = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects)
+    family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
-    return prune_groups(trial.rows, initial, area, evidence, ~trial.anchor, protected, share, certain), _reliable(gains)
+    return prune_groups(trial.rows, prior, family, evidence, ~trial.anchor, protected, share, certain), _reliable(gains)
+
+
+def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:
+    """(n_groups,) int: parts of one object shine alike, more or less; each group of the environment is alone."""
+    face = np.flatnonzero(groups.of_face >= 0)
+    family = -1 - np.arange(n_groups)
+    family[groups.of_face[face]] = photos.scene.object_id[face]
+    return family
 
 
 def _reliable(gains: ObjectGains) -> np.ndarray:
@@ -155,29 +163,32 @@ def _albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
     return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
 
 
-def _initial(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance seen on the groups; and the same followed by that of the environment's groups."""
+def _prior(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, EmissionPrior]:
+    """Radiance seen on the groups; and the prior of the groups, followed by those of the environment."""
     seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
-    return seen, seen if sky is None else np.concatenate([seen, sky.radiance])
+    initial = expected_radiance(rows, seen)
+    if sky is None:
+        return seen, EmissionPrior.independent(initial)
+    if sky.direction is None:
+        return seen, EmissionPrior.independent(np.concatenate([initial, sky.radiance]))
+    return seen, EmissionPrior.independent(initial).beside(sky_prior(sky))
 
 
 def _solve(
-    photos: Photographs, gain: np.ndarray, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None
+    photos: Photographs, gain: np.ndarray, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, threshold: float
 ) -> tuple[EmissionSolution, float, ObjectGains, np.ndarray]:
     """Solve for the groups that shine, which are black from here on, and for the environment.
 
     `gain` (n_objects, 3), from the trial, multiplies the albedo of surface that paths meet and no photograph shows. Returns the
     solution, its loss, the gains found with it, and those that other stages use.
     """
-    pixels, base, rows = choose_rows(photos, groups)
+    pixels, base, rows = choose_rows(photos, groups, threshold)
     transport = _trace(photos, pixels, base, groups, voxels, sky, 3, photos.scene.with_gains(gain).materials())
-    initial = _initial(photos, groups, rows, sky)[1]
+    prior = _prior(photos, groups, rows, sky)[1]
+    initial = prior.initial
     problem = assemble(rows, transport, len(initial), None, sky)
-    problem, found = problem.solve_object_gains(initial, _albedo_limit(photos, sky), photos.scene.n_objects)
-    # Parts of one object shine alike, more or less; groups of the environment are unrelated where cameras see them.
-    face = np.flatnonzero(groups.of_face >= 0)
-    family = -1 - np.arange(len(initial))
-    family[groups.of_face[face]] = photos.scene.object_id[face]
+    problem, found = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects)
+    family = _families(photos, groups, len(initial))
     width = np.full(len(initial), FAMILY_WIDTH)
     if sky is not None and sky.is_unseen:
         family[groups.size :], width[groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
@@ -188,7 +199,7 @@ def _solve(
         options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
-        solution = solve_families(problem.rows, initial, family, width=width)
+        solution = solve_families(problem.rows, prior, family, width)
     solution = solution.with_level_error(np.minimum(found.error_of_group, PRIOR_LEVEL_ERROR))
     gain = _reliable(found) if len(initial) else gain  # without emitters those of the trial stay
     return solution, reference_loss(problem.rows, solution.radiance), found, gain

@@ -1,12 +1,13 @@
 """Emission from photographs by non-negative least squares (docs/method/light.md#least-squares).
 
-Two independent traces of the transport remove the bias of its noise (Eq. L.18, L.19); directions whose reliability is lost in
-noise go to the prior (Eq. L.21).
+Two independent traces of the transport remove the bias of its noise (Eq. L.20, L.21); directions whose reliability is lost in
+noise go to the prior (Eq. L.23).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,6 +18,12 @@ TRUSTED_RELIABILITY = 1.5
 """Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
 _DAMPED_AFTER = 6  # rounds of re-weighting after which steps are halved (docs/method/numerics.md#answers-that-alternate)
 _CHUNK_BYTES = 1 << 24  # of float64 rows converted at a time
+SINGLE_WIDTH = 5.0
+"""Standard deviation of the radiance of a group around its initial value, relative to it."""
+FAMILY_WIDTH = 0.3
+"""Standard deviation of the groups of one object around their common radiance, relative to it."""
+OUTSIDE_WIDTH = 0.5
+"""The same for the directions that stand for the outside of a mesh with large openings."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,7 @@ class EmissionSolution:
 
     Attributes:
         radiance: (G, 3) float64 >= 0.
-        error: (G, 3) standard error (Eq. L.26 without the level).
+        error: (G, 3) standard error (Eq. L.28 without the level).
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
         condition: largest / smallest eigenvalue of the lifted normal matrix at unit diagonal, of the worst channel.
         residual: weighted root mean square of target - A E, relative to that of the target.
@@ -48,18 +55,58 @@ class EmissionSolution:
         return replace(self, error=np.hypot(self.error, level_error * self.radiance))
 
 
+@dataclass(frozen=True)
+class EmissionPrior:
+    """What is assumed of the radiance of every group before the rows are read.
+
+    Attributes:
+        initial: (G, 3) mean, >= 0.
+        width: (G,) standard deviation relative to the mean.
+        correlation: (G, G) positive definite; None = groups are independent.
+    """
+
+    initial: np.ndarray
+    width: np.ndarray
+    correlation: np.ndarray | None = None
+
+    @classmethod
+    def independent(cls, initial: np.ndarray, width: float = SINGLE_WIDTH) -> EmissionPrior:
+        """Prior of unrelated groups of the same relative width."""
+        return cls(initial, np.full(len(initial), width))
+
+    def beside(self, other: EmissionPrior) -> EmissionPrior:
+        """The prior of these groups followed by others that are independent of them."""
+        n, m = len(self.initial), len(other.initial)
+        related = np.eye(n + m)
+        if self.correlation is not None:
+            related[:n, :n] = self.correlation
+        if other.correlation is not None:
+            related[n:, n:] = other.correlation
+        return EmissionPrior(np.concatenate([self.initial, other.initial]), np.concatenate([self.width, other.width]), related)
+
+    def only(self, kept: np.ndarray) -> EmissionPrior:
+        """The prior of a subset of the groups, a mask (G,)."""
+        correlation = None if self.correlation is None else self.correlation[np.ix_(kept, kept)]
+        return EmissionPrior(self.initial[kept], self.width[kept], correlation)
+
+    def solve(self, rows: EmissionRows, max_rounds: int = 20) -> EmissionSolution:
+        """Solve with this prior, see `solve_emission`."""
+        return solve_emission(rows, self.initial, max_rounds=max_rounds, prior_width=self.width, correlation=self.correlation)
+
+
 def solve_emission(
     rows: EmissionRows,
     initial: np.ndarray,
     cross: bool = True,
     ridge: float = 1e-4,
     max_rounds: int = 20,
-    prior_width: float | np.ndarray = 5.0,
+    prior_width: float | np.ndarray = SINGLE_WIDTH,
     family: np.ndarray | None = None,
+    correlation: np.ndarray | None = None,
 ) -> EmissionSolution:
-    """Solve for the radiance of every emitter group: weighted non-negative least squares with one-sided rows (Eq. L.17).
+    """Solve for the radiance of every emitter group: weighted non-negative least squares with one-sided rows (Eq. L.19).
 
-    Saturated rows are as sharp as the noise of the rows (Eq. L.23). Their weights, the residual variance and the prior are
+    Saturated rows are as sharp as the noise of the rows (Eq. L.25). Their weights, the residual variance and the prior are
     updated until the answer comes to rest.
 
     Args:
@@ -71,6 +118,7 @@ def solve_emission(
         max_rounds: of the re-weighting.
         prior_width: number or (G,), standard deviation of E relative to E0; infinity switches the prior off.
         family: (G,) int, groups whose common initial value was itself found from the data; None = each for itself.
+        correlation: (G, G) of the prior, positive definite; None = none.
 
     Returns:
         The solution, always finite.
@@ -93,7 +141,7 @@ def solve_emission(
     matrices, targets = rows.matrices, rows.targets
     cluster = np.full(len(rows.observed), -1) if rows.cluster is None else rows.cluster
     for c in range(3):
-        prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge
+        prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
         data = *(a[:, :, c] for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
         channel = _ChannelRows(*data, cluster, rows.noise, *prior).solve(max_rounds, family)
         radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
@@ -107,31 +155,27 @@ def solve_emission(
     return EmissionSolution(radiance, error, shares.min(1), condition, residual, violated, iterations, converged)
 
 
-FAMILY_WIDTH = 0.3
-"""Standard deviation of the groups of one object around their common radiance, relative to it."""
-OUTSIDE_WIDTH = 0.5
-"""The same for the directions that stand for the outside of a mesh with large openings."""
-
-
 def solve_families(
-    rows: EmissionRows, initial: np.ndarray, family: np.ndarray, width: float | np.ndarray = FAMILY_WIDTH
+    rows: EmissionRows, prior: EmissionPrior, family: np.ndarray, width: float | np.ndarray = FAMILY_WIDTH
 ) -> EmissionSolution:
-    """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.27).
+    """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.29).
 
     The triangles of a window light the room almost alike, so only their sum is well known.
 
     Args:
-        rows, initial: as in `solve_emission`.
+        rows: the system.
+        prior: of the groups. Those of larger families must not be correlated with others.
         family: (G,) int, groups with the same number are parts of one object.
         width: number or (G,), relative standard deviation of groups around the radiance that they share.
 
     Returns:
         The solution of the second step.
     """
-    number, members = np.unique(family, return_inverse=True)
+    number, first, members = np.unique(family, return_index=True, return_inverse=True)
     size = np.bincount(members, minlength=len(number))
     if not len(family) or size.max() == 1:
-        return solve_emission(rows, initial)
+        return prior.solve(rows)
+    initial, correlation = prior.initial, prior.correlation
     joint = np.zeros((len(number), 3))
     np.add.at(joint, members, initial)
     joint /= size[:, None]
@@ -139,14 +183,15 @@ def solve_families(
     for group, member in enumerate(members):
         matrix[:, :, :, member] += rows.matrix[:, :, :, group]
     shared = replace(rows, matrix=matrix)
-    start = solve_emission(shared, joint).radiance[members]
+    of_first = None if correlation is None else correlation[np.ix_(first, first)]
+    start = EmissionPrior(joint, prior.width[first], of_first).solve(shared).radiance[members]
     together = size[members] > 1
     start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
-    return solve_emission(rows, start, prior_width=np.where(together, width, 5.0), family=family)
+    return solve_emission(rows, start, prior_width=np.where(together, width, prior.width), family=family, correlation=correlation)
 
 
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.21)."""
+    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.23)."""
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
@@ -162,7 +207,7 @@ def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, fl
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
 
-    One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.22, L.23). For sigma -> 0 rows below
+    One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.24, L.25). For sigma -> 0 rows below
     their bound count fully and the others not at all.
     """
     from scipy.special import log_ndtr
@@ -206,7 +251,7 @@ class _Channel:
 
 @dataclass(frozen=True)
 class _Normal:
-    """H, its noise part K, M and b of one channel (Eq. L.19, L.20), float64."""
+    """H, its noise part K, M and b of one channel (Eq. L.21, L.22), float64."""
 
     h: np.ndarray
     k: np.ndarray
@@ -249,7 +294,7 @@ class _ChannelRows:
     Attributes:
         first, second: (n, G) float32 views; target, target_second, weight: (n,); bound: (n,) bool.
         cluster: (n,) int; noise: (n,) or None.
-        initial, width: (G,) mean and standard deviation of the prior; cross, ridge: as in `solve_emission`.
+        initial, width: (G,) mean and standard deviation of the prior; cross, ridge, correlation: as in `solve_emission`.
     """
 
     first: np.ndarray
@@ -264,6 +309,7 @@ class _ChannelRows:
     width: np.ndarray
     cross: bool
     ridge: float
+    correlation: np.ndarray | None = None
 
     @property
     def mean_target(self) -> np.ndarray:
@@ -280,26 +326,40 @@ class _ChannelRows:
         return [slice(start, start + step) for start in range(0, len(self.target), step)]
 
     def normal(self, weight: np.ndarray, shift: np.ndarray) -> _Normal:
-        """Sums over the rows, targets shifted."""
+        """Sums over the rows; `weight` and `shift` (n,) of the targets differ from those of `sure` for bounds alone."""
+        own = np.flatnonzero(self.bound & (weight > 0))
+        bounds = self._sums(own, weight[own], shift[own])
+        return _Normal(*(a + b for a, b in zip(self._equalities, bounds, strict=True)))
+
+    @cached_property
+    def _equalities(self) -> tuple[np.ndarray, ...]:
+        """The sums over rows that are no bounds, which stay while bounds are re-weighted."""
+        own = np.flatnonzero(~self.bound & (self.weight > 0))
+        return self._sums(own, self.weight[own], np.zeros(len(own)))
+
+    def _sums(self, rows: np.ndarray, weight: np.ndarray, shift: np.ndarray) -> tuple[np.ndarray, ...]:
+        """H, K, M and b of some rows."""
         groups = self.first.shape[1]
         h, k, m, b = np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros((groups, groups)), np.zeros(groups)
-        for part in self.chunks():
-            w = weight[part, None]
+        step = max(1, _CHUNK_BYTES // (8 * max(groups, 1)))
+        for start in range(0, len(rows), step):
+            part = rows[start : start + step]
+            w, extra = weight[start : start + step], shift[start : start + step]
             a1, a2 = self.first[part].astype(np.float64), self.second[part].astype(np.float64)
             mean = 0.5 * (a1 + a2)
-            t1, t2 = (t[part] + shift[part] for t in (self.target, self.target_second))
-            m += mean.T @ (w * mean)
+            t1, t2 = self.target[part] + extra, self.target_second[part] + extra
+            m += mean.T @ (w[:, None] * mean)
             if self.cross:
-                b += 0.5 * (a1.T @ (w[:, 0] * t2) + a2.T @ (w[:, 0] * t1))
-                product = a1.T @ (w * a2)
+                b += 0.5 * (a1.T @ (w * t2) + a2.T @ (w * t1))
+                product = a1.T @ (w[:, None] * a2)
                 h += 0.5 * (product + product.T)
                 k += 0.5 * (product - product.T)
             else:
-                b += mean.T @ (w[:, 0] * 0.5 * (t1 + t2))
-        return _Normal(h if self.cross else m, k, m, b)
+                b += mean.T @ (w * 0.5 * (t1 + t2))
+        return h if self.cross else m, k, m, b
 
     def scores(self, answer: np.ndarray) -> np.ndarray:
-        """S of Eq. L.24, over clusters of rows that are no bounds: (G, G)."""
+        """S of Eq. L.26, over clusters of rows that are no bounds: (G, G)."""
         parts, weight = [], self.sure
         for part in self.chunks():
             w = weight[part, None]
@@ -328,7 +388,10 @@ class _ChannelRows:
         unit, pick = np.outer(scale, scale), np.ix_(known, known)
         scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
         matrix, lifted, condition = _definite(scaled, self.ridge)
-        prior = np.diag(variance[known] / (self.width[known] * scale) ** 2)
+        each = np.sqrt(variance[known]) / (self.width[known] * scale)
+        prior = np.diag(each**2)
+        if self.correlation is not None:
+            prior = each[:, None] * np.linalg.inv(self.correlation[pick]) * each
         return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
 
     def solve(self, max_rounds: int, family: np.ndarray | None) -> _Channel:
@@ -348,7 +411,7 @@ class _ChannelRows:
             share, shift = _censored(target - mean_a @ before, bound, self.noise, noise)
             system = self.system(weight * share, shift, variance)
             if system is not None:
-                answer, condition = system.solve(self.initial), system.condition
+                answer, condition = self._completed(system.solve(self.initial), system.known), system.condition
             if rounds > _DAMPED_AFTER:  # two answers may alternate: take the one between them
                 answer = 0.5 * (before + answer)
             difference = target - mean_a @ answer
@@ -375,8 +438,18 @@ class _ChannelRows:
             float((np.where(bound, counted, weight) * target**2).sum()),
         )
 
+    def _completed(self, answer: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Groups to which no row responds take what the prior expects of them, given the others (kriging)."""
+        if self.correlation is None or known.all() or not np.isfinite(self.width).all():
+            return answer
+        away = (answer - self.initial)[known] / np.maximum(self.width[known], 1e-300)
+        expected = self.correlation[np.ix_(~known, known)] @ np.linalg.solve(self.correlation[np.ix_(known, known)], away)
+        out = answer.copy()
+        out[~known] = np.maximum(self.initial[~known] + self.width[~known] * expected, 0.0)
+        return out
+
     def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.25)."""
+        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.27)."""
         effect = np.ones(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is not None:
@@ -391,7 +464,7 @@ class _ChannelRows:
         return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
 
     def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """(standard error of Eq. L.26 without the level, share of the answer that comes from data), both (G,)."""
+        """(standard error of Eq. L.28 without the level, share of the answer that comes from data), both (G,)."""
         error, share = self.initial.copy(), np.zeros(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is None:
@@ -407,5 +480,6 @@ class _ChannelRows:
             prior_part = prior_part - np.where(size > 1, mean, 0.0) @ member.T
         data_part = np.clip(np.diag(inverse @ self._score_covariance(system, answer) @ inverse), 0, None)
         share[known] = 1.0 - np.clip(np.diag(response), 0.0, 1.0)
-        error[known] = np.sqrt(data_part + (prior_part**2).sum(1)) / scale
+        related = prior_part if self.correlation is None else prior_part @ self.correlation[np.ix_(known, known)]
+        error[known] = np.sqrt(data_part + np.clip((prior_part * related).sum(1), 0, None)) / scale
         return error, share

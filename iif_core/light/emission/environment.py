@@ -7,13 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.light.environment import direction_in, texel_of
+from iif_core.light.emission.direct import EmissionPrior
+from iif_core.light.environment import direction_in, solid_angles, texel_of
 from iif_core.numerics.xp import NUMPY
 
 HEIGHT, WIDTH = 16, 32  # texels of the map
-MAX_GROUPS = 12
 MIN_PIXELS = 50
 """Escaping camera pixels from which a texel is known by itself."""
+REACH = 0.7
+"""Angle in radians over which the light from outside is correlated (Eq. L.8)."""
+OUTSIDE_SPREAD = 1.0
+"""Standard deviation of the light from outside over all directions, relative to the mean of what cameras see of it."""
+SUN_WIDTH = 30.0
+"""The same of what is saturated outside, relative to the bound."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +29,14 @@ class Sky:
     Attributes:
         columns: (H, W) int32 group of every texel.
         pixels: (E,) camera pixels that see each group; radiance: (E, 3) their mean; bounded: (E,) most are saturated.
+        direction: (E, 3) unit vector to the middle of each group; None = unrelated groups.
     """
 
     columns: np.ndarray
     pixels: np.ndarray
     radiance: np.ndarray
     bounded: np.ndarray
+    direction: np.ndarray | None = None
 
     @property
     def size(self) -> int:
@@ -62,35 +70,31 @@ class SkySums:
         """Return the mean radiance (3,) of all escaping pixels, 0 without any."""
         return self._sums[:, :3].sum(0) / max(self.pixels, 1)
 
-    def groups(self, max_ratio: float = 1.5, max_groups: int = MAX_GROUPS, min_pixels: int = MIN_PIXELS) -> Sky:
-        """Group texels that share an unknown radiance: those of similar brightness, saturated ones apart from the others; all
-        texels that too few pixels have seen are the last group, since nothing tells them apart.
+    def groups(self, min_pixels: int = MIN_PIXELS) -> Sky:
+        """Divide the sphere into 42 directions, and each into what cameras see unsaturated, what they see saturated, and what
+        they do not see (docs/method/light.md#groups-of-texels).
 
-        max_ratio: brightest to darkest texel of a group, doubled in log until `max_groups` suffice; min_pixels: of a texel that
-        counts as seen.
+        min_pixels: of a texel that counts as seen.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
-        mean = self._sums[:, :3] / np.maximum(count, 1)[:, None]
+        towards, solid = _middles(*self.shape), solid_angles(*self.shape).ravel()
         seen, hidden = count >= min_pixels, 2 * saturated > count
-        level = np.log(np.maximum(mean.sum(1), 1e-12))
-        number, step = np.zeros(len(count), np.int64), np.log(max_ratio)
-        while True:
-            number[:] = -1
-            for part in (seen & ~hidden, seen & hidden):
-                if part.any():
-                    steps = np.floor((level[part] - level[part].min()) / step).astype(np.int64)
-                    number[part] = number.max() + 1 + np.unique(steps, return_inverse=True)[1]
-            if number.max() + 1 < max_groups:
-                break
-            step *= 2
-        unseen = number < 0
-        number[unseen] = number.max() + 1
+        part = np.where(seen, np.where(hidden, 1, 0), 2)
+        number = np.unique(3 * (towards @ _bins().T).argmax(1) + part, return_inverse=True)[1]
         size = int(number.max()) + 1
-        pixels = np.bincount(number, count, size)
-        radiance = np.stack([np.bincount(number, self._sums[:, c], size) for c in range(3)], 1) / np.maximum(pixels, 1)[:, None]
-        radiance[pixels == 0] = self.mean()
-        bounded = 2 * np.bincount(number, saturated, size) > pixels
-        return Sky(number.reshape(self.shape).astype(np.int32), pixels.astype(np.int64), radiance, bounded)
+        known = np.where(seen, count, 0.0)
+        pixels = np.bincount(number, known, size)
+        # A texel counts by its solid angle, however many pixels look at it.
+        weight = np.where(seen, solid, 0.0)
+        mean = self._sums[:, :3] / np.maximum(count, 1)[:, None]
+        radiance = np.stack([np.bincount(number, weight * mean[:, c], size) for c in range(3)], 1)
+        total = np.bincount(number, weight, size)
+        average = (weight[:, None] * mean).sum(0) / weight.sum() if weight.any() else self.mean()
+        radiance = np.where(total[:, None] > 0, radiance / np.maximum(total, 1e-30)[:, None], average)
+        direction = np.stack([np.bincount(number, solid * towards[:, c], size) for c in range(3)], 1)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        bounded = np.bincount(number, part == 1, size) > 0
+        return Sky(number.reshape(self.shape).astype(np.int32), pixels.astype(np.int64), radiance, bounded, direction)
 
     def directions(self) -> Sky:
         """Divide the outside of a mesh with large openings into twelve directions, all unknown
@@ -98,12 +102,46 @@ class SkySums:
 
         A texel belongs to the nearest of the twelve vertices of an icosahedron; all start at the mean of what was seen.
         """
-        golden = (1 + 5**0.5) / 2
-        corners = [np.roll([0.0, a, b * golden], i) for i in range(3) for a in (-1, 1) for b in (-1, 1)]
-        towards = np.stack(direction_in(NUMPY, *np.indices(self.shape), 0.5, 0.5, *self.shape), -1)
-        number = (towards @ np.array(corners).T).argmax(-1)
-        size = len(corners)
+        number = (_middles(*self.shape) @ _icosahedron().T).argmax(1).reshape(self.shape)
+        size = 12
         return Sky(number.astype(np.int32), np.zeros(size, np.int64), np.tile(self.mean(), (size, 1)), np.zeros(size, bool))
+
+
+def sky_prior(sky: Sky) -> EmissionPrior:
+    """Return the prior of groups with directions: a field around the mean of what cameras see; what is saturated is apart."""
+    clear = (sky.pixels > 0) & ~sky.bounded
+    share = np.where(clear, 1.0, 0.0) if clear.any() else np.ones(sky.size)
+    mean = (share[:, None] * sky.radiance).sum(0) / share.sum()
+    initial = np.where(sky.bounded[:, None], sky.radiance, mean)
+    related = correlation(sky.direction)
+    related[sky.bounded], related[:, sky.bounded] = 0.0, 0.0
+    np.fill_diagonal(related, 1.0)
+    return EmissionPrior(initial, np.where(sky.bounded, SUN_WIDTH, OUTSIDE_SPREAD), related)
+
+
+def correlation(direction: np.ndarray, reach: float = REACH) -> np.ndarray:
+    """Return exp(-angle / reach) between unit vectors (n, 3) (Eq. L.8), positive definite on the sphere: (n, n)."""
+    return np.exp(-np.arccos(np.clip(direction @ direction.T, -1.0, 1.0)) / reach)
+
+
+def _middles(height: int, width: int) -> np.ndarray:
+    """Unit vectors (H W, 3) to the middles of all texels."""
+    return np.stack(direction_in(NUMPY, *np.indices((height, width)), 0.5, 0.5, height, width), -1).reshape(-1, 3)
+
+
+def _icosahedron() -> np.ndarray:
+    golden = (1 + 5**0.5) / 2
+    corners = np.array([np.roll([0.0, a, b * golden], i) for i in range(3) for a in (-1, 1) for b in (-1, 1)])
+    return corners / np.linalg.norm(corners, axis=1, keepdims=True)
+
+
+def _bins() -> np.ndarray:
+    """Unit vectors (42, 3): the corners of an icosahedron and the middles of its edges."""
+    corners = _icosahedron()
+    first, second = np.triu_indices(len(corners), 1)
+    near = (corners[first] * corners[second]).sum(1) > 0.4  # neighbours enclose 63 degrees, others 117 or 180
+    edges = corners[first[near]] + corners[second[near]]
+    return np.concatenate([corners, edges / np.linalg.norm(edges, axis=1, keepdims=True)])
 
 
 def texels(directions: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 TILE_PIXELS = 8
 """Pixels of one object in one tile of this edge are averaged into one row."""
+FULL_COVERAGE = 0.95
+"""Share of a pixel from which an emitter counts as filling it."""
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels of each group enter the solve."""
 
@@ -20,6 +22,9 @@ class EmissionPixels:
         radiance: (n, 3) linear; bound: (n, 3) bool, `radiance` is a lower bound.
         object_id, view, tile: (n,) int; pixels that agree in all three are averaged.
         group: (n,) emitter group that the pixel looks at, -1 = none.
+        coverage: (n, G) share of each pixel in which it sees each group; None = every pixel sees the group of its middle, or
+            none. A pane behind blinds fills its pixels only in part.
+        rest: largest radiance of what shares a pixel with an emitter and is none itself.
     """
 
     radiance: np.ndarray
@@ -28,6 +33,36 @@ class EmissionPixels:
     view: np.ndarray
     tile: np.ndarray
     group: np.ndarray
+    coverage: np.ndarray | None = None
+    rest: float = 0.0
+
+    def direct(self, groups: int) -> np.ndarray:
+        """(n, groups) share of each pixel that looks at an emitter in which it sees each group; 0 for the others."""
+        own = np.flatnonzero(self.group >= 0)
+        out = np.zeros((len(self.group), groups), np.float32)
+        if self.coverage is None:
+            out[own, self.group[own]] = 1.0
+        else:
+            out[own, : self.coverage.shape[1]] = self.coverage[own]
+        return out
+
+    @property
+    def own_share(self) -> np.ndarray:
+        """(n,) share of each pixel in which it sees the group of its middle; 1 for pixels that look at none."""
+        if self.coverage is None or not self.coverage.shape[1]:
+            return np.ones(len(self.group))
+        own = np.take_along_axis(self.coverage, np.maximum(self.group, 0)[:, None], 1)[:, 0]
+        return np.where(self.group >= 0, own, 1.0)
+
+    @property
+    def partial(self) -> np.ndarray:
+        """(n,) bool: the pixel looks at a group that fills less than `FULL_COVERAGE` of it."""
+        return self.own_share < FULL_COVERAGE
+
+    def take(self, keep: np.ndarray) -> EmissionPixels:
+        """Return some of the pixels."""
+        rows = {name: value[keep] for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
+        return replace(self, **rows)
 
 
 def choose_pixels(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.gains import ObjectGains, estimate_object_gains
 from iif_core.light.emission.pixels import EmissionPixels
@@ -14,7 +15,7 @@ from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
 
 ANCHOR_WEIGHT = 100.0
-"""Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.14)."""
+"""Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.16)."""
 
 
 @dataclass(frozen=True)
@@ -38,18 +39,18 @@ class EmissionProblem:
         return bool((self.rows.cached > 0).any()) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
 
     def solve_object_gains(
-        self, initial: np.ndarray, albedo: np.ndarray | None = None, n_objects: int = 0
+        self, prior: EmissionPrior, albedo: np.ndarray | None = None, n_objects: int = 0
     ) -> tuple[EmissionProblem, ObjectGains]:
         """Estimate the albedo gains of objects together with the light (up to 15 solves; docs/method/light.md#object-gains).
 
-        `initial` is the (G, 3) radiance to start from; no gain brings the mean base albedo (n_objects, 3), if given, above 1.
+        `prior` is that of the groups; no gain brings the mean base albedo (n_objects, 3), if given, above 1.
         Returns the problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and
         the gains.
         """
         identifiable = self.scale_is_identifiable
         # Without a scale the two lobes would fix one by how much they differ, for which predicted gloss is not good enough.
         rows = self.rows if identifiable else self.rows.without_lobes()
-        found = estimate_object_gains(rows, self.owner, initial, identifiable, albedo, n_objects)
+        found = estimate_object_gains(rows, self.owner, prior, identifiable, albedo, n_objects)
         of_row, gloss_of_row = np.ones(rows.observed.shape), np.ones(len(rows.observed))
         known = self.owner >= 0
         of_row[known], gloss_of_row[known] = found.gain[self.owner[known]], found.gloss_gain[self.owner[known]]
@@ -63,10 +64,10 @@ def assemble(
     white: TracedTransport | None = None,
     sky: Sky | None = None,
 ) -> EmissionProblem:
-    """Average pixels over (view, tile, object) with their weights (Eq. L.13), and add rows for the sky.
+    """Average pixels over (view, tile, object) with their weights (Eq. L.14), and add rows for the sky.
 
     A pixel on an emitter shows its emission alone (kept emitters are black): an anchor that outweighs the other rows. With
-    `white`, while it is still open which groups emit, it may as well reflect, up to a white surface (Eq. L.15):
+    `white`, while it is still open which groups emit, it may as well reflect, up to a white surface (Eq. L.17):
     y - (A_w E + h_w) <= E_g <= y, the upper end only where y is not saturated.
 
     Args:
@@ -80,23 +81,26 @@ def assemble(
         The problem, rows of the sky last.
     """
     own = pixels.group >= 0
-    direct = np.zeros((len(own), n_groups, 3), np.float32)
-    direct[np.flatnonzero(own), pixels.group[own]] = 1.0
+    direct = np.repeat(pixels.direct(n_groups)[:, :, None], 3, 2)
     matrix, cached = np.array(transport.matrix), np.array(transport.cached, np.float64)
     matrix[:, :, own], cached[:, :, own] = 0.0, 0.0
+    observed = np.array(pixels.radiance, np.float64)
     if white is not None:
         matrix[:, :1, own], cached[:, :1, own] = white.matrix, white.cached
     matrix[:, 0] += direct
-    bound = pixels.bound if white is None else pixels.bound | own[:, None]
-    observed = np.array(pixels.radiance, np.float64)
+    bounded = pixels.partial if white is None else own
+    bound = pixels.bound | bounded[:, None]
+    clear = bounded & ~pixels.bound.any(1)
+    top = -observed[clear]
+    if white is None:  # what shares a pixel with an emitter is dimmer than `rest`
+        observed -= np.where(pixels.partial, pixels.rest * (1.0 - direct[:, :, 0].sum(1)), 0.0)[:, None]
     key = np.stack([np.where(own, -1, pixels.object_id), pixels.group, pixels.view, pixels.tile], 1)
-    if white is not None:  # the upper ends, as bounds of the negated rows
-        clear = own & ~pixels.bound.any(1)
+    if clear.any():  # the upper ends, as bounds of the negated rows
         upper = np.zeros((*matrix.shape[:2], int(clear.sum()), n_groups, 3), matrix.dtype)
         upper[:, 0] = -direct[clear]
         none = np.zeros((*upper.shape[:3], 3), upper.dtype)
         matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, none], 2)
-        observed, bound = np.r_[observed, -observed[clear]], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
+        observed, bound = np.r_[observed, top], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
     problem = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
     if sky is not None and sky.pixels.any():
@@ -143,7 +147,7 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
 
 
 def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
-    """Anchors outweigh the other rows of their column by ANCHOR_WEIGHT (Eq. L.14)."""
+    """Anchors outweigh the other rows of their column by ANCHOR_WEIGHT (Eq. L.16)."""
     if not anchor.any():
         return rows
     first, second = rows.matrices
@@ -179,6 +183,14 @@ def initial_radiance(pixels: EmissionPixels, observed: np.ndarray, is_hdr: bool)
     return out
 
 
+def expected_radiance(pixels: EmissionPixels, seen: np.ndarray) -> np.ndarray:
+    """Return (G, 3) what groups radiate that show `seen` (G, 3): the middle between that and seen / share of their pixels."""
+    own = pixels.group >= 0
+    count = np.bincount(pixels.group[own], minlength=len(seen))
+    share = np.bincount(pixels.group[own], pixels.own_share[own], len(seen)) / np.maximum(count, 1)
+    return seen / np.sqrt(np.where(count > 0, share, 1.0))[:, None]
+
+
 def white_surface(pixels: EmissionPixels, seen: np.ndarray, white: TracedTransport) -> WhiteSurface:
     """Average over the pixels of each group what they would show if they were white.
 
@@ -190,4 +202,7 @@ def white_surface(pixels: EmissionPixels, seen: np.ndarray, white: TracedTranspo
     matrix, cached = np.zeros((n_groups, n_groups, 3)), np.zeros((n_groups, 3))
     np.add.at(matrix, group, 0.5 * (white.matrix[0, 0] + white.matrix[1, 0]))
     np.add.at(cached, group, 0.5 * (white.cached[0, 0] + white.cached[1, 0]))
-    return WhiteSurface(np.where((count > 0)[:, None], seen, 0.0), matrix / count[:, None, None], cached / count[:, None])
+    covered = np.zeros((n_groups, n_groups))
+    np.add.at(covered, group, pixels.direct(n_groups)[pixels.group >= 0])
+    seen = np.where((count > 0)[:, None], seen, 0.0)
+    return WhiteSurface(seen, matrix / count[:, None, None], cached / count[:, None], covered / count[:, None])

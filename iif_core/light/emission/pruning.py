@@ -1,4 +1,4 @@
-"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect, Eq. L.28).
+"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect, Eq. L.30).
 
 A dropped group continues to light the scene with the radiance that was seen on it, which the radiance cache will hold.
 """
@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.light.emission.direct import EmissionSolution, solve_emission
+from iif_core.light.emission.direct import EmissionPrior, EmissionSolution
 from iif_core.light.emission.rows import EmissionRows
 
 CERTAIN_EXCESS = 2.0
@@ -32,18 +32,28 @@ class WhiteSurface:
         seen: (G, 3) radiance seen on each group, 0 = not seen.
         matrix: (G, G, 3) mean of A over the pixels of each group (first axis) if they were white.
         cached: (G, 3) the same of h.
+        coverage: (G, G) mean share of the pixels of each group (first axis) in which they see each group; None = themselves.
     """
 
     seen: np.ndarray
     matrix: np.ndarray
     cached: np.ndarray
+    coverage: np.ndarray | None = None
+
+    def shown(self, radiance: np.ndarray) -> np.ndarray:
+        """Return (G, 3) what each group itself shows: without the light of others that share its pixels."""
+        if self.coverage is None:
+            return self.seen
+        own = np.diag(self.coverage)
+        beside = (self.coverage - np.diag(own)) @ radiance
+        return np.where(own[:, None] > 0, np.maximum(self.seen - beside, 0.0) / np.maximum(own, 1e-9)[:, None], self.seen)
 
     def excess(self, radiance: np.ndarray) -> np.ndarray:
-        """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.28); infinite
+        """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.30); infinite
         without light, 0 where the group was not seen."""
         others = self.matrix * (1.0 - np.eye(len(self.seen)))[:, :, None]
         white = (np.einsum("ghc,hc->gc", others, radiance) + self.cached).sum(1)
-        seen = self.seen.sum(1)
+        seen = self.shown(radiance).sum(1)
         return np.where(seen > 0, np.divide(seen, white, out=np.full(len(seen), np.inf), where=white > 0), 0.0)
 
 
@@ -60,8 +70,8 @@ class PrunedEmission:
 
 def prune_groups(
     rows: EmissionRows,
-    initial: np.ndarray,
-    area: np.ndarray,
+    prior: EmissionPrior,
+    family: np.ndarray,
     white: WhiteSurface,
     elsewhere: np.ndarray,
     protected: np.ndarray,
@@ -71,28 +81,28 @@ def prune_groups(
     """Solve, then drop groups that do not shine, the least credible first, and solve again.
 
     A group is dropped when no emission is left for it; and, unless the residual elsewhere grows by more than
-    `MAX_RESIDUAL_GROWTH` without it (Eq. L.29), when it is not brighter than `certain` white surfaces or has less than `share` of
-    the total power area x sum E.
+    `MAX_RESIDUAL_GROWTH` without it (Eq. L.31), when it is not brighter than `certain` white surfaces, or when its family gives
+    less than `share` of the light that the other rows show.
 
     Args:
-        rows, initial: as in `solve_emission`.
-        area: (G,) m^2.
+        rows: the system; prior: of the groups.
+        family: (G,) int, groups of one object; a curtain is one lamp however many folds it has.
         white: what the groups show, and what a white surface would show.
         elsewhere: (n,) bool, rows that are not a group's own pixels: what its light does, not what it looks like.
         protected: (G,) bool, never dropped (environment).
-        share: of the total power.
+        share: of the light on the rows `elsewhere`.
         certain: brightness relative to a white surface from which a group shines for certain.
 
     Returns:
         The solution with the groups that remain.
     """
+    members = np.unique(family, return_inverse=True)[1]
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
-    solution = solve_emission(rows, initial, max_rounds=_TRIAL_ROUNDS)
+    solution = prior.solve(rows, _TRIAL_ROUNDS)
     while True:
         emission = solution.radiance.sum(1)
-        power = area * emission * ~protected
-        power = power / max(power.sum(), 1e-300)
+        power = np.bincount(members, _light_shares(rows, solution.radiance, elsewhere))[members]
         shown = np.where(kept[:, None], solution.radiance, white.seen)
         excess = np.where(kept, white.excess(shown), excess)
         dark = kept & ~protected & (emission <= 0)
@@ -108,7 +118,7 @@ def prune_groups(
             break
         if singly and not dark.any():
             drop &= power <= power[drop].min()
-        trial = _solve_subset(rows, initial, kept & ~drop, white.seen)
+        trial = _solve_subset(rows, prior, kept & ~drop, white.seen)
         before = _misfit(rows, shown, elsewhere)
         after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
         if not dark.any() and after > before * (1 + MAX_RESIDUAL_GROWTH) + 1e-12:
@@ -129,7 +139,14 @@ def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
         return "no emission is left for it"
     if reflecting:
         return f"reflects: a white surface in its place would have {1 / max(excess, 1e-9):.0%} of its brightness"
-    return f"{power:.2%} of the power, and not missed"
+    return f"{power:.2%} of the light, and not missed"
+
+
+def _light_shares(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """(G,) share of each group in the light that some rows show: weighted means of A_g E_g and y over their product with y."""
+    weight = np.where(rows.lower_bound[mask], 0.0, rows.weight[mask]) * rows.observed[mask]
+    given = np.einsum("nc,ngc->gc", weight, rows.matrices[:, mask].mean(0)) * radiance
+    return given.sum(1) / max(float((weight * rows.observed[mask]).sum()), 1e-300)
 
 
 def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float:
@@ -140,11 +157,11 @@ def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float
     return float(np.sqrt((counted * difference**2).sum()))
 
 
-def _solve_subset(rows: EmissionRows, initial: np.ndarray, kept: np.ndarray, shown: np.ndarray) -> EmissionSolution:
+def _solve_subset(rows: EmissionRows, prior: EmissionPrior, kept: np.ndarray, shown: np.ndarray) -> EmissionSolution:
     """Solution over all groups, 0 outside `kept`; the others light the scene with what they show, as the cache will."""
-    part = solve_emission(_without(rows, kept, shown), initial[kept], max_rounds=_TRIAL_ROUNDS)
-    radiance, error = np.zeros(initial.shape), np.zeros(initial.shape)
-    determined = np.zeros(len(initial))
+    part = prior.only(kept).solve(_without(rows, kept, shown), _TRIAL_ROUNDS)
+    radiance, error = np.zeros(prior.initial.shape), np.zeros(prior.initial.shape)
+    determined = np.zeros(len(prior.initial))
     radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
     return replace(part, radiance=radiance, error=error, determined=determined)
 
