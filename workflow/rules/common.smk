@@ -59,6 +59,20 @@ if set(config) - {"quality"}:
     )
 
 
+def image(wildcards):
+    """The image that jobs run in; none without `--sdm apptainer`, because Snakemake refuses an image with a space in its path
+    even where it does not read it."""
+    if "apptainer" not in map(str, workflow.deployment_settings.deployment_method):
+        return None
+    path = f"{workflow.basedir}/envs/iif.sif"
+    if " " in path:
+        stop(
+            f"{path}: Snakemake does not read an image with a space in its path. Move the checkout to a folder without spaces,"
+            " or leave out `--sdm apptainer`."
+        )
+    return path
+
+
 wildcard_constraints:
     scene=SCENE_NAME,
     study=rf"(?!(?:{KERNEL_BENCHMARKS})\.){study_files.STUDY}",
