@@ -7,8 +7,10 @@ import os
 import shutil
 import subprocess
 import sys
+from email import message_from_string
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from workflow.runtime import doctor, native
 
@@ -115,6 +117,16 @@ def test_no_network(copy, stand_in, clean_environment):
         assert "the package index cannot be reached" in last_line(result.stderr)
         assert not (copy / ".venv" / ".setup").exists()
     assert "incomplete" in result.stderr
+
+
+def test_the_site_installs_on_every_python_that_is_allowed(repository):
+    """What is pinned for `make docs` must not ask for a later release of Python 3.11 than Debian has."""
+    found = list(repository.glob(".venv-docs/lib/python*/site-packages/*.dist-info/METADATA"))
+    if not found:
+        pytest.skip("no environment for the site; `make docs` makes it")
+    needed = {path.parent.name: message_from_string(path.read_text())["Requires-Python"] for path in found}
+    late = {name: asked for name, asked in needed.items() if not SpecifierSet(asked or "").contains("3.11.0")}
+    assert not late
 
 
 def test_doctor_passes_here(repository, clean_environment):
