@@ -46,5 +46,9 @@ rule verify:
         "python3 -m workflow verify 2>&1 | tee {log:q}"
 
 
+# Last, because it stands for whatever no rule above makes.
+include: "workflow/rules/unknown.smk"
+
+
 onerror:
     tell_reasons()

@@ -77,3 +77,32 @@ def test_the_image_is_named_where_it_is_asked_for(fresh):
         assert asked.returncode == 0, asked.stderr
     else:
         assert "apptainer or singularity command has to be available" in asked.stdout + asked.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments, found, meant",
+    [
+        (["scenes/tiny/report"], "scenes/tiny/report", "scenes/tiny"),
+        (["scenes/../tiny"], "tiny", "scenes/tiny"),
+        (["scenes/a/tinny"], "scenes/a/tinny", "scenes/tiny"),
+        (["results/tiny/bse/manifest.json"], "results/tiny/bse/manifest.json", "results/tiny/base/manifest.json"),
+        (["scenes/tiny", "--forcerun", "bse"], "bse", "base"),
+    ],
+)
+def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant):
+    result = fresh.run("-n", *arguments)
+    last = result.stderr.strip().splitlines()[-1]
+    assert result.returncode == 1 and "Exception" not in result.stderr
+    assert last.startswith(f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name> and ")
+
+
+@pytest.mark.parametrize("target", ["scenes/tiny", "relight/tiny"])
+def test_a_file_in_the_place_of_a_scene_is_one_error(fresh, target):
+    path = fresh.folder / target
+    path.parent.mkdir()
+    path.write_text("")
+    result = fresh.run(target, "-n")
+    path.unlink()
+    path.parent.rmdir()
+    assert result.returncode == 1
+    assert result.stderr.strip().splitlines()[-1] == f"error: {target}: a file, where the workflow makes a folder. Move it away."
