@@ -212,8 +212,19 @@ class TestMake:
     def test_a_scene_that_exists_is_still_given_to_snakemake(self, tmp_path, repository, clean_environment):
         shutil.copy(repository / "Makefile", tmp_path)
         (tmp_path / "scenes" / "kitchen").mkdir(parents=True)
-        for target in ("scenes/kitchen", "scenes"):
+        (tmp_path / "relight" / "kitchen").mkdir(parents=True)
+        (tmp_path / "results" / "kitchen" / "capture").mkdir(parents=True)
+        (tmp_path / "results/kitchen/capture/manifest.json").touch()
+        for target in ("scenes/kitchen", "scenes", "relight/kitchen", "results/kitchen/capture/manifest.json"):
             assert any(f"snakemake --cores all {target}" in line for line in self.commands(tmp_path, clean_environment, target))
+
+    @pytest.mark.parametrize("folder", ["relight", "results", "config", "workflow"])
+    def test_a_folder_that_is_no_target_is_refused(self, tmp_path, repository, clean_environment, folder):
+        shutil.copy(repository / "Makefile", tmp_path)
+        (tmp_path / folder).mkdir()
+        result = run(["make", folder], tmp_path, clean_environment)
+        assert result.returncode == 2 and "Nothing to be done" not in result.stdout + result.stderr
+        assert result.stderr.startswith(f"{folder}: ") and "not a target" in result.stderr
 
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")
