@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from PIL import Image
 
@@ -235,6 +236,14 @@ def _(root):
     return planned(root)
 
 
+@case("the same photograph twice")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][2]["file_path"] = "images/000.png"
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
 @case("images of different sizes")
 def _(root):
     own.bare(root / "data/own")
@@ -295,6 +304,20 @@ def _(root):
 def _(root):
     own.bare(root / "data/own")
     (root / "data/own/mesh.ply").unlink()
+    return planned(root)
+
+
+@case("mesh empty")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.ply").write_bytes(b"")
+    return planned(root)
+
+
+@case("mesh is no PLY")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.ply").write_text("version https://git-lfs.github.com/spec/v1\n")
     return planned(root)
 
 
@@ -377,6 +400,24 @@ def _(root):
 def _(root):
     own.bare(root / "data/own")
     own.save_mesh(root / "data/own/mesh.ply", own.room_mesh()[0], np.zeros((0, 3), int))
+    return captured(root)
+
+
+@case("mesh cut short, as text")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/mesh.ply"
+    path.write_bytes(path.read_bytes()[:-30])
+    return captured(root)
+
+
+@case("mesh cut short, binary")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/mesh.ply"
+    vertices, faces, _ = own.room_mesh()
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    path.write_bytes(path.read_bytes()[:-30])
     return captured(root)
 
 
