@@ -459,6 +459,37 @@ def _(root):
     return captured(root, source={"axes": "opencv"})
 
 
+def filled(root, value, which):
+    """A bare scene of which some photographs have one value everywhere."""
+    document = own.bare(root / "data/own")
+    for i in which:
+        own.save_png(root / "data/own" / document["frames"][i]["file_path"], np.full((48, 64, 3), value))
+
+
+@case("all photographs black")
+def _(root):
+    filled(root, 0.0, range(3))
+    return captured(root)
+
+
+@case("all photographs white")
+def _(root):
+    filled(root, 1.0, range(3))
+    return captured(root)
+
+
+@case("one photograph black")
+def _(root):
+    filled(root, 0.0, [1])
+    return noted(root, "black all over")
+
+
+@case("one photograph white")
+def _(root):
+    filled(root, 1.0, [1])
+    return noted(root, "white all over")
+
+
 @case("camera axes wrong (depth images exist)")
 def _(root):
     own.photographed(root / "data/own")
