@@ -11,10 +11,12 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always
+.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always relight results \
+  config envs iif_core profiles tests workflow
 
 help:
 	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
+	@echo 'make relight/<name>   the scene under other light and from other cameras, as its file says'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make verify           re-hash every artefact against its manifest'
@@ -33,6 +35,19 @@ setup:
 # The folders exist once made, and Snakemake alone knows whether they are up to date: `always` asks it every time.
 scenes/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+relight/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+results/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+# Folders of the checkout, which make would take for targets that are up to date.
+relight results:
+	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter relight,$@),kitchen,kitchen/capture/manifest.json)' >&2; exit 1
+
+config envs iif_core profiles tests workflow:
+	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1
 
 scenes verify: setup
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)

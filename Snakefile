@@ -14,12 +14,14 @@ configfile: f"{workflow.basedir}/config/config.yaml"
 report: "workflow/report/captions/workflow.rst"
 
 
+include: "workflow/rules/common.smk"
+
+
 # Read with `--sdm apptainer` alone: the image of envs/Dockerfile, converted by
 # `apptainer build envs/iif.sif docker-daemon://iif:latest`.
-container: f"{workflow.basedir}/envs/iif.sif"
+container: image
 
 
-include: "workflow/rules/common.smk"
 include: "workflow/rules/stages.smk"
 include: "workflow/rules/deliver.smk"
 include: "workflow/rules/studies.smk"
@@ -42,6 +44,10 @@ rule verify:
         "hashing every artefact again"
     shell:
         "python3 -m workflow verify 2>&1 | tee {log:q}"
+
+
+# Last, because it stands for whatever no rule above makes.
+include: "workflow/rules/unknown.smk"
 
 
 onerror:

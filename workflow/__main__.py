@@ -48,8 +48,18 @@ def _arguments() -> argparse.Namespace:
 
 
 def _verify(scenes: list[str]) -> int:
-    from workflow.artifacts.verify import damaged
+    from workflow.artifacts.verify import damaged, with_artefacts
+    from workflow.settings.names import did_you_mean
 
+    known = with_artefacts()
+    for scene in scenes:
+        if scene not in known:
+            print(
+                f"error: {scene}: neither results/{scene} nor scenes/{scene} holds anything to verify."
+                f"{did_you_mean(scene, known)} What is here: {', '.join(known) or 'nothing'}.",
+                file=sys.stderr,
+            )
+            return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(line)

@@ -7,8 +7,10 @@ import os
 import shutil
 import subprocess
 import sys
+from email import message_from_string
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 from workflow.runtime import doctor, native
 
@@ -117,6 +119,16 @@ def test_no_network(copy, stand_in, clean_environment):
     assert "incomplete" in result.stderr
 
 
+def test_the_site_installs_on_every_python_that_is_allowed(repository):
+    """What is pinned for `make docs` must not ask for a later release of Python 3.11 than Debian has."""
+    found = list(repository.glob(".venv-docs/lib/python*/site-packages/*.dist-info/METADATA"))
+    if not found:
+        pytest.skip("no environment for the site; `make docs` makes it")
+    needed = {path.parent.name: message_from_string(path.read_text())["Requires-Python"] for path in found}
+    late = {name: asked for name, asked in needed.items() if not SpecifierSet(asked or "").contains("3.11.0")}
+    assert not late
+
+
 def test_doctor_passes_here(repository, clean_environment):
     """In an empty environment; every line has the promised form."""
     result = run([sys.executable, "-m", "workflow.runtime.doctor"], repository, clean_environment)
@@ -200,8 +212,19 @@ class TestMake:
     def test_a_scene_that_exists_is_still_given_to_snakemake(self, tmp_path, repository, clean_environment):
         shutil.copy(repository / "Makefile", tmp_path)
         (tmp_path / "scenes" / "kitchen").mkdir(parents=True)
-        for target in ("scenes/kitchen", "scenes"):
+        (tmp_path / "relight" / "kitchen").mkdir(parents=True)
+        (tmp_path / "results" / "kitchen" / "capture").mkdir(parents=True)
+        (tmp_path / "results/kitchen/capture/manifest.json").touch()
+        for target in ("scenes/kitchen", "scenes", "relight/kitchen", "results/kitchen/capture/manifest.json"):
             assert any(f"snakemake --cores all {target}" in line for line in self.commands(tmp_path, clean_environment, target))
+
+    @pytest.mark.parametrize("folder", ["relight", "results", "config", "workflow"])
+    def test_a_folder_that_is_no_target_is_refused(self, tmp_path, repository, clean_environment, folder):
+        shutil.copy(repository / "Makefile", tmp_path)
+        (tmp_path / folder).mkdir()
+        result = run(["make", folder], tmp_path, clean_environment)
+        assert result.returncode == 2 and "Nothing to be done" not in result.stdout + result.stderr
+        assert result.stderr.startswith(f"{folder}: ") and "not a target" in result.stderr
 
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")

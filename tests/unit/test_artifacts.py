@@ -1,6 +1,7 @@
 """Artefacts: what is written is read back; what changed on disk is found and named."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +170,87 @@ def test_non_finite_values_are_not_written(tmp_path, bad):
     with pytest.raises(ValueError, match="non-finite"):
         writer.table("x.parquet", {"a": np.array([bad])})
     assert not list(tmp_path.glob("*.exr")) and not list(tmp_path.glob("*.parquet"))
+
+
+def chain(root, *stages, scene="s", quality="draft", **upstream):
+    """Finished stages without files, each made from those that `upstream` names."""
+    for stage in stages:
+        inputs = {name: {"fingerprint": "0" * 16, "manifest_sha256": ""} for name in upstream.get(stage, ())}
+        facts = {"scene": scene, "stage": stage, "quality": quality, "inputs": inputs}
+        StageWriter(root / "results" / scene / stage, provenance() | facts).finish()
+
+
+def deliverable(root, scene="s"):
+    folder = root / "scenes" / scene
+    folder.mkdir(parents=True)
+    document = {"quality": "draft", "fingerprints": {"capture": "", "report": ""}, "files": {}}
+    (folder / "manifest.json").write_text(json.dumps(document))
+    return folder
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_stage_from_which_others_were_made_must_be_there(tmp_path, whole):
+    chain(tmp_path, "capture", "base", "report", quality="paper", base=["capture"], report=["capture", "base"])
+    assert list(damaged(tmp_path)) == []
+    gone = tmp_path / "results/s/base"
+    shutil.rmtree(gone) if whole else (gone / "manifest.json").unlink()
+    (line,) = damaged(tmp_path)
+    assert line == (
+        f"{gone}/manifest.json: missing, although {tmp_path}/results/s/report was made from it; rebuild with:"
+        " snakemake --cores 2 results/s/base/manifest.json --config quality=paper"
+    )
+
+
+def test_results_from_which_something_was_published_must_be_there(tmp_path):
+    chain(tmp_path, "capture", "report", "publish")
+    deliverable(tmp_path)
+    assert list(damaged(tmp_path)) == []
+    shutil.rmtree(tmp_path / "results/s/publish")
+    (line,) = damaged(tmp_path)
+    assert "results/s/publish/manifest.json: missing" in line and line.endswith("scenes/s --forcerun publish")
+    shutil.rmtree(tmp_path / "results/s")
+    (line,) = damaged(tmp_path)
+    assert "results/s: missing, although" in line and line.endswith("scenes/s --forcerun publish")
+
+
+@pytest.mark.parametrize("finished", ["publish", "report"])
+def test_what_was_published_must_be_there(tmp_path, finished):
+    chain(tmp_path, finished)
+    (tmp_path / "results/s/logs").mkdir()
+    (tmp_path / "results/s/logs/publish.log").touch()
+    (line,) = damaged(tmp_path)
+    assert "scenes/s: missing, although it was published; rebuild with: snakemake --cores 2 scenes/s" in line
+    assert list(damaged(tmp_path, ["other"])) == []
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes/s").write_text("")
+    (line,) = damaged(tmp_path)
+    assert line.endswith("scenes/s: a file where the folder of a scene belongs; move it away")
+
+
+def test_a_page_that_was_asked_for_alone_is_not_missed_in_scenes(tmp_path):
+    chain(tmp_path, "capture", "report", report=["capture"])
+    assert list(damaged(tmp_path)) == []
+
+
+def test_variants_of_a_study_share_stages(tmp_path):
+    chain(tmp_path, "capture", scene="room--s0")
+    chain(tmp_path, "base", scene="room--fusion-mean-s0", base=["capture"])
+    assert list(damaged(tmp_path)) == []
+    shutil.rmtree(tmp_path / "results/room--s0")
+    (line,) = damaged(tmp_path)
+    assert "results/room--fusion-mean-s0/capture/manifest.json: missing" in line
+
+
+def test_verify_of_an_unknown_scene_is_one_error(tmp_path, monkeypatch, capsys):
+    from workflow.__main__ import main
+
+    chain(tmp_path, "capture", scene="kitchen")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["workflow", "verify", "kichen"])
+    assert main() == 1
+    assert capsys.readouterr().err == (
+        "error: kichen: neither results/kichen nor scenes/kichen holds anything to verify. Did you mean kitchen?"
+        " What is here: kitchen.\n"
+    )
+    monkeypatch.setattr("sys.argv", ["workflow", "verify", "kitchen"])
+    assert main() == 0

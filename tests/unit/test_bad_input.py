@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from PIL import Image
 
@@ -235,6 +236,14 @@ def _(root):
     return planned(root)
 
 
+@case("the same photograph twice")
+def _(root):
+    document = own.bare(root / "data/own")
+    document["frames"][2]["file_path"] = "images/000.png"
+    own.write_transforms(root / "data/own", document)
+    return planned(root)
+
+
 @case("images of different sizes")
 def _(root):
     own.bare(root / "data/own")
@@ -295,6 +304,20 @@ def _(root):
 def _(root):
     own.bare(root / "data/own")
     (root / "data/own/mesh.ply").unlink()
+    return planned(root)
+
+
+@case("mesh empty")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.ply").write_bytes(b"")
+    return planned(root)
+
+
+@case("mesh is no PLY")
+def _(root):
+    own.bare(root / "data/own")
+    (root / "data/own/mesh.ply").write_text("version https://git-lfs.github.com/spec/v1\n")
     return planned(root)
 
 
@@ -380,6 +403,24 @@ def _(root):
     return captured(root)
 
 
+@case("mesh cut short, as text")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/mesh.ply"
+    path.write_bytes(path.read_bytes()[:-30])
+    return captured(root)
+
+
+@case("mesh cut short, binary")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/mesh.ply"
+    vertices, faces, _ = own.room_mesh()
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
+    path.write_bytes(path.read_bytes()[:-30])
+    return captured(root)
+
+
 def moved(root, which, by):
     document = own.bare(root / "data/own")
     for i in which:
@@ -416,6 +457,37 @@ def _(root):
     on_floor = (vertices[faces][..., 2] == own.ROOM[0][2]).all(1)
     own.save_mesh(path / "mesh.ply", vertices, faces[(thing == 1) | on_floor])
     return captured(root, source={"axes": "opencv"})
+
+
+def filled(root, value, which):
+    """A bare scene of which some photographs have one value everywhere."""
+    document = own.bare(root / "data/own")
+    for i in which:
+        own.save_png(root / "data/own" / document["frames"][i]["file_path"], np.full((48, 64, 3), value))
+
+
+@case("all photographs black")
+def _(root):
+    filled(root, 0.0, range(3))
+    return captured(root)
+
+
+@case("all photographs white")
+def _(root):
+    filled(root, 1.0, range(3))
+    return captured(root)
+
+
+@case("one photograph black")
+def _(root):
+    filled(root, 0.0, [1])
+    return noted(root, "black all over")
+
+
+@case("one photograph white")
+def _(root):
+    filled(root, 1.0, [1])
+    return noted(root, "white all over")
 
 
 @case("camera axes wrong (depth images exist)")

@@ -1,5 +1,6 @@
 """The last stages on a made-up scene: render, metrics, export, report and publish over artefacts written here."""
 
+import functools
 import json
 import logging
 import os
@@ -51,7 +52,11 @@ class FakeJob:
         self.document = {"seed": 3}
         self.log = logging.getLogger("test")
         self.readers = {}
-        self.writer = StageWriter(root / "results" / scene / stage, {"stage": stage, "fingerprint": f"print of {stage}"})
+
+    @functools.cached_property
+    def writer(self):
+        facts = {"stage": self.stage.name, "fingerprint": f"print of {self.stage.name}"}
+        return StageWriter(self.root / "results" / self.scene / self.stage.name, facts)
 
     def read(self, stage):
         assert stage in self.stage.upstream
@@ -505,8 +510,8 @@ def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
 
 def test_stages_write_the_same_bytes_again(toy):
     for name, stage in (("render", render), ("export", export)):
-        job = FakeJob(name, toy / "twice")
-        job.root = toy
+        job = FakeJob(name, toy)
+        job.writer = StageWriter(toy / "twice/results/toy" / name, {"stage": name, "fingerprint": ""})
         stage.run(job)
         first = json.loads((toy / f"results/toy/{name}/manifest.json").read_text())["files"]
         assert {n: f["sha256"] for n, f in job.writer.files.items()} == {n: f["sha256"] for n, f in first.items()}

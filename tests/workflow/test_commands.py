@@ -1,5 +1,7 @@
 """What Snakemake's own commands say about the workflow, in a folder that has nothing but one scene. No job is run."""
 
+import shutil
+
 import pytest
 from support import Workflow
 
@@ -51,3 +53,56 @@ def test_the_template_is_no_stage(fresh):
     assert (
         result.returncode == 1 and result.stderr.strip().splitlines()[-1] == "error: results/tiny/stage: no stage has this name"
     )
+
+
+def test_a_checkout_may_have_a_space_in_its_path(repository, tmp_path):
+    """Snakemake refuses the path of an image that has one, even where no image is used."""
+    checkout = tmp_path / "a copy"
+    checkout.mkdir()
+    shutil.copy(repository / "Snakefile", checkout)
+    for part in ("config", "iif_core", "profiles", "workflow"):
+        shutil.copytree(repository / part, checkout / part, ignore=shutil.ignore_patterns("__pycache__"))
+    spaced = Workflow(checkout, checkout)
+    assert "publishing scenes/kitchen" in succeeded(spaced.run("scenes/kitchen", "-n"))
+    succeeded(spaced.run("verify"))
+    image = spaced.run("scenes/kitchen", "-n", "--sdm", "apptainer")
+    assert image.returncode == 1
+    assert "a copy/envs/iif.sif: Snakemake does not read an image with a space" in image.stderr.strip().splitlines()[-1]
+
+
+def test_the_image_is_named_where_it_is_asked_for(fresh):
+    """The next step, which looks for apptainer, is Snakemake's own."""
+    asked = fresh.run("scenes/tiny", "-n", "--sdm", "apptainer")
+    if shutil.which("apptainer") or shutil.which("singularity"):
+        assert asked.returncode == 0, asked.stderr
+    else:
+        assert "apptainer or singularity command has to be available" in asked.stdout + asked.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments, found, meant",
+    [
+        (["scenes/tiny/report"], "scenes/tiny/report", "scenes/tiny"),
+        (["scenes/../tiny"], "tiny", "scenes/tiny"),
+        (["scenes/a/tinny"], "scenes/a/tinny", "scenes/tiny"),
+        (["results/tiny/bse/manifest.json"], "results/tiny/bse/manifest.json", "results/tiny/base/manifest.json"),
+        (["scenes/tiny", "--forcerun", "bse"], "bse", "base"),
+    ],
+)
+def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant):
+    result = fresh.run("-n", *arguments)
+    last = result.stderr.strip().splitlines()[-1]
+    assert result.returncode == 1 and "Exception" not in result.stderr
+    assert last.startswith(f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name> and ")
+
+
+@pytest.mark.parametrize("target", ["scenes/tiny", "relight/tiny"])
+def test_a_file_in_the_place_of_a_scene_is_one_error(fresh, target):
+    path = fresh.folder / target
+    path.parent.mkdir()
+    path.write_text("")
+    result = fresh.run(target, "-n")
+    path.unlink()
+    path.parent.rmdir()
+    assert result.returncode == 1
+    assert result.stderr.strip().splitlines()[-1] == f"error: {target}: a file, where the workflow makes a folder. Move it away."

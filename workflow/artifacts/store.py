@@ -17,8 +17,12 @@ MANIFEST = "manifest.json"
 
 def command(scene: str, stage: str, quality: str | None) -> str:
     """Return the command that makes a stage of a scene again at the same quality (`draft` need not be named)."""
-    chosen = f" --config quality={quality}" if quality not in (None, "draft") else ""
-    return f"snakemake --cores 2 scenes/{scene} --forcerun {stage}{chosen}"
+    return f"snakemake --cores 2 scenes/{scene} --forcerun {stage}{chosen(quality)}"
+
+
+def chosen(quality: str | None) -> str:
+    """Return the option that chooses a quality; empty for `draft`, which need not be named."""
+    return f" --config quality={quality}" if quality not in (None, "draft") else ""
 
 
 class DamagedArtefact(InputError):

@@ -2,6 +2,7 @@
 import atexit
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -16,7 +17,7 @@ from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import native
 from workflow.runtime.job_state import reasons
 from workflow.settings import QUALITIES, SCENE_NAME, require_relighting, scene_file
-from workflow.settings import study_files
+from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table
 
 STARTED = time.time()
@@ -57,6 +58,20 @@ if set(config) - {"quality"}:
         f"--config {', '.join(sorted(set(config) - {'quality'}))}: unknown key; allowed: quality."
         " Everything else belongs into config/scenes/<scene>.yaml (docs/reference/settings.md)."
     )
+
+
+def image(wildcards):
+    """The image that jobs run in; none without `--sdm apptainer`, because Snakemake refuses an image with a space in its path
+    even where it does not read it."""
+    if "apptainer" not in map(str, workflow.deployment_settings.deployment_method):
+        return None
+    path = f"{workflow.basedir}/envs/iif.sif"
+    if " " in path:
+        stop(
+            f"{path}: Snakemake does not read an image with a space in its path. Move the checkout to a folder without spaces,"
+            " or leave out `--sdm apptainer`."
+        )
+    return path
 
 
 wildcard_constraints:
@@ -131,6 +146,7 @@ def publish_inputs(*names):
 
     def inputs(wildcards):
         folder = f"scenes/{wildcards.scene}"
+        folder_or_stop(folder)
         again_without(folder, f"{folder}/manifest.json")
         return inputs_of(wildcards)
 
@@ -140,8 +156,15 @@ def publish_inputs(*names):
 def relit_inputs(wildcards):
     """The relightings of a scene; those of which a picture is gone are copied again."""
     source = f"results/{wildcards.scene}/relight/manifest.json"
+    folder_or_stop(f"relight/{wildcards.scene}")
     again_without(f"relight/{wildcards.scene}", source)
     return {"manifest": source}
+
+
+def folder_or_stop(folder):
+    """Refuse a file in the place of a folder, which Snakemake would take for the finished folder."""
+    if os.path.lexists(folder) and not os.path.isdir(folder):
+        stop(f"{folder}: a file, where the workflow makes a folder. Move it away.")
 
 
 def again_without(folder, manifest):
@@ -165,9 +188,25 @@ def relight_inputs(*names):
     return inputs
 
 
+# ---------------------------------------------------------------------------------------------------------- targets
+
+
+def made_by_no_rule():
+    """Pattern of every path that no rule makes that was read so far."""
+    patterns = [
+        output.regex().pattern for rule in workflow.rules for output in rule.output
+    ]
+    unnamed = (re.sub(r"\(\?P<\w+>", "(?:", pattern) for pattern in patterns)
+    return "(?!" + "|".join(f"(?:{pattern})" for pattern in unnamed) + ").+"
+
+
 def unknown(wildcards):
-    """Ends with what is wrong about a scene that can have no file."""
-    return str(or_stop(scene_file, wildcards.name))
+    """Ends with what is wrong about a target that no rule makes, or about a name that no scene can have."""
+    folder, _, name = wildcards.target.partition("/")
+    if folder == "scenes" and "/" not in name:
+        or_stop(scene_file, name)
+    rules = [rule.name for rule in workflow.rules if rule.name != "unknown_target"]
+    or_stop(refuse_target, wildcards.target, rules)
 
 
 # ---------------------------------------------------------------------------------------------------------- studies

@@ -58,15 +58,3 @@ rule relit:
     shell:
         "mkdir -p {output.pictures:q} && cp -r results/{wildcards.scene}/relight/. {output.pictures:q}"
         " && rm {output.pictures:q}/manifest.json > {log:q} 2>&1"
-
-
-# `scenes/My room`, `scenes/kitchen.yaml`: without this rule, Snakemake says only that no rule makes it.
-rule unknown_scene:
-    """Explain why a name cannot be that of a scene."""
-    input:
-        unknown,
-    output:
-        directory("scenes/{name}"),
-    wildcard_constraints:
-        name=rf"(?!{SCENE_NAME}$)[^/]+",
-    localrule: True

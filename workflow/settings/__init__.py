@@ -13,6 +13,7 @@ from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.scene import UNIONS, SceneSettings, dump, select
 from workflow.settings.section import Section
+from workflow.settings.targets import refuse_target
 from workflow.settings.yaml_file import read_yaml
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "load",
     "read_yaml",
     "reference_markdown",
+    "refuse_target",
     "relight_files",
     "require_relighting",
     "scene_file",

@@ -24,6 +24,8 @@ from workflow.sources.folder_scene.inputs import Inputs, find_inputs
 from workflow.sources.folder_scene.transforms import Frame
 
 MIN_COVERAGE = 0.01  # share of the rays of a view that must hit the mesh
+BLACK, WHITE = 2.5 / 255, 253.5 / 255  # sensor values of all channels below and above which a pixel tells nothing about the light
+EVERYWHERE = 0.999  # share of such pixels that makes a photograph black or white
 MAX_LOG_PIXEL_ASPECT = 0.1  # |log(fl_x / fl_y)| above which a note asks whether it is right; real lenses stay below 0.01
 
 
@@ -63,6 +65,7 @@ class _Capture:
         self.notes: list[str] = list(inputs.transforms.notes)
         self.counts = dict.fromkeys(("non_finite", "transparent", "negative", "masked"), 0)
         self.forms: dict[str, set[str]] = {}
+        self.unexposed: dict[str, list[str]] = {"black": [], "white": []}  # names of views without a picture
         self.alignment = alignment.Alignment.empty()
         count = len(inputs.transforms.frames)
         self.tried = {inputs.transforms.frames[i].name for i in transforms.evenly_spread(count, alignment.TRIAL_VIEWS)}
@@ -99,6 +102,7 @@ class _Capture:
                 continue
             photo, valid = self._photo(frame, view, given[i])
             self.writer.photo(view.name, photo, valid, self.encoded)
+            self._look_for_light(view.name, photo[valid])
             self.writer.gbuffer(view.name, depth, face)
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
@@ -111,6 +115,7 @@ class _Capture:
             self.job.progress(i + 1, len(frames), "photographs")
 
         self._check_views(len(frames), dropped, blind)
+        self._check_exposed(len(views))
         self._check_alignment(used, views)
         if self.settings.exposure == "estimate":
             views = self._estimated(shared, used, views)
@@ -282,6 +287,31 @@ class _Capture:
             self.notes.append(f"view {name} dropped: it looks at nothing ({share:.1%} of its rays hit the mesh)")
         if count - len(dropped) == 1:
             self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the prior alone")
+
+    def _look_for_light(self, name: str, pixels: np.ndarray) -> None:
+        """Remember a photograph whose usable pixels (n, 3) are all black or all white."""
+        if not len(pixels):
+            return
+        if (pixels.max(1) <= (BLACK if self.encoded else 0)).mean() >= EVERYWHERE:
+            self.unexposed["black"].append(name)
+        elif self.encoded and (pixels.min(1) >= WHITE).mean() >= EVERYWHERE:
+            self.unexposed["white"].append(name)
+
+    def _check_exposed(self, count: int) -> None:
+        """Refuse photographs that are all black or white; note those that are."""
+        found = {kind: names for kind, names in self.unexposed.items() if names}
+        if sum(map(len, found.values())) == count:
+            raise InputError(
+                f"{self.inputs.transforms.path}: all {count} photographs are {' or '.join(found)}"
+                f" ({'no light was recorded' if 'black' in found else 'every pixel is saturated'}): check the exposure, and the"
+                " conversion that wrote the files"
+            )
+        for kind, names in found.items():
+            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+            self.notes.append(
+                f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}): check their"
+                " exposure, or leave them out"
+            )
 
     def _check_alignment(self, used: list[Frame], views: list[View]) -> None:
         if self.source.alignment == "off":

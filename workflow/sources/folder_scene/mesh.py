@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ NAMES = ("mesh.ply", "mesh.obj", "mesh.glb")
 SUFFIXES = (".ply", ".obj", ".glb")
 MIN_AREA = 1e-12  # m^2; smaller triangles are removed (docs/method/numerics.md#degenerate-faces)
 DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another unit (docs/method/numerics.md#unit-of-the-mesh)
+AGAIN = "export the mesh again, or copy it again"
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -63,6 +65,7 @@ def find(folder: Path, name: str | None) -> Path:
             raise InputError(f"`source.mesh: {name}`: allowed are {', '.join(SUFFIXES)} files")
         if not path.is_file():
             raise InputError(f"{path}: not found (`source.mesh: {name}`).{did_you_mean_path(path)}")
+        _refuse_empty(path)
         return path
     found = [folder / n for n in NAMES if (folder / n).is_file()]
     if len(found) > 1:
@@ -71,7 +74,41 @@ def find(folder: Path, name: str | None) -> Path:
         meshes = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in SUFFIXES)
         hint = f" Found {', '.join(meshes[:3])}: name it with `source.mesh`." if meshes else ""
         raise InputError(f"{folder}: no {', '.join(NAMES)}; a mesh of the scene is needed (docs/guide/own-data.md).{hint}")
+    _refuse_empty(found[0])
     return found[0]
+
+
+def _refuse_empty(path: Path) -> None:
+    """Refuse what its first bytes show to be no mesh."""
+    with open(path, "rb") as file:
+        start = file.read(64)
+    if not start:
+        raise InputError(f"{path}: empty (0 bytes); {AGAIN}")
+    if path.suffix.lower() == ".ply" and not start.startswith(b"ply"):
+        raise InputError(f"{path}: not a PLY file (it begins with {start[:16]!r}, not with 'ply'); {AGAIN}")
+
+
+def _refuse_cut(path: Path) -> None:
+    """Refuse a PLY in text form that holds fewer lines than its header says, of which the reader would return a part."""
+    if path.suffix.lower() != ".ply":
+        return
+    with open(path, "rb") as file:
+        head, mark, _ = file.read(1 << 20).partition(b"end_header")
+    if not mark:
+        raise InputError(f"{path}: cut short (its header has no end); {AGAIN}")
+    if b"format ascii" not in head:
+        return  # the reader itself compares the length of binary files with the header
+    data = path.read_bytes()
+    counts = re.findall(rb"^element\s+(\w+)\s+(\d+)", head, re.MULTILINE)
+    promised = sum(int(count) for _, count in counts)
+    body = data[data.find(b"\n", len(head)) + 1 :].rstrip()
+    found = body.count(b"\n") + 1 if body else 0
+    if found == promised and re.search(rb"element\s+face\s+[1-9]\d*\s+property\s+list[^\n]*\s*$", head):
+        corners, *last = body[body.rfind(b"\n") + 1 :].split()  # of a header that ends with faces, and these with their vertices
+        found -= len(last) < int(corners)
+    if found < promised:
+        said = ", ".join(f"{int(count)} of {name.decode()}" for name, count in counts)
+        raise InputError(f"{path}: cut short (its header announces {said}; {found} lines of {promised} follow); {AGAIN}")
 
 
 @dataclass(frozen=True)
@@ -127,10 +164,14 @@ def majority_id(ids: np.ndarray) -> np.ndarray:
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str] | None]:
     import trimesh
 
+    _refuse_empty(path)
+    _refuse_cut(path)
     try:
         scene = trimesh.load_scene(path, process=False, maintain_order=True)
     except Exception as error:
-        raise InputError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {error})") from None
+        raise InputError(
+            f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); it is damaged or cut short: {AGAIN}"
+        ) from None
     vertices, faces, nodes, names, offset = [], [], [], [], 0
     for node in scene.graph.nodes_geometry:
         transform, key = scene.graph[node]

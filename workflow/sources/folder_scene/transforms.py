@@ -10,6 +10,7 @@ import difflib
 import fnmatch
 import json
 import math
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -343,15 +344,27 @@ def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) ->
 
 
 def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
-    seen: dict[str, str] = {}
+    seen: dict[str, dict[str, Any]] = {}
     for entry in entries:
         name = _name(entry)
-        if name in seen:
+        other = seen.setdefault(name, entry)
+        if other is entry:
+            continue
+        if _one_photograph(other["file_path"], entry["file_path"]):
             raise InputError(
-                f"{path}: {seen[name]!r} and {entry['file_path']!r} would both be view {name!r}; file names without"
-                " extension must differ: rename one, or select with `source.frames`"
+                f"{path}: {other['_where']} and {entry['_where']} are the same photograph, which is listed twice; remove one of"
+                " the two frames"
             )
-        seen[name] = entry["file_path"]
+        raise InputError(
+            f"{path}: {other['file_path']!r} and {entry['file_path']!r} would both be view {name!r}; file names without"
+            " extension must differ: rename one, or select with `source.frames`"
+        )
+
+
+def _one_photograph(first: str, second: str) -> bool:
+    """Return whether two file paths name one file; the extension may be left out."""
+    a, b = Path(os.path.normpath(first)), Path(os.path.normpath(second))
+    return a == b or (a.with_suffix("") == b.with_suffix("") and "" in (a.suffix, b.suffix))
 
 
 def _name(entry: dict[str, Any]) -> str:

@@ -1,0 +1,50 @@
+"""What a target of Snakemake that no rule makes was probably meant to be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from iif_core.errors import InputError
+from workflow.registry import STAGES
+from workflow.settings import batch_table, study_files
+from workflow.settings.names import did_you_mean, scene_names
+
+
+def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> None:
+    """Say that nothing makes `target`, which targets there are, and which of them it resembles.
+
+    Args:
+        target: a file, a folder, or what was taken for the name of a rule.
+        rules: names of the rules, which `--forcerun` and some others take.
+        root: the working folder.
+
+    Raises:
+        InputError: always.
+    """
+    scenes = [*scene_names(root), *(line.name for line in batch_table.read_table(root))]
+    hint = _meant(target, list(dict.fromkeys(scenes)), list(rules), root)
+    raise InputError(
+        f"{target}: no rule makes this.{hint} Targets are scenes/<name> and relight/<name> with the name of one scene"
+        " (letters, digits, _ and -), results/<name>/<stage>/manifest.json, results/studies/<study>.parquet, `scenes` and"
+        " `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
+    )
+
+
+def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
+    parts = Path(target).parts or (target,)
+    if parts[0] in ("scenes", "relight") and len(parts) > 1 and parts[1] in scenes:
+        return f" Did you mean {parts[0]}/{parts[1]}?"
+    if parts[0] in scenes:
+        return f" Did you mean scenes/{parts[0]}?"
+    if parts[0] in ("scenes", "relight") and len(parts) > 1:
+        return did_you_mean(parts[-1], scenes, parts[0] + "/{}") or did_you_mean(parts[1], scenes, parts[0] + "/{}")
+    if parts[:2] == ("results", "studies"):
+        return did_you_mean(target, [f"results/studies/{name}.parquet" for name in study_files.study_names(root)])
+    if parts[0] == "results" and len(parts) > 2:
+        stages = [f"results/{parts[1]}/{stage}/manifest.json" for stage in STAGES if stage != "publish"]
+        same = [path for path in stages if Path(path).parts[2] == parts[2]]
+        return f" Did you mean {same[0]}?" if same else did_you_mean(target, stages)
+    if len(parts) == 1:
+        return did_you_mean(target, rules) or did_you_mean(target, scenes, "scenes/{}")
+    return did_you_mean(target, [f"scenes/{scene}" for scene in scenes])
