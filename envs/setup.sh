@@ -38,6 +38,10 @@ lock_found='' torch_found='' folder='' checked=''
 if [ -f $stamp ]; then
     { read -r lock_found torch_found folder && read -r checked; } <$stamp || true
 fi
+# Making the environment of another checkout anew would break that one.
+if [ -L $venv ] && [ -n "$folder" ] && [ "$folder" != "$root" ] && [ "$venv" -ef "$folder/$venv" ]; then
+    fail "$venv is a link to the environment of $folder; remove the link, or let it point to a folder that no checkout uses"
+fi
 version='import sys; print("%d.%d" % sys.version_info[:2])'
 recent='import sys; sys.exit(sys.version_info < (3, 11))'
 if ! "$venv/bin/python" -c "$recent" 2>/dev/null; then folder=''; fi

@@ -71,6 +71,18 @@ def test_second_setup_does_nothing(repository, clean_environment):
     assert (stamp.stat().st_mtime_ns, stamp.read_text()) == before
 
 
+def test_environment_of_another_checkout_is_left_alone(copy, tmp_path, clean_environment):
+    """A link to it is refused; making it anew would break the other checkout."""
+    other = tmp_path / "other"
+    (other / ".venv").mkdir(parents=True)
+    stamp = other / ".venv/.setup"
+    stamp.write_text(f"lock torch {other}\nchecked\n")
+    (copy / ".venv").symlink_to(other / ".venv")
+    result = run(["bash", "envs/setup.sh"], copy, clean_environment)
+    assert result.returncode == 1 and f".venv is a link to the environment of {other}" in last_line(result.stderr)
+    assert stamp.read_text().startswith("lock")
+
+
 def test_too_old_python(copy, stand_in, clean_environment):
     old = stand_in("oldpython", 'case "$2" in *exit*) exit 1;; *) echo 3.9;; esac\n')
     result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=old)
