@@ -43,8 +43,8 @@ VIEW_MEMORY_MB = 1024.0
 """Megabytes of decoded views that are kept in memory; every pass over the photographs decodes the others again."""
 STATISTICS_PIXELS = 20_000_000
 """Photographs are thinned to about this many pixels for the statistics of faces."""
-COVERAGE_RAYS = 31
-"""Rays through a pixel on an emitter, beside that through its middle."""
+COVERAGE_GRID = 6
+"""Rays across a pixel on an emitter, in both directions, by which its share of the pixel is counted."""
 SEEDS = 0x656D69  # keeps the random streams of this stage apart from those of others
 
 
@@ -309,6 +309,10 @@ def choose_rows(
     group = everything.group
     inner = np.bincount(group[joined.interior & (group >= 0)], minlength=groups.size) > 0
     use = (group < 0) | joined.interior | ~np.append(inner, False)[group]
+    # The same holds for pixels that an emitter fills only in part.
+    whole = (group >= 0) & ~everything.partial & ~everything.bound.any(1)
+    enough = np.bincount(group[whole & use], minlength=groups.size) >= photos.job.settings.emission.min_observations
+    use &= ~(everything.partial & np.append(enough, False)[group])
     return joined.take(use), np.concatenate(base)[use], replace(everything.take(use), rest=rest)
 
 
@@ -323,10 +327,11 @@ def _coverage(
         return share
     du, dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
     middle = view.directions().reshape(-1, 3)[index[own]]
-    offset = rng.random((2, len(own), COVERAGE_RAYS, 1)) - 0.5
+    cell = np.stack(np.indices((COVERAGE_GRID, COVERAGE_GRID)), 0).reshape(2, 1, -1, 1)
+    offset = (cell + rng.random((2, len(own), COVERAGE_GRID**2, 1))) / COVERAGE_GRID - 0.5
     way = middle[:, None] + offset[0] * du + offset[1] * dv
     face, _ = trace(photos.world[0], view.world_from_camera[:3, 3], way.reshape(-1, 3))
-    met = np.column_stack([group[own], np.append(groups.of_face, -1)[face].reshape(len(own), -1)])
+    met = np.append(groups.of_face, -1)[face].reshape(len(own), -1)
     pixel, ray = np.nonzero(met >= 0)
     np.add.at(share, (own[pixel], met[pixel, ray]), np.float32(1.0 / met.shape[1]))
     return share

@@ -10,6 +10,8 @@ TILE_PIXELS = 8
 """Pixels of one object in one tile of this edge are averaged into one row."""
 FULL_COVERAGE = 0.95
 """Share of a pixel from which an emitter counts as filling it."""
+COVERAGE_ERROR = 0.05
+"""By which shares of pixels may be wrong: few rays, and edges of a mesh that are not quite where the photograph has them."""
 ANCHOR_PIXELS = 64
 """At least this many directly seen pixels of each group enter the solve."""
 

@@ -10,7 +10,7 @@ import numpy as np
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.gains import ObjectGains, estimate_object_gains
-from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.pixels import COVERAGE_ERROR, EmissionPixels
 from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
 
@@ -87,17 +87,20 @@ def assemble(
     observed = np.array(pixels.radiance, np.float64)
     if white is not None:
         matrix[:, :1, own], cached[:, :1, own] = white.matrix, white.cached
-    matrix[:, 0] += direct
     bounded = pixels.partial if white is None else own
     bound = pixels.bound | bounded[:, None]
     clear = bounded & ~pixels.bound.any(1)
     top = -observed[clear]
+    partial = pixels.partial
+    least = np.where(partial[:, None, None], np.maximum(direct - COVERAGE_ERROR, 0.0), direct)
+    most = np.where((direct > 0) & partial[:, None, None], np.minimum(direct + COVERAGE_ERROR, 1.0), direct)
+    matrix[:, 0] += most
     if white is None:  # what shares a pixel with an emitter is dimmer than `rest`
-        observed -= np.where(pixels.partial, pixels.rest * (1.0 - direct[:, :, 0].sum(1)), 0.0)[:, None]
+        observed -= np.where(partial, pixels.rest * (1.0 - least[:, :, 0].sum(1)), 0.0)[:, None]
     key = np.stack([np.where(own, -1, pixels.object_id), pixels.group, pixels.view, pixels.tile], 1)
     if clear.any():  # the upper ends, as bounds of the negated rows
         upper = np.zeros((*matrix.shape[:2], int(clear.sum()), n_groups, 3), matrix.dtype)
-        upper[:, 0] = -direct[clear]
+        upper[:, 0] = -least[clear]
         none = np.zeros((*upper.shape[:3], 3), upper.dtype)
         matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, none], 2)
         observed, bound = np.r_[observed, top], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
