@@ -58,12 +58,13 @@ def test_the_sun_is_a_group_of_its_own():
 
 
 @pytest.mark.parametrize("pixels", [0, 3])
-def test_nothing_seen_is_forty_two_directions(pixels):
+def test_nothing_seen_is_forty_two_directions_and_three_pixels_are_one_more(pixels):
     sums = SkySums()
     sums.add(np.tile([0.0, 0, 1], (pixels, 1)), np.ones((pixels, 3)), np.zeros((pixels, 3), bool))
     sky = sums.groups()
-    assert sky.size == 42 and not sky.pixels.any() and not sky.bounded.any()
+    assert sky.size == 42 + (pixels > 0) and sky.pixels.sum() == pixels and not sky.bounded.any()
     np.testing.assert_allclose(sky.radiance, 1.0 if pixels else 0.0)
+    sky = SkySums().groups()
     share = np.bincount(sky.columns.ravel(), solid_angles(*sky.columns.shape).ravel(), 42) / (4 * np.pi)
     np.testing.assert_allclose(share, 1 / 42, atol=0.012)
 

@@ -182,9 +182,9 @@ def test_white_room_with_a_black_and_a_saturated_view(tmp_path, llvm):
     found = _run(tmp_path, "ldr")
     radiance, _ = _kept(found)
     scale = found.affines.json("affines.json")["light_scale"]
-    # The walls are nearly as bright as the lamp, so what it adds of its own is known to a factor.
+    # The walls are nearly as bright as the lamp, so what it adds of its own is known to a factor; pixels of 24 x 24 bound it.
     ratio = np.sort(scale * radiance[:, 0]) / [LAMP, BULB]
-    assert (ratio > 0.5).all() and (ratio < 2).all()
+    assert (ratio > 0.5).all() and (ratio < 2.5).all()
     for name in ("floor", "ceiling", "wall_a", "wall_c"):
         assert _fitted(found, room, name)[0][:, :3].min() > 0.9
     assert "taken as srgb" in _said(found) and "as it was found" in _said(found)
@@ -204,7 +204,15 @@ def test_environment_alone_through_a_hole(tmp_path, llvm):
     found = _run(tmp_path, "hdr", upto="report")
     radiance, kinds = _kept(found)
     assert set(kinds) == {"environment"}
-    np.testing.assert_allclose(radiance, 1.0, rtol=0.02)
+    table = found.emission.table("emitters.parquet")
+    pixels = table["observations"][table["kept"]]
+    seen = pixels > 0
+    error = np.stack([table[f"error_{c}"] for c in "rgb"], 1)[table["kept"]]
+    np.testing.assert_allclose(radiance[pixels >= 20], 1.0, rtol=0.02)
+    np.testing.assert_allclose(radiance[seen], 1.0, rtol=0.1)
+    assert (pixels >= 20).sum() >= 3
+    # Directions that no camera sees are as uncertain as is claimed.
+    assert (np.abs(radiance - 1.0)[~seen] < 3.0 * error[~seen]).mean() > 0.95
     said = _said(found)
     assert "of camera rays and" in said and "no face was seen saturated" in said
     assert found.render.exr("maps/v000.exr")["R"].max() == pytest.approx(1, rel=0.05)  # the sky itself

@@ -13,7 +13,7 @@ from iif_core.numerics.xp import NUMPY
 
 HEIGHT, WIDTH = 16, 32  # texels of the map
 MIN_PIXELS = 50
-"""Escaping camera pixels from which a texel is known by itself."""
+"""Escaping camera pixels that suffice for a texel to count as seen."""
 REACH = 0.7
 """Angle in radians over which the light from outside is correlated (Eq. L.8)."""
 OUTSIDE_SPREAD = 1.0
@@ -74,11 +74,13 @@ class SkySums:
         """Divide the sphere into 42 directions, and each into what cameras see unsaturated, what they see saturated, and what
         they do not see (docs/method/light.md#groups-of-texels).
 
-        min_pixels: of a texel that counts as seen.
+        min_pixels: that suffice for a texel to count as seen, if no other has fifty times as many.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
         towards, solid = _middles(*self.shape), solid_angles(*self.shape).ravel()
-        seen, hidden = count >= min_pixels, 2 * saturated > count
+        # Small pictures have few pixels in any texel; a texel counts that has a fiftieth of the most.
+        enough = np.clip(0.02 * count.max(), 1, min_pixels)
+        seen, hidden = count >= enough, 2 * saturated > count
         part = np.where(seen, np.where(hidden, 1, 0), 2)
         number = np.unique(3 * (towards @ _bins().T).argmax(1) + part, return_inverse=True)[1]
         size = int(number.max()) + 1
