@@ -7,7 +7,7 @@ on the size of the image, or on which other objects are in view. `strength` mult
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +61,11 @@ class SimulatedErrors:
     material_view: float = 0.06
     material_sample: float = 0.08
     material_pattern: float = 0.10
+
+    def with_shared(self, factor: float) -> SimulatedErrors:
+        """Return the errors with those of the albedo that all views of an object share multiplied by `factor`."""
+        shared = ("gain_object", "tint_object", "offset_object")
+        return replace(self, **{name: factor * getattr(self, name) for name in shared})
 
 
 RGBX = SimulatedErrors()

@@ -155,3 +155,21 @@ def test_bad_input_is_refused():
         simulate.simulate_predictions(albedo * np.nan, roughness, metallic, ids, 1, 0, 0)
     with pytest.raises(InputError, match="share height"):
         simulate.simulate_predictions(albedo, roughness, metallic, ids, 1, 0, 0, shading=np.ones((2, 2)))
+
+
+def test_shared_errors_are_those_that_views_and_samples_do_not_average_out():
+    """Over views and samples the mean brightness of objects keeps a spread in proportion to the factor; 0 leaves next to none."""
+    albedo, roughness, metallic, ids, shading = room(32, 48)
+    large = [o for o in np.unique(ids) if (ids == o).sum() > 20]
+
+    def spread(factor):
+        errors = simulate.SimulatedErrors(desaturation=0, leak=0, blur=0, pattern=0).with_shared(factor)
+        views = [
+            simulate.simulate_predictions(np.full_like(albedo, 0.4), roughness, metallic, ids, 8, v, 0, 1.0, shading, errors)
+            for v in range(12)
+        ]
+        maps = np.stack(views)[..., :3].mean((0, 1, -1))
+        return np.std([np.log(maps[ids == o].mean()) for o in large])
+
+    none, one, three = (spread(factor) for factor in (0.0, 1.0, 3.0))
+    assert none < 0.06 < one and 2.0 < three / one < 4.0

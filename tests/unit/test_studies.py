@@ -68,6 +68,23 @@ def test_layers_lie_over_one_another(folder):
     assert settings.load("t").prior.seed is None and settings.load("t").capture.width == 32
 
 
+def test_an_entry_with_a_source_needs_no_scene_file(folder):
+    own = "r: {source: {kind: builtin, scene: sky}, prior: {kind: simulated, shared: 3.0}}\n"
+    folder("studies/scenes", SHARED + own)
+    folder("studies/a", STUDY.replace("scenes: [t]", "scenes: [t, r]"))
+    room = settings.load("r--a-mean-2-s1")
+    assert (room.source.scene, room.prior.shared, room.capture.views, room.prior.seed) == ("sky", 3.0, 3, 1)
+    assert len(study_table.plan("a", "draft").cells) == 12
+    with pytest.raises(InputError, match=r"config/scenes/r.yaml: not found"):
+        settings.load("r")
+    folder("studies/scenes", SHARED + own.replace("scene: sky", "scene: sku"))
+    with pytest.raises(InputError, match=r"config/studies/scenes.yaml, r: `source.*sku"):
+        settings.load("r--s0")
+    folder("studies/scenes", SHARED + "r: {prior: {kind: simulated}}\n")
+    with pytest.raises(InputError, match="scenes.yaml: r: no such scene, and no `source` here"):
+        settings.load("t--s0")
+
+
 def test_what_agrees_is_shared_and_what_does_not_is_not(folder):
     def homes(scene):
         return {stage: fp.home(stage, scene, "draft") for stage in ("capture", "segmentation", "prior", "base", "base_scores")}
@@ -245,6 +262,28 @@ def test_page_says_by_how_much_the_reference_moves():
     lines = study_table.page(study, frame_of(rows), {}).splitlines()
     cells = {line.split("|")[1].strip(): line.split("|")[2].strip() for line in lines if line.startswith(("| a", "| b"))}
     assert cells == {"a": "22.00 ± 3", "b": "24.00 (+2 ± 1)"}
+
+
+def test_scenes_can_be_the_rows_of_the_page():
+    study = study_files.Study(
+        title="Rooms",
+        scenes=["a", "b"],
+        seeds=[0],
+        scores="metrics",
+        rows="scenes",
+        protocols=["raw", "scaled"],
+        variants={"ours": {"label": "result"}, "base": {"row": "base"}},
+        show=["albedo/psnr", "emission/iou"],
+    )
+    values = {("a", "ours"): 30.0, ("a", "base"): 25.0, ("b", "ours"): 28.0}
+    rows = [
+        {"scene": scene, "variant": variant, "seed": 0, "quantity": "albedo", "metric": "psnr", "protocol": "scaled", "value": v}
+        for (scene, variant), v in values.items()
+    ]
+    frame = pd.DataFrame(rows).assign(status="ok", **dict.fromkeys(study_table.COSTS))
+    page = study_table.page(study, frame, {})
+    assert "| scene | result |  base |\n" in page and "| a     |  30.00 | 25.00 |\n| b     |  28.00 |       |\n" in page
+    assert "| mean  |  29.00 | 25.00 |" in page and "emission IoU\n\nNot scored" in page and "scaled" in page
 
 
 def test_a_shared_result_is_read_from_where_it_lies(folder, tmp_path):

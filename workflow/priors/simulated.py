@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.priors.simulate import shading_proxy, simulate_predictions
+from iif_core.priors.simulate import RGBX, shading_proxy, simulate_predictions
 from workflow.scene.normal_form import CaptureReader, View
 
 _NO_TRUTH = (
@@ -61,6 +61,7 @@ def predict(view: View, settings: SimpleNamespace, capture: CaptureReader, seed:
         seed,
         settings.prior.strength,
         shading,
+        RGBX.with_shared(settings.prior.shared),
     )
 
 

@@ -30,7 +30,8 @@ def merge(lower: dict[str, Any], upper: dict[str, Any]) -> dict[str, Any]:
 
 
 def scene_file(scene: str, root: Path = Path(".")) -> Path:
-    """Return the file of a scene; for a derived scene of a study, the file of the scene that it is derived from.
+    """Return the file of a scene; for a derived scene of a study, the file of the scene that it is derived from, which is
+    `config/studies/scenes.yaml` where that has the scene's `source`.
 
     Raises:
         InputError: no such scene (the message suggests the nearest name), or a name that a scene cannot have.
@@ -46,6 +47,8 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
     parts = study_files.derived(scene, root)
     scene = parts.scene if parts else scene
     path = scene_path(scene, root)
+    if parts and not path.is_file() and "source" in study_files.scene_overrides(root).get(scene, {}):
+        return study_files.scenes_path(root)
     if not path.is_file():
         files = scene_names(root)
         listed = [line.name for line in batch_table.read_table(root) if line.name not in files]
@@ -81,7 +84,9 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
             raise InputError(explain(error, batch_table.blame(line, layers))) from None
     path = scene_file(scene, root)
     shown = path.relative_to(root) if path.is_relative_to(root) else path
-    layers = [("", preset), (str(shown), read_yaml(path))]
+    layers = [("", preset)]
+    if path != study_files.scenes_path(root):
+        layers.append((str(shown), read_yaml(path)))
     if parts := study_files.derived(scene, root):
         layers += study_files.layers(parts, root)
     try:

@@ -85,6 +85,8 @@ class Study(Section):
     """Stages whose times are added."""
     protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
     """Protocols in the printed table and the picture; the Parquet file has all."""
+    rows: Literal["variants", "scenes"] = "variants"
+    """Rows of the printed tables; with `scenes` each protocol has a table of its own."""
     common: dict[str, dict[str, Any]] = {}
     """Settings of all variants; those of a variant override them."""
     reference: str = ""
@@ -196,19 +198,26 @@ def _grid(grid: dict[str, list[Any]], where: str) -> dict[str, Variant]:
     return out
 
 
+def scenes_path(root: Path = Path(".")) -> Path:
+    """Return where the settings lie that every study uses for a scene (config/studies/scenes.yaml)."""
+    return configuration("studies", root) / SCENES.name
+
+
 def scene_overrides(root: Path = Path(".")) -> dict[str, dict[str, Any]]:
-    """Return scene -> settings that every study uses for it (config/studies/scenes.yaml)."""
-    path = configuration("studies", root) / SCENES.name
+    """Return scene -> settings that every study uses for it; an entry with a `source` needs no scene of its own."""
+    path = scenes_path(root)
     if not path.is_file():
         raise InputError(f"{SCENES}: not found; it lists the scenes of the studies (docs/development/studies.md)")
     document = read_yaml(path)
     known = scene_names(root)
     for scene, overrides in document.items():
-        if scene not in known:
-            hint = did_you_mean(scene, known)
-            raise InputError(f"{SCENES}: {scene}: no such scene.{hint} Known scenes: {', '.join(known) or 'none'}.")
         if overrides is not None and not isinstance(overrides, dict):
             raise InputError(f"{SCENES}: `{scene}`: found {overrides!r}, needed settings, e.g. {{capture: {{views: 24}}}}")
+        if scene not in known and "source" not in (overrides or {}):
+            hint = did_you_mean(scene, known)
+            raise InputError(
+                f"{SCENES}: {scene}: no such scene, and no `source` here.{hint} Known scenes: {', '.join(known) or 'none'}."
+            )
     return {scene: overrides or {} for scene, overrides in document.items()}
 
 

@@ -266,6 +266,9 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
     for key in study.show:
         quantity, metric = key.split("/")
         chosen = shown[(shown["quantity"] == quantity) & (shown["metric"] == metric)]
+        if study.rows == "scenes":
+            lines += _by_scene(study, chosen, quantity, metric, scenes, labels)
+            continue
         columns = [(scene, protocol) for scene in scenes for protocol in study.protocols]
         columns = [c for c in columns if ((chosen["scene"] == c[0]) & (chosen["protocol"] == c[1])).any()]
         if len(scenes) > 1 and study.scores == "metrics":
@@ -300,6 +303,24 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
     what = "the base texture" if study.costs == ["base"] else ", ".join(study.costs)
     lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
     return "\n".join(lines)
+
+
+def _by_scene(
+    study: study_files.Study, chosen: pd.DataFrame, quantity: str, metric: str, scenes: list[str], labels: dict[str, str]
+) -> list[str]:
+    """Format one metric with a row for each scene and a column for each variant, protocol by protocol."""
+    lines = []
+    for protocol in study.protocols:
+        own = chosen[chosen["protocol"] == protocol]
+        if own.empty:
+            continue
+        means = own.groupby(["scene", "variant"])["value"].mean()
+        cells = {(scene, name): group["value"].tolist() for (scene, name), group in own.groupby(["scene", "variant"])}
+        body = [[scene, *(_number(metric, cells.get((scene, name), [])) for name in labels)] for scene in scenes]
+        body.append(["mean", *(_mean_cell(metric, means[means.index.get_level_values(1) == name].tolist()) for name in labels)])
+        title = f"## {quantity} {METRICS[metric].label}, {PROTOCOLS[protocol].short}{_direction(metric)}"
+        lines += [title, "", *_markdown(["scene", *labels.values()], body), ""]
+    return lines or [f"## {quantity} {METRICS[metric].label}", "", f"Not scored{_why(metric)}.", ""]
 
 
 def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str]) -> list[str]:
