@@ -191,14 +191,14 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
 
 
 def gloss_is_idle(glossy: float, matte: float) -> bool:
-    """Return whether the views of a cell differ as much with the fitted gloss as without (Eq. M.44); 0 = no cell can tell."""
+    """Return whether the views of a cell differ as much with the fitted gloss as without (Eq. M.50); 0 = no cell can tell."""
     return 0 < glossy and matte <= glossy
 
 
 def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
     """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic.
 
-    `scatter`: how much the views of a cell differ with the fitted gloss and without (Eq. M.44); None = not compared.
+    `scatter`: how much the views of a cell differ with the fitted gloss and without (Eq. M.50); None = not compared.
     """
     if scatter is not None and gloss_is_idle(*scatter):
         measure = "how much more the views of a cell differ without gloss than with it (root mean square)"

@@ -1,4 +1,4 @@
-"""Texture of surface cells from the photographs, once light, response and affine maps are known (Eq. M.41 to M.43).
+"""Texture of surface cells from the photographs, once light, response and affine maps are known (Eq. M.47 to M.49).
 
 A prior that was made from the photographs alone (retinex) divided by a light that was not known yet; the division is done again,
 except for slow changes inside an object, which cannot be told from an error of the light.
@@ -31,7 +31,7 @@ def textured_albedo(
     points: np.ndarray,
     object_id: np.ndarray,
 ) -> np.ndarray:
-    """Add the texture of the photographs to the albedo of cells (Eq. M.42).
+    """Add the texture of the photographs to the albedo of cells (Eq. M.48).
 
     Args:
         albedo: (C, 3) of the affine fit; square, cross: (C, 3) sums of w G^2 and w G (y - h); pixels: (C,) weight of the pixels.
@@ -74,7 +74,7 @@ def _spread(values: np.ndarray, pairs: np.ndarray, weight: np.ndarray) -> np.nda
 
 
 def slow_part(values: np.ndarray, weight: np.ndarray, points: np.ndarray, object_id: np.ndarray, reach: float) -> np.ndarray:
-    """Return the weighted Gaussian mean of values inside each object, from boxes of half its width (Eq. M.43).
+    """Return the weighted Gaussian mean of values inside each object, from boxes of half its width (Eq. M.49).
 
     Args:
         values: (n, c); weight: (n,) >= 0.

@@ -1,4 +1,4 @@
-"""Covariance of every fitted number and of the response: a sandwich over clusters of pixels that share errors (Eq. M.32 to M.34).
+"""Covariance of every fitted number and of the response: a sandwich over clusters of pixels that share errors (Eq. M.38 to M.40).
 
 Clusters are corrected for having drawn the fit towards themselves (Bell and McCaffrey 2002, "CR2"). Errors of light and geometry
 that all clusters of an object share are not in it.
@@ -6,19 +6,14 @@ that all clusters of an object share are not in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-
 import numpy as np
 
 from iif_core.fitting.descent import Arrowhead, DescentState, GaussianPrior, ResponsePrior
-from iif_core.fitting.pixels import Pixels, evaluate
+from iif_core.fitting.pixels import Pixels, evaluate_clusters
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.material import NUMBERS
 
-_CLUSTERS_AT_ONCE = 1000
-"""Clusters whose systems are held in memory at once."""
 _MAX_LEVERAGE = 0.95
 """Largest share of one cluster in a direction (docs/method/numerics.md#leverage-near-one)."""
 
@@ -47,7 +42,7 @@ def sandwich_covariance(
     owner = np.repeat(np.arange(px.n_objects), np.diff(px.first))
     alone, reduced = np.zeros((len(owner), NUMBERS)), np.zeros((len(owner), len(schur)))
     leverage = np.zeros(len(owner))
-    for part, scores, h in _clusters(px, state, tone, opt):
+    for part, scores, h in evaluate_clusters(px, state.affine, tone, opt):
         corrected = _correct_leverage(scores, h, system.inverse, system.coupling, free, owner[part])
         alone[part], reduced[part], leverage[part] = corrected
     moved = reduced @ schur
@@ -66,21 +61,9 @@ def sandwich_covariance(
         others = total - d.T @ d - of_priors[o]
         few = (leverage[part] ** 2).sum() / max(leverage[part].sum() ** 2, 1e-100)  # 1 / nu
         out[o] = (1.0 + 0.5 * few) ** 2 * p.T @ p + both @ prior_scatter[o] @ both + by_response[o] @ others @ by_response[o].T
+    i = np.arange(NUMBERS)
+    out[:, i, i] = np.maximum(out[:, i, i], 0.0)  # products of matrices round variances of nothing below 0
     return out, total
-
-
-def _clusters(px: Pixels, state: DescentState, tone: Tone, opt: FitOptions) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Yield the clusters of some objects at a time: their slice, gradients (c, 16 + P) and systems (c, 16 + P, 16 + P)."""
-    low = 0
-    while low < px.n_objects:
-        high = max(low + 1, int(np.searchsorted(px.first, px.first[low] + _CLUSTERS_AT_ONCE, side="right")) - 1)
-        some = px.only(np.arange(low, high))
-        count = len(some.starts) - 1
-        each = np.repeat(np.arange(count), np.diff(some.starts))
-        affine = np.repeat(state.affine[low:high], np.diff(some.first), 0)
-        terms = evaluate(replace(some, obj=each, first=np.arange(count + 1)), affine, tone, opt, True)
-        yield slice(px.first[low], px.first[high]), terms.g, terms.h
-        low = high
 
 
 def _correct_leverage(

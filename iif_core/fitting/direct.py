@@ -20,6 +20,7 @@ from iif_core.fitting.descent import (
     eliminate_objects,
     make_response_prior,
 )
+from iif_core.fitting.object_levels import UNKNOWN_SCATTER, ObjectLevels, light_scatter, measure_levels
 from iif_core.fitting.pixels import Pixels, choose_evenly, evaluate, prepare_pixels, residuals
 from iif_core.fitting.population import (
     Population,
@@ -73,6 +74,7 @@ class FitProgress:
         metallic: (O, 2) gain and bias of the metallic.
         profiled: roughness from the profile, once it was made.
         response_weight: (O,) weight q of each object's pixels (Eq. M.25); None: 1.
+        levels: both estimates of the level of each object, once they were compared.
     """
 
     state: DescentState
@@ -81,6 +83,7 @@ class FitProgress:
     metallic: np.ndarray
     profiled: ProfiledRoughness | None = None
     response_weight: np.ndarray | None = None
+    levels: ObjectLevels | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -97,12 +100,19 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
     fit = _start(px, texture, start_params, opt)
     if len(members):
-        fit = _descend_all(px, fit, tone, texture, opt, start_params)
+        scatter = np.full(problem.n_objects, UNKNOWN_SCATTER) if problem.scatter is None else problem.scatter
+        fit = _descend_all(px, fit, tone, texture, opt, start_params, scatter[members])
     return result_of(px, fit, tone, texture, opt, start_params, members, everything.usable)
 
 
 def _descend_all(
-    px: Pixels, fit: FitProgress, tone: Tone, texture: Texture, opt: FitOptions, start_params: np.ndarray
+    px: Pixels,
+    fit: FitProgress,
+    tone: Tone,
+    texture: Texture,
+    opt: FitOptions,
+    start_params: np.ndarray,
+    scatter: np.ndarray,
 ) -> FitProgress:
     """Select the kinds, learn the population, and descend on all pixels."""
     if opt.select and not opt.matte:
@@ -110,6 +120,7 @@ def _descend_all(
     if opt.population:
         some = px.take(choose_evenly(px.obj, px.offsets, POPULATION_PIXELS))
         measured, roughness = some.target, texture.mean[:, 3]
+        exposure, light_gain = some.exposure, np.ones(some.n_objects)
         for _ in range(2):
             weigh_by_halves(some, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
             state, _ = descend(some, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
@@ -118,8 +129,12 @@ def _descend_all(
             population = update_population(
                 fit.population, terms, state.affine, state.free, noise, roughness, fit.metallic, EVIDENCE_DISCOUNT
             )
-            fit = replace(fit, state=state, population=population)
+            levels = measure_levels(some, state.affine, tone.at(state.params), opt, texture.mean[:, :3], scatter, light_gain)
+            light_gain = levels.light_gain
+            some = replace(some, exposure=exposure * light_gain[some.obj])
+            fit = replace(fit, state=state, population=population, levels=levels)
             fit = replace(fit, prior=_make_prior(fit, noise, roughness))
+        px.exposure = px.exposure * light_gain[px.obj]
     measured = px.target
     if not opt.population:
         weigh_by_halves(px, measured, fit.state.affine, tone.at(fit.state.params), opt, fit.response_weight)
@@ -292,14 +307,21 @@ def result_of(
     if len(px.obj):
         terms = evaluate(px, state.affine, final, opt, True)
         fitted = bool(opt.free_response and tone.size)
+        prior = fit.prior
+        if fit.levels is not None:
+            by_light = light_scatter(fit.levels, terms.h[:, :NUMBERS, :NUMBERS], state.affine)
+            prior = replace(prior, scatter=by_light if prior.scatter is None else prior.scatter + by_light)
         blocks = decompose_objects(terms.h, state.free, fit.prior)
         curve_prior = make_response_prior(opt, len(px.obj), start_params)
         system = eliminate_objects(terms, state, fit.prior, curve_prior, fitted, blocks, damped=False)
-        covariance[members], of_response = sandwich_covariance(px, state, system, fit.prior, curve_prior, final, opt)
+        covariance[members], of_response = sandwich_covariance(px, state, system, prior, curve_prior, final, opt)
         errors = residuals(px, state.affine, final, opt).mean(1)
         errors[px.saturated] = 0.0
         square = px.sum_by_object((np.minimum(np.abs(errors), 1e6) ** 2).sum(1))
         residual[members] = np.sqrt(square / np.maximum(px.sum_by_object((~px.saturated).sum(1)), 1))
+    light_gain = np.ones(n_objects)
+    if fit.levels is not None:
+        light_gain[members] = fit.levels.light_gain
     rank = np.zeros(n_objects, np.int64)
     rank[members] = texture.rank
     return FitResult(
@@ -316,5 +338,16 @@ def result_of(
         of_response,
         max(len(state.history) - 1, 0),
         state.reason or "nothing to fit",
-        {"population": fit.population.facts()} if fit.population is not None and len(members) else {},
+        _facts(fit) if len(members) else {},
+        light_gain,
     )
+
+
+def _facts(fit: FitProgress) -> dict[str, object]:
+    """Return what was learnt from the scene, for `affines.json`."""
+    facts: dict[str, object] = {}
+    if fit.population is not None:
+        facts["population"] = fit.population.facts()
+    if fit.levels is not None:
+        facts["level_errors"] = fit.levels.facts()
+    return facts

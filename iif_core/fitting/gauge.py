@@ -49,10 +49,10 @@ class Gauge:
 
 
 def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
-    """Divide the albedo numbers of a fit by the factor of the gauge and multiply `light_scale` by it (Eq. M.36).
+    """Divide the albedo numbers of a fit by the factor of the gauge and multiply `light_scale` by it (Eq. M.42).
 
     `facts["scale"]` records `kind`, `factor` and `relative_error`. For conventions the error is that of the fitted numbers alone
-    (Eq. M.38); it does not include the error of the convention.
+    (Eq. M.44); it does not include the error of the convention.
     """
     factor, error = _factor(problem, fit, gauge)
     facts: dict[str, Any] = {**fit.facts, "scale": {"kind": gauge.kind, "factor": factor, "relative_error": error}}
@@ -68,7 +68,7 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
 
 
 def _weigh_levels(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, float]:
-    """Return factor and error of the weighted mean of found level and prior's level (Eq. M.37)."""
+    """Return factor and error of the weighted mean of found level and prior's level (Eq. M.43)."""
     if error <= 0:
         return 1.0, 0.0
     share = 1.0 / (1.0 + (PRIOR_LEVEL_ERROR / error) ** 2) if np.isfinite(error) else 1.0
@@ -98,7 +98,7 @@ def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, f
 
 
 def _mean_error(fit: FitResult, object_id: np.ndarray, base: np.ndarray) -> float:
-    """Return the standard deviation of the mean fitted albedo, objects taken as independent (Eq. M.38)."""
+    """Return the standard deviation of the mean fitted albedo, objects taken as independent (Eq. M.44)."""
     n_objects = len(fit.affine)
     slope = np.zeros((n_objects, 16))
     one = np.concatenate([base[:, :3], np.ones((len(base), 1))], 1)

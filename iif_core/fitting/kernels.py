@@ -74,7 +74,7 @@ class Penalties(NamedTuple):
     """Weight of the squared distance to the allowed range (Eq. M.11)."""
     roughness_weight: float
     metallic_weight: float
-    """Weights of 1 - r and of m in the mean squared error (Eq. M.39)."""
+    """Weights of 1 - r and of m in the mean squared error (Eq. M.45)."""
 
 
 class Sums(NamedTuple):
@@ -358,7 +358,7 @@ def _sum_object(pixels, tone, penalties, t, o, want, layout, piece, out):
 @_inlined
 def _clamp(b, t, penalties, value, beyond, is_free, cost):
     """Write the clamped material of base value b under map t, its distance beyond the allowed range, and 1.0 where it lies
-    within. Returns `cost` plus the terms of the objective that depend on the material alone (Eq. M.11, M.39)."""
+    within. Returns `cost` plus the terms of the objective that depend on the material alone (Eq. M.11, M.45)."""
     for i in range(5):
         if i < 3:
             raw = t[4 * i] * b[0] + t[4 * i + 1] * b[1] + t[4 * i + 2] * b[2] + t[4 * i + 3]
@@ -487,7 +487,7 @@ def _add_piece(piece, last_half, m, layout, h, g):
 
 @_compiled
 def gradient(pixels: PixelArrays, tone: ResponseTables, penalties: Penalties, affine: NDArray, rows: NDArray, g: NDArray) -> None:
-    """Sum the gradient of the paper's loss over some pixels: (sum over channels of e^2) / 3 + w_r (1 - r) + w_m m (Eq. M.39).
+    """Sum the gradient of the paper's loss over some pixels: (sum over channels of e^2) / 3 + w_r (1 - r) + w_m m (Eq. M.45).
 
     Args:
         pixels: with one half of the cache; tone, penalties: the problem.

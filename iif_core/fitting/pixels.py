@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -18,6 +18,8 @@ RANGE_WEIGHT = 0.05
 """Weight of the squared distance to the allowed range (Eq. M.11)."""
 _DEFAULT_CLUSTERS = 64
 """Clusters of an object if the problem names none."""
+_CLUSTERS_AT_ONCE = 1000
+"""Clusters whose systems are held in memory at once."""
 _OF_EACH_PIXEL = ("index", "obj", "base", "diffuse", "lobes", "target", "exposure", "saturated", "trust")
 
 
@@ -241,6 +243,29 @@ def evaluate(
         Sums in float64; they do not depend on `opt.threads`.
     """
     return _run(px, affine, tone, opt, (2 if scores else 1) if system else 0, free, objects)[0]
+
+
+def evaluate_clusters(
+    px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """Evaluate gradient and Gauss-Newton system of every cluster by itself, some objects at a time.
+
+    Args:
+        px: pixels; affine: (O, 16) numbers of the objects; tone: curve with the current response; opt: loss and limits.
+
+    Yields:
+        A slice of the clusters, their gradients (c, 16 + P) and their systems (c, 16 + P, 16 + P).
+    """
+    low = 0
+    while low < px.n_objects:
+        high = max(low + 1, int(np.searchsorted(px.first, px.first[low] + _CLUSTERS_AT_ONCE, side="right")) - 1)
+        some = px.only(np.arange(low, high))
+        count = len(some.starts) - 1
+        each = np.repeat(np.arange(count), np.diff(some.starts))
+        own = np.repeat(affine[low:high], np.diff(some.first), 0)
+        terms = evaluate(replace(some, obj=each, first=np.arange(count + 1)), own, tone, opt, True)
+        yield slice(px.first[low], px.first[high]), terms.g, terms.h
+        low = high
 
 
 def residuals(px: Pixels, affine: np.ndarray, tone: Tone, opt: FitOptions) -> np.ndarray:

@@ -29,6 +29,8 @@ class FitProblem:
         saturated: (n, 3) bool: `value` is a lower bound.
         cluster: (n,) int, pixels of an object with the same number share errors (see `clusters.patches`); None: 64 runs of the
             pixels of an object in their given order.
+        scatter: (O,) of the logarithm of the brightness of each object over its predictions
+            (`object_levels.prediction_scatter`); None: not known.
     """
 
     object_id: np.ndarray
@@ -42,6 +44,7 @@ class FitProblem:
     exposure: np.ndarray
     saturated: np.ndarray
     cluster: np.ndarray | None = None
+    scatter: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n, j = len(self.object_id), len(self.levels)
@@ -95,7 +98,7 @@ class FitOptions:
         response_ridge: weight lambda of that prior for each pixel (Eq. M.14). 1e-5 is the square of a residual of 0.05 over 250
             independent errors; errors of the shading are common to an object in a view, so the pixels are not independent.
         roughness_weight, metallic_weight: weights of |r - 1| and |m| in the mean squared error, 1e-3 and 5e-3 in the paper's loss
-            (Eq. M.39).
+            (Eq. M.45).
         population: draw each object towards what the objects of the scene have in common (empirical Bayes).
         ridge: without population and selection, weight for each pixel of a prior at the identity.
         select: choose between dielectric and metal, and the local minimum of the roughness, by their evidence; otherwise start at
@@ -154,7 +157,8 @@ class FitResult:
 
     Attributes:
         affine: (O, 16) float64 numbers of the objects.
-        covariance: (O, 16, 16) of these numbers (Eq. M.32), given light and geometry; 0 for numbers that were not fitted.
+        covariance: (O, 16, 16) of these numbers (Eq. M.38), from the direct solver with the error of the light on each object;
+            0 for numbers that were not fitted.
         free: (O, 16) bool, which numbers were fitted.
         pixels: (O,) int, usable pixels.
         residual: (O,) root mean square of f(e L) - I over unsaturated channels, in sensor units (HDR: in units of the curve of
@@ -167,6 +171,7 @@ class FitResult:
         response_covariance: (P, P) of the response parameters, channel by channel.
         iterations: steps of the last descent; reason: why it ended.
         facts: further numbers for `affines.json`.
+        light_gain: (O,) factor by which the light on each object is believed to be brighter than computed (Eq. M.36); None: 1.
     """
 
     affine: np.ndarray
@@ -183,6 +188,7 @@ class FitResult:
     iterations: int = 0
     reason: str = ""
     facts: dict[str, Any] = field(default_factory=dict)
+    light_gain: np.ndarray | None = None
 
 
 def albedo_uncertainty(

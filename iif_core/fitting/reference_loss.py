@@ -1,4 +1,4 @@
-"""The loss of the paper's material stage, by which all solvers are judged (Eq. M.39, M.9; docs/method/numerics.md#clamped-loss).
+"""The loss of the paper's material stage, by which all solvers are judged (Eq. M.45, M.9; docs/method/numerics.md#clamped-loss).
 
 The terms of the paper's own response basis have no counterpart. For HDR, the error is measured in the curve of Eq. M.3.
 """

@@ -1,4 +1,4 @@
-"""The paper's optimiser on the same problem: stochastic gradient descent on the paper's loss (Eq. M.39, M.40).
+"""The paper's optimiser on the same problem: stochastic gradient descent on the paper's loss (Eq. M.45, M.46).
 
 The step of an object is proportional to its share of the pixels (docs/method/numerics.md#small-objects-under-a-mean-loss);
 `adam`, which is not in the paper, takes steps of one size whatever the gradient.

@@ -22,7 +22,7 @@ def ldr():
 
 
 def test_reference_loss_by_hand(ldr):
-    """Eq. M.39, written with plain arrays."""
+    """Eq. M.45, written with plain arrays."""
     from iif_core.fitting.levels import interpolate_levels
 
     affine = np.tile(IDENTITY, (4, 1)) * 0.9

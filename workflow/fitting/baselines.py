@@ -122,7 +122,7 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
 
 
 def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Result:
-    """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.50).
+    """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.56).
 
     Cells that no photograph shows have the mean of their object. One gain for all cells makes albedo times diffuse light match
     the radiance in least squares. The response is that of stage emission; saturated values are used as they are.
@@ -163,7 +163,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
 
 
 def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
-    """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.46, M.49)."""
+    """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.52, M.55)."""
     levels = roughness_levels(job)
     options = FIPT if model == "fipt" else IRIS
     edge = max(1, round(BLOCK_FOOTPRINTS * _footprint(capture) / scene.cell_edge))
@@ -320,7 +320,8 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
     for name, part in NUMBERS_OF.items():
         columns[f"T_{name}"], columns[f"std_{name}"] = affine[:, part], np.zeros_like(affine[:, part])
     zeros = np.zeros(len(names))
-    columns |= {"covariance_trace": zeros, "residual": zeros, "model": np.array([MODEL_NAMES[model]] * len(names), dtype=str)}
+    columns |= {"covariance_trace": zeros, "residual": zeros, "light_gain": 1.0 + zeros}
+    columns["model"] = np.array([MODEL_NAMES[model]] * len(names), dtype=str)
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 
 

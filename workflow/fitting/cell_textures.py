@@ -44,7 +44,7 @@ class CellTextures:
         return cls(job, scene, views, roughness_levels(job))
 
     def scatter(self, fit: FitResult) -> tuple[float, float]:
-        """Return how much the views of a cell differ with the fitted gloss, and without gloss (Eq. M.44).
+        """Return how much the views of a cell differ with the fitted gloss, and without gloss (Eq. M.50).
 
         The comparison decides whether the scene has gloss (docs/method/fitting.md#gloss-has-to-pay)."""
         fitted = self._fitted(fit)

@@ -91,9 +91,9 @@ class Affines(Section):
     }
 
     model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
-    """`objects`: one affine map per object. The others are baselines under the same light: `base`: nothing is fitted;
-    `object_mean`: the mean of the predictions of each object; `texture_average`: the mean colour of each surface cell in the
-    photographs, taken as albedo; `fipt`, `iris`: a free BRDF in every surface cell (docs/development/studies.md)."""
+    """`objects`: one affine map per object. The others are baselines under the same light (docs/development/studies.md):
+    `base`: nothing is fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each
+    surface cell, taken as albedo; `fipt`, `iris`: a free BRDF in every cell."""
     solver: Literal["direct", "sgd", "adam"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
     loss. With `fipt`, `iris`: `direct`: exact for every cell; `adam`: gradient descent on the same loss."""
@@ -117,12 +117,9 @@ class Affines(Section):
     rate: float | None = Field(_DESCENT.rate, gt=0)
     """`sgd`, `adam`: step size; the default is 10 for `sgd` and 0.01 for `adam`."""
     scale: Literal["found", "prior"] | KnownScale = "found"
-    """`objects`: what fixes the factor between light and albedo. `found`: the level of the light that stage `emission` found from
-    the share of indirect light (always so for HDR, unless a known scale is given); `prior`: the mean albedo of the prior; or a
-    known quantity: {white_patch:
-    {object: NAME, albedo: 0.9}}, {white_patch: {view: NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id:
-    0, radiance: [5, 5, 4]}} or {mean_albedo: 0.4}."""
-
+    """`objects`: what fixes the factor between light and albedo. `found`: the share of indirect light; `prior`: the mean albedo
+    of the prior (read as `found` for HDR); or a known quantity: {white_patch: {object: NAME, albedo: 0.9}}, {white_patch: {view:
+    NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id: 0, radiance: [5, 5, 4]}}, {mean_albedo: 0.4}."""
     texture: Literal["auto", "base", "photographs"] = "auto"
     """`objects`: albedo of the surface cells. `base`: the base texture under the affine maps; `photographs`: the same, plus the
     detail that the photographs show in each cell, without slow changes across an object; `auto`: `photographs` for

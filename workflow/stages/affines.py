@@ -14,6 +14,7 @@ from iif_core.errors import InputError
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.object_levels import prediction_scatter
 from iif_core.fitting.pixels import fair_shares
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
@@ -282,8 +283,22 @@ def _problem(
         joined["exposure"],
         saturated,
         patches(object_id, position),
+        _scatter(job, scene.n_objects),
     )
     return problem, _Places(joined["view"], joined["index"])
+
+
+def _scatter(job: Job, n_objects: int) -> np.ndarray:
+    """Return how far the predictions of each object are apart, (O,)."""
+    base = job.read("base")
+    chosen, means = base.table("selection.parquet"), base.table("objects.parquet")
+    owner = base.table("segments.parquet")["object_id"].astype(np.int64)
+    affine = np.stack(chosen["affine_albedo"]) if len(chosen["k"]) else np.zeros((0, 12))
+    samples = int(np.max(chosen["k"], initial=0)) + 1
+    weight = np.asarray(chosen["weight_albedo"]).reshape(-1, samples).sum(1)
+    mean = np.stack([means[f"albedo_{c}"] for c in "rgb"], 1)[:n_objects]
+    seen = owner >= 0
+    return prediction_scatter(affine.reshape(-1, samples, 3, 4)[seen], weight[seen], owner[seen], mean)
 
 
 def _cached(
@@ -314,6 +329,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
     columns |= {
         "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2),
         "residual": fit.residual,
+        "light_gain": np.ones(len(names)) if fit.light_gain is None else fit.light_gain,
         "model": np.array(fit.model, dtype=str),
     }
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})

@@ -1,4 +1,4 @@
-"""Albedo of surface cells, once roughness and metallic are known for blocks of cells, which share their light (Eq. M.49)."""
+"""Albedo of surface cells, once roughness and metallic are known for blocks of cells, which share their light (Eq. M.55)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BlockLight:
 
 
 class AlbedoSums:
-    """Collects the sums of Eq. M.49 from pixels in any number of pieces; 8 numbers for each cell."""
+    """Collects the sums of Eq. M.55 from pixels in any number of pieces; 8 numbers for each cell."""
 
     def __init__(self, cells: int):
         self._square, self._cross, self._pixels = np.zeros((cells, 3)), np.zeros((cells, 3)), np.zeros(cells)
@@ -74,7 +74,7 @@ class AlbedoSums:
         return self._square, self._cross, self._pixels
 
     def scatter(self, least: float = 3.0) -> float:
-        """Return the root mean square of y - h - a G at the best albedo a of each cell (Eq. M.44): how much the views of a cell
+        """Return the root mean square of y - h - a G at the best albedo a of each cell (Eq. M.50): how much the views of a cell
         differ beyond what the gloss h explains. Over cells whose pixels weigh at least `least`; 0 without such a cell."""
         seen = (self._pixels >= least)[:, None] & (self._square > 0)
         fitted = np.where(seen, self._cross**2 / np.where(seen, self._square, 1.0), 0.0).sum(1)

@@ -1,0 +1,265 @@
+"""Two estimates of the brightness of each object, by the photographs and by the base texture, and what follows from both
+(docs/method/fitting.md#two-estimates-of-a-level).
+
+The photographs know the brightness of an object up to the error of the light there, the base up to the error of the predictions.
+Both errors are learnt from the scene. What the light is believed to err by is taken out of it before the last descent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.fitting.pixels import Pixels, evaluate_clusters
+from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.tone import Tone
+from iif_core.numerics.color import srgb_from_linear
+from iif_core.reflectance.material import BIASES, NUMBERS
+
+_LARGEST_STEP = 1.5
+"""Largest logarithm of a ratio that one linear step may report."""
+_PSEUDO_PATCHES = 4.0
+"""Weight of the room's error of light in that of an object, in patches."""
+_BASE_FACTORS, _BASE_FACTOR, _BASE_FACTOR_WIDTH = np.geomspace(0.3, 6.0, 15), 1.4, 0.4
+"""Values among which the factor between the error of the base and the scatter of the predictions is sought; centre and width (of
+the logarithm) of its prior."""
+_LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
+"""The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
+_QUARTILES = 1.349
+"""Distance of the quartiles of a normal distribution, in standard deviations."""
+_MIDDLE_ALBEDO = 0.3
+"""Albedo to which the room's scatter of predictions refers."""
+UNKNOWN_SCATTER = 0.15
+"""Scatter of predictions whose scatter is not known."""
+_DARKEST_LEVEL = 0.01
+"""Levels of the base below this count as this."""
+_SMALLEST_ERROR = 0.02
+"""Of the light on an object, as a logarithm."""
+_DEGREES_OF_FREEDOM = 4.0
+"""Of Student's t of both errors."""
+_MOST_OBJECTS = 200
+"""Objects from which the errors are learnt, the largest."""
+_NODES = np.sinh(np.linspace(-5.0, 5.0, 121)) / 2.0
+"""Nodes of the quadrature around each of the two estimates, in units of its error."""
+
+
+@dataclass(frozen=True)
+class ObjectLevels:
+    """Both estimates of the brightness of each object, and what follows.
+
+    Attributes:
+        base: (O, 3) mean base albedo; shown: (O, 3) the level that the photographs ask for.
+        discrepancy: (O,) logarithm of the brightness that the photographs ask for over that of the base.
+        light_error, base_error: (O,) scale of the error of either estimate, as a logarithm.
+        gain: (3,) mean of `shown` over `base`.
+        light_gain: (O,) factor by which the light is brighter than computed, posterior mean (Eq. M.36).
+        deviation: (O,) posterior standard deviation of its logarithm.
+        pixels: (O,) usable pixels.
+    """
+
+    base: np.ndarray
+    shown: np.ndarray
+    discrepancy: np.ndarray
+    light_error: np.ndarray
+    base_error: np.ndarray
+    gain: np.ndarray
+    light_gain: np.ndarray
+    deviation: np.ndarray
+    pixels: np.ndarray
+
+    def facts(self) -> dict[str, object]:
+        """Return both errors, root mean squares over the pixels, and the mean square of the normalised discrepancy."""
+        share = self.pixels / max(self.pixels.sum(), 1)
+        # The variance of Student's t of four degrees of freedom is twice the square of its scale.
+        away = self.discrepancy**2 / (2.0 * (self.light_error**2 + self.base_error**2))
+        return {
+            "base": float(np.sqrt(share @ self.base_error**2)),
+            "light": float(np.sqrt(share @ self.light_error**2)),
+            "normalised_discrepancy": float(share @ np.minimum(away, 10.0)),
+        }
+
+
+def prediction_scatter(
+    affine: np.ndarray, weight: np.ndarray, object_of_segment: np.ndarray, mean_base: np.ndarray
+) -> np.ndarray:
+    """Return how far the predictions of each object are apart, as a standard deviation of log brightness (Eq. M.33).
+
+    Args:
+        affine: (S, K, 3, 4) maps that correct the predictions of each segment to the base.
+        weight: (S,) weight of each segment, 0 = unused; object_of_segment: (S,); mean_base: (O, 3) mean base albedo.
+
+    Returns:
+        (O,); objects that few predictions show are drawn towards the median of the scene.
+    """
+    n = len(mean_base)
+    base = np.maximum(mean_base, _DARKEST_LEVEL)[object_of_segment]
+    moved = np.einsum("skci,si->skc", affine[..., :3], base) + affine[..., 3]
+    if not len(affine):
+        return np.full(n, UNKNOWN_SCATTER)
+    away = -np.log(np.clip(moved.sum(2) / base.sum(1)[:, None], 0.2, 5.0))
+    own, used = np.repeat(object_of_segment, affine.shape[1]), np.repeat(weight > 0, affine.shape[1])
+    own, away = own[used], away.ravel()[used]
+    order = np.lexsort((away, own))
+    own, away = own[order], away[order]
+    count = np.bincount(own, minlength=n)
+    low = np.r_[0, np.cumsum(count)[:-1]]
+    quarter, three = (away[np.minimum(low + (q * (count - 1)).astype(np.int64), max(len(away) - 1, 0))] for q in (0.25, 0.75))
+    known = count > 2
+    variance = np.where(known, ((three - quarter) / _QUARTILES) ** 2, 0.0)
+    room = float(np.median(variance[known])) if known.any() else UNKNOWN_SCATTER**2
+    freedom = np.where(known, count - 1.0, 0.0)
+    return np.sqrt((_PSEUDO_PATCHES * room + freedom * variance) / (_PSEUDO_PATCHES + freedom))
+
+
+def measure_levels(
+    px: Pixels,
+    affine: np.ndarray,
+    tone: Tone,
+    opt: FitOptions,
+    mean_base: np.ndarray,
+    scatter: np.ndarray,
+    light_gain: np.ndarray,
+) -> ObjectLevels:
+    """Compare both estimates of each level and learn the error of each (Eq. M.32 to M.36).
+
+    Args:
+        px: pixels; affine: (O, 16) current numbers; tone: curve with the current response; opt: loss and limits.
+        mean_base: (O, 3) mean base albedo; scatter: (O,) of the predictions (`prediction_scatter`).
+        light_gain: (O,) factor on the light of each object that is in the exposure of `px`.
+    """
+    n = px.n_objects
+    base = np.maximum(np.asarray(mean_base, np.float64), _DARKEST_LEVEL)
+    linear = affine[:, :12].reshape(n, 3, 4)[:, :, :3]
+    level = np.maximum(np.einsum("oci,oi->oc", linear, base) + affine[:, BIASES], _DARKEST_LEVEL)
+    rows = np.zeros((n, 3, NUMBERS))
+    for c in range(3):
+        rows[:, c, 4 * c : 4 * c + 4] = affine[:, 4 * c : 4 * c + 4]
+    gradient, curvature = np.zeros((n, 3)), np.zeros((n, 3))
+    clusters = len(px.starts) - 1
+    step, weight = np.zeros(clusters), np.zeros(clusters)
+    owner = np.repeat(np.arange(n), np.diff(px.first))
+    for part, g, h in evaluate_clusters(px, affine, tone, opt):
+        own = rows[owner[part]]
+        slope = np.einsum("kcj,kj->kc", own, g[:, :NUMBERS])
+        bend = np.einsum("kci,kij,kdj->kcd", own, h[:, :NUMBERS, :NUMBERS], own)
+        np.add.at(gradient, owner[part], slope)
+        np.add.at(curvature, owner[part], np.diagonal(bend, axis1=1, axis2=2))
+        weight[part] = np.maximum(bend.sum((1, 2)), 0.0)
+        step[part] = -slope.sum(1) / np.maximum(weight[part], 1e-100)
+    away = np.clip(-gradient / np.maximum(curvature, 1e-100), -_LARGEST_STEP, _LARGEST_STEP)
+    shown = light_gain[:, None] * level * np.exp(away)
+    pixels = px.usable.astype(np.float64)
+    smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
+    return compare_levels(base, shown, scatter, smooth, pixels)
+
+
+def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return how much the logarithm of the photograph over the prediction varies smoothly over each object (Eq. M.32).
+
+    That is the root of its covariance between patches that follow one another on the surface; noise and texture, which
+    neighbouring patches do not share, are not in it. Objects of few patches are drawn towards the room.
+
+    Args:
+        step, weight: (C,) the logarithm in each patch, and its weight; owner: (C,) object, sorted; pixels: (O,).
+    """
+    n = len(pixels)
+    filled = weight > 0
+    step, weight, owner = step[filled], weight[filled], owner[filled]
+    patches = np.bincount(owner, minlength=n)
+    total = np.maximum(np.bincount(owner, weight, n), 1e-100)
+    away = step - (np.bincount(owner, weight * step, n) / total)[owner]
+    variance = np.bincount(owner, weight * away**2, n) / total * patches / np.maximum(patches - 1, 1)
+    both = np.sqrt(weight[1:] * weight[:-1]) * (owner[1:] == owner[:-1])
+    pairs = np.maximum(np.bincount(owner[1:], both, n), 1e-100)
+    # The subtracted mean lowers the covariance by about the variance of the mean.
+    shared = np.bincount(owner[1:], both * away[1:] * away[:-1], n) / pairs + variance / np.maximum(patches, 1)
+    known = patches > 2
+    share = np.where(known, pixels, 0.0)
+    room = max(float(share @ shared / share.sum()) if share.sum() else UNKNOWN_SCATTER**2, 0.0)
+    freedom = np.where(known, patches - 2.0, 0.0)
+    return np.sqrt(np.maximum(_PSEUDO_PATCHES * room + freedom * shared, 0.0) / (_PSEUDO_PATCHES + freedom))
+
+
+def compare_levels(
+    base: np.ndarray, shown: np.ndarray, scatter: np.ndarray, smooth: np.ndarray, pixels: np.ndarray
+) -> ObjectLevels:
+    """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
+
+    Both errors follow Student's t, so that of two estimates that disagree strongly the one that claims the smaller error is
+    believed.
+
+    Args:
+        base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
+        scatter: (O,) of the logarithm of the brightness over predictions; smooth: (O,) smooth error of the light.
+        pixels: (O,) by which objects count.
+    """
+    pixels = pixels if pixels.any() else np.ones(len(pixels))
+    base, shown, smooth = np.maximum(base, _DARKEST_LEVEL), np.maximum(shown, _DARKEST_LEVEL), np.maximum(smooth, _SMALLEST_ERROR)
+    size = srgb_from_linear(np.array(_MIDDLE_ALBEDO)) / srgb_from_linear(np.clip(base.mean(1), 0.0, 1.0))
+    order = np.argsort(scatter / size)
+    middle = (scatter / size)[order][np.searchsorted(np.cumsum(pixels[order]), 0.5 * pixels.sum())]
+    scatter = np.maximum(middle, _SMALLEST_ERROR) * size
+    some = np.argsort(-pixels, kind="stable")[:_MOST_OBJECTS]
+    share = pixels[some] / max(pixels[some].sum(), 1e-100)
+    count = 1.0 / max(float((share**2).sum()), 1e-100)
+    best = (-np.inf, _BASE_FACTOR, _LIGHT_FACTOR, np.ones(3))
+    for of_base in _BASE_FACTORS:
+        for of_light in _LIGHT_FACTORS:
+            own, light = of_base * scatter[some], of_light * smooth[some]
+            gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
+            log_prior = -0.5 * (np.log(of_base / _BASE_FACTOR) / _BASE_FACTOR_WIDTH) ** 2
+            log_prior -= 0.5 * (np.log(of_light / _LIGHT_FACTOR) / _LIGHT_FACTOR_WIDTH) ** 2
+            found = count * (share @ _divide(away, own, light)[0]) + log_prior
+            if found > best[0]:
+                best = (found, float(of_base), float(of_light), gain)
+    _, of_base, of_light, gain = best
+    discrepancy = np.log(shown.sum(1) / (base @ gain))
+    base_error, light_error = of_base * scatter, of_light * smooth
+    _, mean, deviation = _divide(discrepancy, base_error, light_error)
+    return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, np.exp(mean), deviation, pixels)
+
+
+def _mean_gain(base: np.ndarray, shown: np.ndarray, share: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean gain (3,) and the logarithm of each object's brightness over it; robust against few large ones."""
+    ratio = np.log(shown / base)
+    weight = share / error**2
+    for _ in range(8):
+        gain = np.exp(weight @ ratio / weight.sum())
+        away = np.log(shown.sum(1) / (base @ gain))
+        weight = share / error**2 * (_DEGREES_OF_FREEDOM + 1) / (_DEGREES_OF_FREEDOM + (away / error) ** 2)
+        middle = weight @ away / weight.sum()
+        gain, away = gain * np.exp(middle), away - middle
+    return gain, away
+
+
+def _divide(
+    discrepancy: np.ndarray, base_error: np.ndarray, light_error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Divide d = error of the light - error of the base, both Student's t: log likelihood, and mean and deviation of the light's
+    part, each (O,), by quadrature."""
+    around_base = discrepancy[:, None] - base_error[:, None] * _NODES
+    light = np.sort(np.concatenate([light_error[:, None] * _NODES, around_base], 1), 1)
+    density = np.exp(_log_t(light, light_error[:, None]) + _log_t(discrepancy[:, None] - light, base_error[:, None]))
+    step = np.diff(light, axis=1)
+    weight = 0.5 * (np.pad(step, ((0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 1)))) * density
+    total = np.maximum(weight.sum(1), 1e-300)
+    mean = (weight * light).sum(1) / total
+    variance = (weight * (light - mean[:, None]) ** 2).sum(1) / total
+    return np.log(total), mean, np.sqrt(variance)
+
+
+def _log_t(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the log density of Student's t up to a constant."""
+    return -np.log(scale) - 0.5 * (_DEGREES_OF_FREEDOM + 1) * np.log1p((x / scale) ** 2 / _DEGREES_OF_FREEDOM)
+
+
+def light_scatter(levels: ObjectLevels, system: np.ndarray, affine: np.ndarray) -> np.ndarray:
+    """Return the covariance (O, 16, 16) that the error of the light on each object adds to the gradient (Eq. M.37).
+
+    Args:
+        levels: both estimates; system: (O, 16, 16) Gauss-Newton system of the data at the solution; affine: (O, 16).
+    """
+    brighter = np.where(np.arange(NUMBERS) < 12, affine, 0.0)
+    moved = np.einsum("oij,oj->oi", system, brighter)
+    return levels.deviation[:, None, None] ** 2 * moved[:, :, None] * moved[:, None, :]
