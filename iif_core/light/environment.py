@@ -1,4 +1,4 @@
-"""A latitude-longitude map of the light around a scene: directions, texels and solid angles (Eq. L.6, L.7).
+"""A latitude-longitude map of the light around a scene: directions, texels and solid angles (Eq. L.7, L.8).
 
 Row 0 is up (+z); radiance is constant in a texel.
 """
@@ -17,7 +17,7 @@ Array = np.ndarray
 
 
 def solid_angles(height: int, width: int) -> Array:
-    """Return the solid angles (H, W) float64 of all texels in steradians (Eq. L.7); they sum to 4 pi.
+    """Return the solid angles (H, W) float64 of all texels in steradians (Eq. L.8); they sum to 4 pi.
 
     >>> bool(abs(solid_angles(4, 8).sum() - 4 * np.pi) < 1e-12)
     True
@@ -29,7 +29,7 @@ def solid_angles(height: int, width: int) -> Array:
 
 
 def texel_of(xp: Namespace, direction: tuple[Any, Any, Any], height: int, width: int) -> tuple[Any, Any]:
-    """Find the texel of a direction (Eq. L.6; docs/method/numerics.md#poles-of-the-environment-map).
+    """Find the texel of a direction (Eq. L.7; docs/method/numerics.md#poles-of-the-environment-map).
 
     Args:
         xp: array namespace.

@@ -5,7 +5,13 @@ import pytest
 
 from iif_core.errors import InputError
 from iif_core.light.emission.cache import RadianceSums
-from iif_core.light.emission.candidates import FaceStatistics, emitter_candidates, face_statistics, radiance_threshold
+from iif_core.light.emission.candidates import (
+    FaceStatistics,
+    emitter_candidates,
+    face_statistics,
+    glowing_pieces,
+    radiance_threshold,
+)
 from iif_core.light.emission.groups import GroupingOptions, group_emitters
 from iif_core.surface.segments import face_adjacency
 from iif_core.surface.triangles import face_geometry
@@ -188,6 +194,27 @@ def test_gradient_is_cut_into_steps():
         inside = brightness[out.of_face == g]
         assert inside.max() / inside.min() < 2.3
     assert out.area.sum() == pytest.approx(20) and (np.diff(out.area * out.observed.sum(1)) <= 1e-9).all()
+
+
+def test_a_curtain_is_one_lamp_however_its_folds_fall():
+    """Folds of alternating brightness and normals: dark ones are not bright by themselves, the curtain is; the wall beside it,
+    with one bright face, is not."""
+    vertices, faces = _strip(20)
+    vertices[:, 2] = 0.8 * (np.arange(len(vertices)) % 21 % 2)  # folds of nearly 40 degrees
+    normals, areas = face_geometry(vertices, faces)
+    object_id = np.repeat([0] * 12 + [1] * 8, 2)
+    brightness = np.repeat([2.0, 0.5, 4.0] * 4 + [0.2] * 7 + [3.0], 2)
+    stats, adjacency = _statistics([30] * 40, 0.5 * brightness, np.repeat(brightness[:, None], 3, 1)), face_adjacency(faces)
+    glowing = glowing_pieces(stats, adjacency, object_id, 1.0)
+    assert (glowing[object_id == 0] == glowing[0]).all() and glowing[0] >= 0 and (glowing[object_id == 1] == -1).all()
+    alone = emitter_candidates(stats, adjacency, areas, 1.0)
+    candidate = emitter_candidates(stats, adjacency, areas, 1.0, glowing=glowing)
+    assert candidate[object_id == 0].all() and not alone[object_id == 0].all()
+    assert (candidate[object_id == 1] == alone[object_id == 1]).all()
+    assert group_emitters(alone, stats, adjacency, normals, areas).size > 4
+    out = group_emitters(candidate, stats, adjacency, normals, areas, glowing=glowing)
+    assert np.ptp(out.of_face[object_id == 0]) == 0 and out.size == 2
+    assert (glowing_pieces(_statistics([3] + [0] * 39, 9 * np.ones(40)), adjacency, object_id, 1.0) == -1).all()  # hardly seen
 
 
 def test_small_and_surplus_groups_are_dropped_with_a_reason():

@@ -45,7 +45,7 @@ def test_planted_emission_is_recovered():
 
 
 def test_noise_in_a_attenuates_and_two_estimates_cure_it():
-    """Eq. L.20 and L.21: the attenuated answer (7.27, 9.77, 14.77) follows in closed form for uniform A."""
+    """Eq. L.21 and L.22: the attenuated answer (7.27, 9.77, 14.77) follows in closed form for uniform A."""
     rng = np.random.default_rng(1)
     a, y = _random(200_000, seed=2)
     a1, a2 = (a * (1 + 0.5 * rng.standard_normal(a.shape)) for _ in range(2))

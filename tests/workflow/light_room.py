@@ -298,7 +298,10 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
         prior.exr(f"maps/{view.name}.exr", {name: maps[..., i] for i, name in enumerate(names)})
     prior.finish()
     n = len(room.names)
-    base.table("selection.parquet", {"segment_id": np.arange(n), "k": np.zeros(n, int), "weight_albedo": np.ones(n)})
+    identity = np.tile(np.eye(3, 4, dtype=np.float32).ravel(), (n, 1))
+    chosen = {"segment_id": np.arange(n), "k": np.zeros(n, int), "weight_albedo": np.ones(n), "affine_albedo": identity}
+    base.table("selection.parquet", chosen)
+    base.table("segments.parquet", {"segment_id": np.arange(n), "object_id": np.arange(n, dtype=np.int32)})
     facts = {"predictions": 1, "plan": [], "seen_once_share": 0.0}
     base.json("base.json", {**facts, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()

@@ -19,7 +19,7 @@ class RadianceVoxels:
         ijk: (n, 3) int32, in order of key; a voxel that is not listed is unknown, not black
             (docs/method/numerics.md#empty-voxels-of-the-radiance-cache).
         radiance: (n, 3) float32 mean of the unsaturated observations; where there are none the largest saturated one, a lower
-            bound (Eq. L.5).
+            bound (Eq. L.6).
         samples: (n,) int32 observations behind `radiance`.
         censored: (n,) bool, `radiance` is a lower bound.
     """

@@ -165,8 +165,38 @@ def radiance_threshold(statistics: FaceStatistics, ratio: float = CANDIDATE_RATI
     return ratio * max(median, floor) if max(median, floor) > 0 else float("inf")
 
 
+def glowing_pieces(
+    statistics: FaceStatistics, adjacency: np.ndarray, object_id: np.ndarray, threshold: float, min_observations: int = 8
+) -> np.ndarray:
+    """Find connected surface of one object that is brighter than `threshold` as a whole (Eq. L.4).
+
+    Curtains, blinds and shades with light behind them transmit it unevenly, so that few of their faces are bright all over.
+    A piece counts when the median over its pixels of the mean radiance of the face that they see reaches the threshold.
+
+    Args:
+        statistics: of F faces; adjacency: (E, 2) pairs of neighbouring faces; object_id: (F,), -1 = none.
+        threshold: radiance, see `radiance_threshold`; min_observations: pixels that must have seen a piece.
+
+    Returns:
+        (F,) int32 number of the piece, -1 on all other surface.
+    """
+    same = object_id[adjacency[:, 0]] == object_id[adjacency[:, 1]]
+    piece = component_labels(len(object_id), *adjacency[same].T)
+    brightness, count = statistics.mean.max(-1), statistics.count.astype(np.float64)
+    size = int(piece.max(initial=-1)) + 1
+    pixels = np.bincount(piece, count, size)
+    bright = np.bincount(piece, np.where(brightness >= threshold, count, 0.0), size)
+    glows = (pixels >= min_observations) & (bright >= 0.5 * pixels)
+    return np.where(glows[piece] & (object_id >= 0), piece, -1).astype(np.int32)
+
+
 def emitter_candidates(
-    statistics: FaceStatistics, adjacency: np.ndarray, areas: np.ndarray, threshold: float, min_observations: int = 8
+    statistics: FaceStatistics,
+    adjacency: np.ndarray,
+    areas: np.ndarray,
+    threshold: float,
+    min_observations: int = 8,
+    glowing: np.ndarray | None = None,
 ) -> np.ndarray:
     """Find the faces that may shine by themselves.
 
@@ -181,12 +211,15 @@ def emitter_candidates(
         areas: (F,) m^2.
         threshold: radiance, see `radiance_threshold`.
         min_observations: pixels that must have seen a pool.
+        glowing: (F,) from `glowing_pieces`, whose faces all count; None = none.
 
     Returns:
         (F,) bool.
     """
     solid, unseen = areas > 1e-12, statistics.count == 0
     bright = ~unseen & ((statistics.low >= threshold) | statistics.bounded) & solid
+    if glowing is not None:
+        bright |= (glowing >= 0) & solid
     if not bright.any():
         return bright
     first, second = adjacency[:, 0], adjacency[:, 1]

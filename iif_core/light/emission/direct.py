@@ -1,7 +1,7 @@
 """Emission from photographs by non-negative least squares (docs/method/light.md#least-squares).
 
-Two independent traces of the transport remove the bias of its noise (Eq. L.20, L.21); directions whose reliability is lost in
-noise go to the prior (Eq. L.23).
+Two independent traces of the transport remove the bias of its noise (Eq. L.21, L.22); directions whose reliability is lost in
+noise go to the prior (Eq. L.24).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class EmissionSolution:
 
     Attributes:
         radiance: (G, 3) float64 >= 0.
-        error: (G, 3) standard error (Eq. L.28 without the level).
+        error: (G, 3) standard error (Eq. L.29 without the level).
         determined: (G,) in [0, 1]: share of the answer that comes from data rather than from the initial value.
         condition: largest / smallest eigenvalue of the lifted normal matrix at unit diagonal, of the worst channel.
         residual: weighted root mean square of target - A E, relative to that of the target.
@@ -104,9 +104,9 @@ def solve_emission(
     family: np.ndarray | None = None,
     correlation: np.ndarray | None = None,
 ) -> EmissionSolution:
-    """Solve for the radiance of every emitter group: weighted non-negative least squares with one-sided rows (Eq. L.19).
+    """Solve for the radiance of every emitter group: weighted non-negative least squares with one-sided rows (Eq. L.20).
 
-    Saturated rows are as sharp as the noise of the rows (Eq. L.25). Their weights, the residual variance and the prior are
+    Saturated rows are as sharp as the noise of the rows (Eq. L.26). Their weights, the residual variance and the prior are
     updated until the answer comes to rest.
 
     Args:
@@ -158,7 +158,7 @@ def solve_emission(
 def solve_families(
     rows: EmissionRows, prior: EmissionPrior, family: np.ndarray, width: float | np.ndarray = FAMILY_WIDTH
 ) -> EmissionSolution:
-    """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.29).
+    """Solve in two steps: groups of one object first share one radiance, then deviate from it (Eq. L.30).
 
     The triangles of a window light the room almost alike, so only their sum is well known.
 
@@ -191,7 +191,7 @@ def solve_families(
 
 
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.23)."""
+    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.24)."""
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
@@ -207,7 +207,7 @@ def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, fl
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
 
-    One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.24, L.25). For sigma -> 0 rows below
+    One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.25, L.26). For sigma -> 0 rows below
     their bound count fully and the others not at all.
     """
     from scipy.special import log_ndtr
@@ -251,7 +251,7 @@ class _Channel:
 
 @dataclass(frozen=True)
 class _Normal:
-    """H, its noise part K, M and b of one channel (Eq. L.21, L.22), float64."""
+    """H, its noise part K, M and b of one channel (Eq. L.22, L.23), float64."""
 
     h: np.ndarray
     k: np.ndarray
@@ -359,7 +359,7 @@ class _ChannelRows:
         return h if self.cross else m, k, m, b
 
     def scores(self, answer: np.ndarray) -> np.ndarray:
-        """S of Eq. L.26, over clusters of rows that are no bounds: (G, G)."""
+        """S of Eq. L.27, over clusters of rows that are no bounds: (G, G)."""
         parts, weight = [], self.sure
         for part in self.chunks():
             w = weight[part, None]
@@ -449,7 +449,7 @@ class _ChannelRows:
         return out
 
     def _design_effect(self, answer: np.ndarray, variance: np.ndarray) -> np.ndarray:
-        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.27)."""
+        """(G,) >= 1, variance of the answer relative to that of rows with independent errors (Kish 1965; Eq. L.28)."""
         effect = np.ones(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is not None:
@@ -464,7 +464,7 @@ class _ChannelRows:
         return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
 
     def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """(standard error of Eq. L.28 without the level, share of the answer that comes from data), both (G,)."""
+        """(standard error of Eq. L.29 without the level, share of the answer that comes from data), both (G,)."""
         error, share = self.initial.copy(), np.zeros(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)
         if system is None:

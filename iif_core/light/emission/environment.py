@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 16, 32  # texels of the map
 MIN_PIXELS = 50
 """Escaping camera pixels that suffice for a texel to count as seen."""
 REACH = 0.7
-"""Angle in radians over which the light from outside is correlated (Eq. L.8)."""
+"""Angle in radians over which the light from outside is correlated (Eq. L.9)."""
 OUTSIDE_SPREAD = 1.0
 """Standard deviation of the light from outside over all directions, relative to the mean of what cameras see of it."""
 SUN_WIDTH = 30.0
@@ -122,7 +122,7 @@ def sky_prior(sky: Sky) -> EmissionPrior:
 
 
 def correlation(direction: np.ndarray, reach: float = REACH) -> np.ndarray:
-    """Return exp(-angle / reach) between unit vectors (n, 3) (Eq. L.8), positive definite on the sphere: (n, n)."""
+    """Return exp(-angle / reach) between unit vectors (n, 3) (Eq. L.9), positive definite on the sphere: (n, n)."""
     return np.exp(-np.arccos(np.clip(direction @ direction.T, -1.0, 1.0)) / reach)
 
 

@@ -16,12 +16,12 @@ PRIOR_LEVEL_ERROR = 0.35
 SHARED_LEVEL_ERROR = 0.1
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
-"""Logarithms of the level of all light that are tried (Eq. L.37)."""
+"""Logarithms of the level of all light that are tried (Eq. L.38)."""
 GAIN_BOUNDS = (0.1, 10.0)
 GLOSS_BOUNDS = (0.0, 3.0)
 GLOSS_PRIOR_ROWS = 30.0
 """The predicted strength of an object's gloss is taken to be uncertain by 100 % and counts as much as this many rows, because so
-many rows of an object may err together (Eq. L.36)."""
+many rows of an object may err together (Eq. L.37)."""
 MAX_SHARE_ABOVE_WHITE = 0.03
 """Share of the rows whose objects may come out brighter than white: gloss, and lamps that nobody found."""
 
@@ -32,7 +32,7 @@ class GainOptions:
 
     Attributes:
         rounds: most alternations between emission and gains.
-        shrinkage: weight of the common gain relative to the rows of an object (mu of Eq. L.33).
+        shrinkage: weight of the common gain relative to the rows of an object (mu of Eq. L.34).
     """
 
     rounds: int = 15
@@ -73,10 +73,10 @@ def estimate_object_gains(
 ) -> ObjectGains:
     """Estimate the albedo gain of each object and channel, and the strength of its gloss, together with the light.
 
-    y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s) (Eq. L.32) is solved alternately for E (non-negative least squares) and for
-    gains, gloss and level s in closed form (Eq. L.33 to L.37). Each round makes the weights relative to what is predicted
+    y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s) (Eq. L.33) is solved alternately for E (non-negative least squares) and for
+    gains, gloss and level s in closed form (Eq. L.34 to L.38). Each round makes the weights relative to what is predicted
     (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, the level is raised until at most
-    `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.43).
+    `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.44).
 
     Args:
         rows: the system; without lobes there is one factor for everything that an object reflects.
@@ -129,7 +129,7 @@ def estimate_object_gains(
 def _level_errors(
     of_objects: _ObjectRows, weight: np.ndarray, gloss_weight: np.ndarray, radiance: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """(error of the level of all light, (G, 3) of each group's light), Eq. L.41 and L.42.
+    """(error of the level of all light, (G, 3) of each group's light), Eq. L.42 and L.43.
 
     What emitters radiate that are seen unsaturated is known like photographed light (h); the level of the other emitters has
     the error e_free. Whether the seen groups are emitters, and radiate elsewhere what they show the camera, is judged by the
@@ -163,7 +163,7 @@ def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray
 
 
 def raise_to_physical_albedo(moments: _Moments, owner: np.ndarray, albedo: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Find the level of least cost, raised in all channels alike until albedos are at most 1 (Eq. L.43).
+    """Find the level of least cost, raised in all channels alike until albedos are at most 1 (Eq. L.44).
 
     Returns log s (3,) and by how much it was raised, 0 if no level makes the albedos possible. owner (n,): object of each row,
     the last = anchors.
@@ -272,7 +272,7 @@ class _Moments:
 
         sum w (y - g_o x - t_o z)^2,   x = s d + h,   z = s e + k,
 
-    with d, h the modelled and the photographed light in the albedo lobe and e, k the same in the gloss (Eq. L.33).
+    with d, h the modelled and the photographed light in the albedo lobe and e, k the same in the gloss (Eq. L.34).
 
     Attributes:
         observed_squared: <yy>; observed_albedo: <yx>; albedo_squared: <xx>; observed_gloss: <yz>; albedo_gloss: <xz>;
@@ -301,7 +301,7 @@ class _Moments:
         return tuple(moment.at(s) for moment in moments)
 
     def _solve(self, log_level: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(cost, g, t) of all but the last object, at log s (..., 1 or 3): (..., O, 3) twice and (..., O); Eq. L.33 to L.36."""
+        """(cost, g, t) of all but the last object, at log s (..., 1 or 3): (..., O, 3) twice and (..., O); Eq. L.34 to L.37."""
         yx, yz, xx, xz, zz = (part[..., :-1, :] for part in self._at(log_level))
         xx, zz = np.maximum(xx, 0.0), np.maximum(zz, 0.0)
         floor = 1e-9 * np.maximum(xx.max((-2, -1), keepdims=True), 1e-300)
@@ -338,11 +338,11 @@ class _Moments:
         return self._solve(log_level)[1:]
 
     def level(self) -> np.ndarray:
-        """(3,) log s of least cost (Eq. L.37)."""
+        """(3,) log s of least cost (Eq. L.38)."""
         return _lowest(self.costs().sum(1))
 
     def level_error(self) -> float:
-        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.41)."""
+        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.42)."""
         costs = self.costs().sum(2)
         has_rows = self.observed_squared[:-1].sum(1) > 0
         whole, n = costs.sum(1), int(has_rows.sum())

@@ -43,7 +43,7 @@ class EmitterGroups:
 
 @dataclass(frozen=True)
 class GroupingOptions:
-    """Which candidates are merged (Eq. L.4), and which groups are kept.
+    """Which candidates are merged (Eq. L.5), and which groups are kept.
 
     Attributes:
         max_angle: degrees between the normals of two groups that are merged.
@@ -70,6 +70,7 @@ def group_emitters(
     normals: np.ndarray,
     areas: np.ndarray,
     options: GroupingOptions | None = None,
+    glowing: np.ndarray | None = None,
 ) -> EmitterGroups:
     """Merge candidates into groups that share one radiance (docs/method/light.md#emitter-groups).
 
@@ -83,6 +84,8 @@ def group_emitters(
         adjacency: (E, 2) pairs of neighbouring faces.
         normals, areas: (F, 3) unit vectors, and (F,) m^2.
         options: None = defaults.
+        glowing: (F,) from `candidates.glowing_pieces`: those faces of a piece that shine to one side are one group, whatever
+            their normals and colours; None = none.
 
     Returns:
         The groups, strongest first.
@@ -102,6 +105,9 @@ def group_emitters(
     small, min_cosine = piece_area < options.small_area, np.cos(np.radians(options.max_angle))
     parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, min_cosine, options.max_ratio)
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
+    if glowing is not None and (glowing[ids] >= 0).any():
+        whole = len(ids) + 3 * glowing[ids].astype(np.int64) + side[ids] + 1
+        label = np.unique(np.where(glowing[ids] >= 0, whole, label), return_inverse=True)[1]
     return _strongest(ids, label, side, statistics, areas, options)
 
 
@@ -161,7 +167,7 @@ def _merge(
     min_cosine: float,
     max_ratio: float,
 ) -> np.ndarray:
-    """Union-find over neighbouring faces (Eq. L.4); returns the root of each."""
+    """Union-find over neighbouring faces (Eq. L.5); returns the root of each."""
     n = len(areas)
     parent = np.arange(n)
     normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()

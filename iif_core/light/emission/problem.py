@@ -15,7 +15,7 @@ from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
 
 ANCHOR_WEIGHT = 100.0
-"""Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.16)."""
+"""Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.17)."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +64,10 @@ def assemble(
     white: TracedTransport | None = None,
     sky: Sky | None = None,
 ) -> EmissionProblem:
-    """Average pixels over (view, tile, object) with their weights (Eq. L.14), and add rows for the sky.
+    """Average pixels over (view, tile, object) with their weights (Eq. L.15), and add rows for the sky.
 
     A pixel on an emitter shows its emission alone (kept emitters are black): an anchor that outweighs the other rows. With
-    `white`, while it is still open which groups emit, it may as well reflect, up to a white surface (Eq. L.17):
+    `white`, while it is still open which groups emit, it may as well reflect, up to a white surface (Eq. L.18):
     y - (A_w E + h_w) <= E_g <= y, the upper end only where y is not saturated.
 
     Args:
@@ -150,7 +150,7 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
 
 
 def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:
-    """Anchors outweigh the other rows of their column by ANCHOR_WEIGHT (Eq. L.16)."""
+    """Anchors outweigh the other rows of their column by ANCHOR_WEIGHT (Eq. L.17)."""
     if not anchor.any():
         return rows
     first, second = rows.matrices

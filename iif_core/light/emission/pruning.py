@@ -1,4 +1,4 @@
-"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect, Eq. L.30).
+"""Groups that only reflect are recognised by the solve and dropped (docs/method/light.md#groups-that-only-reflect, Eq. L.31).
 
 A dropped group continues to light the scene with the radiance that was seen on it, which the radiance cache will hold.
 """
@@ -49,7 +49,7 @@ class WhiteSurface:
         return np.where(own[:, None] > 0, np.maximum(self.seen - beside, 0.0) / np.maximum(own, 1e-9)[:, None], self.seen)
 
     def excess(self, radiance: np.ndarray) -> np.ndarray:
-        """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.30); infinite
+        """Return (G,) brightness of each group relative to the white surface under the light of the others (Eq. L.31); infinite
         without light, 0 where the group was not seen."""
         others = self.matrix * (1.0 - np.eye(len(self.seen)))[:, :, None]
         white = (np.einsum("ghc,hc->gc", others, radiance) + self.cached).sum(1)
@@ -81,7 +81,7 @@ def prune_groups(
     """Solve, then drop groups that do not shine, the least credible first, and solve again.
 
     A group is dropped when no emission is left for it; and, unless the residual elsewhere grows by more than
-    `MAX_RESIDUAL_GROWTH` without it (Eq. L.31), when it is not brighter than `certain` white surfaces, or when its family gives
+    `MAX_RESIDUAL_GROWTH` without it (Eq. L.32), when it is not brighter than `certain` white surfaces, or when its family gives
     less than `share` of the light that the other rows show.
 
     Args:

@@ -12,7 +12,7 @@ from iif_core.errors import InputError
 
 @dataclass(frozen=True)
 class TracedTransport:
-    """A and h (Eq. L.12) of n points, from two independent traces (first axis).
+    """A and h (Eq. L.13) of n points, from two independent traces (first axis).
 
     Attributes:
         matrix: (2, L, n, G, 3) float32. The second axis is the lobe: 0 = what is proportional to the albedo (the diffuse lobe,
@@ -35,13 +35,13 @@ class EmissionRows:
     Attributes:
         matrix: (2, L, n, G, 3), cached: (2, L, n, 3) as in `TracedTransport`. The two traces may be the same array when A is
             exact. A and h of one trace share their noise, so the right-hand side of the normal equations crosses the traces
-            as well (Eq. L.21).
+            as well (Eq. L.22).
         observed: (n, 3) radiance y; a row asks for A E = y - h.
         weight: (n, 3) >= 0, weight of the squared residual.
         lower_bound: (n, 3) bool: the sensor was saturated, y is a lower bound and only a prediction below it counts.
         cluster: (n,) int, rows with the same number >= 0 may err together (one object in one view: its albedo is off); -1 or
             None = independent.
-        noise: (n,) > 0, relative size of the noise of one pixel of a row (nu of Eq. L.14). None = bounds are exact.
+        noise: (n,) > 0, relative size of the noise of one pixel of a row (nu of Eq. L.15). None = bounds are exact.
     """
 
     matrix: np.ndarray

@@ -38,7 +38,7 @@ class Emitters:
         sampling_weight: (m,) >= 0, how often a face is drawn; None = area x mean radiance.
         environment_weight: (H, W) >= 0, how often a texel is drawn; None = solid angle x mean radiance. A map of one texel is
             never drawn, since directions of the BRDF find it as well.
-        environment_share: of all draws, where faces and texels are drawn; None = by power (Eq. L.10).
+        environment_share: of all draws, where faces and texels are drawn; None = by power (Eq. L.11).
 
     Raises:
         InputError: wrong shapes, negative radiance or weights, unknown sides.
@@ -137,7 +137,7 @@ class Emitters:
 
 
 def share_of_environment(geometry: Geometry, power: float, sky: float) -> float:
-    """Choose the share of draws for the environment beside emitting faces, by the light that each gives to surfaces (Eq. L.10).
+    """Choose the share of draws for the environment beside emitting faces, by the light that each gives to surfaces (Eq. L.11).
 
     power: sum of area x mean radiance of the faces; sky: mean radiance over all directions. Clipped to SHARE_LIMITS.
     """
@@ -199,7 +199,7 @@ def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
     """(slots uint32, pdf (m,) float32): item of every slot and count / slots / measure, the density of one draw.
 
     Each item of positive weight owns at least one slot; the rest follow the weights by largest remainder,
-    ties to the lower id (Eq. L.9; docs/method/numerics.md#searching-a-cumulative-sum).
+    ties to the lower id (Eq. L.10; docs/method/numerics.md#searching-a-cumulative-sum).
     """
     pdf = np.zeros(len(weight), np.float32)
     items = np.flatnonzero(weight > 0)

@@ -87,7 +87,7 @@ def _share(part: Any, rest: Any) -> Any:
 
 
 def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumns, paths: PathOptions) -> tuple[Array, Array]:
-    """Trace the transport matrix (Eq. L.13): a point reflects A @ E + h by each lobe, for emitter radiances E (G, 3).
+    """Trace the transport matrix (Eq. L.14): a point reflects A @ E + h by each lobe, for emitter radiances E (G, 3).
 
     Emission that a point sees directly is not included.
 
