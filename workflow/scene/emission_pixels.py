@@ -23,7 +23,13 @@ from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, wit
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.pinhole import direction_derivatives
 from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
-from iif_core.light.emission.candidates import FaceStatistics, face_statistics, radiance_threshold, with_thin_objects
+from iif_core.light.emission.candidates import (
+    FaceStatistics,
+    face_statistics,
+    glowing_pieces,
+    radiance_threshold,
+    with_thin_objects,
+)
 from iif_core.light.emission.environment import SkySums, cosine_directions
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose_pixels, tile_of
@@ -216,8 +222,11 @@ def _shared_surface(photos: Photographs) -> PatchRows:
     return join_rows(parts)
 
 
-def statistics_of_faces(photos: Photographs) -> tuple[FaceStatistics, float]:
-    """Return the statistics of all faces, and the radiance from which a face may shine."""
+def statistics_of_faces(photos: Photographs, adjacency: np.ndarray) -> tuple[FaceStatistics, float, np.ndarray]:
+    """Return the statistics of all faces, the radiance from which a face may shine, and the pieces that glow as a whole, (F,).
+
+    `adjacency`: (E, 2) pairs of neighbouring faces.
+    """
     scene, views, least = photos.scene, photos.views, photos.job.settings.emission.min_observations
     total = sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
@@ -226,14 +235,18 @@ def statistics_of_faces(photos: Photographs) -> tuple[FaceStatistics, float]:
         pixels = photos.records[view].pixels
         pixels = pixels.take(np.flatnonzero(pixels.valid)[::stride])
         radiance, bound = photos.radiance(view, pixels.value, pixels.index)
-        parts.append((pixels.face, radiance.astype(np.float32), bound, pixels.from_front, pixels.interior))
+        number = np.full(len(pixels.face), done)
+        parts.append((pixels.face, radiance.astype(np.float32), bound, pixels.from_front, pixels.interior, number))
         photos.job.progress(done + 1, len(views), "views searched for emitters")
-    face, radiance, bound, front, inside = (np.concatenate(part) for part in zip(*parts, strict=True))
+    face, radiance, bound, front, inside, view = (np.concatenate(part) for part in zip(*parts, strict=True))
     every = face_statistics(face, radiance, front, len(scene.faces), bound)
     inner = face_statistics(face[inside], radiance[inside], front[inside], len(scene.faces), bound[inside])
     threshold = radiance_threshold(every)
     bright = (radiance.max(1) >= threshold) | bound.any(1)
-    return with_thin_objects(inner, every, scene.object_id, face, bright, inside, least), float(threshold)
+    statistics = with_thin_objects(inner, every, scene.object_id, face, bright, inside, least)
+    pixels = face[inside], view[inside], radiance[inside].max(1)
+    glowing = glowing_pieces(statistics, adjacency, scene.object_id, threshold, pixels, least)
+    return statistics, float(threshold), glowing
 
 
 def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[RadianceVoxels, SkySums, float, float | None]:

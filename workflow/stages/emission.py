@@ -9,7 +9,7 @@ import numpy as np
 from iif_core.camera.calibration.choice import calibration_facts
 from iif_core.camera.response import response, response_facts
 from iif_core.light.emission.cache import RadianceVoxels
-from iif_core.light.emission.candidates import emitter_candidates, glowing_pieces
+from iif_core.light.emission.candidates import emitter_candidates
 from iif_core.light.emission.direct import FAMILY_WIDTH, OUTSIDE_WIDTH, EmissionPrior, EmissionSolution, solve_families
 from iif_core.light.emission.environment import Sky, sky_prior
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, ObjectGains
@@ -59,9 +59,8 @@ def run(job: Job) -> None:
     records = ViewRecords(job, capture, scene)
     photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, known, records))
     notes.extend([camera.gauge] if camera.gauge else [])
-    statistics, threshold = statistics_of_faces(photos)
     adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
-    glowing = glowing_pieces(statistics, adjacency, scene.object_id, threshold, least)
+    statistics, threshold, glowing = statistics_of_faces(photos, adjacency)
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least, glowing)
     options = GroupingOptions(min_observations=least)
     groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, options, glowing)

@@ -165,17 +165,29 @@ def radiance_threshold(statistics: FaceStatistics, ratio: float = CANDIDATE_RATI
     return ratio * max(median, floor) if max(median, floor) > 0 else float("inf")
 
 
+LARGEST_CHANGE = 0.7
+"""Standard deviation over views of the logarithm of what a piece shows, above which it is a mirror rather than a lamp."""
+
+
 def glowing_pieces(
-    statistics: FaceStatistics, adjacency: np.ndarray, object_id: np.ndarray, threshold: float, min_observations: int = 8
+    statistics: FaceStatistics,
+    adjacency: np.ndarray,
+    object_id: np.ndarray,
+    threshold: float,
+    pixels: tuple[np.ndarray, np.ndarray, np.ndarray],
+    min_observations: int = 8,
 ) -> np.ndarray:
-    """Find connected surface of one object that is brighter than `threshold` as a whole (Eq. L.4).
+    """Find connected surface of one object that is brighter than `threshold` as a whole (Eq. L.4), in all views alike.
 
     Curtains, blinds and shades with light behind them transmit it unevenly, so that few of their faces are bright all over.
-    A piece counts when the median over its pixels of the mean radiance of the face that they see reaches the threshold.
+    A piece counts when the median over its pixels of the mean radiance of the face that they see reaches the threshold. What a
+    mirror shows depends on where the camera stands.
 
     Args:
         statistics: of F faces; adjacency: (E, 2) pairs of neighbouring faces; object_id: (F,), -1 = none.
-        threshold: radiance, see `radiance_threshold`; min_observations: pixels that must have seen a piece.
+        threshold: radiance, see `radiance_threshold`.
+        pixels: face, view and largest channel of each pixel, (n,) each; face -1 = none.
+        min_observations: pixels that must have seen a piece.
 
     Returns:
         (F,) int32 number of the piece, -1 on all other surface.
@@ -184,10 +196,26 @@ def glowing_pieces(
     piece = component_labels(len(object_id), *adjacency[same].T)
     brightness, count = statistics.mean.max(-1), statistics.count.astype(np.float64)
     size = int(piece.max(initial=-1)) + 1
-    pixels = np.bincount(piece, count, size)
+    seen = np.bincount(piece, count, size)
     bright = np.bincount(piece, np.where(brightness >= threshold, count, 0.0), size)
-    glows = (pixels >= min_observations) & (bright >= 0.5 * pixels)
+    glows = (seen >= min_observations) & (bright >= 0.5 * seen)
+    if glows.any():
+        glows &= _change_over_views(piece, size, *pixels) <= LARGEST_CHANGE
     return np.where(glows[piece] & (object_id >= 0), piece, -1).astype(np.int32)
+
+
+def _change_over_views(piece: np.ndarray, size: int, face: np.ndarray, view: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return how much the logarithm of the mean of each piece varies over views: standard deviation by pixels, (size,)."""
+    good = (face >= 0) & np.isfinite(value)
+    views = int(view.max(initial=0)) + 1
+    key = piece[face[good]].astype(np.int64) * views + view[good]
+    kinds, at = np.unique(key, return_inverse=True)
+    count = np.bincount(at, minlength=len(kinds)).astype(np.float64)
+    log_mean = np.log(np.maximum(np.bincount(at, value[good], len(kinds)) / count, 1e-30))
+    owner = kinds // views
+    total = np.maximum(np.bincount(owner, count, size), 1e-30)
+    mean = np.bincount(owner, count * log_mean, size) / total
+    return np.sqrt(np.bincount(owner, count * (log_mean - mean[owner]) ** 2, size) / total)
 
 
 def emitter_candidates(
