@@ -10,6 +10,7 @@ import argparse
 import logging
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,7 @@ def _arguments() -> argparse.Namespace:
     study.add_argument("study")
     study.add_argument("--quality", default="draft")
     study.add_argument("--fingerprint", help="of the plan; recorded by Snakemake, not checked")
+    study.add_argument("--keep", type=Path, help="CSV file to which the scores that are finished so far are added; nothing else")
     study.add_argument("--log", type=Path)
     lpips = commands.add_parser("lpips_vgg")
     lpips.add_argument("--log", type=Path)
@@ -132,10 +134,11 @@ def main() -> int:
 
     configure_logging(arguments.log)
     if arguments.command == "study":
-        from workflow.studies.table import write_study
+        from workflow.studies.table import keep_rows, write_study
 
-        state = JobState("studies", arguments.study)
-        return _guarded(f"study {arguments.study}", lambda: write_study(arguments.study, arguments.quality), state)
+        name, quality, kept = arguments.study, arguments.quality, arguments.keep
+        work = partial(keep_rows, name, quality, kept) if kept else partial(write_study, name, quality)
+        return _guarded(f"study {name}", work, JobState("studies", name))
     if arguments.command == "lpips_vgg":
         from workflow.models.lpips import fetch_vgg
 

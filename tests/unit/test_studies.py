@@ -214,6 +214,33 @@ def test_table_of_the_result_reads_the_row_of_each_variant(folder, tmp_path):
         study_table.table("late", "draft")
 
 
+def test_finished_scores_are_kept_before_the_study_ends(folder, tmp_path):
+    """Cells that are not there or were made by other code are left out, and older rows of other cells stay."""
+    folder("studies/late", LATE.replace("[0, 1]", "[0]"))
+    names = ("variant", "view", "quantity", "metric", "protocol", "value")
+    for variant, mark in (("first", None), ("other", "stale")):
+        scene = f"t--late-{variant}-s0"
+        mark = mark or fp.fingerprint("metrics", scene, "draft")
+        writer = StageWriter(tmp_path / "results" / scene / "metrics", {"scene": scene, "stage": "metrics", "fingerprint": mark})
+        rows = [("result", "a", "albedo", "psnr", "raw", 20.0), ("prior_k0", "a", "albedo", "psnr", "raw", 10.0)]
+        columns = zip(names, zip(*rows, strict=True), strict=True)
+        writer.table("variants.parquet", {name: list(column) for name, column in columns})
+        writer.finish()
+    kept = tmp_path / "kept.csv"
+    pd.DataFrame(
+        [[scene, "first", 0, "albedo", "psnr", "raw", 1.5, 2, None, "z"] for scene in ("u", "t")],
+        columns=study_table.KEPT,
+    ).to_csv(kept, index=False)
+    for _ in range(2):
+        study_table.keep_rows("late", "draft", kept)
+        frame = pd.read_csv(kept)
+        assert frame[["scene", "variant", "value"]].to_numpy().tolist() == [
+            ["t", "first", 20.0],
+            ["t", "same", 10.0],
+            ["u", "first", 1.5],
+        ]
+
+
 def test_page_of_the_result_has_means_over_scenes_and_the_protocol_of_each_number():
     study = study_files.Study(
         title="T",

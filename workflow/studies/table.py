@@ -123,29 +123,64 @@ def table(name: str, quality: str) -> pd.DataFrame:
     import pandas as pd
 
     study, cells, skipped = plan(name, quality)
-    rows: list[dict[str, Any]] = []
-    for cell in cells:
-        variant = study.variants[cell.variant]
-        facts = {
-            "study": name,
-            "scene": cell.scene,
-            "variant": cell.variant,
-            "label": variant.label or cell.variant,
-            "settings": json.dumps(variant.overrides, sort_keys=True),
-            "seed": cell.seed,
-            **(_costs(cell, quality, study.costs) if not variant.row else {}),
-            "status": "ok",
-        }
-        paper = study.paper.get(cell.variant)
-        for (quantity, metric, protocol), (value, views) in _scores(cell, quality, study.scores, variant.row or "result").items():
-            agrees = paper is not None and protocol == _protocol_of(paper, quantity)
-            printed = paper.values.get(f"{quantity}/{metric}") if paper and agrees else None
-            scored = {"quantity": quantity, "metric": metric, "protocol": protocol, "value": value, "views": views}
-            rows.append({**facts, **scored, "paper": printed})
+    rows = [row for cell in cells for row in _rows(name, study, cell, quality)]
     rows += [{"study": name, "scene": scene, "status": "skipped", "reason": reason} for scene, reason in skipped.items()]
     frame = pd.DataFrame(rows, columns=[name for name, _ in COLUMNS])
     frame["pareto"] = _pareto(frame)
     return frame
+
+
+def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list[dict[str, Any]]:
+    """One row for each score of a cell."""
+    variant = study.variants[cell.variant]
+    facts = {
+        "study": name,
+        "scene": cell.scene,
+        "variant": cell.variant,
+        "label": variant.label or cell.variant,
+        "settings": json.dumps(variant.overrides, sort_keys=True),
+        "seed": cell.seed,
+        **(_costs(cell, quality, study.costs) if not variant.row else {}),
+        "status": "ok",
+    }
+    paper, rows = study.paper.get(cell.variant), []
+    for (quantity, metric, protocol), (value, views) in _scores(cell, quality, study.scores, variant.row or "result").items():
+        agrees = paper is not None and protocol == _protocol_of(paper, quantity)
+        printed = paper.values.get(f"{quantity}/{metric}") if paper and agrees else None
+        scored = {"quantity": quantity, "metric": metric, "protocol": protocol, "value": value, "views": views}
+        rows.append({**facts, **scored, "paper": printed})
+    return rows
+
+
+KEPT = ("scene", "variant", "seed", "quantity", "metric", "protocol", "value", "views", "cpu_seconds", "fingerprint")
+"""Columns of the rows that outlive the folder of a study."""
+
+
+def keep_rows(name: str, quality: str, path: Path) -> None:
+    """Add the scores of the cells that are finished so far to a CSV file, in place of older scores of the same cells.
+
+    Args:
+        name: of the study; quality: of its runs.
+        path: the file, with the columns `KEPT`; `fingerprint` is that of the stage that scored the cell.
+    """
+    import pandas as pd
+
+    study, cells, _ = plan(name, quality)
+    rows = []
+    for cell in cells:
+        manifest = home(cell, quality, study.scores) / "manifest.json"
+        found = json.loads(manifest.read_text())["fingerprint"] if manifest.is_file() else ""
+        if found == fp.fingerprint(study.scores, cell.name, quality):
+            rows += [{**row, "fingerprint": found} for row in _rows(name, study, cell, quality)]
+    frame, cell_of = pd.DataFrame(rows, columns=list(KEPT)), ["scene", "variant", "seed"]
+    done = set(map(tuple, frame[cell_of].drop_duplicates().to_numpy().tolist()))
+    if path.is_file():
+        older = pd.read_csv(path)
+        left = [tuple(row) not in done for row in older[cell_of].to_numpy().tolist()]
+        frame = pd.concat([part for part in (older[left], frame) if len(part)] or [frame])
+    frame = frame.sort_values(list(KEPT[:6]), kind="stable")
+    write_atomically(path, lambda temporary: frame.to_csv(temporary, index=False, float_format="%.6g"))
+    logging.getLogger("study").info("%s: %d cells of this run, %d rows", path, len(done), len(frame))
 
 
 COLUMNS = [
