@@ -40,6 +40,8 @@ _DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of both errors."""
 _MOST_OBJECTS = 200
 """Objects from which the errors are learnt, the largest."""
+_INTERVAL = (0.1587, 0.8413)
+"""Shares of a normal distribution below one standard deviation either side."""
 _NODES = np.sinh(np.linspace(-5.0, 5.0, 121)) / 2.0
 """Nodes of the quadrature around each of the two estimates, in units of its error."""
 
@@ -54,7 +56,7 @@ class ObjectLevels:
         light_error, base_error: (O,) scale of the error of either estimate, as a logarithm.
         gain: (3,) mean of `shown` over `base`.
         light_gain: (O,) factor by which the light is brighter than computed, posterior mean (Eq. M.36).
-        deviation: (O,) posterior standard deviation of its logarithm.
+        deviation: (O,) half the width of the central 68 % interval of its logarithm.
         pixels: (O,) usable pixels.
     """
 
@@ -236,8 +238,8 @@ def _mean_gain(base: np.ndarray, shown: np.ndarray, share: np.ndarray, error: np
 def _divide(
     discrepancy: np.ndarray, base_error: np.ndarray, light_error: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Divide d = error of the light - error of the base, both Student's t: log likelihood, and mean and deviation of the light's
-    part, each (O,), by quadrature."""
+    """Divide d = error of the light - error of the base, both Student's t: log likelihood, mean of the light's part, and half
+    the width of its central 68 % interval, each (O,), by quadrature."""
     around_base = discrepancy[:, None] - base_error[:, None] * _NODES
     light = np.sort(np.concatenate([light_error[:, None] * _NODES, around_base], 1), 1)
     density = np.exp(_log_t(light, light_error[:, None]) + _log_t(discrepancy[:, None] - light, base_error[:, None]))
@@ -245,8 +247,20 @@ def _divide(
     weight = 0.5 * (np.pad(step, ((0, 0), (1, 0))) + np.pad(step, ((0, 0), (0, 1)))) * density
     total = np.maximum(weight.sum(1), 1e-300)
     mean = (weight * light).sum(1) / total
-    variance = (weight * (light - mean[:, None]) ** 2).sum(1) / total
-    return np.log(total), mean, np.sqrt(variance)
+    # Tails hardly matter for an interval of 68 %, but they would for a standard deviation.
+    below = (np.cumsum(weight, 1) - 0.5 * weight) / total[:, None]
+    low, high = (_crossing(light, below, share) for share in _INTERVAL)
+    return np.log(total), mean, 0.5 * (high - low)
+
+
+def _crossing(x: np.ndarray, share: np.ndarray, level: float) -> np.ndarray:
+    """Return where increasing shares (O, n) at increasing x (O, n) cross a level, (O,)."""
+    row = np.arange(len(x))
+    after = np.clip((share < level).sum(1), 1, x.shape[1] - 1)
+    before = after - 1
+    rise = np.maximum(share[row, after] - share[row, before], 1e-300)
+    part = np.clip((level - share[row, before]) / rise, 0.0, 1.0)
+    return x[row, before] + part * (x[row, after] - x[row, before])
 
 
 def _log_t(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -263,3 +277,17 @@ def light_scatter(levels: ObjectLevels, system: np.ndarray, affine: np.ndarray) 
     brighter = np.where(np.arange(NUMBERS) < 12, affine, 0.0)
     moved = np.einsum("oij,oj->oi", system, brighter)
     return levels.deviation[:, None, None] ** 2 * moved[:, :, None] * moved[:, None, :]
+
+
+def level_deviation(affine: np.ndarray, covariance: np.ndarray, mean_base: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of the logarithm of the brightness of each object, (O,); 0 where it has no albedo.
+
+    Args:
+        affine: (O, 16) numbers; covariance: (O, 16, 16) of them; mean_base: (O, 3) mean base albedo.
+    """
+    row = np.zeros((len(affine), NUMBERS))
+    for c in range(3):
+        row[:, 4 * c : 4 * c + 3], row[:, 4 * c + 3] = mean_base, 1.0
+    brightness = np.einsum("oi,oi->o", row, affine)
+    variance = np.maximum(np.einsum("oi,oij,oj->o", row, covariance, row), 0.0)
+    return np.where(brightness > 0, np.sqrt(variance) / np.maximum(brightness, 1e-12), 0.0)

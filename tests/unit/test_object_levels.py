@@ -10,7 +10,7 @@ from scipy import integrate, stats
 from iif_core.camera.response import response
 from iif_core.fitting import object_levels
 from iif_core.fitting.direct import fit_affines
-from iif_core.fitting.object_levels import compare_levels, prediction_scatter
+from iif_core.fitting.object_levels import compare_levels, level_deviation, prediction_scatter
 from iif_core.fitting.problem import FitOptions
 from iif_core.reflectance.material import IDENTITY
 from tests.unit.planted_fit import problem_of
@@ -76,12 +76,16 @@ def test_division_agrees_with_adaptive_integration(d, s, c):
         return x**power * stats.t.pdf(x, 4, scale=c) * stats.t.pdf(d - x, 4, scale=s)
 
     corners = sorted({0.0, d, *(q * c for q in (-3, 3)), *(d + q * s for q in (-3, 3))})
-    total, first, second = (integrate.quad(product, -60, 60, (p,), points=corners, limit=400)[0] for p in range(3))
+    total, first = (integrate.quad(product, -60, 60, (p,), points=corners, limit=400)[0] for p in range(2))
     log_likelihood, mean, deviation = (x[0] for x in object_levels._divide(*(np.array([x]) for x in (d, s, c))))
     height = stats.t.pdf(0, 4) ** 2
     assert np.exp(log_likelihood) * height == pytest.approx(total, rel=5e-3)
     assert mean == pytest.approx(first / total, abs=3e-3 * max(s, c))
-    assert deviation == pytest.approx(np.sqrt(second / total - (first / total) ** 2), rel=0.02)
+    fine = np.concatenate([np.linspace(-40 * c, 40 * c, 20001), d + np.linspace(-40 * s, 40 * s, 20001)])
+    fine.sort()
+    share = np.cumsum(np.gradient(fine) * product(fine)) / total
+    low, high = np.interp([0.1587, 0.8413], share, fine)
+    assert deviation == pytest.approx(0.5 * (high - low), rel=0.05)
 
 
 def test_smooth_errors_are_told_from_noise():
@@ -149,3 +153,15 @@ def test_uneven_light_leaves_the_level_to_the_base_and_the_gloss_alone():
     spread = np.sqrt(found.covariance[0, 0, 0]), np.sqrt(right.covariance[0, 0, 0])
     assert spread[0] > 3 * spread[1]
     np.testing.assert_allclose(found.affine[1:, 13], right.affine[1:, 13], atol=0.05)
+
+
+def test_deviation_of_the_level_is_that_of_drawn_numbers():
+    rng = np.random.default_rng(2)
+    affine = np.tile(IDENTITY, (2, 1)) + rng.normal(0, 0.05, (2, 16))
+    root = rng.normal(0, 0.02, (2, 16, 16))
+    base = np.array([[0.3, 0.4, 0.6], [0.05, 0.1, 0.02]])
+    claimed = level_deviation(affine, root @ root.transpose(0, 2, 1), base)
+    drawn = affine[:, None] + np.einsum("oij,onj->oni", root, rng.normal(size=(2, 40000, 16)))
+    level = np.einsum("onci,oi->on", drawn[..., :12].reshape(2, -1, 3, 4)[..., :3], base) + drawn[..., 3:12:4].sum(2)
+    np.testing.assert_allclose(claimed, level.std(1) / level.mean(1), rtol=0.03)
+    assert (level_deviation(np.zeros((1, 16)), np.ones((1, 16, 16)), base[:1]) == 0).all()

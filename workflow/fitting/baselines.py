@@ -320,7 +320,7 @@ def _write_objects(job: Job, scene: BaseScene, result: _Result, model: str) -> N
     for name, part in NUMBERS_OF.items():
         columns[f"T_{name}"], columns[f"std_{name}"] = affine[:, part], np.zeros_like(affine[:, part])
     zeros = np.zeros(len(names))
-    columns |= {"covariance_trace": zeros, "residual": zeros, "light_gain": 1.0 + zeros}
+    columns |= {"std_level": zeros, "covariance_trace": zeros, "residual": zeros, "light_gain": 1.0 + zeros}
     columns["model"] = np.array([MODEL_NAMES[model]] * len(names), dtype=str)
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 

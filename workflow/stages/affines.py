@@ -14,7 +14,7 @@ from iif_core.errors import InputError
 from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
-from iif_core.fitting.object_levels import prediction_scatter
+from iif_core.fitting.object_levels import level_deviation, prediction_scatter
 from iif_core.fitting.pixels import fair_shares
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
@@ -326,7 +326,10 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
     }
     columns |= {f"T_{name}": fit.affine[:, part] for name, part in NUMBERS_OF.items()}
     columns |= {f"std_{name}": spread[:, part] for name, part in NUMBERS_OF.items()}
+    means = job.read("base").table("objects.parquet")
+    mean = np.stack([means[f"albedo_{c}"] for c in "rgb"], 1)[: len(names)]
     columns |= {
+        "std_level": level_deviation(fit.affine, fit.covariance, mean),
         "covariance_trace": np.trace(fit.covariance, axis1=1, axis2=2),
         "residual": fit.residual,
         "light_gain": np.ones(len(names)) if fit.light_gain is None else fit.light_gain,
