@@ -204,11 +204,12 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
     normals, areas = face_geometry(vertices, faces)
     object_id = np.repeat([0] * 12 + [1] * 8, 2)
     brightness = np.repeat([2.0, 0.5, 4.0] * 4 + [0.2] * 7 + [3.0], 2)
-    stats, adjacency = _statistics([30] * 40, 0.5 * brightness, np.repeat(brightness[:, None], 3, 1)), face_adjacency(faces)
+    count = np.repeat([30] * 12 + [100] * 7 + [30], 2)  # the wall fills most of the photographs
+    stats, adjacency = _statistics(count, 0.5 * brightness, np.repeat(brightness[:, None], 3, 1)), face_adjacency(faces)
     views = np.tile(np.arange(6), 40)
     face = np.repeat(np.arange(40), 6)
     steady = face, views, np.repeat(brightness, 6)
-    glowing = glowing_pieces(stats, adjacency, object_id, 1.0, steady)
+    glowing = glowing_pieces(stats, adjacency, object_id, steady)
     assert (glowing[object_id == 0] == glowing[0]).all() and glowing[0] >= 0 and (glowing[object_id == 1] == -1).all()
     alone = emitter_candidates(stats, adjacency, areas, 1.0)
     candidate = emitter_candidates(stats, adjacency, areas, 1.0, glowing=glowing)
@@ -217,9 +218,9 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
     assert group_emitters(alone, stats, adjacency, normals, areas).size > 4
     out = group_emitters(candidate, stats, adjacency, normals, areas, glowing=glowing)
     assert np.ptp(out.of_face[object_id == 0]) == 0 and out.size == 2
-    assert (glowing_pieces(_statistics([3] + [0] * 39, 9 * np.ones(40)), adjacency, object_id, 1.0, steady) == -1).all()
+    assert (glowing_pieces(_statistics([3] + [0] * 39, 9 * np.ones(40)), adjacency, object_id, steady) == -1).all()
     mirror = face, views, np.repeat(brightness, 6) * np.where(views % 2 == 0, 0.1, 1.9)  # a window in every other view
-    assert (glowing_pieces(stats, adjacency, object_id, 1.0, mirror) == -1).all()
+    assert (glowing_pieces(stats, adjacency, object_id, mirror) == -1).all()
 
 
 def test_small_and_surplus_groups_are_dropped_with_a_reason():

@@ -245,7 +245,7 @@ def statistics_of_faces(photos: Photographs, adjacency: np.ndarray) -> tuple[Fac
     bright = (radiance.max(1) >= threshold) | bound.any(1)
     statistics = with_thin_objects(inner, every, scene.object_id, face, bright, inside, least)
     pixels = face[inside], view[inside], radiance[inside].max(1)
-    glowing = glowing_pieces(statistics, adjacency, scene.object_id, threshold, pixels, least)
+    glowing = glowing_pieces(statistics, adjacency, scene.object_id, pixels, least)
     return statistics, float(threshold), glowing
 
 

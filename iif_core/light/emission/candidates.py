@@ -165,6 +165,8 @@ def radiance_threshold(statistics: FaceStatistics, ratio: float = CANDIDATE_RATI
     return ratio * max(median, floor) if max(median, floor) > 0 else float("inf")
 
 
+GLOW_RATIO = 4.0
+"""Radiance of a piece that glows as a whole relative to the median of the room, both of means over faces."""
 LARGEST_CHANGE = 0.7
 """Standard deviation over views of the logarithm of what a piece shows, above which it is a mirror rather than a lamp."""
 
@@ -173,19 +175,17 @@ def glowing_pieces(
     statistics: FaceStatistics,
     adjacency: np.ndarray,
     object_id: np.ndarray,
-    threshold: float,
     pixels: tuple[np.ndarray, np.ndarray, np.ndarray],
     min_observations: int = 8,
 ) -> np.ndarray:
-    """Find connected surface of one object that is brighter than `threshold` as a whole (Eq. L.4), in all views alike.
+    """Find connected surface of one object that is much brighter than the room as a whole (Eq. L.4), in all views alike.
 
     Curtains, blinds and shades with light behind them transmit it unevenly, so that few of their faces are bright all over.
-    A piece counts when the median over its pixels of the mean radiance of the face that they see reaches the threshold. What a
-    mirror shows depends on where the camera stands.
+    A piece counts when the median over its pixels of the mean radiance of the face that they see is `GLOW_RATIO` times that of
+    all pixels. What a mirror shows depends on where the camera stands.
 
     Args:
         statistics: of F faces; adjacency: (E, 2) pairs of neighbouring faces; object_id: (F,), -1 = none.
-        threshold: radiance, see `radiance_threshold`.
         pixels: face, view and largest channel of each pixel, (n,) each; face -1 = none.
         min_observations: pixels that must have seen a piece.
 
@@ -196,6 +196,11 @@ def glowing_pieces(
     piece = component_labels(len(object_id), *adjacency[same].T)
     brightness, count = statistics.mean.max(-1), statistics.count.astype(np.float64)
     size = int(piece.max(initial=-1)) + 1
+    if not count.any():
+        return np.full(len(object_id), -1, np.int32)
+    order = np.argsort(brightness, kind="stable")
+    middle = brightness[order][np.searchsorted(np.cumsum(count[order]), 0.5 * count.sum())]
+    threshold = GLOW_RATIO * middle if middle > 0 else np.inf
     seen = np.bincount(piece, count, size)
     bright = np.bincount(piece, np.where(brightness >= threshold, count, 0.0), size)
     glows = (seen >= min_observations) & (bright >= 0.5 * seen)
