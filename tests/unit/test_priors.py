@@ -221,7 +221,7 @@ class Capture:
 
 
 def test_simulated_spoils_the_truth():
-    prior = SimpleNamespace(samples=3, strength=1.0)
+    prior = SimpleNamespace(samples=3, strength=1.0, shared=1.0)
     maps = simulated.predict(view(), SimpleNamespace(prior=prior), Capture(), 0)
     assert maps.shape == (3, HEIGHT, WIDTH, 5) and np.isfinite(maps).all()
     prior.strength = 0.0
