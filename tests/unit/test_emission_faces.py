@@ -223,6 +223,20 @@ def test_a_curtain_is_one_lamp_however_its_folds_fall():
     assert (glowing_pieces(stats, adjacency, object_id, mirror) == -1).all()
 
 
+def test_a_lamp_that_is_cut_into_many_objects_stays_one():
+    """Six quads of one lamp, each an object that glows by itself, beside a dark wall."""
+    vertices, faces = _strip(20)
+    normals, areas = face_geometry(vertices, faces)
+    object_id = np.repeat([*range(1, 7), *[0] * 14], 2)
+    brightness = np.repeat([8.0, 8.2, 8.1, 7.9, 8.0, 8.3] + [0.2] * 14, 2)
+    stats, adjacency = _statistics([30] * 40, brightness), face_adjacency(faces)
+    face, views = np.repeat(np.arange(40), 3), np.tile(np.arange(3), 40)
+    glowing = glowing_pieces(stats, adjacency, object_id, (face, views, np.repeat(brightness, 3)))
+    assert len(np.unique(glowing[:12])) == 6 and (glowing[12:] == -1).all()
+    out = group_emitters(brightness > 1, stats, adjacency, normals, areas, glowing=glowing)
+    assert out.size == 1 and (out.of_face[:12] == 0).all()
+
+
 def test_small_and_surplus_groups_are_dropped_with_a_reason():
     vertices, faces = _strip(6)
     normals, areas = face_geometry(vertices * 1e-3, faces)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.light.emission.candidates import SMALL_AREA, FaceStatistics, components
+from iif_core.numerics.graph import component_labels
 
 
 @dataclass(frozen=True)
@@ -84,8 +85,8 @@ def group_emitters(
         adjacency: (E, 2) pairs of neighbouring faces.
         normals, areas: (F, 3) unit vectors, and (F,) m^2.
         options: None = defaults.
-        glowing: (F,) from `candidates.glowing_pieces`: those faces of a piece that shine to one side are one group, whatever
-            their normals and colours; None = none.
+        glowing: (F,) from `candidates.glowing_pieces`: groups with faces of one piece that shine to one side are
+            joined, whatever their normals and colours; None = none.
 
     Returns:
         The groups, strongest first.
@@ -106,9 +107,17 @@ def group_emitters(
     parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, min_cosine, options.max_ratio)
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
     if glowing is not None and (glowing[ids] >= 0).any():
-        whole = len(ids) + 3 * glowing[ids].astype(np.int64) + side[ids] + 1
-        label = np.unique(np.where(glowing[ids] >= 0, whole, label), return_inverse=True)[1]
+        label = _joined(label, np.where(glowing[ids] >= 0, 3 * glowing[ids].astype(np.int64) + side[ids] + 1, -1))
     return _strongest(ids, label, side, statistics, areas, options)
+
+
+def _joined(label: np.ndarray, piece: np.ndarray) -> np.ndarray:
+    """Join groups, (n,) from 0, that have faces of the same piece, (n,) >= 0, -1 = of none; returns labels from 0."""
+    inside = np.flatnonzero(piece >= 0)
+    size = int(label.max()) + 1
+    node = size + np.unique(piece[inside], return_inverse=True)[1]
+    joined = component_labels(int(node.max()) + 1, label[inside], node)
+    return np.unique(joined[label], return_inverse=True)[1]
 
 
 def _sides(candidate: np.ndarray, statistics: FaceStatistics) -> np.ndarray:
