@@ -91,9 +91,9 @@ class Affines(Section):
     }
 
     model: Literal["objects", "base", "object_mean", "texture_average", "fipt", "iris"] = "objects"
-    """`objects`: one affine map per object. The others are baselines under the same light (docs/development/studies.md):
-    `base`: nothing is fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each
-    surface cell, taken as albedo; `fipt`, `iris`: a free BRDF in every cell."""
+    """`objects`: one affine map per object. Baselines under the same light (docs/development/studies.md): `base`: nothing is
+    fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each cell as albedo;
+    `fipt`, `iris`: a free BRDF in every cell."""
     solver: Literal["direct", "sgd", "adam"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
     loss. With `fipt`, `iris`: `direct`: exact for every cell; `adam`: gradient descent on the same loss."""
@@ -117,8 +117,8 @@ class Affines(Section):
     rate: float | None = Field(_DESCENT.rate, gt=0)
     """`sgd`, `adam`: step size; the default is 10 for `sgd` and 0.01 for `adam`."""
     scale: Literal["found", "prior"] | KnownScale = "found"
-    """`objects`: what fixes the factor between light and albedo. `found`: the share of indirect light; `prior`: the mean albedo
-    of the prior (read as `found` for HDR); or a known quantity: {white_patch: {object: NAME, albedo: 0.9}}, {white_patch: {view:
+    """`objects`: what fixes the factor between light and albedo: `found`: the share of indirect light; `prior`: the prior's mean
+    albedo (`found` for HDR); or a known quantity: {white_patch: {object: NAME, albedo: 0.9}}, {white_patch: {view:
     NAME, box: [left, top, right, bottom], albedo: 0.9}}, {lamp: {emitter_id: 0, radiance: [5, 5, 4]}}, {mean_albedo: 0.4}."""
     texture: Literal["auto", "base", "photographs"] = "auto"
     """`objects`: albedo of the surface cells. `base`: the base texture under the affine maps; `photographs`: the same, plus the
