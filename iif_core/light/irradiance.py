@@ -224,7 +224,7 @@ def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
 
 
 def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trace, rng: np.random.Generator) -> NDArray:
-    """(n,) cosine-weighted share of the hemisphere of every cell that the cells `lamp` cover, by points on them (Eq. L.53)."""
+    """(n,) cosine-weighted share of the hemisphere of every cell that the cells `lamp` cover, by points on them (Eq. L.56)."""
     total, n = np.zeros(len(cells)), len(cells)
     for _ in range(SHADOW_RAYS):
         own = lamp[rng.integers(0, len(lamp), n)]
@@ -244,7 +244,7 @@ def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trac
 
 def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tuple[NDArray, NDArray]:
     """Fit log light on every cell and log albedo of its group, (n, 3) each; diffuse radiance is e^(their sum), up to texture
-    (Eq. L.54).
+    (Eq. L.57).
 
     A group of m cells has the weight of sqrt(m). The albedo has a weak prior at `mean_albedo`, which fixes the scale where no
     photographed surface lights anything.
@@ -286,7 +286,7 @@ def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tu
 
 def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDArray:
     """Extract what of the residual log radiance (n, 3) changes slowly inside a group: light that `fit_light` could not explain
-    (Eq. L.55).
+    (Eq. L.58).
 
     Robust means over boxes of edge reach / 2 (same group and side), then a Gaussian over boxes of width `reach` metres in
     position and 1 in the normal. All of the luminance is used, and CHROMA_SHARE of the chromaticity.

@@ -12,7 +12,7 @@ Array = np.ndarray
 
 
 def ease(t: ArrayLike) -> Array:
-    """Ease times in [0, 1] in and out: 2 t^2, then 1 - 2 (1 - t)^2, with speed 0 at both ends (Eq. L.49).
+    """Ease times in [0, 1] in and out: 2 t^2, then 1 - 2 (1 - t)^2, with speed 0 at both ends (Eq. L.52).
 
     >>> ease([0.0, 0.25, 0.5, 1.0]).tolist()
     [0.0, 0.125, 0.5, 1.0]
@@ -50,7 +50,7 @@ def camera_path(poses: ArrayLike, times: ArrayLike) -> Array:
 def sphere_mesh(centre: ArrayLike, radius: float, subdivisions: int = 3) -> tuple[Array, Array]:
     """Build an icosphere with outward normals: (v, 3) float32 metres and (f, 3) int32, 20 x 4^subdivisions faces.
 
-    It is scaled to the area of the sphere, so that a given radiance sends out the power of the sphere (Eq. L.50).
+    It is scaled to the area of the sphere, so that a given radiance sends out the power of the sphere (Eq. L.53).
     """
     golden = (1 + 5**0.5) / 2
     vertices = np.array([[0, s, t * golden] for s in (1, -1) for t in (1, -1)], np.float64)
@@ -81,7 +81,7 @@ def _split(vertices: Array, faces: Array) -> tuple[Array, Array]:
 
 
 def exposure_for(radiance: ArrayLike, quantile: float = 0.95, level: float = 0.8) -> float:
-    """Return the factor that brings the `quantile` of the largest channel to `level`, 1 for black pictures (Eq. L.51)."""
+    """Return the factor that brings the `quantile` of the largest channel to `level`, 1 for black pictures (Eq. L.54)."""
     brightest = float(np.quantile(np.asarray(radiance, np.float64).max(-1), quantile))
     return level / brightest if brightest > 0 else 1.0
 

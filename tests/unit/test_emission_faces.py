@@ -302,3 +302,19 @@ def test_radiance_voxels_extremes():
             sums.add(np.full((1, 3), point), np.ones((1, 3)), np.zeros(1, bool))
     with pytest.raises(InputError):
         RadianceSums(0.0, np.zeros(3)).add(np.zeros((1, 3)), np.ones((1, 3)), np.zeros(1, bool))
+
+
+def test_bounds_of_the_cache_are_raised_and_nothing_else():
+    sums = RadianceSums(1.0, np.zeros(3))
+    points = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [2.5, 0.5, 0.5]])
+    sums.add(points, np.full((3, 3), 2.0), np.array([True, True, False]))
+    cache = sums.finish()
+    at = np.concatenate([points[[0, 0, 2]], [[9.5, 0.5, 0.5]]])
+    out = cache.raised(at, np.array([[3.0, 1.0, 8.0], [5.0, 2.0, 8.0], [7.0] * 3, [7.0] * 3]))
+    order = np.argsort(out.ijk[:, 0])
+    assert out.radiance[order].tolist() == [[4.0, 2.0, 8.0], [2.0] * 3, [2.0] * 3]
+    assert out.censored.tolist() == cache.censored.tolist() and (cache.radiance == 2).all()
+    assert cache.raised(np.zeros((0, 3)), np.zeros((0, 3))).radiance.tolist() == cache.radiance.tolist()
+    known = RadianceSums(1.0, np.zeros(3))
+    known.add(points, np.ones((3, 3)), np.zeros(3, bool))
+    assert known.finish().raised(points, np.full((3, 3), 9.0)).radiance.max() == 1

@@ -32,9 +32,9 @@ from iif_core.light.emission.candidates import (
 )
 from iif_core.light.emission.environment import SkySums, cosine_directions
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose_pixels, tile_of
+from iif_core.light.emission.pixels import ANCHOR_PIXELS, TILE_PIXELS, EmissionPixels, choose_pixels, tile_of
 from iif_core.light.emission.sensor import Sensor
-from iif_core.surface.cells import grid_origin
+from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from workflow import decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, decode_view, pixel_gains, view_pixels
@@ -270,8 +270,8 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
     return sums.finish(), sky, sky.pixels / max(total, 1), brightness
 
 
-def escaping_share(photos: Photographs) -> float:
-    """Return the share of cosine-distributed rays from visible surface that leave the mesh."""
+def rays_from_surface(photos: Photographs) -> np.ndarray:
+    """Return the faces that cosine-distributed rays from visible surface meet, (n,) int, -1 = they leave the mesh."""
     geometry, _ = photos.world
     from iif_core.light.transport.geometry import trace
 
@@ -286,18 +286,31 @@ def escaping_share(photos: Photographs) -> float:
         directions.append(cosine_directions(normal, rng))
         origins.append(pixels.points + 1e-3 * normal)
     if not origins:
-        return 1.0
-    face, _ = trace(geometry, np.concatenate(origins), np.concatenate(directions))
-    return float((face < 0).mean())
+        return np.full(1, -1)
+    return np.asarray(trace(geometry, np.concatenate(origins), np.concatenate(directions))[0])
+
+
+def seen_surface(photos: Photographs) -> np.ndarray:
+    """Return (F,) bool: a pixel shows the face, or the same object in the same voxel of the radiance cache."""
+    scene, edge = photos.scene, photos.job.settings.emission.cache_edge
+    origin = cache_origin(scene, edge)
+    shown, keys = np.zeros(len(scene.faces), bool), [np.zeros(0, np.uint64)]
+    for view in photos.views:
+        pixels = photos.records[view].pixels
+        pixels = pixels.take(np.flatnonzero(pixels.valid))
+        shown[pixels.face] = True
+        keys.append(np.unique(pack_keys(voxel_indices(pixels.points, edge, origin), pixels.object_id)))
+    centre = scene.vertices[scene.faces].mean(1)
+    return shown | np.isin(pack_keys(voxel_indices(centre, edge, origin), scene.object_id), np.concatenate(keys))
 
 
 def choose_rows(
-    photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1
+    photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1, tile_edge: int = TILE_PIXELS
 ) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
-    `rest` is the radiance from which surface may be an emitter. Returns the pixels three times: as surface points, as base
-    materials (n, 5), and as what they show.
+    `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge` will be averaged.
+    Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
     """
     rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
     elsewhere = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
@@ -313,20 +326,21 @@ def choose_rows(
         choice = choose_pixels(group, usable, pixels.interior, elsewhere, per_group, rng)
         part = pixels.take(choice)
         shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
-        tile, covered = tile_of(part.index, view.width), _coverage(photos, groups, view, part.index, group[choice], rng)
+        covered = _coverage(photos, groups, view, part.index, group[choice], rng)
+        tile = tile_of(part.index, view.width, tile_edge)
         rows = EmissionPixels(*shown, part.object_id, number, tile, group[choice], covered)
         parts.append((part, record.base[choice], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))
-    joined, everything = _joined(pixels), _joined(rows)
+    every, shown = joined(pixels), joined(rows)
     # Border pixels mix with what is beside the emitter; they are used only for emitters that have no others.
-    group = everything.group
-    inner = np.bincount(group[joined.interior & (group >= 0)], minlength=groups.size) > 0
-    use = (group < 0) | joined.interior | ~np.append(inner, False)[group]
+    group = shown.group
+    inner = np.bincount(group[every.interior & (group >= 0)], minlength=groups.size) > 0
+    use = (group < 0) | every.interior | ~np.append(inner, False)[group]
     # The same holds for pixels that an emitter fills only in part.
-    whole = (group >= 0) & ~everything.partial & ~everything.bound.any(1)
+    whole = (group >= 0) & ~shown.partial & ~shown.bound.any(1)
     enough = np.bincount(group[whole & use], minlength=groups.size) >= photos.job.settings.emission.min_observations
-    use &= ~(everything.partial & np.append(enough, False)[group])
-    return joined.take(use), np.concatenate(base)[use], replace(everything.take(use), rest=rest)
+    use &= ~(shown.partial & np.append(enough, False)[group])
+    return every.take(use), np.concatenate(base)[use], replace(shown.take(use), rest=rest)
 
 
 def _coverage(
@@ -350,7 +364,7 @@ def _coverage(
     return share
 
 
-def _joined(parts: Sequence[Any]) -> Any:
+def joined(parts: Sequence[Any]) -> Any:
     """Join records of arrays, one after another."""
     arrays = {name: value for name, value in parts[0].__dict__.items() if isinstance(value, np.ndarray)}
     return replace(parts[0], **{name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays})

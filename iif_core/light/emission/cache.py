@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,6 +30,22 @@ class RadianceVoxels:
     radiance: np.ndarray
     samples: np.ndarray
     censored: np.ndarray
+
+    def raised(self, points: np.ndarray, radiance: np.ndarray) -> RadianceVoxels:
+        """Return the cache with its lower bounds raised to what the light that was found lets the surface show (Eq. L.42).
+
+        radiance (n, 3): of surface at `points` (n, 3), m; points outside voxels that hold bounds are left out.
+        """
+        own = np.flatnonzero(self.censored)
+        keys = pack_keys(self.ijk[own])
+        found = pack_keys(voxel_indices(points, self.edge, self.origin))
+        at = np.minimum(np.searchsorted(keys, found), max(len(keys) - 1, 0))
+        hit = keys[at] == found if len(keys) else np.zeros(len(found), bool)
+        count = np.bincount(at[hit], minlength=len(own))
+        total = np.stack([np.bincount(at[hit], radiance[hit, c], len(own)) for c in range(3)], 1)
+        values = self.radiance.copy()
+        values[own] = np.maximum(values[own], total / np.maximum(count, 1)[:, None])
+        return replace(self, radiance=values)
 
 
 class RadianceSums:

@@ -76,7 +76,7 @@ def estimate_object_gains(
     y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s) (Eq. L.33) is solved alternately for E (non-negative least squares) and for
     gains, gloss and level s in closed form (Eq. L.34 to L.38). Each round makes the weights relative to what is predicted
     (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, the level is raised until at most
-    `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.44).
+    `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.47).
 
     Args:
         rows: the system; without lobes there is one factor for everything that an object reflects.
@@ -94,7 +94,7 @@ def estimate_object_gains(
     count = max(int(owner.max(initial=-1)) + 1, n_objects)
     gain, gloss_gain = np.ones((count, 3)), np.ones(count)
     known = owner >= 0
-    if not known.any() or rows.groups == 0:
+    if not known.any():
         return ObjectGains(gain, gloss_gain, float("inf"), np.full((rows.groups, 3), np.inf), rows.weight)
     # Every row that belongs to no object is an anchor; anchors are an object of their own at the end, with gain 1.
     column = np.where(known, owner, count)
@@ -129,7 +129,7 @@ def estimate_object_gains(
 def _level_errors(
     of_objects: _ObjectRows, weight: np.ndarray, gloss_weight: np.ndarray, radiance: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """(error of the level of all light, (G, 3) of each group's light), Eq. L.42 and L.43.
+    """(error of the level of all light, (G, 3) of each group's light), Eq. L.45 and L.46.
 
     What emitters radiate that are seen unsaturated is known like photographed light (h); the level of the other emitters has
     the error e_free. Whether the seen groups are emitters, and radiate elsewhere what they show the camera, is judged by the
@@ -163,7 +163,7 @@ def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray
 
 
 def raise_to_physical_albedo(moments: _Moments, owner: np.ndarray, albedo: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Find the level of least cost, raised in all channels alike until albedos are at most 1 (Eq. L.44).
+    """Find the level of least cost, raised in all channels alike until albedos are at most 1 (Eq. L.47).
 
     Returns log s (3,) and by how much it was raised, 0 if no level makes the albedos possible. owner (n,): object of each row,
     the last = anchors.
@@ -342,7 +342,7 @@ class _Moments:
         return _lowest(self.costs().sum(1))
 
     def level_error(self) -> float:
-        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.42)."""
+        """Standard error of one log s of all channels by the jackknife over objects (Eq. L.45)."""
         costs = self.costs().sum(2)
         has_rows = self.observed_squared[:-1].sum(1) > 0
         whole, n = costs.sum(1), int(has_rows.sum())

@@ -17,7 +17,8 @@ class EmitterGroups:
     Attributes:
         of_face: (F,) int32 group of every face, -1 = none.
         side: (F,) int32: +1 shines to the side of the normal, -1 to the other, 0 to both; 0 where `of_face` is -1.
-        faces: (G,) int32; area: (G,) m^2; observed: (G, 3) mean observed value, weighted by pixels; count: (G,) pixels.
+        faces: (G,) int32; area: (G,) m^2; observed: (G, 3) mean observed value, weighted by pixels; count: (G,) pixels, 0 for
+            surface that no camera sees.
         dropped: [(faces, area, reason)] groups that were left out.
     """
 
@@ -32,6 +33,11 @@ class EmitterGroups:
     @property
     def size(self) -> int:
         return len(self.faces)
+
+    @property
+    def is_hidden(self) -> np.ndarray:
+        """(G,) bool: no camera sees the group."""
+        return self.count == 0
 
     def select(self, kept: np.ndarray) -> EmitterGroups:
         """The groups of a mask (G,), renumbered."""

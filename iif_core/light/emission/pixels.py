@@ -92,11 +92,11 @@ def choose_pixels(
     return np.sort(np.concatenate(chosen))
 
 
-def tile_of(index: np.ndarray, width: int) -> np.ndarray:
-    """Return (n,) int, the tile of pixels with the flattened indices (n,) in an image of `width` columns.
+def tile_of(index: np.ndarray, width: int, edge: int = TILE_PIXELS) -> np.ndarray:
+    """Return (n,) int, the tile with edges of `edge` pixels; index (n,) is flattened, of an image of `width` columns.
 
     >>> tile_of(np.array([0, 7, 8, 160]), 20).tolist()
     [0, 0, 1, 3]
     """
     row, column = index // width, index % width
-    return (row // TILE_PIXELS) * (-(-width // TILE_PIXELS)) + column // TILE_PIXELS
+    return (row // edge) * (-(-width // edge)) + column // edge

@@ -9,13 +9,15 @@ import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky
-from iif_core.light.emission.gains import ObjectGains, estimate_object_gains
+from iif_core.light.emission.gains import GainOptions, ObjectGains, estimate_object_gains
 from iif_core.light.emission.pixels import COVERAGE_ERROR, EmissionPixels
-from iif_core.light.emission.pruning import WhiteSurface
+from iif_core.light.emission.pruning import WhiteSurface, without_groups
 from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
 
 ANCHOR_WEIGHT = 100.0
 """Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.17)."""
+ROW_FLOOR = 0.05
+"""Error of a row that does not shrink with its radiance, relative to the median of all rows (Eq. L.15)."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +28,13 @@ class EmissionProblem:
         rows: the system.
         owner: (m,) object that reflects, -1 = an emitter or the sky, seen directly.
         anchor: (m,) bool, an emitter or the sky, seen directly.
+        pixels: (m,) how many were averaged.
     """
 
     rows: EmissionRows
     owner: np.ndarray
     anchor: np.ndarray
+    pixels: np.ndarray
 
     @property
     def scale_is_identifiable(self) -> bool:
@@ -38,19 +42,53 @@ class EmissionProblem:
         has a scale in the units of the photographs."""
         return bool((self.rows.cached > 0).any()) or bool((self.anchor & ~self.rows.lower_bound.any(1)).any())
 
+    def misfit(self, radiance: np.ndarray) -> float:
+        """Return how badly light `radiance` (G, 3) explains the pixels that look at no emitter (Eq. L.40): their mean squared
+        relative error, without the noise of the two traces, which is independent; each error is at most 2."""
+        used = ~self.anchor
+        observed, bound = self.rows.observed[used], self.rows.lower_bound[used]
+        predicted = [
+            np.einsum("ngc,gc->nc", matrix[used], radiance) + cached[used]
+            for matrix, cached in zip(self.rows.matrices, self.rows.cached.sum(1), strict=True)
+        ]
+        mean = 0.5 * (predicted[0] + predicted[1])
+        floor = ROW_FLOOR * float(np.median(observed.mean(1))) if len(observed) else 1.0
+        scale = np.maximum(0.5 * (observed + np.abs(mean)) + floor, 1e-300)
+        error = (observed - predicted[0]) / scale * ((observed - predicted[1]) / scale)
+        error = np.where(bound & (mean > observed), 0.0, error).mean(1)
+        return float((self.pixels[used] * error).sum() / max(self.pixels[used].sum(), 1e-300))
+
+    def take(self, keep: np.ndarray) -> EmissionProblem:
+        """Return some of the rows."""
+        return EmissionProblem(self.rows.take(keep), self.owner[keep], self.anchor[keep], self.pixels[keep])
+
+    def beside(self, other: EmissionProblem) -> EmissionProblem:
+        """These rows, followed by others of the same groups."""
+        joined = (np.concatenate([getattr(part, name) for part in (self, other)]) for name in ("owner", "anchor", "pixels"))
+        return EmissionProblem(self.rows.beside(other.rows), *joined)
+
+    def columns(self, keep: np.ndarray, shown: np.ndarray) -> EmissionProblem:
+        """The problem of a subset of the groups, a mask (G,); the others light the scene with the radiance `shown` (G, 3)."""
+        return replace(self, rows=without_groups(self.rows, keep, shown))
+
     def solve_object_gains(
-        self, prior: EmissionPrior, albedo: np.ndarray | None = None, n_objects: int = 0
+        self,
+        prior: EmissionPrior,
+        albedo: np.ndarray | None = None,
+        n_objects: int = 0,
+        options: GainOptions | None = None,
     ) -> tuple[EmissionProblem, ObjectGains]:
         """Estimate the albedo gains of objects together with the light (up to 15 solves; docs/method/light.md#object-gains).
 
-        `prior` is that of the groups; no gain brings the mean base albedo (n_objects, 3), if given, above 1.
+        `prior` is that of the groups; no gain brings the mean base albedo (n_objects, 3), if given, above 1; options: None =
+        defaults.
         Returns the problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and
         the gains.
         """
         identifiable = self.scale_is_identifiable
         # Without a scale the two lobes would fix one by how much they differ, for which predicted gloss is not good enough.
         rows = self.rows if identifiable else self.rows.without_lobes()
-        found = estimate_object_gains(rows, self.owner, prior, identifiable, albedo, n_objects)
+        found = estimate_object_gains(rows, self.owner, prior, identifiable, albedo, n_objects, options)
         of_row, gloss_of_row = np.ones(rows.observed.shape), np.ones(len(rows.observed))
         known = self.owner >= 0
         of_row[known], gloss_of_row[known] = found.gain[self.owner[known]], found.gloss_gain[self.owner[known]]
@@ -105,29 +143,42 @@ def assemble(
         matrix, cached = np.concatenate([matrix, upper], 2), np.concatenate([cached, none], 2)
         observed, bound = np.r_[observed, top], np.r_[bound, np.ones((int(clear.sum()), 3), bool)]
         key = np.r_[key, key[clear] * [1, 1, 1, -1] - [0, 0, 0, 1]]
-    problem = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
+    problem, _ = _averaged(EmissionRows(matrix, observed, cached, np.ones(observed.shape), bound), key)
     if sky is not None and sky.pixels.any():
         problem = _with_sky(problem, n_groups, sky)
     return problem if white is not None else replace(problem, rows=_strengthened(problem.rows, problem.anchor))
 
 
-def _averaged(rows: EmissionRows, key: np.ndarray) -> EmissionProblem:
-    """Averages of rows with the same key (owner, group, view, tile), weighted for relative noise."""
+def reflecting_rows(pixels: EmissionPixels, transport: TracedTransport, n_groups: int) -> tuple[EmissionProblem, np.ndarray]:
+    """Average pixels that look at groups (Eq. L.15) as if these only reflected.
+
+    Returns the problem of its rows, and the group that each of them looks at.
+    """
+    shape = (len(pixels.group), 3)
+    rows = EmissionRows(transport.matrix, pixels.radiance.astype(float), transport.cached, np.ones(shape), pixels.bound)
+    tile = pixels.tile.astype(np.int64) * n_groups + pixels.group
+    key = np.stack([pixels.object_id, np.full(shape[0], -1), pixels.view, tile], 1)
+    averaged, first = _averaged(rows, key)
+    return averaged, pixels.group[first]
+
+
+def _averaged(rows: EmissionRows, key: np.ndarray) -> tuple[EmissionProblem, np.ndarray]:
+    """Averages of rows with the same key (owner, group, view, tile), weighted for relative noise; and a row that each is of."""
     keys, block = np.unique(key, axis=0, return_inverse=True)
     rows, pixel = block_rows(rows, block.ravel())
-    key = key[pixel]
+    key, pixels = key[pixel], rows.weight[:, 0]
     brightness = np.abs(rows.observed).mean(1, keepdims=True)
     for g in np.unique(key[key[:, 1] >= 0, 1]):  # one weight for all that is seen of a group, or its dark edges count most
         own = key[:, 1] == g
         brightness[own] = brightness[own].mean()
-    floor = 0.05 * float(np.median(brightness)) if len(brightness) else 1.0
+    floor = ROW_FLOOR * float(np.median(brightness)) if len(brightness) else 1.0
     scale = np.maximum(brightness + floor, 1e-12)
     owner = key[:, 0].astype(np.int64)
     # What an emitter shows itself has next to no noise.
     noise = np.where(owner >= 0, 1.0, 1e-3) * scale[:, 0]
     cluster = np.where(owner >= 0, owner * (int(key[:, 2].max(initial=0)) + 1) + key[:, 2], -1)
     rows = replace(rows, weight=rows.weight / scale**2, cluster=cluster, noise=noise)
-    return EmissionProblem(rows, owner, key[:, 1] >= 0)
+    return EmissionProblem(rows, owner, key[:, 1] >= 0, pixels), pixel
 
 
 def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProblem:
@@ -146,7 +197,8 @@ def _with_sky(problem: EmissionProblem, n_groups: int, sky: Sky) -> EmissionProb
         np.r_[old.cluster, np.full(count, -1)],
         np.r_[old.noise, 1e-3 * level],
     )
-    return EmissionProblem(rows, np.r_[problem.owner, np.full(count, -1)], np.r_[problem.anchor, np.ones(count, bool)])
+    owner, anchor = np.r_[problem.owner, np.full(count, -1)], np.r_[problem.anchor, np.ones(count, bool)]
+    return EmissionProblem(rows, owner, anchor, np.r_[problem.pixels, sky.pixels[known]])
 
 
 def _strengthened(rows: EmissionRows, anchor: np.ndarray) -> EmissionRows:

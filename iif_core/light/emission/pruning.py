@@ -159,14 +159,14 @@ def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float
 
 def _solve_subset(rows: EmissionRows, prior: EmissionPrior, kept: np.ndarray, shown: np.ndarray) -> EmissionSolution:
     """Solution over all groups, 0 outside `kept`; the others light the scene with what they show, as the cache will."""
-    part = prior.only(kept).solve(_without(rows, kept, shown), _TRIAL_ROUNDS)
+    part = prior.only(kept).solve(without_groups(rows, kept, shown), _TRIAL_ROUNDS)
     radiance, error = np.zeros(prior.initial.shape), np.zeros(prior.initial.shape)
     determined = np.zeros(len(prior.initial))
     radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
     return replace(part, radiance=radiance, error=error, determined=determined)
 
 
-def _without(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
-    """The system of the `kept` groups; the light of the others, `shown` (G, 3), is added to what is cached."""
+def without_groups(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
+    """Return the system of the `kept` groups (G,) bool; the light of the others, `shown` (G, 3), is added to what is cached."""
     light = np.einsum("klngc,gc->klnc", rows.matrix[:, :, :, ~kept], shown[~kept])
     return replace(rows.columns(kept), cached=rows.cached + light)

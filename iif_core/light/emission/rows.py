@@ -23,6 +23,10 @@ class TracedTransport:
     matrix: np.ndarray
     cached: np.ndarray
 
+    def take(self, keep: np.ndarray) -> TracedTransport:
+        """Return some of the points."""
+        return TracedTransport(self.matrix[:, :, keep], self.cached[:, :, keep])
+
     def without_lobes(self) -> TracedTransport:
         """Add the lobes up."""
         return TracedTransport(self.matrix.sum(1, keepdims=True), self.cached.sum(1, keepdims=True))
@@ -84,6 +88,18 @@ class EmissionRows:
         """(n, 3) mean of the two targets."""
         return self.targets.mean(0)
 
+    def take(self, keep: np.ndarray) -> EmissionRows:
+        """Return some of the rows."""
+        rows = {name: getattr(self, name) for name in _OF_ROW if getattr(self, name) is not None}
+        traces = {name: getattr(self, name)[:, :, keep] for name in _OF_TRACE}
+        return replace(self, **traces, **{name: value[keep] for name, value in rows.items()})
+
+    def beside(self, other: EmissionRows) -> EmissionRows:
+        """These rows, followed by others of the same groups; both must know clusters and noise, or neither."""
+        traces = {name: np.concatenate([getattr(self, name), getattr(other, name)], 2) for name in _OF_TRACE}
+        names = [name for name in _OF_ROW if getattr(self, name) is not None]
+        return replace(self, **traces, **{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
+
     def columns(self, keep: np.ndarray) -> EmissionRows:
         """The system of a subset of the groups, a mask (G,)."""
         return replace(self, matrix=self.matrix[:, :, :, keep])
@@ -99,6 +115,10 @@ class EmissionRows:
         matrix = sum(factor[:, None].astype(np.float32) * self.matrix[:, lobe] for lobe, factor in enumerate(factors))
         cached = sum(factor * self.cached[:, lobe] for lobe, factor in enumerate(factors))
         return replace(self, matrix=matrix[:, None], cached=cached[:, None])
+
+
+_OF_TRACE = ("matrix", "cached")
+_OF_ROW = ("observed", "weight", "lower_bound", "cluster", "noise")
 
 
 def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.ndarray]:

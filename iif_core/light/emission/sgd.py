@@ -1,5 +1,5 @@
 """Emission by stochastic gradient descent on traced pixels, the paper's kind of optimiser, as a twin of `direct`
-(docs/method/light.md#stochastic-gradient-descent, Eq. L.46, L.47).
+(docs/method/light.md#stochastic-gradient-descent, Eq. L.49, L.50).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class SgdOptions:
     """How to descend.
 
     Attributes:
-        preset: `safe` scales steps by the diagonal of the normal matrix (Eq. L.46), `paper` descends at rate 100 (Eq. L.47).
+        preset: `safe` scales steps by the diagonal of the normal matrix (Eq. L.49), `paper` descends at rate 100 (Eq. L.50).
         steps: batches.
         batch: rows of a batch.
         prune: ((step, share), ...): after that step groups whose sum of channels is at most `share` of the largest are switched

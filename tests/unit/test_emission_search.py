@@ -1,0 +1,175 @@
+"""Lamps that no camera sees: which surface may hide them, how well light explains the photographs, and the search."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iif_core.light.emission.direct import EmissionPrior
+from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.hidden import MAX_HIDDEN, MIN_HITS, with_hidden_surface
+from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.problem import EmissionProblem, reflecting_rows
+from iif_core.light.emission.rows import TracedTransport
+from iif_core.light.emission.search import STEP, Candidates, search
+from tests.unit.emission_systems import rows_of
+
+
+def _groups(of_face):
+    of_face = np.asarray(of_face, np.int32)
+    n = int(of_face.max(initial=-1)) + 1
+    return EmitterGroups(of_face, np.where(of_face >= 0, 1, 0), *[np.ones(n)] * 2, np.ones((n, 3)), np.full(n, 50), [])
+
+
+def test_hidden_surface_is_one_group_an_object_and_only_where_rays_arrive():
+    """Faces: a lamp in sight, its far side, two unseen objects, one that hardly a ray meets, one without an object."""
+    groups = _groups([0, -1, -1, -1, -1, -1, -1])
+    object_id = np.array([0, 0, 1, 1, 2, 3, -1])
+    seen = np.array([True, False, False, False, False, True, False])
+    hits = np.array([90, 5, 3, 4, MIN_HITS - 1, 50, 80])
+    out = with_hidden_surface(groups, seen, object_id, np.arange(1.0, 8.0), hits)
+    assert out.of_face.tolist() == [0, 2, 1, 1, -1, -1, -1]  # more rays meet object 1
+    assert out.is_hidden.tolist() == [False, True, True] and out.faces.tolist() == [1, 2, 1] and out.area.tolist() == [1, 7, 2]
+    assert (out.observed[1:] == 0).all() and (out.side[1:4] == 0).all()
+    assert with_hidden_surface(groups, seen | True, object_id, np.ones(7), hits) is groups
+    many = MAX_HIDDEN + 9
+    out = with_hidden_surface(
+        _groups(np.full(many, -1)), np.zeros(many, bool), np.arange(many), np.ones(many), 10 + np.arange(many)
+    )
+    assert out.size == MAX_HIDDEN and (out.of_face[:9] == -1).all()  # the least in sight are left out
+
+
+def _problem(matrix, observed, cached=0.0, owner=0, anchor=False, pixels=1.0, bound=False):
+    rows = rows_of(matrix, observed=observed, cached=(cached,))
+    n = len(rows.observed)
+    rows = replace(rows, lower_bound=np.broadcast_to(np.reshape(bound, (-1, 1)), (n, 3)))
+    return EmissionProblem(rows, *(np.broadcast_to(part, (n,)) for part in (owner, anchor, np.asarray(pixels, float))))
+
+
+def test_misfit_by_hand():
+    """Two rows of 1 and 3 pixels, y = 1, predicted 1 and 3; the floor is a twentieth of the median."""
+    matrix, one = np.ones((2, 1, 3)), np.ones((1, 3))
+    problem = _problem(matrix, np.ones((2, 3)), cached=np.array([[0.0] * 3, [2.0] * 3]), pixels=[1, 3])
+    expected = 0.75 * (2 / (0.5 * (1 + 3) + 0.05)) ** 2
+    assert problem.misfit(one) == pytest.approx(expected)
+    assert replace(problem, anchor=np.array([False, True])).misfit(one) == 0
+    met = _problem(matrix, np.ones((2, 3)), cached=np.array([[0.0] * 3, [2.0] * 3]), bound=[False, True])
+    assert met.misfit(one) == 0  # a lower bound that is met
+    assert met.misfit(0 * one) == pytest.approx(0.5 * (1 / 0.55) ** 2)
+    assert replace(problem, anchor=np.array([True, True])).misfit(one) == 0
+
+
+def test_noise_of_the_traces_does_not_count_as_misfit():
+    rng = np.random.default_rng(0)
+    n, a = 40_000, 1.0
+    noisy = [np.full((n, 1, 3), a) + 0.2 * rng.standard_normal((n, 1, 3)) for _ in range(2)]
+    problem = _problem(tuple(noisy), np.full((n, 3), 2.0))
+    assert abs(problem.misfit(np.full((1, 3), 2.0))) < 2e-3  # 0.04 if one trace were squared
+    assert problem.misfit(np.full((1, 3), 3.0)) == pytest.approx((1 / 2.6) ** 2, rel=0.15)  # the scale is noisy
+
+
+_RADIANCE = st.just(0.0) | st.floats(1e-6, 1e6)
+
+
+@given(st.floats(1e-12, 1e12), _RADIANCE, _RADIANCE)
+def test_misfit_has_no_units_and_is_bounded(scale, seen, light):
+    scaled, plain = (
+        _problem(np.ones((3, 1, 3)), np.full((3, 3), seen * k)).misfit(np.full((1, 3), light * k)) for k in (scale, 1)
+    )
+    assert 0 <= scaled <= 4 and scaled == pytest.approx(plain, rel=1e-4, abs=1e-9)
+
+
+def test_rows_beside_one_another_and_some_of_them():
+    rng = np.random.default_rng(1)
+    first, second = (_problem(rng.random((n, 2, 3)), rng.random((n, 3)), owner=n, pixels=n) for n in (4, 3))
+    both = first.beside(second)
+    for part, rows in ((first, np.arange(4)), (second, np.arange(4, 7))):
+        again = both.take(rows)
+        np.testing.assert_array_equal(again.rows.matrix, part.rows.matrix)
+        np.testing.assert_array_equal(again.rows.observed, part.rows.observed)
+        assert again.owner.tolist() == part.owner.tolist() and again.pixels.tolist() == part.pixels.tolist()
+
+
+def test_pixels_on_a_group_as_if_it_reflected():
+    group, tile = np.array([0, 0, 1]), np.zeros(3, int)
+    pixels = EmissionPixels(np.arange(9.0).reshape(3, 3), np.zeros((3, 3), bool), np.full(3, 7), tile, tile, group)
+    transport = TracedTransport(np.ones((2, 2, 3, 2, 3), np.float32), np.zeros((2, 2, 3, 3), np.float32))
+    rows, of_group = reflecting_rows(pixels, transport, 2)
+    assert of_group.tolist() == [0, 1] and rows.owner.tolist() == [7, 7] and not rows.anchor.any()
+    assert rows.pixels.tolist() == [2, 1] and rows.rows.observed[0].tolist() == [1.5, 2.5, 3.5]
+
+
+def _room(strip, seed=3):
+    """A ceiling and four other objects under a lamp in sight (column 0) and a strip that no camera sees (column 2). Column 1 is a
+    patch of the ceiling beside the strip that looks like a lamp, and column 3 unseen surface that is dark. The light of the patch
+    on the other rows is what it reflects."""
+    rng = np.random.default_rng(seed)
+    n, lamp, e = 4000, 6.0, 9.0 * strip
+    owner = rng.integers(0, 5, n)
+    albedo = np.array([0.8, 0.3, 0.5, 0.2, 0.6])
+    form = rng.uniform(0.02, 0.1, (n, 4)) * [1.0, 0.3, 0.0, 0.1]
+    near = (owner == 0) & (rng.random(n) < 0.3)
+    form[near, 2], form[near, 1] = rng.uniform(0.05, 0.3, near.sum()), 0.0  # the strip lights the ceiling, its patch does not
+    patch_form = np.array([0.05, 0.0, 0.4, 0.0])
+    patch = 0.8 * (patch_form @ [lamp, 0, e, 0])
+    light = form @ [lamp, patch, e, 0.0]
+    y = albedo[owner] * light * np.exp(0.1 * rng.standard_normal(n))
+    guess = albedo * np.exp(0.15 * rng.standard_normal(5))
+
+    def columns(of, form, owner):
+        a = (guess[owner][:, None] * form)[:, :, None] * np.ones(3)
+        noise = [1 + 0.2 * rng.standard_normal(a.shape) for _ in range(2)]
+        return _problem(tuple(a * k for k in noise), y_of(of), owner=owner)
+
+    def y_of(values):
+        return values[:, None] * np.ones(3)
+
+    problem = columns(y, form, owner)
+    seen = np.zeros((2, 4, 3))
+    seen[[0, 1], [0, 1]] = 1.0
+    anchors = _problem(seen, np.array([[lamp] * 3, [patch] * 3]), owner=-1, anchor=True)
+    anchors = replace(anchors, rows=replace(anchors.rows, weight=np.full((2, 3), 1e4)))
+    own = np.repeat([0, 1], 40)
+    mine = np.where(own[:, None] == 0, [0.0, 0.1, 0.0, 0.0], patch_form)
+    reflecting = columns(np.where(own == 0, lamp, patch), mine, np.where(own == 0, 1, 0))
+    prior = EmissionPrior(np.array([lamp, patch, 0.1, 0.1])[:, None] * np.ones(3), np.array([5.0, 5.0, 300.0, 300.0]))
+    shown = np.array([lamp, patch, 0.0, 0.0])[:, None] * np.ones(3)
+    hidden = np.array([False, False, True, True])
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, None, 5)
+
+
+def test_a_strip_that_no_camera_sees_takes_the_place_of_what_it_lights():
+    proposals = _room(1.0).proposals(frozenset({0, 1}))
+    assert proposals[0] in ({0, 2}, {0, 1, 2}) and {0, 2} in proposals
+    assert not any(3 in families or 0 not in families for families in proposals)
+
+
+def test_a_room_that_is_explained_is_left_alone():
+    assert _room(0.0).proposals(frozenset({0})) == []
+
+
+def test_search_takes_the_simplest_of_what_is_better():
+    scores = {(0, 1): 1.0, (0,): 0.90, (0, 2): 0.89, (0, 3): 0.5, (0, 2, 3): 0.49, (1,): 0.97}
+    misfit = {frozenset(key): value for key, value in scores.items()}.__getitem__
+    start = frozenset({0, 1})
+
+    def run(*proposed):
+        return search(start, lambda chosen: [frozenset(p) for p in proposed] if chosen == start else [], misfit)
+
+    assert run() == (start, [])
+    # What takes the place of family 1 is compared with nothing in its place, which no proposal named.
+    assert run((0, 2)) == (frozenset({0}), [(frozenset({0}), 1.0, 0.90)])
+    assert run((0, 2, 3), (0, 3))[0] == {0, 3}
+    assert run((1,))[0] == start and scores[(1,)] > 1 - STEP
+
+
+def test_search_ends():
+    """Every proposal is better than the one before; the number of changes is limited."""
+
+    def worth(families):
+        return 0.5 ** max(families, default=-9)
+
+    chosen, changes = search(frozenset({0}), lambda families: [frozenset({max(families) + 1})], worth)
+    assert len(changes) == 4 and chosen == {4}

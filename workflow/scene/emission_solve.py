@@ -1,0 +1,337 @@
+"""Which groups of faces emit light and how much: pixels are traced, and the linear problems of `iif_core.light.emission` solved
+(docs/method/light.md#least-squares)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from iif_core.light.emission.cache import RadianceVoxels
+from iif_core.light.emission.direct import (
+    FAMILY_WIDTH,
+    HIDDEN_WIDTH,
+    OUTSIDE_WIDTH,
+    SINGLE_WIDTH,
+    EmissionPrior,
+    EmissionSolution,
+    solve_families,
+)
+from iif_core.light.emission.environment import Sky, sky_prior
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, GainOptions, ObjectGains
+from iif_core.light.emission.groups import EmitterGroups
+from iif_core.light.emission.hidden import with_hidden_surface
+from iif_core.light.emission.loss import reference_loss
+from iif_core.light.emission.pixels import TILE_PIXELS, EmissionPixels
+from iif_core.light.emission.problem import (
+    EmissionProblem,
+    assemble,
+    expected_radiance,
+    initial_radiance,
+    reflecting_rows,
+    white_surface,
+)
+from iif_core.light.emission.pruning import PrunedEmission, prune_groups
+from iif_core.light.emission.rows import TracedTransport
+from iif_core.light.emission.search import QUICK, Candidates, Families, search
+from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
+from iif_core.surface.cells import pack_keys, voxel_indices
+from workflow.scene.base_scene import ViewPixels
+from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_surface
+
+if TYPE_CHECKING:
+    from iif_core.light.transport.materials import CellMaterials
+
+WHITE = (1.0, 1.0, 1.0, 1.0, 0.0)
+"""Material of the brightest surface that only reflects."""
+METAL = 0.9
+"""Predicted metalness above which a surface counts as metal in the solve."""
+FIRST_LOOK_ROWS = 20_000
+"""Pixels that are traced with all groups as columns, to see which other emitters are worth a trace of their own."""
+SATURATED_SHARE = 0.01
+"""Share of the cached light by which saturated surface must be brighter than was thought before the light is solved again."""
+SATURATED_ROUNDS = 3
+SATURATED_PIXELS = 20_000
+"""Pixels of saturated surface that are traced."""
+COMPARISON_TILE = 24
+"""Edge in pixels of the tiles whose pixels are averaged while emitters are compared: light changes slowly."""
+
+
+@dataclass(frozen=True)
+class Traced:
+    """Groups that emit light, the cache of everything else, and the problem that they pose, with its gains.
+
+    Attributes:
+        groups, cache: of faces.
+        prior: of the groups, then of the sky.
+        problem: with rows scaled by the gains; gains: of the objects.
+    """
+
+    groups: EmitterGroups
+    cache: RadianceVoxels
+    prior: EmissionPrior
+    problem: EmissionProblem
+    gains: ObjectGains
+
+    @cached_property
+    def misfit(self) -> float:
+        """Misfit of the solution with this prior (Eq. L.40)."""
+        return self.problem.misfit(self.prior.solve(self.problem.rows).radiance)
+
+
+def trial(
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, certain: float, threshold: float
+) -> tuple[PrunedEmission, np.ndarray]:
+    """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
+    pixels, base, rows = choose_rows(photos, groups, threshold, 2)
+    own = rows.group >= 0
+    transport = _trace(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
+    paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
+    white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
+    seen, prior = _prior(photos, groups, rows, sky)
+    n_groups = len(prior.initial)
+    problem = assemble(rows, transport, n_groups, white, sky)
+    tried, gains = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects)
+    family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
+    evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
+    share = photos.job.settings.emission.prune
+    return prune_groups(tried.rows, prior, family, evidence, ~tried.anchor, protected, share, certain), reliable(gains)
+
+
+def traced(
+    photos: Photographs,
+    gain: np.ndarray,
+    groups: EmitterGroups,
+    sky: Sky | None,
+    threshold: float,
+    tile_edge: int = TILE_PIXELS,
+    options: GainOptions | None = None,
+    voxels: RadianceVoxels | None = None,
+) -> Traced:
+    """Trace the rows of groups that emit light, and estimate the gains of objects under it.
+
+    `gain` (n_objects, 3), from the trial, multiplies the albedo of surface that paths meet and no photograph shows; `tile_edge`
+    and `options` as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs.
+    """
+    cache = radiance_cache(photos, groups)[0] if voxels is None else voxels
+    pixels, base, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
+    transport = _trace(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
+    prior = _prior(photos, groups, rows, sky)[1]
+    problem = assemble(rows, transport, len(prior.initial), None, sky)
+    problem, found = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects, options)
+    return Traced(groups, cache, prior, problem, found)
+
+
+def search_emitters(
+    photos: Photographs, gain: np.ndarray, groups: EmitterGroups, sky: Sky | None, threshold: float, hits: np.ndarray
+) -> tuple[Traced, np.ndarray, list[str]]:
+    """Find whether other emitters explain the photographs better: with surface that no camera sees, or without some.
+
+    hits: (F,) rays from visible surface that meet each face. Returns the problem of the emitters, which of `groups` are among
+    them, and what was changed, in words.
+    """
+    scene = photos.scene
+    every = with_hidden_surface(groups, seen_surface(photos), scene.object_id, scene.areas, hits)
+    family = _families(photos, every, every.size)
+    names = np.unique(family)
+    family = np.searchsorted(names, family)
+    misfits: dict[Families, float] = {}
+
+    def misfit(chosen: Families) -> float:
+        if chosen not in misfits:
+            some = every.select(np.isin(family, [*chosen]))
+            misfits[chosen] = traced(photos, gain, some, sky, threshold, COMPARISON_TILE, QUICK).misfit
+        return misfits[chosen]
+
+    start = frozenset(family[: groups.size].tolist())
+    look = _first_look(photos, gain, every, family, sky, threshold)
+    chosen, changes = search(start, look.proposals, misfit)
+    told, before = [], start
+    for after, old, new in changes:
+        parts = [(after - before, "added"), (before - after, "taken out")]
+        what = [f"{_names(photos, every, family, f)} {word}" for families, word in parts for f in sorted(families)]
+        told.append(f"{' and '.join(what)}: the misfit of the light falls from {old:.4f} to {new:.4f}")
+        before = after
+    emitters = every.select(np.isin(family, [*chosen]))
+    return traced(photos, gain, emitters, sky, threshold), np.isin(family[: groups.size], [*chosen]), told
+
+
+def solve_with_saturated_surface(
+    photos: Photographs, gain: np.ndarray, found: Traced, sky: Sky | None, threshold: float
+) -> tuple[Traced, EmissionSolution, float]:
+    """Solve, and solve once more if saturated surface that only reflects turns out to be much brighter than its bound.
+
+    The bounds of the cache are raised to what the surface reflects of the light that was found (Eq. L.42), up to three times.
+    Returns the problem, with the cache that goes with it, its solution, and the loss of that.
+    """
+    solution, loss = solve(photos, found, sky)
+    bounds = found.cache
+    for _ in range(SATURATED_ROUNDS):
+        cache = _raised(photos, gain, found, bounds, solution.radiance, sky)
+        before, after = (float(voxels.radiance.sum()) for voxels in (found.cache, cache))
+        if abs(after - before) < SATURATED_SHARE * before:
+            break
+        more = after / max(float(bounds.radiance.sum()), 1e-300) - 1.0
+        photos.job.log.info("saturated surface adds %.0f %% to the cached light", 100 * more)
+        found = traced(photos, gain, found.groups, sky, threshold, voxels=cache)
+        solution, loss = solve(photos, found, sky)
+    return found, solution, loss
+
+
+def _raised(
+    photos: Photographs, gain: np.ndarray, found: Traced, cache: RadianceVoxels, radiance: np.ndarray, sky: Sky | None
+) -> RadianceVoxels:
+    """The cache of the photographs, with its bounds raised to what surface reflects of the light `radiance` (G, 3)."""
+    bounds = pack_keys(cache.ijk[cache.censored])
+    if not len(bounds):
+        return cache
+    rng = np.random.default_rng([photos.job.seed, SEEDS, 2])
+    parts, materials = [], []
+    for view in photos.views:
+        record = photos.records[view]
+        pixels = record.pixels
+        use = np.flatnonzero(pixels.valid & pixels.interior & (found.groups.of_face[pixels.face] < 0))
+        keys = pack_keys(voxel_indices(pixels.points[use], cache.edge, cache.origin))
+        inside = rng.permutation(np.flatnonzero(np.isin(keys, bounds)))
+        first = use[inside[np.unique(keys[inside], return_index=True)[1]]]  # one pixel a voxel and view
+        first = rng.permutation(first)[: -(-SATURATED_PIXELS // len(photos.views))]
+        parts.append(pixels.take(first))
+        materials.append(record.base[first])
+    pixels, base = joined(parts), np.concatenate(materials)
+    if not len(base):
+        return cache
+    transport = _trace(photos, pixels, base, found.groups, found.cache, sky, 2, photos.scene.with_gains(gain).materials())
+    matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
+    light = np.einsum("ngc,gc->nc", matrix, radiance) + cached
+    of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
+    return cache.raised(pixels.points, of_object[pixels.object_id] * light)
+
+
+def _first_look(
+    photos: Photographs, gain: np.ndarray, every: EmitterGroups, family: np.ndarray, sky: Sky | None, threshold: float
+) -> Candidates:
+    """Trace all groups as columns of one problem, on some of the rows."""
+    thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
+    cache = radiance_cache(photos, every)[0]
+    pixels, base, rows = choose_rows(photos, every, threshold, thin, COMPARISON_TILE)
+    transport = _trace(photos, pixels, base, every, cache, sky, 2, photos.scene.with_gains(gain).materials())
+    seen, prior = _prior(photos, every, rows, sky)
+    outside = len(prior.initial) - every.size
+    problem = assemble(rows, transport, len(prior.initial), None, sky)
+    own = np.flatnonzero(rows.group >= 0)
+    reflecting, of_group = reflecting_rows(rows.take(own), transport.take(own), len(prior.initial))
+    hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
+    shown = np.concatenate([seen, np.zeros((outside, 3))])
+    of_all = np.r_[family, np.full(outside, -1)]
+    limit = _albedo_limit(photos, sky), photos.scene.n_objects
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, *limit)
+
+
+def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, number: int) -> str:
+    """A family in words: its object, and whether a camera sees it."""
+    own = np.flatnonzero(family == number)
+    thing = int(photos.scene.object_id[np.flatnonzero(groups.of_face == own[0])[0]])
+    table = photos.job.read("segmentation").table("objects.parquet")
+    name = dict(zip(table["object_id"].tolist(), table["name"].tolist(), strict=True)).get(thing, "surface of no object")
+    unseen = "unseen surface of " if groups.is_hidden[own[0]] else ""
+    return f"{unseen}{name} ({groups.area[own].sum():.2g} m^2)"
+
+
+def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[EmissionSolution, float]:
+    """Solve for the groups that shine, which are black from here on, and for the environment; return also the loss."""
+    problem, prior = found.problem, found.prior
+    initial = prior.initial
+    family = _families(photos, found.groups, len(initial))
+    width = np.full(len(initial), FAMILY_WIDTH)
+    if sky is not None and sky.is_unseen:
+        family[found.groups.size :], width[found.groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
+    settings = photos.job.settings.emission
+    if settings.solver == "sgd":
+        # Which groups emit is known by now, so `safe` has nothing to prune.
+        prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
+        options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
+        solution = solve_emission_sgd(problem.rows, initial, options)
+    else:
+        solution = solve_families(problem.rows, prior, family, width)
+    solution = solution.with_level_error(np.minimum(found.gains.error_of_group, PRIOR_LEVEL_ERROR))
+    return solution, reference_loss(problem.rows, solution.radiance)
+
+
+def _families(photos: Photographs, groups: EmitterGroups, n_groups: int) -> np.ndarray:
+    """(n_groups,) int: parts of one object shine alike, more or less, and so does its unseen surface; each group of the
+    environment is alone."""
+    face = np.flatnonzero(groups.of_face >= 0)
+    family = -1 - np.arange(n_groups)
+    family[groups.of_face[face]] = photos.scene.object_id[face]
+    family[: groups.size][groups.is_hidden] += photos.scene.n_objects
+    return family
+
+
+def reliable(gains: ObjectGains) -> np.ndarray:
+    """Return (n_objects, 3) gains, 1 where the level of the light, and so theirs, is no better known than from the prior."""
+    return gains.gain if gains.level_error < PRIOR_LEVEL_ERROR else np.ones_like(gains.gain)
+
+
+def _albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
+    """(n_objects, 3) base albedos that no gain may bring above 1, where light comes from where no camera looks: its level is
+    the least certain. In a closed room the gains of single objects are less certain than the light: None."""
+    return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
+
+
+def _prior(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, EmissionPrior]:
+    """Radiance seen on the groups; and the prior of the groups, followed by those of the environment."""
+    seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
+    seen[groups.is_hidden] = 0.0
+    initial, width = expected_radiance(rows, seen), np.where(groups.is_hidden, HIDDEN_WIDTH, SINGLE_WIDTH)
+    if groups.is_hidden.any():
+        initial[groups.is_hidden] = np.median(rows.radiance[rows.group < 0], 0)
+    prior = EmissionPrior(initial, width)
+    if sky is None:
+        return seen, prior
+    return seen, prior.beside(sky_prior(sky) if sky.direction is not None else EmissionPrior.independent(sky.radiance))
+
+
+def _trace(
+    photos: Photographs,
+    pixels: ViewPixels,
+    base: np.ndarray,
+    groups: EmitterGroups,
+    voxels: RadianceVoxels,
+    sky: Sky | None,
+    stream: int,
+    unseen: CellMaterials | None = None,
+) -> TracedTransport:
+    """Two independent estimates of (A, h), by lobe.
+
+    unseen: materials of surface that paths meet and no photograph shows; None = the base texture."""
+    job, settings = photos.job, photos.job.settings.emission
+    geometry, material = photos.world
+    from iif_core.light.transport.cache import RadianceCache
+    from iif_core.light.transport.matrix import transport_matrix
+    from iif_core.light.transport.scene import EmitterColumns, PathOptions, Scene, ShadingPoints
+
+    cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
+    scene = Scene(geometry, material if unseen is None else unseen, None, cache)
+    # A wrongly predicted metal would remove the diffuse light of a whole surface; only high values are believed.
+    metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
+    points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
+    side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
+    texels = sky.columns + groups.size if sky else None
+    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels)
+    samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
+    halves = []
+    for half in range(2):
+        job.progress(half, 2, "halves of the transport matrix traced")
+        found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half))
+        halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
+    job.progress(2, 2, "halves of the transport matrix traced")
+    return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
+
+
+def _albedo_and_gloss(values: np.ndarray, dielectric: np.ndarray) -> np.ndarray:
+    """(2, n, ...) of (n, 2, ...) values by diffuse and specular lobe: what is proportional to the albedo, the specular lobe of
+    metals included, and the gloss of dielectrics."""
+    gloss = np.where(dielectric.reshape(-1, *[1] * (values.ndim - 2)), values[:, 1], 0.0)
+    return np.stack([values[:, 0] + (values[:, 1] - gloss), gloss])
