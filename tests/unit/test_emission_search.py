@@ -12,6 +12,7 @@ from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import MAX_HIDDEN, MIN_HITS, with_hidden_surface
 from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import EmissionProblem, reflecting_rows
+from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.search import STEP, Candidates, search
 from tests.unit.emission_systems import rows_of
@@ -23,17 +24,17 @@ def _groups(of_face):
     return EmitterGroups(of_face, np.where(of_face >= 0, 1, 0), *[np.ones(n)] * 2, np.ones((n, 3)), np.full(n, 50), [])
 
 
-def test_hidden_surface_is_one_group_an_object_and_only_where_rays_arrive():
-    """Faces: a lamp in sight, its far side, two unseen objects, one that hardly a ray meets, one without an object."""
-    groups = _groups([0, -1, -1, -1, -1, -1, -1])
-    object_id = np.array([0, 0, 1, 1, 2, 3, -1])
-    seen = np.array([True, False, False, False, False, True, False])
-    hits = np.array([90, 5, 3, 4, MIN_HITS - 1, 50, 80])
-    out = with_hidden_surface(groups, seen, object_id, np.arange(1.0, 8.0), hits)
-    assert out.of_face.tolist() == [0, 2, 1, 1, -1, -1, -1]  # more rays meet object 1
-    assert out.is_hidden.tolist() == [False, True, True] and out.faces.tolist() == [1, 2, 1] and out.area.tolist() == [1, 7, 2]
-    assert (out.observed[1:] == 0).all() and (out.side[1:4] == 0).all()
-    assert with_hidden_surface(groups, seen | True, object_id, np.ones(7), hits) is groups
+def test_hidden_objects_are_one_group_each_and_only_where_rays_arrive():
+    """Faces: a lamp in sight and its far side, two unseen objects, one hardly in sight of others, one seen in part, no object."""
+    groups = _groups([0, -1, -1, -1, -1, -1, -1, -1, -1])
+    object_id = np.array([0, 0, 1, 1, 4, 2, 3, 3, -1])
+    seen = np.array([True, False, False, False, False, False, True, False, False])
+    hits = np.array([90, 5, 3, 4, 9, MIN_HITS - 1, 50, 50, 80])
+    out = with_hidden_surface(groups, seen, object_id, np.arange(1.0, 10.0), hits)
+    assert out.of_face.tolist() == [0, -1, 2, 2, 1, -1, -1, -1, -1]  # more rays meet object 4
+    assert out.is_hidden.tolist() == [False, True, True] and out.faces.tolist() == [1, 1, 2] and out.area.tolist() == [1, 5, 7]
+    assert (out.observed[1:] == 0).all() and (out.side[2:5] == 0).all()
+    assert with_hidden_surface(groups, seen | True, object_id, np.ones(9), hits) is groups
     many = MAX_HIDDEN + 9
     out = with_hidden_surface(
         _groups(np.full(many, -1)), np.zeros(many, bool), np.arange(many), np.ones(many), 10 + np.arange(many)
@@ -101,10 +102,10 @@ def test_pixels_on_a_group_as_if_it_reflected():
     assert rows.pixels.tolist() == [2, 1] and rows.rows.observed[0].tolist() == [1.5, 2.5, 3.5]
 
 
-def _room(strip, seed=3):
+def _room(strip, reflects=0.1, seed=3):
     """A ceiling and four other objects under a lamp in sight (column 0) and a strip that no camera sees (column 2). Column 1 is a
     patch of the ceiling beside the strip that looks like a lamp, and column 3 unseen surface that is dark. The light of the patch
-    on the other rows is what it reflects."""
+    on the other rows is what it reflects. A white surface in the place of hidden ones would show `reflects`."""
     rng = np.random.default_rng(seed)
     n, lamp, e = 4000, 6.0, 9.0 * strip
     owner = rng.integers(0, 5, n)
@@ -137,13 +138,18 @@ def _room(strip, seed=3):
     prior = EmissionPrior(np.array([lamp, patch, 0.1, 0.1])[:, None] * np.ones(3), np.array([5.0, 5.0, 300.0, 300.0]))
     shown = np.array([lamp, patch, 0.0, 0.0])[:, None] * np.ones(3)
     hidden = np.array([False, False, True, True])
-    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, None, 5)
+    white = WhiteSurface(np.zeros((4, 3)), np.zeros((4, 4, 3)), np.full((4, 3), reflects))
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, None, 5)
 
 
 def test_a_strip_that_no_camera_sees_takes_the_place_of_what_it_lights():
     proposals = _room(1.0).proposals(frozenset({0, 1}))
     assert proposals[0] in ({0, 2}, {0, 1, 2}) and {0, 2} in proposals
     assert not any(3 in families or 0 not in families for families in proposals)
+
+
+def test_unseen_surface_that_a_white_one_could_match_is_no_lamp():
+    assert not any(2 in families for families in _room(1.0, reflects=1e3).proposals(frozenset({0, 1})))
 
 
 def test_a_room_that_is_explained_is_left_alone():
@@ -155,14 +161,16 @@ def test_search_takes_the_simplest_of_what_is_better():
     misfit = {frozenset(key): value for key, value in scores.items()}.__getitem__
     start = frozenset({0, 1})
 
-    def run(*proposed):
-        return search(start, lambda chosen: [frozenset(p) for p in proposed] if chosen == start else [], misfit)
+    def run(*proposed, doubtful=()):
+        found = [frozenset(p) for p in proposed]
+        return search(start, lambda chosen: found if chosen == start else [], misfit, frozenset(doubtful))
 
     assert run() == (start, [])
     # What takes the place of family 1 is compared with nothing in its place, which no proposal named.
     assert run((0, 2)) == (frozenset({0}), [(frozenset({0}), 1.0, 0.90)])
     assert run((0, 2, 3), (0, 3))[0] == {0, 3}
     assert run((1,))[0] == start and scores[(1,)] > 1 - STEP
+    assert run((1,), doubtful=[0])[0] == {1} and run((1,), doubtful=[1])[0] == start
 
 
 def test_search_ends():

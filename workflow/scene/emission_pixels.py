@@ -34,7 +34,7 @@ from iif_core.light.emission.environment import SkySums, cosine_directions
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.pixels import ANCHOR_PIXELS, TILE_PIXELS, EmissionPixels, choose_pixels, tile_of
 from iif_core.light.emission.sensor import Sensor
-from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from iif_core.surface.cells import grid_origin
 from workflow import decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, decode_view, pixel_gains, view_pixels
@@ -290,18 +290,13 @@ def rays_from_surface(photos: Photographs) -> np.ndarray:
     return np.asarray(trace(geometry, np.concatenate(origins), np.concatenate(directions))[0])
 
 
-def seen_surface(photos: Photographs) -> np.ndarray:
-    """Return (F,) bool: a pixel shows the face, or the same object in the same voxel of the radiance cache."""
-    scene, edge = photos.scene, photos.job.settings.emission.cache_edge
-    origin = cache_origin(scene, edge)
-    shown, keys = np.zeros(len(scene.faces), bool), [np.zeros(0, np.uint64)]
+def seen_faces(photos: Photographs) -> np.ndarray:
+    """Return (F,) bool: a pixel shows the face."""
+    shown = np.zeros(len(photos.scene.faces), bool)
     for view in photos.views:
         pixels = photos.records[view].pixels
-        pixels = pixels.take(np.flatnonzero(pixels.valid))
-        shown[pixels.face] = True
-        keys.append(np.unique(pack_keys(voxel_indices(pixels.points, edge, origin), pixels.object_id)))
-    centre = scene.vertices[scene.faces].mean(1)
-    return shown | np.isin(pack_keys(voxel_indices(centre, edge, origin), scene.object_id), np.concatenate(keys))
+        shown[pixels.face[pixels.valid]] = True
+    return shown
 
 
 def choose_rows(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -33,13 +33,13 @@ from iif_core.light.emission.problem import (
     reflecting_rows,
     white_surface,
 )
-from iif_core.light.emission.pruning import PrunedEmission, prune_groups
+from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, prune_groups
 from iif_core.light.emission.rows import TracedTransport
-from iif_core.light.emission.search import QUICK, Candidates, Families, search
+from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.surface.cells import pack_keys, voxel_indices
 from workflow.scene.base_scene import ViewPixels
-from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_surface
+from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, joined, radiance_cache, seen_faces
 
 if TYPE_CHECKING:
     from iif_core.light.transport.materials import CellMaterials
@@ -55,8 +55,18 @@ SATURATED_SHARE = 0.01
 SATURATED_ROUNDS = 3
 SATURATED_PIXELS = 20_000
 """Pixels of saturated surface that are traced."""
-COMPARISON_TILE = 24
-"""Edge in pixels of the tiles whose pixels are averaged while emitters are compared: light changes slowly."""
+HIDDEN_POINTS = 32
+"""Points of each hidden surface at which the light that falls on it is estimated."""
+TILES_ACROSS = 8
+"""Tiles across a picture whose pixels are averaged while emitters are compared: light changes slowly."""
+
+
+class SurfacePoints(NamedTuple):
+    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    wo: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -109,14 +119,19 @@ def traced(
     tile_edge: int = TILE_PIXELS,
     options: GainOptions | None = None,
     voxels: RadianceVoxels | None = None,
+    left_out: np.ndarray | None = None,
 ) -> Traced:
     """Trace the rows of groups that emit light, and estimate the gains of objects under it.
 
     `gain` (n_objects, 3), from the trial, multiplies the albedo of surface that paths meet and no photograph shows; `tile_edge`
-    and `options` as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs.
+    and `options` as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs; left_out: (F,) bool, faces
+    whose pixels are no rows unless they shine.
     """
     cache = radiance_cache(photos, groups)[0] if voxels is None else voxels
     pixels, base, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
+    if left_out is not None:
+        use = (rows.group >= 0) | ~left_out[pixels.face]
+        pixels, base, rows = pixels.take(use), base[use], rows.take(use)
     transport = _trace(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
     prior = _prior(photos, groups, rows, sky)[1]
     problem = assemble(rows, transport, len(prior.initial), None, sky)
@@ -125,29 +140,41 @@ def traced(
 
 
 def search_emitters(
-    photos: Photographs, gain: np.ndarray, groups: EmitterGroups, sky: Sky | None, threshold: float, hits: np.ndarray
+    photos: Photographs,
+    gain: np.ndarray,
+    groups: EmitterGroups,
+    lit: np.ndarray,
+    excess: np.ndarray,
+    sky: Sky | None,
+    threshold: float,
+    hits: np.ndarray,
 ) -> tuple[Traced, np.ndarray, list[str]]:
-    """Find whether other emitters explain the photographs better: with surface that no camera sees, or without some.
+    """Find whether other emitters explain the photographs better: with objects that no camera sees, with others of the `groups`
+    than those that are `lit` (G,) bool, or without some.
 
-    hits: (F,) rays from visible surface that meet each face. Returns the problem of the emitters, which of `groups` are among
-    them, and what was changed, in words.
+    excess: (G,) brightness of the groups relative to a white surface; hits: (F,) rays from visible surface that meet each face.
+    Returns the problem of the emitters, which of `groups` are among them, and what was changed, in words.
     """
     scene = photos.scene
-    every = with_hidden_surface(groups, seen_surface(photos), scene.object_id, scene.areas, hits)
+    every = with_hidden_surface(groups, seen_faces(photos), scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
-    names = np.unique(family)
-    family = np.searchsorted(names, family)
+    family[: groups.size][~lit] += 2 * scene.n_objects
+    family = np.unique(family, return_inverse=True)[1]
+    # A lamp that comes back must be needed by other surface than its own.
+    weak = np.isin(every.of_face, np.flatnonzero(~lit))
     misfits: dict[Families, float] = {}
 
     def misfit(chosen: Families) -> float:
         if chosen not in misfits:
             some = every.select(np.isin(family, [*chosen]))
-            misfits[chosen] = traced(photos, gain, some, sky, threshold, COMPARISON_TILE, QUICK).misfit
+            found = traced(photos, gain, some, sky, threshold, _comparison_tile(photos), QUICK, left_out=weak)
+            misfits[chosen] = found.misfit
         return misfits[chosen]
 
-    start = frozenset(family[: groups.size].tolist())
-    look = _first_look(photos, gain, every, family, sky, threshold)
-    chosen, changes = search(start, look.proposals, misfit)
+    start = frozenset(family[: groups.size][lit].tolist())
+    look = _first_look(photos, gain, every, lit, family, sky, threshold)
+    doubtful = frozenset(f for f in start if excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
+    chosen, changes = search(start, look.proposals, misfit, doubtful)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
@@ -210,23 +237,57 @@ def _raised(
 
 
 def _first_look(
-    photos: Photographs, gain: np.ndarray, every: EmitterGroups, family: np.ndarray, sky: Sky | None, threshold: float
+    photos: Photographs,
+    gain: np.ndarray,
+    every: EmitterGroups,
+    lit: np.ndarray,
+    family: np.ndarray,
+    sky: Sky | None,
+    threshold: float,
 ) -> Candidates:
-    """Trace all groups as columns of one problem, on some of the rows."""
+    """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
     thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)[0]
-    pixels, base, rows = choose_rows(photos, every, threshold, thin, COMPARISON_TILE)
-    transport = _trace(photos, pixels, base, every, cache, sky, 2, photos.scene.with_gains(gain).materials())
+    pixels, base, rows = choose_rows(photos, every, threshold, thin, _comparison_tile(photos))
+    material = photos.scene.with_gains(gain).materials()
+    transport = _trace(photos, pixels, base, every, cache, sky, 2, material)
+    white = _white_hidden_surface(photos, every, cache, sky, material)
     seen, prior = _prior(photos, every, rows, sky)
     outside = len(prior.initial) - every.size
     problem = assemble(rows, transport, len(prior.initial), None, sky)
-    own = np.flatnonzero(rows.group >= 0)
+    own = np.flatnonzero(np.isin(rows.group, np.flatnonzero(lit)))
     reflecting, of_group = reflecting_rows(rows.take(own), transport.take(own), len(prior.initial))
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
     limit = _albedo_limit(photos, sky), photos.scene.n_objects
-    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, *limit)
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, *limit)
+
+
+def _white_hidden_surface(
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, material: CellMaterials
+) -> WhiteSurface:
+    """What both sides together of each hidden group would show if they were white; nothing for the other groups."""
+    scene, rng = photos.scene, np.random.default_rng([photos.job.seed, SEEDS, 3])
+    number = groups.size + (sky.size if sky else 0)
+    matrix, cached = np.zeros((number, number, 3)), np.zeros((number, 3))
+    own = np.flatnonzero(groups.is_hidden)
+    if len(own):
+        faces = [np.flatnonzero(groups.of_face == g) for g in own]
+        drawn = [rng.choice(f, HIDDEN_POINTS, p=scene.areas[f] / scene.areas[f].sum()) for f in faces]
+        face, group = np.concatenate(drawn), np.repeat(own, HIDDEN_POINTS)
+        normal = scene.normals[face] * np.where(np.arange(len(face)) % 2, -1.0, 1.0)[:, None]
+        middle = scene.vertices[scene.faces[face]].mean(1) + 1e-3 * normal
+        points = SurfacePoints(*(part.astype(np.float32) for part in (middle, normal, normal)))
+        paint = np.tile(np.float32(WHITE), (len(face), 1))
+        white = _trace(photos, points, paint, groups, voxels, sky, 1, material).without_lobes()
+        np.add.at(matrix, group, white.matrix[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
+        np.add.at(cached, group, white.cached[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
+    return WhiteSurface(np.zeros((number, 3)), matrix, cached)
+
+
+def _comparison_tile(photos: Photographs) -> int:
+    return max(1, int(np.median([max(view.width, view.height) for view in photos.views])) // TILES_ACROSS)
 
 
 def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, number: int) -> str:
@@ -235,7 +296,7 @@ def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, numbe
     thing = int(photos.scene.object_id[np.flatnonzero(groups.of_face == own[0])[0]])
     table = photos.job.read("segmentation").table("objects.parquet")
     name = dict(zip(table["object_id"].tolist(), table["name"].tolist(), strict=True)).get(thing, "surface of no object")
-    unseen = "unseen surface of " if groups.is_hidden[own[0]] else ""
+    unseen = "unseen " if groups.is_hidden[own[0]] else ""
     return f"{unseen}{name} ({groups.area[own].sum():.2g} m^2)"
 
 
@@ -295,7 +356,7 @@ def _prior(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky
 
 def _trace(
     photos: Photographs,
-    pixels: ViewPixels,
+    pixels: ViewPixels | SurfacePoints,
     base: np.ndarray,
     groups: EmitterGroups,
     voxels: RadianceVoxels,
@@ -319,7 +380,8 @@ def _trace(
     points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None
-    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels)
+    weight = _drawn(groups, photos.scene.areas)
+    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight)
     samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
     halves = []
     for half in range(2):
@@ -328,6 +390,16 @@ def _trace(
         halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
+
+
+def _drawn(groups: EmitterGroups, areas: np.ndarray) -> np.ndarray | None:
+    """(F,) how often faces are drawn where some groups are hidden: half of the draws go to what cameras see, however many objects
+    may hide a lamp, and all groups of either kind get the same. None = as usual."""
+    hidden = groups.is_hidden
+    if not hidden.any() or hidden.all():
+        return None
+    share = np.where(hidden, 0.5 / hidden.sum(), 0.5 / (~hidden).sum()) / np.maximum(groups.area, 1e-12)
+    return np.where(groups.of_face >= 0, areas * np.append(share, 0.0)[groups.of_face], 0.0)
 
 
 def _albedo_and_gloss(values: np.ndarray, dielectric: np.ndarray) -> np.ndarray:

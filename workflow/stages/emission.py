@@ -66,14 +66,18 @@ def run(job: Job) -> None:
         )
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
-    lit = pruned.kept[: groups.size]
+    reasons = np.array(pruned.reason[: groups.size], dtype=object)
+    # What was dropped for giving little light, and not for being no brighter than a white surface, may be needed after all.
+    offered = pruned.kept[: groups.size] | (pruned.excess[: groups.size] >= certain)
     hits = np.bincount(met[met >= 0], minlength=len(scene.faces))
-    found, stays, changes = search_emitters(photos, gain, groups.select(lit), outside, threshold, hits)
+    lit = pruned.kept[: groups.size][offered]
+    excess, some = pruned.excess[: groups.size][offered], groups.select(offered)
+    found, shines, changes = search_emitters(photos, gain, some, lit, excess, outside, threshold, hits)
     for change in changes:
         job.log.info("emitters: %s", change)
     notes.extend(changes)
-    reasons = np.array(pruned.reason[: groups.size], dtype=object)
-    reasons[np.flatnonzero(lit)[~stays]] = "the photographs are explained better without it"
+    reasons[np.flatnonzero(offered)[lit & ~shines]] = "the photographs are explained better without it"
+    reasons[np.flatnonzero(offered)[shines]] = ""
     left_out, emitters = groups.select(reasons != ""), found.groups
     candidates = groups.size + len(groups.dropped) + int(emitters.is_hidden.sum())
     found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)

@@ -1,4 +1,4 @@
-"""Surface that no camera sees and that may hide a lamp (docs/method/light.md#lamps-that-no-camera-sees)."""
+"""Objects that no camera sees and that may be lamps (docs/method/light.md#lamps-that-no-camera-sees)."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import numpy as np
 from iif_core.light.emission.groups import EmitterGroups
 
 MIN_HITS = 4
-"""Rays from visible surface that must meet hidden surface before it is asked whether it shines."""
+"""Rays from visible surface that must meet an object before it is asked whether it shines."""
 MAX_HIDDEN = 64
-"""Largest number of objects whose hidden surface is asked; those that most rays meet."""
+"""Largest number of objects that are asked; those that most rays meet."""
 
 
 def with_hidden_surface(
@@ -19,13 +19,16 @@ def with_hidden_surface(
     areas: np.ndarray,
     hits: np.ndarray,
 ) -> EmitterGroups:
-    """Append groups of surface that no camera sees, one for each object.
+    """Append objects that no camera sees, one group each.
 
-    Only surface that lights what cameras see matters, so that groups which few rays from there meet are left out.
+    A lamp is mostly an object of its own. Unseen parts of objects that are seen, and do not shine there, would explain light that
+    the model lacks for other reasons.
+
+    Only what lights the surface that cameras see matters, so that objects which few rays from there meet are left out.
 
     Args:
         groups: of what cameras see, on F faces.
-        seen: (F,) bool, some pixel shows the face or the same object beside it.
+        seen: (F,) bool, some pixel shows the face.
         object_id: (F,), -1 = none.
         areas: (F,) m^2.
         hits: (F,) cosine-distributed rays from visible surface that meet each face.
@@ -33,7 +36,9 @@ def with_hidden_surface(
     Returns:
         The groups. Those that were appended shine to both sides and have `count` 0.
     """
-    face = np.flatnonzero(~seen & (groups.of_face < 0) & (object_id >= 0) & (areas > 1e-12))
+    known = np.zeros(int(object_id.max(initial=-1)) + 2, bool)
+    known[object_id[seen | (groups.of_face >= 0)]] = True
+    face = np.flatnonzero(~known[object_id] & (object_id >= 0) & (areas > 1e-12))
     if not len(face):
         return groups
     label = np.unique(object_id[face], return_inverse=True)[1]

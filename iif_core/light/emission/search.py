@@ -11,6 +11,7 @@ import numpy as np
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.gains import GainOptions, ObjectGains
 from iif_core.light.emission.problem import ROW_FLOOR, EmissionProblem
+from iif_core.light.emission.pruning import WhiteSurface
 
 Families = frozenset[int]
 
@@ -20,7 +21,10 @@ PROMISING = 0.02
 """The same in the first look, on fewer pixels."""
 NOTICEABLE = 0.005
 """The same if the light of a family is added and all else stays, from which it is looked at."""
-_ADDED, _SWAPPED = 3, 2  # hidden families that are tried in addition to the others, and in place of one of them
+HIDDEN_EXCESS = 4.0
+"""Brightness of unseen surface relative to a white one in its place from which it is a lamp and not a reflector of light that the
+model lacks."""
+_ADDED, _SWAPPED = 3, 2  # families that are tried in addition to the others, and in place of one of them
 _MISSED = 1.5  # growth of the misfit without a family from which nothing else can take its place
 _CONFIRMED = 2  # proposals that are traced
 _MAX_CHANGES = 4
@@ -39,6 +43,7 @@ class Candidates:
         family: (G,) int >= 0, groups that shine or do not shine together; -1 = sky, which always shines.
         hidden: (G,) bool, no camera sees the group.
         shown: (G, 3) radiance with which a group lights the scene that only reflects.
+        white: what a white surface would show in the place of hidden groups.
         albedo: (n_objects, 3) mean base albedo that no gain brings above 1, or None; n_objects.
     """
 
@@ -49,32 +54,34 @@ class Candidates:
     family: np.ndarray
     hidden: np.ndarray
     shown: np.ndarray
+    white: WhiteSurface
     albedo: np.ndarray | None
     n_objects: int
 
     def proposals(self, chosen: Families) -> list[Families]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
 
-        Families are taken out, and hidden families added or put in the place of one of the chosen, in the order of what their
-        light alone would take off the misfit.
+        Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
+        would take off the misfit.
         """
         misfit, lit = self._look(chosen)
         found: dict[Families, float] = {}
 
-        def with_hidden(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
-            for f in self._best_hidden(families, lit, NOTICEABLE * misfit)[:most]:
+        def with_added(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
+            for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
                 added = self._look(families | {f})[0]
                 if added <= (1.0 - PROMISING) * value:
                     found[families | {f}] = added
 
-        with_hidden(chosen, misfit, lit, _ADDED)
+        with_added(chosen, misfit, lit, _ADDED)
         for out in sorted(chosen):
             rest = chosen - {out}
             found[rest], lit = self._look(rest)
             if found[rest] <= _MISSED * misfit:
-                with_hidden(rest, found[rest], lit, _SWAPPED)
-        penalised = {f: value * (1.0 + PROMISING) ** (len(f) - len(chosen)) for f, value in found.items()}
-        return [f for f in sorted(penalised, key=lambda f: penalised[f]) if penalised[f] <= (1.0 - PROMISING) * misfit]
+                with_added(rest, found[rest], lit, _SWAPPED)
+        order = sorted(found, key=lambda f: found[f] * (1.0 + PROMISING) ** len(f))
+        # Fewer families are worth a trace of their own if they explain nearly as much.
+        return [f for f in order if found[f] <= misfit * (1.0 + PROMISING if len(f) < len(chosen) else 1.0 - PROMISING)]
 
     def _look(self, chosen: Families) -> tuple[float, EmissionProblem]:
         """Misfit of the families, and the problem with all columns, scaled by the gains, in which their light is cached."""
@@ -85,11 +92,13 @@ class Candidates:
         radiance = prior.solve(solved.rows, QUICK.rounds).radiance
         light = self.shown.copy()
         light[keep] = radiance
-        return solved.misfit(radiance), _lit(every, gains, light)
+        # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.
+        reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & self.hidden & keep
+        return np.inf if reflects.any() else solved.misfit(radiance), _lit(every, gains, light)
 
-    def _best_hidden(self, chosen: Families, lit: EmissionProblem, least: float) -> list[int]:
-        """Hidden families, not chosen, whose light would take at least `least` off the misfit if all else stayed."""
-        gain = {f: 0.0 for f in np.unique(self.family[self.hidden]).tolist() if f not in chosen}
+    def _best_added(self, chosen: Families, lit: EmissionProblem, least: float) -> list[int]:
+        """Families, not chosen, whose light would take at least `least` off the misfit if all else stayed."""
+        gain = {f: 0.0 for f in np.unique(self.family[self.family >= 0]).tolist() if f not in chosen}
         for family in gain:
             gain[family] = _decrease(lit, lit.rows.matrices[:, :, self.family == family].sum(2))
         return [f for f in sorted(gain, key=lambda f: -gain[f]) if gain[f] > least]
@@ -114,8 +123,8 @@ def _decrease(lit: EmissionProblem, column: np.ndarray) -> float:
     residual, owner = rows.mean_target[used], lit.owner[used]
     predicted = np.maximum(rows.observed[used] - residual, 0.0)
     scale = 0.5 * (rows.observed[used] + predicted) + ROW_FLOOR * np.median(rows.observed[used].mean(1))
-    weight = lit.pixels[used, None] / np.maximum(scale, 1e-300) ** 2
-    weight = np.where(rows.lower_bound[used] & (residual < 0), 0.0, weight)
+    counts = (scale > 0) & ~(rows.lower_bound[used] & (residual < 0))
+    weight = np.divide(lit.pixels[used, None], scale**2, out=np.zeros(scale.shape), where=counts & (scale**2 > 0))
     first, second = column[:, used]
     mean = 0.5 * (first + second)
 
@@ -132,7 +141,10 @@ def _decrease(lit: EmissionProblem, column: np.ndarray) -> float:
 
 
 def search(
-    chosen: Families, proposals: Callable[[Families], list[Families]], misfit: Callable[[Families], float]
+    chosen: Families,
+    proposals: Callable[[Families], list[Families]],
+    misfit: Callable[[Families], float],
+    doubtful: Families = frozenset(),
 ) -> tuple[Families, list[tuple[Families, float, float]]]:
     """Change the emitters as long as others explain the photographs better by `STEP`; of those that do, a family more must be
     worth as much.
@@ -141,6 +153,7 @@ def search(
         chosen: families to begin with.
         proposals: sets of families that look better than a given one, best first.
         misfit: of a set of families, from a trace of its own.
+        doubtful: families that are taken out if the misfit does not grow.
 
     Returns:
         The families, and for each change: the families after it, and the misfit before and after.
@@ -153,7 +166,8 @@ def search(
         if not tried:
             break
         before, after = misfit(chosen), [misfit(families) for families in tried]
-        better = [i for i, value in enumerate(after) if value < (1.0 - STEP) * before]
+        fewer = [families < chosen and chosen - families <= doubtful for families in tried]
+        better = [i for i, value in enumerate(after) if value < (1.0 - STEP) * before or (fewer[i] and value <= before)]
         if not better:
             break
         best = min(better, key=lambda i: after[i] * (1.0 + STEP) ** len(tried[i]))
