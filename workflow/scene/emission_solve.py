@@ -173,7 +173,8 @@ def search_emitters(
 
     start = frozenset(family[: groups.size][lit].tolist())
     look = _first_look(photos, gain, every, lit, family, sky, threshold)
-    doubtful = frozenset(f for f in start if excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
+    # Without light from outside something in the room has to shine.
+    doubtful = frozenset(f for f in start if sky is not None and excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
     chosen, changes = search(start, look.proposals, misfit, doubtful)
     told, before = [], start
     for after, old, new in changes:

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     pass
 
 
-
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
     and emission.json."""
