@@ -165,6 +165,8 @@ def search_emitters(
     misfits: dict[Families, float] = {}
 
     def misfit(chosen: Families) -> float:
+        if not chosen and start and sky is None:
+            return np.inf
         if chosen not in misfits:
             some = every.select(np.isin(family, [*chosen]))
             found = traced(photos, gain, some, sky, threshold, _comparison_tile(photos), QUICK, left_out=weak)
