@@ -20,7 +20,7 @@ from iif_core.fitting.descent import (
     eliminate_objects,
     make_response_prior,
 )
-from iif_core.fitting.object_levels import UNKNOWN_SCATTER, ObjectLevels, light_scatter, measure_levels
+from iif_core.fitting.object_levels import UNKNOWN_SCATTER, ObjectLevels, gain_of_the_rest, light_scatter, measure_levels
 from iif_core.fitting.pixels import Pixels, choose_evenly, evaluate, prepare_pixels, residuals
 from iif_core.fitting.population import (
     Population,
@@ -294,14 +294,20 @@ def result_of(
         members: indices of the fitted objects; counts: (O,) usable pixels of every object.
 
     Returns:
-        Numbers of all objects; those that were not fitted have the mean of the population, or the identity without one.
+        Numbers of all objects. Those that were not fitted have the mean of the population, or the identity without one; their
+        albedo is that of the base at the level that the others have relative to it.
     """
     state, n_objects = fit.state, len(counts)
     affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, NUMBERS), bool)
+    covariance, residual = np.zeros((n_objects, NUMBERS, NUMBERS)), np.zeros(n_objects)
     if fit.population is not None and len(members):
         affine[:] = population_mean(fit.population, np.zeros(1), KINDS[:1])
         affine[:, 12] = 0.0
-    covariance, residual = np.zeros((n_objects, NUMBERS, NUMBERS)), np.zeros(n_objects)
+        spread = fit.population.spread[0]
+        if fit.levels is not None:
+            affine[:, GAINS], spread = gain_of_the_rest(fit.levels, state.affine)
+        albedo = np.where(np.isin(np.arange(NUMBERS), GAINS), affine, 0.0)
+        covariance[:] = (spread * albedo)[:, :, None] * (spread * albedo)[:, None, :]
     affine[members], free[members] = state.affine, state.free
     final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
     if len(px.obj):

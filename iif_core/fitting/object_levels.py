@@ -268,6 +268,22 @@ def _log_t(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return -np.log(scale) - 0.5 * (_DEGREES_OF_FREEDOM + 1) * np.log1p((x / scale) ** 2 / _DEGREES_OF_FREEDOM)
 
 
+def gain_of_the_rest(levels: ObjectLevels, affine: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the gain (3,) of objects that were not fitted, and the standard deviation of its logarithm for one object.
+
+    The gain is the mean brightness that fitted objects have relative to their base. The gains of their affines would not do:
+    they trade with offsets.
+
+    Args:
+        levels: both estimates of the fitted objects; affine: (O, 16) their numbers.
+    """
+    linear = affine[:, :12].reshape(-1, 3, 4)[:, :, :3]
+    fitted = np.maximum(np.einsum("oci,oi->oc", linear, levels.base) + affine[:, BIASES], _DARKEST_LEVEL)
+    share = levels.pixels / max(levels.pixels.sum(), 1e-100)
+    gain, _ = _mean_gain(levels.base, fitted, share, np.hypot(levels.base_error, levels.light_error))
+    return gain, float(np.sqrt(share @ levels.base_error**2))
+
+
 def light_scatter(levels: ObjectLevels, system: np.ndarray, affine: np.ndarray) -> np.ndarray:
     """Return the covariance (O, 16, 16) that the error of the light on each object adds to the gradient (Eq. M.37).
 

@@ -380,7 +380,9 @@ def own_render(parts, camera, samples):
         material = np.concatenate([part.albedo, part.roughness[:, None], part.metallic[:, None]], 1)
         values.append(material[part.faces].mean(1))
         radiance.append(np.tile(part.radiance, (len(part.faces), 1)))
-    geometry = build_geometry(np.concatenate(vertices), np.concatenate(faces), np.zeros(sum(map(len, faces)), np.int32))
+    passes = np.concatenate([np.full(len(part.faces), 1.0 - part.opacity) for part in parts])
+    objects = np.zeros(len(passes), np.int32)
+    geometry = build_geometry(np.concatenate(vertices), np.concatenate(faces), objects, passes)
     radiance = np.concatenate(radiance)
     emitters = Emitters(geometry, radiance, np.ones(len(radiance), np.int8))
     pose = camera.world_from_camera
@@ -417,6 +419,25 @@ def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
     assert (structure(theirs) * structure(ours)).mean() > 0.95
     shifted = np.roll(theirs, 3, axis=1)
     assert (structure(shifted) * structure(ours)).mean() < 0.9
+
+
+def test_surface_that_lets_light_through(mi, tmp_path):
+    """The box lets half of the light through: in Mitsuba's renderer as in ours, and as alpha in glTF."""
+    scene = replace(room(), transmittance=np.array([0, 0.5, 0], np.float32))
+    parts = parts_of(scene, 0.1)
+    assert {name: part.opacity for name, part in parts.items() if part.opacity < 1} == {"white <box>": 0.5}
+    assert parts["white <box>"].double_sided
+    camera = view(cx=19.0, cy=21.0)
+    loaded = mi.load_file(str(written(tmp_path / "out", mitsuba_files(list(parts.values()), [camera], np.zeros(3)))))
+    theirs, ours = np.array(mi.render(loaded, spp=256, seed=1))[..., :3], own_render(list(parts.values()), camera, 256)
+    solid = own_render(list(parts_of(room(), 0.1).values()), camera, 256)
+    on_box = np.abs(ours - solid).mean(-1) > 0.15 * solid.mean()
+    assert on_box.mean() > 0.02
+    # The ratio of the two renderers is that of their reflectances, on the box as elsewhere.
+    assert theirs[on_box].mean() / ours[on_box].mean() == pytest.approx(theirs[~on_box].mean() / ours[~on_box].mean(), rel=0.06)
+    document, _ = chunks_of(glb_bytes(list(parts.values()), scene.up, {}))
+    alphas = {m["name"]: (m.get("alphaMode"), m["pbrMetallicRoughness"]["baseColorFactor"][3]) for m in document["materials"]}
+    assert alphas["white <box>"] == ("BLEND", 0.5) and alphas["walls"] == (None, 1.0)
 
 
 def test_glb_looks_the_same_when_it_comes_back(mi, glb, tmp_path):

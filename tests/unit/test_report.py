@@ -193,6 +193,8 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     rows |= {f"radiance_{c}": np.array([LAMP[i] / 2, 0.01]) for i, c in enumerate("rgb")}
     rows |= {f"error_{c}": np.array([0.1, 0.1]) for c in "rgb"} | {"reason": ["", "below 1 % of the power"]}
     job.writer.table("emitters.parquet", rows)
+    none = {name: np.zeros(0, np.float32) for name in ("gain_r", "gain_g", "gain_b", "transmittance")}
+    job.writer.table("object_gains.parquet", {"object_id": np.zeros(0, np.int32), **none})
     job.writer.table("emitter_faces.parquet", {"face_id": np.array([24, 25]), "emitter_id": [0, 0], "side": [1, 1]})
     exposure = [view.exposure for view, *_ in seen]
     gains = {"exposure": exposure, "gain": [[e] * 3 for e in exposure], "vignetting": [0.0, 0.0]}

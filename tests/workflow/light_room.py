@@ -112,6 +112,7 @@ class Room:
         for name, radiance in (lamps if lights is None else lights).items():
             self.emission[self.object_id == self.names.index(name)] = radiance
         self.side = np.where(self.emission.any(1), 1, 0).astype(np.int8)
+        self.transmittance = np.zeros(len(self.faces), np.float32)
 
     def views(self, count: int, size: int, exposures: np.ndarray) -> list[View]:
         """Cameras on a ring that look across the room."""
@@ -181,7 +182,8 @@ def build(
     rng = np.random.default_rng(seed + 1)
     exposures = np.ones(views) if exposures is None else exposures
     cameras = room.views(views, size, exposures)
-    geometry = build_geometry(room.vertices, room.faces, room.object_id)
+    geometry = build_geometry(room.vertices, room.faces, room.object_id, room.transmittance)
+    scanned = build_geometry(room.vertices, room.faces, room.object_id)
     material = FaceMaterials(room.material)
     emitters = Emitters(geometry, room.emission, room.side, **({"environment": np.full(3, sky)} if sky else {}))
     sensor = response_curve(curve) if curve else None
@@ -194,7 +196,7 @@ def build(
     for view in cameras:
         directions = pixel_directions(view.fx, view.fy, view.cx, view.cy, size, size, view.world_from_camera).reshape(-1, 3)
         origin = view.world_from_camera[:3, 3]
-        face, depth = trace(geometry, origin, directions)
+        face, depth = trace(scanned, origin, directions)
         radiance = render(
             Scene(geometry, material, emitters), origin, directions, PathOptions(samples, bounces, 1000 + view.view_id)
         )

@@ -9,6 +9,7 @@ import yaml
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, StubJob, _box, _join, _quad, build
 
 from iif_core.camera.pinhole import look_at
+from workflow.artifacts.store import ids_from_disk
 from workflow.stages import affines, emission, export, metrics, render, report, shading
 
 STAGES = {
@@ -17,11 +18,11 @@ STAGES = {
 }
 
 
-def _run(folder, dynamic_range, upto="metrics"):
+def _run(folder, dynamic_range, upto="metrics", **emission_settings):
     """The stages with few samples; every artefact is checked as it is read back."""
     settings = {
         "capture": {"dynamic_range": dynamic_range},
-        "emission": {**EMISSION, "rows": 2000, "samples": 4},
+        "emission": {**EMISSION, "rows": 2000, "samples": 4, **emission_settings},
         "shading": {**SHADING, "samples": 4, "levels": 5, "max_samples": 32},
         "affines": {**AFFINES, "iterations": 20},
         "render": {"samples": 8, "max_bounces": 8, "denoise": False},
@@ -231,6 +232,46 @@ def test_lamp_that_nobody_sees(tmp_path, llvm):
     assert len(lamp) == 1 and table["observations"][lamp] == 0
 
     assert "unseen lamp" in _said(found)
+
+
+class CurtainRoom(Room):
+    """Nothing shines inside; a wall has an opening, behind a curtain that lets half of the light through."""
+
+    def __init__(self):
+        x, y, z = SIZE
+        across = [_quad((x, 0, low), (0, 0, high), (0, y, 0), 6) for low, high in ((0, 0.9), (1.9, z - 1.9))]
+        sides = [_quad((x, low, 0.9), (0, 0, 1.0), (0, 1.1, 0), 4) for low in (0, y - 1.1)]
+        curtain = _quad((x - 0.1, 0.95, 0.8), (0, 0, 1.2), (0, y - 1.9, 0), 10)
+        super().__init__(
+            parts={"wall_b": _join([*across, *sides]), "curtain": curtain, "lamp": None, "bulb": None},
+            looks={"curtain": ((0.7, 0.7, 0.68), 0.9, 0)},
+            lights={},
+        )
+        self.transmittance[self.object_id == self.names.index("curtain")] = 0.5
+
+
+def test_curtain_lets_light_through(tmp_path, llvm):
+    room = build(tmp_path, truth=True, views=6, size=32, samples=1024, room=CurtainRoom(), sky=6.0)
+    found = _run(tmp_path, "hdr", upto="report", rows=6000, samples=64)
+    passes = found.emission.table("object_gains.parquet")["transmittance"]
+    assert np.flatnonzero(passes).tolist() == [room.names.index("curtain")] and passes.max() == 0.5
+    assert "passes through curtain" in _said(found)
+    radiance, kinds = _kept(found)
+    assert set(kinds) == {"environment"}
+    table = found.emission.table("emitters.parquet")
+    seen = table["observations"][table["kept"]] >= 20
+    # Camera rays show the cloth as well, which reflects the light of the room.
+    np.testing.assert_allclose(radiance[seen], 6.0, rtol=0.15)
+    curtain = room.object_id == room.names.index("curtain")
+    for view in ("v000", "v003"):
+        photo, ours = found.capture.exr(f"photos/{view}.exr"), found.render.exr(f"maps/{view}.exr")
+        face = ids_from_disk(found.capture.exr(f"gbuffer/{view}.exr")["face.id"])
+        own = curtain[np.maximum(face, 0)] & (face >= 0)
+        if own.any():
+            assert ours["G"][own].mean() == pytest.approx(photo["G"][own].mean(), rel=0.15)
+    # Pixels on the curtain say nothing about its material: it keeps its base, at the level of the others.
+    albedo, words = _fitted(found, room, "curtain")
+    assert words == "population (0 pixels)" and 0.4 < albedo[:, :3].mean() < 0.95
 
 
 @pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])

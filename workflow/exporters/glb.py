@@ -70,11 +70,13 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
 
 def _material(part: Part) -> dict[str, Any]:
     surface = {
-        "baseColorFactor": [1.0, 1.0, 1.0, 1.0],
+        "baseColorFactor": [1.0, 1.0, 1.0, part.opacity],
         "metallicFactor": _mean(part.metallic, 0.0),
         "roughnessFactor": _mean(part.roughness, 1.0),
     }
     material: dict[str, Any] = {"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": part.double_sided}
+    if part.opacity < 1:
+        material["alphaMode"] = "BLEND"
     strength = float(part.radiance.max(initial=0.0))
     if strength > 0:
         material["emissiveFactor"] = [round(float(v) / strength, 6) for v in part.radiance]

@@ -131,6 +131,8 @@ def _shape(part: Part, file: str) -> str:
         black = '<bsdf type="diffuse"><rgb name="reflectance" value="0, 0, 0"/></bsdf>'
         lines += [f"\t\t{black}", f'\t\t<emitter type="area">{_rgb("radiance", part.radiance)}</emitter>']
     else:
+        if part.opacity < 1:
+            lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
         lines += ['\t\t<bsdf type="twosided">', '\t\t\t<bsdf type="principled">']
         for parameter, attribute in (("base_color", "albedo"), ("roughness", "roughness"), ("metallic", "metallic")):
             lines.append(
@@ -138,6 +140,7 @@ def _shape(part: Part, file: str) -> str:
                 f'<string name="name" value="vertex_{attribute}"/></texture>'
             )
         lines += ['\t\t\t\t<float name="specular" value="0.5"/>', "\t\t\t</bsdf>", "\t\t</bsdf>"]
+        lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])
 
 

@@ -36,6 +36,7 @@ class RecoveredScene:
         environment: (3,) or (H, W, 3) radiance outside of the mesh, as in `iif_core.light.environment`.
         seen_front, seen_back: (m,) numbers of pixels that see each side of a face.
         up: (3,) unit vector.
+        transmittance: (objects,) share of the light that passes straight through each; None = none.
     """
 
     vertices: Array
@@ -53,6 +54,7 @@ class RecoveredScene:
     seen_front: Array
     seen_back: Array
     up: Array
+    transmittance: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class Part:
     metallic: Array  # (n,) float32
     radiance: Array  # (3,) float32, 0 for what does not emit
     double_sided: bool
+    opacity: float = 1.0  # share of the light that does not pass straight through
 
 
 def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> list[Part]:
@@ -113,6 +116,8 @@ def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> l
         else:
             values = _vertex_values(scene, object_id, xyz, longest_edge)
         values = np.clip(values, 0, 1).astype(np.float32)
+        sheer = scene.transmittance is not None and object_id >= 0
+        opacity = 1.0 - float(scene.transmittance[object_id]) if sheer else 1.0
         parts.append(
             Part(
                 names.unique(name),
@@ -125,7 +130,8 @@ def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> l
                 values[:, 3],
                 values[:, 4],
                 radiance,
-                bool(sides),
+                bool(sides) or opacity < 1,
+                opacity,
             )
         )
     return parts

@@ -29,9 +29,8 @@ from workflow.scene.base_scene import (
     ViewPixels,
     base_maps,
     pixel_gains,
-    read_base_scene,
     read_gains,
-    read_light,
+    read_lit_scene,
     sensor_bounds,
     view_pixels,
 )
@@ -70,11 +69,12 @@ class _Result:
 def run(job: Job) -> None:
     """Write the artefacts of stage `affines` for the model that the settings name."""
     model = job.settings.affines.model
-    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
+    mixed = light.emits | scene.is_sheer
     if model == "texture_average":
-        result = _texture_average(job, capture, scene)
+        result = _texture_average(job, capture, scene, mixed)
     elif model in ("fipt", "iris"):
-        result = _free_cells(job, capture, scene, model)
+        result = _free_cells(job, capture, scene, mixed, model)
     else:
         result = _given(job, capture, scene, model)
     _write_objects(job, scene, result, model)
@@ -121,7 +121,7 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
     return np.where(sums[:, 5:] > 0, sums[:, :5] / np.maximum(sums[:, 5:], 1), scene.object_values)
 
 
-def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Result:
+def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> _Result:
     """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.56).
 
     Cells that no photograph shows have the mean of their object. One gain for all cells makes albedo times diffuse light match
@@ -129,14 +129,13 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
     """
     curve, gains = _start(job), read_gains(job)
     cells, objects = np.zeros((len(scene.cell_object), 4)), np.zeros((scene.n_objects, 4))
-    emits = read_light(job, len(scene.faces)).emits
     lit: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for number, view in enumerate(capture.views):
         if view.split == "test":
             continue
         pixels = view_pixels(job, capture, scene, view)
         cell = cells_of(job, view)[pixels.index]
-        use = pixels.valid & (cell >= 0) & ~emits[pixels.face]
+        use = pixels.valid & (cell >= 0) & ~mixed[pixels.face]
         pixels, cell = pixels.take(use), cell[use]
         radiance = np.asarray(pixels.value, np.float64)
         if not capture.is_hdr:
@@ -162,7 +161,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene) -> _Res
 # --------------------------------------------------------------------------------------------------------- free cells
 
 
-def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) -> _Result:
+def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, model: str) -> _Result:
     """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.52, M.55)."""
     levels = roughness_levels(job)
     options = FIPT if model == "fipt" else IRIS
@@ -170,7 +169,7 @@ def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, model: str) 
     block_of, owner = blocks_of(scene.cell_ijk, scene.cell_object, edge)
     prior = _object_means(job, capture, scene) if model == "iris" else None
     goal = prior[owner, :3] if prior is not None else None
-    views = CellPixels(job, capture, scene, block_of, len(owner))
+    views = CellPixels(job, capture, scene, mixed, block_of, len(owner))
     sums = CellSums(owner, scene.n_objects, levels)
     curve, camera = (response("srgb") if not capture.is_hdr else response("identity")), []
     if goal is not None and not capture.is_hdr:
@@ -222,17 +221,17 @@ def _footprint(capture: CaptureReader) -> float:
 
 
 class CellPixels:
-    """Valid pixels of surface that does not emit, view by view: rows by block, and the cell of each pixel.
+    """Valid pixels of surface that neither emits nor lets light through (`mixed` (m,) bool), view by view: rows by block, and
+    the cell of each pixel.
 
     Attributes:
         count: number of pixels; dark: light below which a pixel is not used (`PixelRows.usable`).
         diffuse: (B, 3) mean diffuse light of the blocks.
     """
 
-    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, block_of: np.ndarray, blocks: int):
-        self.job, self.capture, self.scene, self.block_of = job, capture, scene, block_of
+    def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, block_of: np.ndarray, blocks: int):
+        self.job, self.capture, self.scene, self.mixed, self.block_of = job, capture, scene, mixed, block_of
         require_denoiser()
-        self.emits = read_light(job, len(scene.faces)).emits
         self.levels = len(roughness_levels(job))
         light, samples, self.count = BlockLight(blocks), [np.zeros(0)], 0
         for rows, _ in self._views(None):
@@ -254,7 +253,7 @@ class CellPixels:
         for done, view in enumerate(views):
             pixels = view_pixels(job, capture, self.scene, view)
             cell = cells_of(job, view)[pixels.index]
-            use = pixels.valid & (cell >= 0) & ~self.emits[pixels.face]
+            use = pixels.valid & (cell >= 0) & ~self.mixed[pixels.face]
             channels = job.read("shading").exr(f"maps/{view.name}.exr")
             d = _denoised(channels, view, pixels)[use] if diffuse is None else np.zeros(0)
             pixels, cell = pixels.take(use), cell[use]

@@ -34,12 +34,12 @@ class CellTextures:
     levels: np.ndarray
 
     @classmethod
-    def of(cls, job: Job, capture: CaptureReader, scene: BaseScene) -> CellTextures | None:
-        """Read them, or return None where `affines.texture` does not ask for them."""
+    def of(cls, job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> CellTextures | None:
+        """Read them, or return None where `affines.texture` does not ask for them; `mixed` as in `CellPixels`."""
         texture, cells = job.settings.affines.texture, len(scene.cell_object)
         if texture == "base" or (texture == "auto" and job.settings.prior.kind != "retinex") or not cells:
             return None
-        views = CellPixels(job, capture, scene, np.arange(cells), cells)
+        views = CellPixels(job, capture, scene, mixed, np.arange(cells), cells)
         views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)
         return cls(job, scene, views, roughness_levels(job))
 

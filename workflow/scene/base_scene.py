@@ -32,6 +32,7 @@ class BaseScene:
         cell_edge, cell_origin, cell_ijk (c, 3), cell_object (c,), cell_values (c, 5): surface cells of the base
             texture.
         object_values: (n_objects, 5) means, for surface that no photograph shows.
+        transmittance: (n_objects,) share of the light that passes straight through the surface of each object; None = none.
     """
 
     vertices: np.ndarray
@@ -46,6 +47,18 @@ class BaseScene:
     cell_object: np.ndarray
     cell_values: np.ndarray
     object_values: np.ndarray
+    transmittance: np.ndarray | None = None
+
+    @property
+    def is_sheer(self) -> np.ndarray:
+        """(m,) bool: light passes through the face, so that pixels on it show what lies behind as well."""
+        return self.passes > 0
+
+    @property
+    def passes(self) -> np.ndarray:
+        """(m,) float32 share of the light that passes straight through each face."""
+        share = np.zeros(self.n_objects, np.float32) if self.transmittance is None else self.transmittance
+        return np.append(share, np.float32(0.0))[self.object_id]  # the last for surface of no object, -1
 
     def with_gains(self, gain: np.ndarray) -> BaseScene:
         """Return the scene with the albedos of its objects multiplied by `gain` (n_objects, 3) and limited to 1."""
@@ -62,12 +75,14 @@ class BaseScene:
         from iif_core.light.transport.geometry import build_geometry
 
         object_id = self.object_id if black is None else np.where(black, self.n_objects, self.object_id)
+        passes = self.passes
         if extra is None:
-            return build_geometry(self.vertices, self.faces, object_id), material
+            return build_geometry(self.vertices, self.faces, object_id, passes), material
         vertices = np.concatenate([self.vertices, extra[0]])
         faces = np.concatenate([self.faces, extra[1] + len(self.vertices)])
         object_id = np.concatenate([object_id, np.full(len(extra[1]), self.n_objects, np.int32)])
-        return build_geometry(vertices, faces, object_id), material
+        passes = np.concatenate([passes, np.zeros(len(extra[1]), np.float32)])
+        return build_geometry(vertices, faces, object_id, passes), material
 
     def materials(self) -> CellMaterials:
         """Build the materials on the device; an object of id `n_objects` is black."""
@@ -246,8 +261,8 @@ class Light:
         return Emitters(geometry, self.radiance, self.side, self.environment)
 
 
-def read_light(job: Job, n_faces: int) -> Light:
-    """Read the emitters that were kept and the environment; the job needs emission upstream."""
+def _read_light(job: Job, n_faces: int) -> Light:
+    """The emitters that were kept, and the environment."""
     reader = job.read("emission")
     table, faces = reader.table("emitters.parquet"), reader.table("emitter_faces.parquet")
     rows = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float32).reshape(-1, 3)
@@ -283,6 +298,15 @@ def read_object_gains(job: Job, n_objects: int) -> np.ndarray:
     gain = np.ones((n_objects, 3), np.float32)
     gain[table["object_id"]] = np.stack([table[f"gain_{c}"] for c in "rgb"], 1)
     return gain
+
+
+def read_lit_scene(job: Job) -> tuple[BaseScene, Light]:
+    """Read the scene with what stage emission found: which surface lets light through, and the light. The job needs emission
+    upstream."""
+    scene, table = read_base_scene(job), job.read("emission").table("object_gains.parquet")
+    share = np.zeros(scene.n_objects, np.float32)
+    share[table["object_id"]] = table["transmittance"]
+    return replace(scene, transmittance=share), _read_light(job, len(scene.faces))
 
 
 def read_gains(job: Job) -> CameraGains:

@@ -65,6 +65,7 @@ class ViewRecord:
         counted: number of valid pixels of the whole photograph.
         escaping: (k,) flattened indices of the valid pixels that meet no surface.
         escaping_value, escaping_direction: (k, 3) what these pixels show, and their directions in the world.
+        escaping_share: (k,) share of the light from outside that reaches these pixels; 1 but behind curtains.
     """
 
     pixels: ViewPixels
@@ -74,6 +75,7 @@ class ViewRecord:
     escaping: np.ndarray
     escaping_value: np.ndarray
     escaping_direction: np.ndarray
+    escaping_share: np.ndarray
 
     @property
     def megabytes(self) -> float:
@@ -111,7 +113,8 @@ class ViewRecords:
         direction = view.directions().reshape(-1, 3)[out]
         deep = decoded.depth[decoded.depth > 0]
         median = np.median(deep) if deep.size else None
-        return ViewRecord(pixels, base, median, int(decoded.valid.sum()), np.flatnonzero(out), values[out], direction)
+        outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()))
+        return ViewRecord(pixels, base, median, int(decoded.valid.sum()), *outside)
 
 
 @dataclass(frozen=True)
@@ -263,7 +266,8 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
         sums.add(pixels.points[use], radiance[use], bound[use].any(1))
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
         hits += int(pixels.valid.sum())
-        sky.add(record.escaping_direction, *photos.radiance(view, record.escaping_value, record.escaping))
+        light, bound = photos.radiance(view, record.escaping_value, record.escaping)
+        sky.add(record.escaping_direction, light / record.escaping_share[:, None], bound)
         total += record.counted
         photos.job.progress(done + 1, len(photos.views), "views cached")
     brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None
@@ -291,8 +295,8 @@ def rays_from_surface(photos: Photographs) -> np.ndarray:
 
 
 def seen_faces(photos: Photographs) -> np.ndarray:
-    """Return (F,) bool: a pixel shows the face."""
-    shown = np.zeros(len(photos.scene.faces), bool)
+    """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it."""
+    shown = photos.scene.passes > 0
     for view in photos.views:
         pixels = photos.records[view].pixels
         shown[pixels.face[pixels.valid]] = True

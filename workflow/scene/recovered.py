@@ -11,7 +11,7 @@ from iif_core.errors import InputError
 from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, Light, read_base_scene, read_light
+from workflow.scene.base_scene import BaseScene, Light, read_lit_scene
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def read_recovered(job: Job) -> Recovered:
     Raises:
         InputError: the cells of affines are not those of base.
     """
-    base = read_base_scene(job)
+    base, light = read_lit_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
     names = object_names(job, base.n_objects)
     cells, fitted = job.read("base").table("cells.parquet"), affines.table("cells.parquet")
@@ -66,7 +66,6 @@ def read_recovered(job: Job) -> Recovered:
         object_values = apply_affines(read_affines(affines, base.n_objects), each, object_values).astype(np.float32)
     cell_values = np.stack([fitted[name] for name in CHANNELS], 1).astype(np.float32)
     scale = float(affines.json("affines.json").get("light_scale", 1.0)) if affines.has("affines.json") else 1.0
-    light = read_light(job, len(base.faces))
     light = replace(light, radiance=light.radiance * np.float32(scale), environment=light.environment * np.float32(scale))
     emitters, faces = emission.table("emitters.parquet"), emission.table("emitter_faces.parquet")
     shines = light.emits[faces["face_id"]]

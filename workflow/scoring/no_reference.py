@@ -11,7 +11,7 @@ from iif_core.evaluation.metrics import Score
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from workflow.artifacts.store import ids_from_disk, rgb
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import read_light
+from workflow.scene.base_scene import read_lit_scene
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.scores import prediction_numbers
 
@@ -28,13 +28,14 @@ def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, s
     views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
     """
     vertices, faces = capture.mesh()
-    emits = read_light(job, len(faces)).emits
+    scene, light = read_lit_scene(job)
+    mixed = light.emits | scene.is_sheer
     edge = float(job.read("shading").json("shading.json")["diffuse"]["cell_edge_m"])
     origin = grid_origin(vertices[faces.ravel()], edge)
     left: dict[str, ShadingLeft] = {}
     spread: dict[str, ViewSpread] = {}
     for view in capture.used:
-        light, use, object_id = _light(job, capture, view, emits)
+        light, use, object_id = _light(job, capture, view, mixed)
         if not use.any():
             continue
         points = capture.points(view, capture.gbuffer(view)[0])[use]
@@ -66,13 +67,13 @@ def _scores(left: ShadingLeft, spread: ViewSpread) -> list[Score]:
     ]
 
 
-def _light(job: Job, capture: CaptureReader, view: View, emits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _light(job: Job, capture: CaptureReader, view: View, mixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Diffuse light (H, W, 3), which pixels count (H, W), and object (H, W)."""
     file = f"maps/{view.name}.exr"
     channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
     light = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
     face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
-    use = capture.photo(view)[1] & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~emits[np.maximum(face, 0)]
+    use = capture.photo(view)[1] & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~mixed[np.maximum(face, 0)]
     brightness = light.mean(-1)
     return light, use & (brightness > DARK * float(np.median(brightness[use])) if use.any() else use), object_id
 

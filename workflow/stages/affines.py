@@ -29,9 +29,8 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,
     base_maps,
-    read_base_scene,
     read_gains,
-    read_light,
+    read_lit_scene,
     sensor_bounds,
     view_pixels,
 )
@@ -49,14 +48,14 @@ def run(job: Job) -> None:
     """Write objects.parquet, camera_response.parquet (LDR), cells.parquet, maps/<view>.exr and affines.json."""
     if job.settings.affines.model != "objects":
         return baselines.run(job)
-    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     names = object_names(job, scene.n_objects)
     find_gauge = _gauge(job, capture, names)  # wrong settings stop the stage before any work
-    emits = read_light(job, len(scene.faces)).emits
-    problem, places = _problem(job, capture, scene, emits, read_gains(job))
+    mixed = light.emits | scene.is_sheer
+    problem, places = _problem(job, capture, scene, mixed, read_gains(job))
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
-    textures = CellTextures.of(job, capture, scene)
+    textures = CellTextures.of(job, capture, scene, mixed)
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
     direct = job.settings.affines.solver == "direct"  # only the direct solver can fit without gloss
     scatter = textures.scatter(fit) if textures is not None and direct else None
@@ -222,30 +221,30 @@ class _Chosen:
 
 
 def _eligible(
-    job: Job, capture: CaptureReader, scene: BaseScene, view: View, emits: np.ndarray, thin: np.ndarray | None = None
+    job: Job, capture: CaptureReader, scene: BaseScene, view: View, mixed: np.ndarray, thin: np.ndarray | None = None
 ) -> _Chosen:
     """Return the valid pixels of surface that does not emit: interior ones, and all of those of `thin` objects (O,) bool."""
     pixels = view_pixels(job, capture, scene, view)
-    use = pixels.valid & (pixels.object_id >= 0) & ~emits[pixels.face]
+    use = pixels.valid & (pixels.object_id >= 0) & ~mixed[pixels.face]
     use &= pixels.interior if thin is None else pixels.interior | thin[np.maximum(pixels.object_id, 0)]
     return _Chosen(pixels.index[use], pixels.object_id[use], pixels.value[use])
 
 
 def _problem(
-    job: Job, capture: CaptureReader, scene: BaseScene, emits: np.ndarray, gains: CameraGains
+    job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
     """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
     views = capture.used
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
-        counts += np.bincount(_eligible(job, capture, scene, view, emits).object_id, minlength=len(counts))
+        counts += np.bincount(_eligible(job, capture, scene, view, mixed).object_id, minlength=len(counts))
     thin = counts < THIN_PIXELS
     share = fair_shares(counts, job.settings.affines.pixels)
     shading, levels = job.read("shading"), roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
     for done, view in enumerate(views):
-        chosen = _eligible(job, capture, scene, view, emits, thin)
+        chosen = _eligible(job, capture, scene, view, mixed, thin)
         rng = np.random.default_rng([job.seed, _STREAM, view.view_id])
         keep = rng.random(len(chosen.index)) < share[chosen.object_id]
         index = chosen.index[keep]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from iif_core.camera.calibration.choice import calibration_facts
+from iif_core.camera.calibration.choice import CalibratedResponse, calibration_facts
 from iif_core.camera.response import response, response_facts
-from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.candidates import emitter_candidates
 from iif_core.light.emission.direct import EmissionSolution
 from iif_core.light.emission.environment import Sky
@@ -29,25 +29,78 @@ from workflow.scene.emission_pixels import (
     statistics_of_faces,
     view_exposures,
 )
-from workflow.scene.emission_solve import reliable, search_emitters, solve_with_saturated_surface, trial
+from workflow.scene.emission_solve import Traced, reliable, search_emitters, solve_with_saturated_surface, trial
 from workflow.scene.normal_form import CaptureReader
+from workflow.scene.recovered import object_names
+from workflow.scene.see_through import TRANSMITTANCE, seen_through, translucent_objects
 
-if TYPE_CHECKING:
-    pass
+
+@dataclass(frozen=True)
+class FoundLight:
+    """All light of a scene under one assumption about which surface lets light through.
+
+    Attributes:
+        photos: with that assumption; transmittance: (n_objects,) share of the light that passes straight through each object.
+        found: the problem; solution, loss: of it.
+        left_out, reasons: candidate groups that turned out to reflect, and why.
+        candidates: number of groups that were looked at; dropped: [(faces, area, reason)] without a solve.
+        gain: (n_objects, 3) of the albedos.
+        outside, environment: the sky, None = none, and the decision about it.
+        escape: share of camera rays and of rays from surface that leave the mesh; threshold: radiance of candidates.
+        notes: what a person should know.
+    """
+
+    photos: Photographs
+    found: Traced
+    solution: EmissionSolution
+    loss: float
+    left_out: EmitterGroups
+    reasons: list[str]
+    candidates: int
+    dropped: list[tuple[int, float, str]]
+    gain: np.ndarray
+    outside: Sky | None
+    environment: decisions.Decision
+    escape: tuple[float, float]
+    threshold: float
+    notes: list[str]
+
+    @property
+    def transmittance(self) -> np.ndarray:
+        scene = self.photos.scene
+        return np.zeros(scene.n_objects, np.float32) if scene.transmittance is None else scene.transmittance
 
 
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
     and emission.json."""
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
-    views = capture.used
     notes: list[str] = []
     known = view_exposures(capture, notes)
     unknown = Sensor(response("identity"), capture.is_hdr, job.settings.emission.saturation)
     records = ViewRecords(job, capture, scene)
-    photos, camera = calibrated(Photographs(job, capture, scene, views, unknown, known, records))
+    photos, camera = calibrated(Photographs(job, capture, scene, capture.used, unknown, known, records))
     notes.extend([camera.gauge] if camera.gauge else [])
-    adjacency, least = face_adjacency(scene.faces), job.settings.emission.min_observations
+    adjacency = face_adjacency(scene.faces)
+    light, glowing = _light(photos, adjacency)
+    sheer = translucent_objects(photos, glowing)
+    if sheer.any():
+        names = ", ".join(object_names(job, scene.n_objects)[o] for o in np.flatnonzero(sheer))
+        job.log.info("%s: does it shine, or does light pass through it?", names)
+        through, _ = _light(seen_through(photos, sheer), adjacency)
+        misfits = f"misfit {through.found.misfit:.4f} against {light.found.misfit:.4f} if it shines"
+        if through.found.misfit < light.found.misfit:
+            light = through
+            notes.append(f"{TRANSMITTANCE:.0%} of the light passes through {names}: {misfits}")
+        job.log.info("%s", misfits)
+    table = _table(light)
+    _write(job, light, table)
+    _write_facts(job, light, table, camera, notes + light.notes)
+
+
+def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.ndarray]:
+    """Find the light of the scene; also return the pieces of surface that glow as a whole, (F,)."""
+    job, scene, least = photos.job, photos.scene, photos.job.settings.emission.min_observations
     statistics, threshold, glowing = statistics_of_faces(photos, adjacency)
     candidate = emitter_candidates(statistics, adjacency, scene.areas, threshold, least, glowing)
     options = GroupingOptions(min_observations=least)
@@ -59,6 +112,7 @@ def run(job: Job) -> None:
     environment = decisions.environment(job.settings.emission.environment, escape, secondary, brightness)
     is_open = secondary > decisions.ESCAPE_OPEN
     outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
+    notes: list[str] = []
     if outside is not None and is_open:
         notes.append(
             f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
@@ -77,26 +131,29 @@ def run(job: Job) -> None:
     notes.extend(changes)
     reasons[np.flatnonzero(offered)[lit & ~shines]] = "the photographs are explained better without it"
     reasons[np.flatnonzero(offered)[shines]] = ""
-    left_out, emitters = groups.select(reasons != ""), found.groups
-    candidates = groups.size + len(groups.dropped) + int(emitters.is_hidden.sum())
+    candidates = groups.size + len(groups.dropped) + int(found.groups.is_hidden.sum())
     found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
-    table = _table(emitters, left_out, [reason for reason in reasons if reason], solution, outside)
-    _write(job, emitters, table, found.cache, outside)
-    gains = {f"gain_{c}": gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
-    job.writer.table("object_gains.parquet", {"object_id": np.arange(len(gain), dtype=np.int32), **gains})
-    kept = int(np.count_nonzero(table["kept"] & (table["kind"] == "area")))
+    left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
+    light = (found, solution, loss, left_out, why, candidates, groups.dropped, gain, outside, environment)
+    return FoundLight(photos, *light, (escape, secondary), threshold, notes), glowing
+
+
+def _write_facts(job: Job, light: FoundLight, table: dict[str, Any], camera: CalibratedResponse, notes: list[str]) -> None:
+    """Write emission.json."""
+    found, solution, photos = light.found, light.solution, light.photos
+    kept, candidates = int(np.count_nonzero(table["kept"] & (table["kind"] == "area"))), light.candidates
     job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
-    for why in sorted({reason for _, _, reason in groups.dropped}):
-        areas = [area for _, area, reason in groups.dropped if reason == why]
+    for why in sorted({reason for _, _, reason in light.dropped}):
+        areas = [area for _, area, reason in light.dropped if reason == why]
         notes.append(f"{len(areas)} candidates (the largest {max(areas):.2g} m^2) left out before the solve: {why}")
-    if not kept and not environment["included"]:
+    if not kept and not light.environment["included"]:
         notes.append("no emitter and no environment: light comes from the radiance cache alone, re-renderings will be dark")
     level_error, level_raised = found.gains.level_error, found.gains.level_raised
     if level_raised > 0:
         raised = f"light raised {np.exp(level_raised):.2f} times so that albedos are at most 1"
         notes.append(f"{raised}; the error of its level does not contain that")
-    plan = [environment, *gain_plan(capture, photos.gains), decisions.emitters(kept, candidates - kept, candidates)]
+    plan = [light.environment, *gain_plan(photos.capture, photos.gains), decisions.emitters(kept, candidates - kept, candidates)]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",
@@ -105,13 +162,14 @@ def run(job: Job) -> None:
             "cache_origin": [float(x) for x in found.cache.origin],
             "condition": solution.condition,
             "residual": solution.residual,
+            "misfit": found.misfit,
             "solver": job.settings.emission.solver,
-            "reference_loss": loss,
+            "reference_loss": light.loss,
             "level_error": level_error if np.isfinite(level_error) else None,
             "level_raised": level_raised,
             "active_set": active_set,
-            "escape_share": {"primary": escape, "secondary": secondary},
-            "threshold": threshold if np.isfinite(threshold) else None,
+            "escape_share": {"primary": light.escape[0], "secondary": light.escape[1]},
+            "threshold": light.threshold if np.isfinite(light.threshold) else None,
             "exposure": photos.gains.exposure.tolist(),
             "gain": photos.gains.gain.tolist(),
             "vignetting": photos.gains.vignetting.tolist(),
@@ -125,10 +183,9 @@ def run(job: Job) -> None:
 # ------------------------------------------------------------------------------------------------------------ writing
 
 
-def _table(
-    groups: EmitterGroups, left_out: EmitterGroups, reasons: list[str], solution: EmissionSolution, sky: Sky | None
-) -> dict[str, Any]:
+def _table(light: FoundLight) -> dict[str, Any]:
     """Columns of emitters.parquet: emitters, the environment, and the groups that turned out to reflect."""
+    groups, left_out, solution, sky = light.found.groups, light.left_out, light.solution, light.outside
     outside, out = sky.size if sky else 0, left_out.size
     sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
     pixels = sky.pixels if sky else np.zeros(0)
@@ -143,7 +200,7 @@ def _table(
         **{f"error_{c}": error[:, i].astype(np.float32) for i, c in enumerate("rgb")},
         "observations": np.r_[groups.count, pixels, left_out.count].astype(np.int64),
         "kept": np.arange(groups.size + outside + out) < groups.size + outside,
-        "reason": np.array([""] * (groups.size + outside) + reasons, dtype=str),
+        "reason": np.array([""] * (groups.size + outside) + light.reasons, dtype=str),
     }
 
 
@@ -152,7 +209,8 @@ def _side_of(groups: EmitterGroups, group: int) -> int:
     return int(sides[0]) if len(sides) and (sides == sides[0]).all() else 0
 
 
-def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: RadianceVoxels, sky: Sky | None) -> None:
+def _write(job: Job, light: FoundLight, table: dict[str, Any]) -> None:
+    groups, cache, sky = light.found.groups, light.found.cache, light.outside
     units = {"area_m2": "m^2", "radiance_r": "relative", "error_r": "relative"}
     job.writer.table("emitters.parquet", table, units)
     face = np.flatnonzero(groups.of_face >= 0)
@@ -162,6 +220,9 @@ def _write(job: Job, groups: EmitterGroups, table: dict[str, Any], cache: Radian
         "side": groups.side[face].astype(np.int32),
     }
     job.writer.table("emitter_faces.parquet", columns)
+    gains = {f"gain_{c}": light.gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
+    gains["transmittance"] = light.transmittance
+    job.writer.table("object_gains.parquet", {"object_id": np.arange(len(light.gain), dtype=np.int32), **gains})
     voxels = {name: cache.ijk[:, axis] for axis, name in enumerate("ijk")}
     voxels |= {f"radiance_{c}": cache.radiance[:, i] for i, c in enumerate("rgb")}
     voxels |= {"samples": cache.samples, "censored": cache.censored}

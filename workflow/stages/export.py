@@ -80,6 +80,7 @@ def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredSc
         front,
         back,
         np.asarray(up, np.float64) if up else up_axis(poses),
+        surface.transmittance,
     )
 
 

@@ -15,10 +15,8 @@ from workflow.artifacts.store import split_rgb
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,
-    Light,
     ViewPixels,
-    read_base_scene,
-    read_light,
+    read_lit_scene,
     read_object_gains,
     read_radiance_cache,
     view_pixels,
@@ -48,14 +46,13 @@ def run(job: Job) -> None:
     shading.json."""
     from iif_core.light.transport.scene import Scene
 
-    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     levels = roughness_levels(job.settings.shading.levels)
-    light = read_light(job, len(scene.faces))
     cells = _cells(job, capture, scene)
     # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
-    decision = _indirect(job, geometry, cache, light, cells)
+    decision = _indirect(job, geometry, cache, light.emits | scene.is_sheer, cells)
     world = Scene(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
     with job.timed("diffuse"):
         diffuse = _diffuse(job, world, cells)
@@ -74,8 +71,11 @@ def _cells(job: Job, capture: CaptureReader, scene: BaseScene) -> ShadingCells:
     return builder.finish()
 
 
-def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, cells: ShadingCells) -> decisions.Decision:
-    """Decide whether paths end in the radiance cache, by the share of visible surface that it contains (Eq. S.14)."""
+def _indirect(
+    job: Job, geometry: Geometry, cache: RadianceCache, uncached: np.ndarray, cells: ShadingCells
+) -> decisions.Decision:
+    """Decide whether paths end in the radiance cache, by the share of visible surface that it contains (Eq. S.14), where it
+    should: `uncached` (m,) are faces that shine or let light through."""
     from iif_core.light.transport.geometry import cosine_directions, trace
 
     rng = np.random.default_rng([job.seed, _SEEDS])
@@ -84,7 +84,7 @@ def _indirect(job: Job, geometry: Geometry, cache: RadianceCache, light: Light, 
     normal = cells.normals[cell, 0]
     origin, way = cells.points[cell, 0] + 1e-3 * normal, cosine_directions(normal, rng)
     face, t = trace(geometry, origin, way)
-    hit = (face >= 0) & ~light.emits[np.maximum(face, 0)]
+    hit = (face >= 0) & ~uncached[np.maximum(face, 0)]
     covered = cache.covers((origin + t[:, None] * way)[hit]) if hit.any() else np.zeros(0, bool)
     censored = job.read("emission").table("radiance_cache.parquet")["censored"].astype(bool)
     return decisions.radiance_cache(

@@ -16,6 +16,8 @@ MIN_PIXELS = 50
 """Escaping camera pixels that suffice for a texel to count as seen."""
 REACH = 0.7
 """Angle in radians over which the light from outside is correlated (Eq. L.9)."""
+LIKENESS = 0.99
+"""Correlation of two groups in the same direction."""
 OUTSIDE_SPREAD = 1.0
 """Standard deviation of the light from outside over all directions, relative to the mean of what cameras see of it."""
 SUN_WIDTH = 30.0
@@ -122,8 +124,11 @@ def sky_prior(sky: Sky) -> EmissionPrior:
 
 
 def correlation(direction: np.ndarray, reach: float = REACH) -> np.ndarray:
-    """Return exp(-angle / reach) between unit vectors (n, 3) (Eq. L.9), positive definite on the sphere: (n, n)."""
-    return np.exp(-np.arccos(np.clip(direction @ direction.T, -1.0, 1.0)) / reach)
+    """Return the correlation (n, n) of the light from unit vectors (n, 3), LIKENESS exp(-angle / reach) off the diagonal
+    (Eq. L.9): positive definite, also where the seen and the unseen part of a direction have the same middle."""
+    related = LIKENESS * np.exp(-np.arccos(np.clip(direction @ direction.T, -1.0, 1.0)) / reach)
+    np.fill_diagonal(related, 1.0)
+    return related
 
 
 def _middles(height: int, width: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import chunks, table, to_numpy, vectors
+from iif_core.light.transport.arrays import chunks, rows_of, table, to_numpy, vectors
 
 Array = np.ndarray
 
@@ -29,10 +29,11 @@ class Geometry:
         vertices: (n, 3) float32 metres; faces: (m, 3) int32; object_id: (m,) int32.
         normals: (m, 3) float32 unit right-hand normals, finite for degenerate faces too.
         areas: (m,) float64 m^2, 0 for degenerate faces.
+        transmittance: (m,) float32 in [0, 1), share of the rays that pass straight through a face; None = none does anywhere.
     """
 
-    def __init__(self, vertices: Array, faces: Array, object_id: Array):
-        self.vertices, self.faces, self.object_id = vertices, faces, object_id
+    def __init__(self, vertices: Array, faces: Array, object_id: Array, transmittance: Array | None = None):
+        self.vertices, self.faces, self.object_id, self.transmittance = vertices, faces, object_id, transmittance
         corners = vertices.astype(np.float64)[faces]
         edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         normals = np.cross(edge1, edge2)
@@ -56,6 +57,7 @@ class Geometry:
         self._normal_object = table(np.column_stack([self.normals, object_id.view(np.float32)]))
         self._corner = table(_padded(corners[:, 0]))
         self._edge1, self._edge2 = table(_padded(edge1)), table(_padded(edge2))
+        self._transmittance = None if transmittance is None else table(transmittance)
 
     def normal_and_object(self, face: Any, active: Any) -> tuple[Any, Any]:
         """Unit right-hand normal and object id of a face (device types)."""
@@ -78,8 +80,29 @@ class Geometry:
         p = v0 + b1 * e1 + b2 * e2
         return mi.Point3f(p.x, p.y, p.z)
 
-    def intersect(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(hit, face, t) of the nearest face along origin + t direction; face is 0 where nothing is hit."""
+    def intersect(self, origin: Any, direction: Any, active: Any, salt: Any = 0) -> tuple[Any, Any, Any]:
+        """(hit, face, t) of the nearest face along origin + t direction that stops the ray; face is 0 where nothing is hit.
+
+        A face lets a ray pass with the probability `transmittance` (docs/method/shading.md#surface-that-lets-light-through).
+        Whether it does follows from the ray, the face and `salt` (`draw_salt`).
+        """
+        if self._transmittance is None:
+            return self.nearest(origin, direction, active)
+        return _first_stop(self, origin, direction, active, mi.UInt32(salt))
+
+    def draw_salt(self, rng: Any) -> Any:
+        """Draw what distinguishes equal rays that may pass a face; without such faces nothing is drawn."""
+        return 0 if self._transmittance is None else rng.next_uint32()
+
+    def passes(self, face: Any, direction: Any, t: Any, active: Any, salt: Any) -> Any:
+        """Decide by chance whether a ray passes a face; the random number is a hash of the face, the ray and `salt`."""
+        share = dr.gather(mi.Float, self._transmittance, face, active)
+        bits = [dr.reinterpret_array(mi.UInt32, mi.Float(value)) for value in (t, direction.x, direction.y)]
+        first, second = bits[0] ^ (bits[1] * 0x9E3779B1), bits[2] + face * 0x85EBCA77
+        return active & (mi.sample_tea_float32(first ^ salt, second) < share)
+
+    def nearest(self, origin: Any, direction: Any, active: Any) -> tuple[Any, Any, Any]:
+        """As `intersect`, with faces that stop every ray."""
         found = self.scene.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=False, active=active)
         hit = active & found.is_valid()
         face = dr.select(hit, found.prim_index, 0)
@@ -87,25 +110,45 @@ class Geometry:
             face = dr.gather(mi.UInt32, self._face_of_primitive, face, hit)
         return hit, face, found.t
 
-    def occluded(self, origin: Any, direction: Any, distance: Any, active: Any) -> Any:
-        """Test for anything between two points.
+    def occluded(self, origin: Any, direction: Any, distance: Any, active: Any, salt: Any = 0) -> Any:
+        """Test for anything between two points that stops the ray.
 
         Args:
             origin, direction: start of the ray and unit direction.
             distance, active: metres up to which something counts, and lanes that need the answer.
+            salt: as in `intersect`.
 
         Returns:
             Bool, true where something lies on origin + t direction with 0 < t < distance.
         """
+        if self._transmittance is not None:
+            hit, _, t = self.intersect(origin, direction, active, salt)
+            return hit & (t < distance)
         return self.scene.ray_test(mi.Ray3f(origin, direction, distance, 0.0, mi.Color0f()), coherent=False, active=active)
+
+
+@dr.syntax
+def _first_stop(geometry: Geometry, origin: Any, direction: Any, active: Any, salt: Any) -> tuple[Any, Any, Any]:
+    """(hit, face, t) of the first face that a ray does not pass."""
+    hit, face, t = geometry.nearest(origin, direction, active)
+    going = geometry.passes(face, direction, t, hit, salt)
+    while going:
+        past = offset_from(mi.Point3f(dr.fma(direction, t, origin)), direction * dr.rcp(dr.norm(direction)))
+        hit, face, further = geometry.nearest(past, direction, going)
+        t = dr.norm(past - origin) * dr.rcp(dr.norm(direction)) + further
+        going = geometry.passes(face, direction, t, hit, salt)
+    return hit, face, t
 
 
 def _padded(rows: Array) -> Array:
     return np.column_stack([rows, np.zeros(len(rows))])
 
 
-def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) -> Geometry:
-    """Build a mesh from vertices (n, 3) metres, faces (m, 3) vertex ids and object_id (m,) (-1 = none).
+def build_geometry(
+    vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike, transmittance: ArrayLike | None = None
+) -> Geometry:
+    """Build a mesh from vertices (n, 3) metres, faces (m, 3) vertex ids, object_id (m,) (-1 = none) and the share (m,) of the
+    rays that pass straight through each face (None = none passes).
 
     Degenerate faces keep their id and are never hit. Raises InputError for wrong shapes, ids out of range, non-finite vertices
     or a mesh without surface.
@@ -123,7 +166,12 @@ def build_geometry(vertices: ArrayLike, faces: ArrayLike, object_id: ArrayLike) 
         raise InputError("the mesh has faces with NaN or infinite vertices; remove them first")
     if object_id.min() < -1:
         raise InputError(f"object ids start at {object_id.min()}; -1 means none, others count from 0")
-    return Geometry(np.where(np.isfinite(vertices), vertices, 0), faces, object_id)
+    share = None
+    if transmittance is not None and np.any(transmittance):
+        share = rows_of(transmittance, len(faces), None, "transmittance")
+        if share.min() < 0 or share.max() >= 1:
+            raise InputError(f"transmittance of {share.min():g} to {share.max():g}; expected shares in [0, 1)")
+    return Geometry(np.where(np.isfinite(vertices), vertices, 0), faces, object_id, share)
 
 
 def offset_from(point: Any, normal: Any) -> Any:
@@ -145,18 +193,20 @@ class Hit:
     t: Any
 
 
-def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any) -> Hit:
+def nearest_hit(geometry: Geometry, origin: Any, direction: Any, active: Any, salt: Any = 0) -> Hit:
     """Intersect rays with the mesh.
 
     Args:
         geometry: the mesh.
         origin, direction: Point3f in metres, and Vector3f of any length above 0.
         active: lanes that have a ray.
+        salt: as in `Geometry.intersect`; None = every face stops every ray.
 
     Returns:
         Everything that a path needs to know about the nearest intersection.
     """
-    valid, face, t = geometry.intersect(origin, direction, active)
+    ray = (origin, direction, active)
+    valid, face, t = geometry.nearest(*ray) if salt is None else geometry.intersect(*ray, salt)
     normal, object_id = geometry.normal_and_object(face, valid)
     return Hit(valid, face, object_id, mi.Point3f(dr.fma(direction, t, origin)), normal, t)
 

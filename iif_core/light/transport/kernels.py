@@ -176,7 +176,7 @@ def sample_light(world: World, rng: Any, point: Any, normal: Any, active: Any) -
         wi = dr.select(on_sky, emitters.direction_to(texel, u1, u2), wi)
         valid, reach = (valid & ~on_sky) | (active & on_sky), dr.select(on_sky, dr.inf, reach)
     valid &= (dr.dot(normal, wi) > 0) & (pdf > 0)
-    valid &= ~geometry.occluded(point, wi, reach, valid)
+    valid &= ~geometry.occluded(point, wi, reach, valid, geometry.draw_salt(rng))
     return LightSample(valid, face, on_sky, texel, radiance, wi, pdf)
 
 
@@ -269,7 +269,7 @@ def incoming(
     bounce = mi.UInt32(bounce)
     active = mi.Bool(active)
     while active:
-        hit = nearest_hit(world.geometry, origin, direction, active)
+        hit = nearest_hit(world.geometry, origin, direction, active, world.geometry.draw_salt(rng))
         escapes = active & ~hit.valid
         texel = world.emitters.texel_along(direction)
         sky, sky_pdf = world.emitters.texel(texel, escapes)

@@ -114,7 +114,7 @@ def first_hits(
     face = np.full(len(directions), -1, np.int32)
     for part in chunks(len(directions), chunk):
         way = vectors(mi.Vector3f, directions[part])
-        hit = nearest_hit(geometry, vectors(mi.Point3f, origins[part]), way, mi.Bool(True))
+        hit = nearest_hit(geometry, vectors(mi.Point3f, origins[part]), way, mi.Bool(True), salt=None)
         base_color, _, _ = material(hit.point, hit.face, hit.object_id, hit.valid)
         toward = dr.select(dr.dot(hit.normal, way) > 0, -hit.normal, hit.normal)
         results = (
