@@ -73,6 +73,7 @@ METRICS = {
     "shading_left": Metric("shading left (correlation with light inside objects)", "shading left", axis="shading_left"),
     "shading_slope": Metric("shading left (slope over light inside objects)", "its slope", axis="shading_slope"),
     "view_spread": Metric("spread of log albedo over views", "spread over views", False, axis="view_spread"),
+    "light_spread": Metric("spread over objects of the error of the light", "light's error", False, axis="light_spread"),
     "psnr_3d": Metric("PSNR over cells, one affine an object", "3D PSNR", True, unit="dB"),
 }
 """Metrics in the order of tables."""

@@ -104,7 +104,7 @@ class ViewSpread:
 def held_out_gain(
     radiance: NDArray, photo: NDArray, mask: NDArray, response: Callable[[NDArray], NDArray], per_channel: bool = False
 ) -> NDArray:
-    """Estimate the gains of one held-out photograph for scoring: argmin over g of sum |f(clip(g L, 0, 1)) - I|^2 (Eq. E.16).
+    """Estimate the gains of one held-out photograph for scoring: argmin over g of sum |f(clip(g L, 0, 1)) - I|^2 (Eq. E.17).
 
     The search uses a grid of 1/4 stop within GAIN_STOPS of the ratio of medians, then golden section.
 

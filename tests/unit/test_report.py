@@ -205,7 +205,10 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job = FakeJob("shading", root)
     for view, p, _, _ in seen:
         light = np.repeat(1 + 0.3 * p[:, :1], 3, 1).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
-        job.writer.exr(f"maps/{view.name}.exr", split_rgb(light, "half0.diffuse") | split_rgb(light, "half1.diffuse"))
+        layers = {layer: np.zeros_like(light) for layer in ("s0.00", "s0.01", "s1.00", "s1.01")} | {"diffuse": light}
+        halves = (split_rgb(value, f"half{half}.{layer}") for half in range(2) for layer, value in layers.items())
+        job.writer.exr(f"maps/{view.name}.exr", {name: value for half in halves for name, value in half.items()})
+    job.writer.table("levels.parquet", {"level": np.arange(2, dtype=np.int32), "roughness": [0.02, 1.0]})
     job.writer.json("shading.json", {"diffuse": {"cell_edge_m": 0.1}, "plan": []})
     job.writer.finish()
 

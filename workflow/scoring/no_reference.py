@@ -28,8 +28,8 @@ def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, s
     views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
     """
     vertices, faces = capture.mesh()
-    scene, light = read_lit_scene(job)
-    mixed = light.emits | scene.is_sheer
+    scene, emitters = read_lit_scene(job)
+    mixed = emitters.emits | scene.is_sheer
     edge = float(job.read("shading").json("shading.json")["diffuse"]["cell_edge_m"])
     origin = grid_origin(vertices[faces.ravel()], edge)
     left: dict[str, ShadingLeft] = {}

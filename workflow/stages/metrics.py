@@ -16,7 +16,8 @@ from workflow.artifacts.store import StageReader, ids_from_disk, rgb
 from workflow.models.lpips import FETCH_VGG
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scoring.no_reference import truth_free_scores
+from workflow.scoring.light_error import light_error
+from workflow.scoring.no_reference import EVERY_VIEW, truth_free_scores
 from workflow.scoring.scores import (
     UNITS,
     MaterialTruth,
@@ -67,6 +68,8 @@ def run(job: Job) -> None:
             job.progress(done + 1, len(capture.views), "views scored")
     for entry in truth_free_scores(job, capture):
         rows.add(*entry)
+    if capture.has_truth:
+        rows.add("result", EVERY_VIEW, "rgb", light_error(job, capture))
     job.writer.table("metrics.parquet", rows.table(job.scene, {"result"}), UNITS)
     job.writer.table("variants.parquet", rows.table(job.scene), UNITS)
     job.writer.json("summary.json", _summary(rows, capture))

@@ -1,0 +1,38 @@
+"""How wrong the computed light is, judged with the true materials (docs/method/evaluation.md#error-of-the-light)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SMALLEST_SHARE = 0.01
+"""Share of the pixels from which an object counts."""
+
+
+class LightSpread:
+    """Spread over objects of the error of the light (Eq. E.16).
+
+    With L the true radiance, P that of the true materials under the computed light, and sums over the pixels and channels of an
+    object o, e_o = log(sum L / sum P). The spread is the standard deviation of e_o over objects of more than `SMALLEST_SHARE`
+    of the pixels. A factor that all objects share is left out.
+    """
+
+    def __init__(self) -> None:
+        self.sums = np.zeros((0, 3))  # pixels, L, P
+
+    def add(self, true: NDArray, predicted: NDArray, object_id: NDArray) -> None:
+        """Add the pixels of one view: linear radiance (n, 3) and (n, 3), object (n,) int >= 0; non-finite pixels are left out."""
+        use = np.isfinite(true).all(-1) & np.isfinite(predicted).all(-1)
+        own = np.asarray(object_id, np.int64)[use]
+        count = max(len(self.sums), int(own.max(initial=-1)) + 1)
+        sums = np.zeros((count, 3))
+        sums[: len(self.sums)] = self.sums
+        for i, values in enumerate((None, true[use].mean(-1, dtype=np.float64), predicted[use].mean(-1, dtype=np.float64))):
+            sums[:, i] += np.bincount(own, values, count)
+        self.sums = sums
+
+    def finish(self) -> float | None:
+        """Return the spread; None if fewer than two objects count."""
+        pixels, true, predicted = self.sums.T
+        use = (pixels > SMALLEST_SHARE * pixels.sum()) & (true > 0) & (predicted > 0)
+        return float(np.std(np.log(true[use] / predicted[use]))) if use.sum() > 1 else None
