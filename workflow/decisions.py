@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.gains import SIGNIFICANT, Evidence
+from iif_core.light.emission.search import STEP
+from iif_core.light.emission.translucent import TRANSMITTANCE
 
 Decision = dict[str, Any]
 
@@ -133,6 +135,24 @@ def emitters(groups: int, dropped: int, candidates: int) -> Decision:
     else:
         reason = "no face was seen saturated often enough; light comes from cache and environment"
     return _decision("emitters", groups > 0, "emitter groups", groups, 1, reason)
+
+
+def transmission(names: str, shines: float, passes: float, possible: bool) -> Decision:
+    """Decide whether objects that glow shine, or let light from outside through.
+
+    See docs/method/light.md#surface-that-lets-light-through.
+
+    Args:
+        names: of the objects.
+        shines, passes: misfit of the light (Eq. L.40) under either assumption, on the rows of other objects.
+        possible: light comes from outside where the objects let it through, and the mesh stays closed otherwise.
+    """
+    measure = "share by which the misfit falls if light passes"
+    value = 1.0 - passes / shines if 0 < shines < np.inf and np.isfinite(passes) else 0.0
+    included = possible and passes * (1 + STEP) < shines
+    what = f"{TRANSMITTANCE:.0%} of the light passes through {names}" if included else f"no light passes through {names}"
+    reason = f"{what}: misfit {passes:.4f}, and {shines:.4f} if it shines"
+    return _decision("transmission", included, measure, value, 1 - 1 / (1 + STEP), reason)
 
 
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:

@@ -38,6 +38,8 @@ _SMALLEST_ERROR = 0.02
 """Of the light on an object, as a logarithm."""
 _DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of both errors."""
+_T_INTERVAL = 1.142
+"""Half the width of the central 68 % interval of Student's t of four degrees of freedom, in units of its scale."""
 _MOST_OBJECTS = 200
 """Objects from which the errors are learnt, the largest."""
 _INTERVAL = (0.1587, 0.8413)
@@ -269,7 +271,8 @@ def _log_t(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def gain_of_the_rest(levels: ObjectLevels, affine: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the gain (3,) of objects that were not fitted, and the standard deviation of its logarithm for one object.
+    """Return the gain (3,) of objects that were not fitted, and half the width of the 68 % interval of its logarithm for one
+    object: the error of the base, and that of the mean.
 
     The gain is the mean brightness that fitted objects have relative to their base. The gains of their affines would not do:
     they trade with offsets.
@@ -280,8 +283,11 @@ def gain_of_the_rest(levels: ObjectLevels, affine: np.ndarray) -> tuple[np.ndarr
     linear = affine[:, :12].reshape(-1, 3, 4)[:, :, :3]
     fitted = np.maximum(np.einsum("oci,oi->oc", linear, levels.base) + affine[:, BIASES], _DARKEST_LEVEL)
     share = levels.pixels / max(levels.pixels.sum(), 1e-100)
-    gain, _ = _mean_gain(levels.base, fitted, share, np.hypot(levels.base_error, levels.light_error))
-    return gain, float(np.sqrt(share @ levels.base_error**2))
+    error = np.hypot(levels.base_error, levels.light_error)
+    gain, _ = _mean_gain(levels.base, fitted, share, error)
+    weight = share / error**2
+    of_mean = np.sqrt(weight**2 @ error**2) / max(weight.sum(), 1e-100)
+    return gain, _T_INTERVAL * float(np.hypot(np.sqrt(share @ levels.base_error**2), of_mean))
 
 
 def light_scatter(levels: ObjectLevels, system: np.ndarray, affine: np.ndarray) -> np.ndarray:

@@ -132,3 +132,28 @@ def test_directions_of_an_open_mesh_are_unseen_and_share_the_sphere():
     np.testing.assert_allclose(share, 1 / 12, atol=0.03)
     up, down = sky.columns[0], sky.columns[-1]
     assert not set(up) & set(down)
+
+
+def test_mean_through_sheets():
+    """Texels seen directly and through one and three sheets: what is reflected in front counts by how much light passes."""
+    way = _middles()[100]
+    sums, level, cloth = SkySums(), 5.0, 0.2
+    for sheets, pixels in ((0, 10), (1, 40), (3, 80)):
+        share = 0.5**sheets
+        shown = level * share + (cloth if sheets else 0.0)
+        sums.add(np.tile(way, (pixels, 1)), np.full((pixels, 3), shown), np.zeros((pixels, 3), bool), np.full(pixels, share))
+    sky = sums.groups(min_pixels=5)
+    seen = sky.pixels > 0
+    extra = cloth * (40 * 0.5 + 80 * 0.125) / (10 + 40 * 0.25 + 80 / 64)
+    np.testing.assert_allclose(sky.radiance[seen], level + extra, rtol=1e-6)
+    np.testing.assert_allclose(sums.mean(), level + extra, rtol=1e-6)
+    assert sky.pixels.sum() == 130
+
+
+def test_seen_and_unseen_part_of_a_direction_with_the_same_middle():
+    towards = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    field = Sky(np.zeros((1, 1), np.int32), np.array([9, 0, 9]), np.ones((3, 3)), np.zeros(3, bool), towards)
+    related = sky_prior(field).correlation
+    assert np.linalg.eigvalsh(related)[0] > 1e-3
+    np.testing.assert_allclose(np.diag(related), 1.0)
+    assert related[0, 1] > 0.98 > related[0, 2]

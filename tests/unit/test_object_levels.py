@@ -165,3 +165,22 @@ def test_deviation_of_the_level_is_that_of_drawn_numbers():
     level = np.einsum("onci,oi->on", drawn[..., :12].reshape(2, -1, 3, 4)[..., :3], base) + drawn[..., 3:12:4].sum(2)
     np.testing.assert_allclose(claimed, level.std(1) / level.mean(1), rtol=0.03)
     assert (level_deviation(np.zeros((1, 16)), np.ones((1, 16, 16)), base[:1]) == 0).all()
+
+
+def test_gain_of_objects_that_were_not_fitted():
+    """Affines whose gains trade with offsets: what counts is how bright they make the base."""
+    from iif_core.fitting.object_levels import ObjectLevels, gain_of_the_rest
+
+    base = np.array([[0.5, 0.4, 0.3], [0.2, 0.3, 0.6], [0.7, 0.7, 0.7]])
+    true = np.array([1.5, 1.2, 0.9])
+    affine = np.zeros((3, 16))
+    for o, slope in enumerate((0.2, 1.0, -0.3)):
+        for c in range(3):
+            affine[o, 4 * c + c], affine[o, 4 * c + 3] = slope, (true[c] - slope) * base[o, c]
+    one = np.ones(3)
+    levels = ObjectLevels(base, base * true, 0 * one, 0.1 * one, 0.1 * one, true, one, 0.1 * one, 1000 * one)
+    gain, error = gain_of_the_rest(levels, affine)
+    np.testing.assert_allclose(gain, true, rtol=1e-6)
+    assert 0.1 < error < 0.2  # the error of the base, and a little of the mean
+    unsure = ObjectLevels(base, base * true, 0 * one, 1.0 * one, 0.1 * one, true, one, 0.1 * one, 1000 * one)
+    assert gain_of_the_rest(unsure, affine)[1] > 0.5

@@ -1,5 +1,7 @@
 """Surface that lets light through: in the tracer, and how it is recognised."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -139,3 +141,20 @@ def test_too_few_pixels_of_one_kind():
 def test_units_do_not_matter(unit, ratio):
     if abs(ratio - OPEN_RATIO) > 1e-6:
         assert is_brighter_where_open(*pixels_of(unit * ratio, unit), 3)[1] == (ratio > OPEN_RATIO)
+
+
+def test_sheets_on_a_ray(llvm):
+    """Two sides of one cloth half a millimetre apart count twice, as paths meet them; a ray beside them counts once."""
+    from workflow.scene.see_through import _Behind
+
+    levels = (0.0, 1.0, 1.0005, 1.6)
+    parts = [quad((-1, -1, z), (2, 0, 0), (0, 2, 0)) for z in levels]
+    vertices, faces = np.concatenate([v for v, _ in parts]), np.concatenate([f + 4 * i for i, (_, f) in enumerate(parts)])
+    scene = SimpleNamespace(vertices=vertices, faces=faces, object_id=np.repeat(np.arange(4), 2))
+    behind = _Behind(scene, np.repeat([False, True, True, True], 2))
+    view = SimpleNamespace(world_from_camera=np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]))
+    towards = np.array([[0.0, 0.1, -1.0], [0.1, 0.0, 1.0], [0.0, 1.3, -1.0]])
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    assert behind.sheets(view, towards).tolist() == [3, 1, 1]
+    assert behind.is_open(view, towards).tolist() == [False, True, True]
+    assert behind.sheets(view, towards[:0]).tolist() == []

@@ -58,7 +58,8 @@ def _checked(folder):
                         assert values.max() <= 1, (name, file, channel)
             elif file.endswith(".json"):
                 _finite(reader.json(file), f"{name}/{file}")
-    assert {entry["metric"] for entry in found.metrics.json("summary.json")["not_scored"]} == {"lpips"}  # too few pixels for it
+    missing = {entry["metric"] for entry in found.metrics.json("summary.json")["not_scored"]}
+    assert missing - {"light_spread"} == {"lpips"}  # too few pixels for it; one object has no spread
     if hasattr(found, "report"):
         _reported(found)
     return found
@@ -255,7 +256,7 @@ def test_curtain_lets_light_through(tmp_path, llvm):
     found = _run(tmp_path, "hdr", upto="report", rows=6000, samples=64)
     passes = found.emission.table("object_gains.parquet")["transmittance"]
     assert np.flatnonzero(passes).tolist() == [room.names.index("curtain")] and passes.max() == 0.5
-    assert "passes through curtain" in _said(found)
+    assert "of the light passes through curtain" in _said(found)
     radiance, kinds = _kept(found)
     assert set(kinds) == {"environment"}
     table = found.emission.table("emitters.parquet")
@@ -263,15 +264,20 @@ def test_curtain_lets_light_through(tmp_path, llvm):
     # Camera rays show the cloth as well, which reflects the light of the room.
     np.testing.assert_allclose(radiance[seen], 6.0, rtol=0.15)
     curtain = room.object_id == room.names.index("curtain")
-    for view in ("v000", "v003"):
+    shown, rendered = [], []
+    for view in (f"v{i:03d}" for i in range(6)):
         photo, ours = found.capture.exr(f"photos/{view}.exr"), found.render.exr(f"maps/{view}.exr")
         face = ids_from_disk(found.capture.exr(f"gbuffer/{view}.exr")["face.id"])
         own = curtain[np.maximum(face, 0)] & (face >= 0)
-        if own.any():
-            assert ours["G"][own].mean() == pytest.approx(photo["G"][own].mean(), rel=0.15)
+        shown.append(photo["G"][own])
+        rendered.append(ours["G"][own])
+    shown, rendered = np.concatenate(shown), np.concatenate(rendered)
+    assert len(shown) > 50 and rendered.mean() == pytest.approx(shown.mean(), rel=0.15)
     # Pixels on the curtain say nothing about its material: it keeps its base, at the level of the others.
     albedo, words = _fitted(found, room, "curtain")
-    assert words == "population (0 pixels)" and 0.4 < albedo[:, :3].mean() < 0.95
+    cells = found.base.table("cells.parquet")
+    base = np.stack([cells[f"albedo_{c}"][cells["object_id"] == room.names.index("curtain")] for c in "rgb"], 1)
+    assert words == "population (0 pixels)" and albedo[:, :3].mean() == pytest.approx(base.mean(), rel=0.2)
 
 
 @pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])

@@ -40,6 +40,8 @@ _ENVIRONMENT = """\t<emitter type="envmap">
 ENVIRONMENT_ROWS = 256
 """Texels are repeated up to about this many rows, because Mitsuba interpolates and the workflow's texels are constant."""
 
+MASKS = 8
+"""Passages through surface that lets light through that a path may have in addition."""
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
@@ -70,6 +72,8 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
         body.append(_ENVIRONMENT)
     elif np.any(environment > 0):
         body.append(f'\t<emitter type="constant">\n\t\t{_rgb("radiance", environment)}\n\t</emitter>')
+    if any(part.opacity < 1 for part in parts):  # Mitsuba counts the passage through a mask as an interaction
+        max_depth += MASKS
     first = views[0]
     head = [
         '<?xml version="1.0" encoding="utf-8"?>',

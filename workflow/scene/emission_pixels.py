@@ -79,7 +79,7 @@ class ViewRecord:
 
     @property
     def megabytes(self) -> float:
-        arrays = (*self.pixels.__dict__.values(), self.base, self.escaping, self.escaping_value, self.escaping_direction)
+        arrays = [value for value in (*self.__dict__.values(), *self.pixels.__dict__.values()) if isinstance(value, np.ndarray)]
         return sum(array.nbytes for array in arrays) / 1e6
 
 
@@ -113,7 +113,7 @@ class ViewRecords:
         direction = view.directions().reshape(-1, 3)[out]
         deep = decoded.depth[decoded.depth > 0]
         median = np.median(deep) if deep.size else None
-        outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()))
+        outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()), np.float32)
         return ViewRecord(pixels, base, median, int(decoded.valid.sum()), *outside)
 
 
@@ -267,7 +267,7 @@ def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[Radiance
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
         hits += int(pixels.valid.sum())
         light, bound = photos.radiance(view, record.escaping_value, record.escaping)
-        sky.add(record.escaping_direction, light / record.escaping_share[:, None], bound)
+        sky.add(record.escaping_direction, light, bound, record.escaping_share)
         total += record.counted
         photos.job.progress(done + 1, len(photos.views), "views cached")
     brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None

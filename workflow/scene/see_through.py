@@ -13,9 +13,8 @@ from workflow.scene.base_scene import BaseScene
 from workflow.scene.emission_pixels import Photographs, ViewRecord, ViewRecords
 from workflow.scene.normal_form import View
 
-__all__ = ["TRANSMITTANCE", "seen_through", "translucent_objects"]
 MAX_SHEETS = 16
-"""Folds of a curtain that one ray crosses, at most."""
+"""Folds of a curtain that one ray crosses, at most; light through more of them would not be seen."""
 
 
 def translucent_objects(photos: Photographs, glowing: np.ndarray) -> np.ndarray:
@@ -26,9 +25,10 @@ def translucent_objects(photos: Photographs, glowing: np.ndarray) -> np.ndarray:
     whole = np.bincount(scene.object_id[known], area[known], scene.n_objects)
     glows = known & (glowing >= 0)
     some = np.bincount(scene.object_id[glows], area[glows], scene.n_objects) > 0.5 * whole
-    if not some.any():
-        return some
-    behind = _Behind(scene, np.append(some, False)[scene.object_id])
+    sheer = np.append(some, False)[scene.object_id]
+    if not some.any() or not area[~sheer].any():
+        return np.zeros_like(some)
+    behind = _Behind(scene, sheer)
     objects, opens, brightness = [], [], []
     for view in photos.views:
         pixels = photos.records[view].pixels
@@ -61,10 +61,10 @@ class _SeenThrough(ViewRecords):
         record = self._records[view]
         pixels = record.pixels
         if view.view_id not in self._escaping:
-            own = np.flatnonzero(pixels.valid & self._behind.sheer[pixels.face])
-            out = own[self._behind.is_open(view, -pixels.wo[own])]
+            own = np.flatnonzero(pixels.valid & pixels.interior & self._behind.sheer[pixels.face])
+            out = own[self._behind.is_open(view, -pixels.wo[own])].astype(np.int32)
             share = self.scene.passes[pixels.face[out]] ** self._behind.sheets(view, -pixels.wo[out])
-            self._escaping[view.view_id] = out, share
+            self._escaping[view.view_id] = out, share.astype(np.float32)
         out, share = self._escaping[view.view_id]
         return replace(
             record,
@@ -97,8 +97,11 @@ class _Behind:
         return trace(self._rest, view.world_from_camera[:3, 3], towards)[0] < 0
 
     def sheets(self, view: View, towards: np.ndarray) -> np.ndarray:
-        """(n,) how often each ray meets `sheer` surface."""
-        from iif_core.light.transport.geometry import trace
+        """(n,) how often each ray meets `sheer` surface, at least once."""
+        import mitsuba
+
+        from iif_core.light.transport.arrays import to_numpy, vectors
+        from iif_core.light.transport.geometry import offset_from, trace
 
         start = np.tile(view.world_from_camera[:3, 3], (len(towards), 1))
         count, going = np.zeros(len(towards), np.int64), np.arange(len(towards))
@@ -109,5 +112,7 @@ class _Behind:
             if not len(going):
                 break
             count[going] += 1
-            start[going] += (distance[met, None] + 1e-3) * towards[going]
-        return count
+            at = start[going] + distance[met, None] * towards[going]
+            past = offset_from(vectors(mitsuba.Point3f, at), vectors(mitsuba.Vector3f, towards[going]))
+            start[going] = to_numpy(past)
+        return np.maximum(count, 1)

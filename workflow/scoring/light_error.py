@@ -14,25 +14,28 @@ from workflow.scene.normal_form import CaptureReader, View
 
 
 def light_error(job: Job, capture: CaptureReader) -> list[Score]:
-    """Score the light of stage shading at interior pixels of surface that neither emits nor lets light through, in the views that
-    were used."""
-    scene, light = read_lit_scene(job)
-    mixed, spread = light.emits | scene.is_sheer, LightSpread()
+    """Score the light of stage shading at interior pixels, in the views that were used.
+
+    Left out is surface that emits in truth, whatever was found, and surface that was found to let light through.
+    """
+    if capture.facts["source"] == "folder" and not capture.is_hdr:
+        return [Score("light_spread", "raw", None, "8-bit photographs of a folder are no true radiance")]
+    sheer, spread = read_lit_scene(job)[0].is_sheer, LightSpread()
     levels = job.read("shading").table("levels.parquet")["roughness"]
     for view in capture.used:
-        spread.add(*_pixels(job, capture, view, mixed, levels))
+        spread.add(*_pixels(job, capture, view, sheer, levels))
     found = spread.finish()
     return [Score("light_spread", "raw", found, "" if found is not None else "fewer than two objects are large enough")]
 
 
 def _pixels(
-    job: Job, capture: CaptureReader, view: View, mixed: np.ndarray, levels: np.ndarray
+    job: Job, capture: CaptureReader, view: View, sheer: np.ndarray, levels: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True radiance and that of the true materials under the computed light, (n, 3) each, and objects (n,)."""
     file, truth = f"maps/{view.name}.exr", capture.truth(view)
     channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
     face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
-    use = truth.valid & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~mixed[np.maximum(face, 0)]
+    use = truth.valid & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~sheer[np.maximum(face, 0)]
     use &= ~truth.emission.any(-1)
 
     def both(layer: str) -> np.ndarray:

@@ -24,8 +24,8 @@ DARK = 0.02
 def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, str, str, list[Score]]]:
     """Score the albedo of `result`, `base` and `prior_k0`, and the mean of the scores of all predictions (`prior_mean_k`).
 
-    The light is the diffuse light of stage shading (mean of its halves) at interior pixels of surface that does not emit, in the
-    views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
+    The light is the diffuse light of stage shading (mean of its halves) at interior pixels of surface that neither emits nor lets
+    light through, in the views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
     """
     vertices, faces = capture.mesh()
     scene, emitters = read_lit_scene(job)

@@ -223,7 +223,8 @@ class _Chosen:
 def _eligible(
     job: Job, capture: CaptureReader, scene: BaseScene, view: View, mixed: np.ndarray, thin: np.ndarray | None = None
 ) -> _Chosen:
-    """Return the valid pixels of surface that does not emit: interior ones, and all of those of `thin` objects (O,) bool."""
+    """Return the valid pixels of faces that are not `mixed` (m,) bool, as emitters are: interior ones, and all of those of `thin`
+    objects (O,) bool."""
     pixels = view_pixels(job, capture, scene, view)
     use = pixels.valid & (pixels.object_id >= 0) & ~mixed[pixels.face]
     use &= pixels.interior if thin is None else pixels.interior | thin[np.maximum(pixels.object_id, 0)]

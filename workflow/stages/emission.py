@@ -32,7 +32,7 @@ from workflow.scene.emission_pixels import (
 from workflow.scene.emission_solve import Traced, reliable, search_emitters, solve_with_saturated_surface, trial
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names
-from workflow.scene.see_through import TRANSMITTANCE, seen_through, translucent_objects
+from workflow.scene.see_through import seen_through, translucent_objects
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,17 @@ class FoundLight:
     notes: list[str]
 
     @property
+    def is_open(self) -> bool:
+        """So much of the surface faces holes of the mesh that light from outside is twelve directions (`SkySums.directions`)."""
+        return self.outside is not None and self.outside.is_unseen
+
+    def misfit(self, without: np.ndarray) -> float:
+        """Return the misfit (Eq. L.40) over the rows of other objects than `without`, (n_objects,) bool; inf without rows."""
+        problem = self.found.problem
+        rows = problem.take(~np.append(without, False)[problem.owner])
+        return rows.misfit(self.solution.radiance) if (~rows.anchor).any() else np.inf
+
+    @property
     def transmittance(self) -> np.ndarray:
         scene = self.photos.scene
         return np.zeros(scene.n_objects, np.float32) if scene.transmittance is None else scene.transmittance
@@ -83,19 +94,20 @@ def run(job: Job) -> None:
     notes.extend([camera.gauge] if camera.gauge else [])
     adjacency = face_adjacency(scene.faces)
     light, glowing = _light(photos, adjacency)
+    plan: list[decisions.Decision] = []
     sheer = translucent_objects(photos, glowing)
     if sheer.any():
         names = ", ".join(object_names(job, scene.n_objects)[o] for o in np.flatnonzero(sheer))
         job.log.info("%s: does it shine, or does light pass through it?", names)
         through, _ = _light(seen_through(photos, sheer), adjacency)
-        misfits = f"misfit {through.found.misfit:.4f} against {light.found.misfit:.4f} if it shines"
-        if through.found.misfit < light.found.misfit:
-            light = through
-            notes.append(f"{TRANSMITTANCE:.0%} of the light passes through {names}: {misfits}")
-        job.log.info("%s", misfits)
+        same_kind = through.outside is not None and through.is_open <= light.is_open
+        decision = decisions.transmission(names, light.misfit(sheer), through.misfit(sheer), same_kind)
+        light = through if decision["included"] else light
+        plan, notes = [decision], [*notes, decision["reason"]]
+        job.log.info("%s", decision["reason"])
     table = _table(light)
     _write(job, light, table)
-    _write_facts(job, light, table, camera, notes + light.notes)
+    _write_facts(job, light, table, camera, plan, notes + light.notes)
 
 
 def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.ndarray]:
@@ -139,8 +151,15 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     return FoundLight(photos, *light, (escape, secondary), threshold, notes), glowing
 
 
-def _write_facts(job: Job, light: FoundLight, table: dict[str, Any], camera: CalibratedResponse, notes: list[str]) -> None:
-    """Write emission.json."""
+def _write_facts(
+    job: Job,
+    light: FoundLight,
+    table: dict[str, Any],
+    camera: CalibratedResponse,
+    plan: list[decisions.Decision],
+    notes: list[str],
+) -> None:
+    """Write emission.json; `plan` and `notes`: what was decided and noted before."""
     found, solution, photos = light.found, light.solution, light.photos
     kept, candidates = int(np.count_nonzero(table["kept"] & (table["kind"] == "area"))), light.candidates
     job.log.info("%d of %d groups kept; residual %.3f, condition %.3g", kept, candidates, solution.residual, solution.condition)
@@ -153,7 +172,8 @@ def _write_facts(job: Job, light: FoundLight, table: dict[str, Any], camera: Cal
     if level_raised > 0:
         raised = f"light raised {np.exp(level_raised):.2f} times so that albedos are at most 1"
         notes.append(f"{raised}; the error of its level does not contain that")
-    plan = [light.environment, *gain_plan(photos.capture, photos.gains), decisions.emitters(kept, candidates - kept, candidates)]
+    found_emitters = decisions.emitters(kept, candidates - kept, candidates)
+    plan = [light.environment, *plan, *gain_plan(photos.capture, photos.gains), found_emitters]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",

@@ -55,13 +55,21 @@ class SkySums:
 
     def __init__(self, height: int = HEIGHT, width: int = WIDTH):
         self.shape = (height, width)
-        self._sums = np.zeros((height * width, 5))  # R G B, pixels, saturated
+        self._sums = np.zeros((height * width, 6))  # R G B times share, pixels, saturated, squares of the share
 
-    def add(self, directions: np.ndarray, radiance: np.ndarray, bound: np.ndarray) -> None:
-        """directions (n, 3) of any length; radiance (n, 3) finite; bound (n, 3) bool: only a lower bound."""
+    def add(self, directions: np.ndarray, radiance: np.ndarray, bound: np.ndarray, share: np.ndarray | None = None) -> None:
+        """Add the pixels of one view.
+
+        Args:
+            directions: (n, 3) of any length; radiance: (n, 3) finite; bound: (n, 3) bool, only a lower bound.
+            share: (n,) of the light from outside that reaches the camera, None = 1. Means are sum y s / sum s^2, in which pixels
+                that little light reaches count little.
+        """
         texel = texels(directions, *self.shape)
-        values = np.concatenate([radiance, np.ones((len(texel), 1)), bound.any(1)[:, None]], 1)
-        for i in range(5):
+        share = np.ones(len(texel)) if share is None else share
+        columns = [share[:, None] * radiance, np.ones((len(texel), 1)), bound.any(1)[:, None], share[:, None] ** 2]
+        values = np.concatenate(columns, 1)
+        for i in range(6):
             self._sums[:, i] += np.bincount(texel, values[:, i], len(self._sums))
 
     @property
@@ -70,7 +78,7 @@ class SkySums:
 
     def mean(self) -> np.ndarray:
         """Return the mean radiance (3,) of all escaping pixels, 0 without any."""
-        return self._sums[:, :3].sum(0) / max(self.pixels, 1)
+        return self._sums[:, :3].sum(0) / max(float(self._sums[:, 5].sum()), 1e-30)
 
     def groups(self, min_pixels: int = MIN_PIXELS) -> Sky:
         """Divide the sphere into 42 directions, and each into what cameras see unsaturated, what they see saturated, and what
@@ -90,7 +98,7 @@ class SkySums:
         pixels = np.bincount(number, known, size)
         # A texel counts by its solid angle, however many pixels look at it.
         weight = np.where(seen, solid, 0.0)
-        mean = self._sums[:, :3] / np.maximum(count, 1)[:, None]
+        mean = self._sums[:, :3] / np.maximum(self._sums[:, 5], 1e-30)[:, None]
         radiance = np.stack([np.bincount(number, weight * mean[:, c], size) for c in range(3)], 1)
         total = np.bincount(number, weight, size)
         average = (weight[:, None] * mean).sum(0) / weight.sum() if weight.any() else self.mean()
