@@ -138,9 +138,10 @@ def emitters(groups: int, dropped: int, candidates: int) -> Decision:
 
 
 def transmission(names: str, shines: float, passes: float, possible: bool) -> Decision:
-    """Decide whether objects that glow shine, or let light from outside through.
+    """Decide whether objects that show what is behind them shine, or let light from outside through.
 
-    See docs/method/light.md#surface-that-lets-light-through.
+    That they show it speaks for the latter, unless it explains the other objects clearly worse
+    (docs/method/light.md#surface-that-lets-light-through).
 
     Args:
         names: of the objects.
@@ -149,10 +150,10 @@ def transmission(names: str, shines: float, passes: float, possible: bool) -> De
     """
     measure = "share by which the misfit falls if light passes"
     value = 1.0 - passes / shines if 0 < shines < np.inf and np.isfinite(passes) else 0.0
-    included = possible and passes * (1 + STEP) < shines
+    included = possible and passes < (1 + STEP) * shines
     what = f"{TRANSMITTANCE:.0%} of the light passes through {names}" if included else f"no light passes through {names}"
     reason = f"{what}: misfit {passes:.4f}, and {shines:.4f} if it shines"
-    return _decision("transmission", included, measure, value, 1 - 1 / (1 + STEP), reason)
+    return _decision("transmission", included, measure, value, -STEP, reason)
 
 
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:

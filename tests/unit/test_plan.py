@@ -65,3 +65,18 @@ def test_objects_say_how_stable_they_are():
     assert "7 of 100 masks" in firm["reason"] and "overlay" not in firm["reason"]
     assert "overlay" in decisions.segmentation("geometry", 40, 0.5, "views left out", {})["reason"]
     assert decisions.segmentation("given", 40, None, "", {})["measure"] == "ids taken as they are"
+
+
+def test_light_passes_unless_it_explains_the_room_worse():
+    for shines, passes, possible, expected in (
+        (0.070, 0.044, True, True),
+        (0.074, 0.0745, True, True),
+        (0.070, 0.080, True, False),
+        (0.070, 0.044, False, False),
+        (float("inf"), float("inf"), True, False),
+        (0.0, 0.0, True, False),
+    ):
+        found = decisions.transmission("curtain", shines, passes, possible)
+        assert found["included"] == expected
+        assert ("no light passes" in found["reason"]) != expected and "curtain" in found["reason"]
+        assert np.isfinite(found["value"])
