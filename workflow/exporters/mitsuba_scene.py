@@ -26,6 +26,9 @@ _NOTE = """
   Mitsuba has no such BSDF; `principled` with specular 0.5 (the same F0 = 0.04) is the nearest one. Its diffuse lobe
   has a retro-reflective term and its microfacets shadow less: surfaces are about 10 % brighter than in the workflow.
 
+  Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
+  samples.
+
   Relight: change or remove the emitters below, or add your own.
   Sizes: mitsuba -m scalar_rgb scene.xml -Dspp=256 -Dresx=640 -Dresy=480
   Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)
