@@ -163,8 +163,7 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
     materials += [("albedo", "scaled", m) for m in ("l2", "psnr", "ssim")]
     materials += [(q, "raw", m) for q in ("roughness", "metallic") for m in ("l2", "psnr", "ssim")]
     oracle = [(q, "oracle_affine", m) for q in ("albedo", "roughness", "metallic") for m in ("l2", "psnr", "ssim")]
-    light = [("rgb", "raw", m) for m in ("l2", "psnr", "ssim", "flip", "log_l2")] + [("rgb", "scaled", "log_l2")]
-    light += [("rgb", "raw", "light_spread")]
+    light = [("rgb", "raw", m) for m in ("l2", "psnr", "ssim", "flip", "log_l2", "light_spread")] + [("rgb", "scaled", "log_l2")]
     light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [("emission", "scaled", m) for m in ("l2", "log_l2")]
     tables = [
         score_table(
