@@ -19,7 +19,7 @@ MAX_SHEETS = 16
 
 def translucent_objects(photos: Photographs, glowing: np.ndarray) -> np.ndarray:
     """Return (n_objects,) bool: objects that may let light through. Most of their surface glows (`glowing` (F,), -1 = not),
-    and they are much brighter where nothing lies behind them than where something does."""
+    and they are much brighter where nothing but other such objects lies behind them than where something else does."""
     scene = photos.scene
     known, area = scene.object_id >= 0, scene.areas
     whole = np.bincount(scene.object_id[known], area[known], scene.n_objects)
@@ -43,7 +43,7 @@ def translucent_objects(photos: Photographs, glowing: np.ndarray) -> np.ndarray:
 
 def seen_through(photos: Photographs, sheer: np.ndarray) -> Photographs:
     """Return the photographs of a scene in which the objects `sheer` (n_objects,) bool let light through: their pixels show
-    what lies behind them."""
+    the light from outside where nothing lies behind them, and nothing elsewhere."""
     scene = replace(photos.scene, transmittance=np.where(sheer, np.float32(TRANSMITTANCE), np.float32(0.0)))
     return replace(photos, scene=scene, records=_SeenThrough(photos.records, photos.job, scene))
 
