@@ -11,6 +11,7 @@ import numpy as np
 
 from iif_core.camera.gains import SIGNIFICANT, Evidence
 from iif_core.light.emission.search import STEP
+from iif_core.light.emission.sun import SHARP, Disc, is_needed
 from iif_core.light.emission.translucent import TRANSMITTANCE
 
 Decision = dict[str, Any]
@@ -77,6 +78,24 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     else:
         reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
     return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
+
+
+def sun(disc: Disc | None, without: float, with_it: float, narrow: float = 0.0) -> Decision:
+    """Decide about a sun that no camera sees (docs/method/light.md#the-sun).
+
+    Args:
+        disc: that explains the photographs best; None = no single direction helps.
+        without, with_it: misfit of the light (Eq. L.40), if a narrow disc is as good of views that it was not found on.
+        narrow: share of what the disc explains that a narrow one does.
+    """
+    value = 1.0 - with_it / without if 0 < without < np.inf else 0.0
+    included = disc is not None and is_needed(without, with_it) and narrow >= SHARP
+    reason = f"misfit {without:.4f}, and {with_it:.4f} with the best sun"
+    if disc is not None:
+        towards, size = ", ".join(f"{x:.2f}" for x in disc.direction), np.degrees(disc.radius)
+        reason += f", towards ({towards}), {f'a disc of radius {size:.1f} degrees' if size else 'one texel'}"
+        reason += f"; a narrow one explains {narrow:.0%} of that{'' if included else ', so that it is a part of the sky'}"
+    return _decision("sun", included, "share by which the misfit falls with a sun", value, STEP, reason)
 
 
 def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:

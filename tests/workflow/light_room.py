@@ -162,14 +162,15 @@ def build(
     exposures: np.ndarray | None = None,
     brightness: float = 1.0,
     room: Room | None = None,
-    sky: float = 0.0,
+    sky: float | np.ndarray = 0.0,
     bounces: int = 10,
     retouch: Callable[[int, np.ndarray], np.ndarray] | None = None,
     truth: bool = False,
 ) -> Room:
     """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture.
 
-    `sky`: radiance of what is outside the mesh; `retouch(view, image)`: the photograph as it is stored.
+    `sky`: radiance of what is outside the mesh, one number or a map (H, W, 3); `retouch(view, image)`: the photograph
+    as it is stored.
     """
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry, trace
@@ -185,7 +186,7 @@ def build(
     geometry = build_geometry(room.vertices, room.faces, room.object_id, room.transmittance)
     scanned = build_geometry(room.vertices, room.faces, room.object_id)
     material = FaceMaterials(room.material)
-    emitters = Emitters(geometry, room.emission, room.side, **({"environment": np.full(3, sky)} if sky else {}))
+    emitters = Emitters(geometry, room.emission, room.side, environment=np.full(3, sky) if np.ndim(sky) == 0 else sky)
     sensor = response_curve(curve) if curve else None
     capture = StubJob("capture", folder, {}).writer
     segmentation = StubJob("segmentation", folder, {}).writer

@@ -9,6 +9,8 @@ import yaml
 from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, SIZE, Room, StubJob, _box, _join, _quad, build
 
 from iif_core.camera.pinhole import look_at
+from iif_core.light.environment import direction_in, solid_angles
+from iif_core.numerics.xp import NUMPY
 from workflow.artifacts.store import ids_from_disk
 from workflow.stages import affines, emission, export, metrics, render, report, shading
 
@@ -278,6 +280,51 @@ def test_curtain_lets_light_through(tmp_path, llvm):
     cells = found.base.table("cells.parquet")
     base = np.stack([cells[f"albedo_{c}"][cells["object_id"] == room.names.index("curtain")] for c in "rgb"], 1)
     assert words == "population (0 pixels)" and albedo[:, :3].mean() == pytest.approx(base.mean(), rel=0.2)
+
+
+class SunRoom(Room):
+    """Nothing shines inside; the sky comes in through an opening high up in a wall."""
+
+    def __init__(self):
+        x, y, z = SIZE
+        across = [_quad((x, 0, low), (0, 0, high), (0, y, 0), 6) for low, high in ((0, 0.9), (2.3, z - 2.3))]
+        sides = [_quad((x, low, 0.9), (0, 0, 1.4), (0, 0.4, 0), 4) for low in (0, y - 0.4)]
+        super().__init__(parts={"wall_b": _join([*across, *sides]), "lamp": None, "bulb": None}, lights={})
+
+
+def _sky_with_sun(towards, radiance, cosine):
+    """A map (64, 128, 3) of radiance 1 with a disc of `radiance` (3,) around the unit vector `towards`."""
+    row, column = np.indices((64, 128)).astype(float)
+    ways = np.stack(direction_in(NUMPY, row, column, 0.5, 0.5, 64, 128), -1)
+    sun = ways @ towards >= cosine
+    return np.where(sun[..., None], radiance, 1.0).astype(np.float32), (solid_angles(64, 128) * sun).sum()
+
+
+@pytest.mark.parametrize("shines", [True, pytest.param(False, marks=pytest.mark.long)])
+def test_sun_that_nobody_sees(tmp_path, llvm, shines):
+    towards = np.array([0.62, 0.1, 0.78])
+    towards /= np.linalg.norm(towards)
+    colour = np.array([600.0, 540.0, 450.0])
+    sky, solid = _sky_with_sun(towards, colour if shines else np.ones(3), np.cos(np.radians(4.0)))
+    build(tmp_path, truth=True, views=6, size=40, samples=512, room=SunRoom(), sky=sky)
+    found = _run(tmp_path, "hdr", rows=6000, samples=64)
+    sun = {p["component"]: p for p in found.emission.json("emission.json")["plan"]}["sun"]
+    assert sun["included"] == shines
+    texels = found.emission.table("environment_texels.parquet")
+    if not shines:
+        assert len(texels["row"]) == 512
+        return
+    table = found.emission.table("emitters.parquet")
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
+    number = int(radiance[:, 1].argmax())
+    own = texels["emitter_id"] == number
+    assert len(texels["row"]) == 64 * 128 and table["observations"][number] == 0
+    place = direction_in(NUMPY, texels["row"][own].astype(float), texels["column"][own].astype(float), 0.5, 0.5, 64, 128)
+    middle = np.stack(place, -1).mean(0)
+    assert np.degrees(np.arccos(middle @ towards / np.linalg.norm(middle))) < 5.0
+    irradiance = radiance[number] * solid_angles(64, 128)[texels["row"][own], texels["column"][own]].sum()
+    np.testing.assert_allclose(irradiance, colour * solid, rtol=0.25)
+    np.testing.assert_allclose(irradiance / irradiance[1], colour / colour[1], rtol=0.05)
 
 
 @pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])

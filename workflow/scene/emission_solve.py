@@ -97,13 +97,13 @@ def trial(
     """Find which groups emit light, and the albedo gains of objects (n_objects, 3), from half of the rows."""
     pixels, base, rows = choose_rows(photos, groups, threshold, 2)
     own = rows.group >= 0
-    transport = _trace(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
+    transport = trace_rows(photos, pixels, base, groups, voxels, sky, 0).without_lobes()
     paint = np.tile(np.float32(WHITE), (int(own.sum()), 1))
-    white = _trace(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
-    seen, prior = _prior(photos, groups, rows, sky)
+    white = trace_rows(photos, pixels.take(own), paint, groups, voxels, sky, 1).without_lobes()
+    seen, prior = light_prior(photos, groups, rows, sky)
     n_groups = len(prior.initial)
     problem = assemble(rows, transport, n_groups, white, sky)
-    tried, gains = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects)
+    tried, gains = problem.solve_object_gains(prior, albedo_limit(photos, sky), photos.scene.n_objects)
     family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
@@ -132,10 +132,10 @@ def traced(
     if left_out is not None:
         use = (rows.group >= 0) | ~left_out[pixels.face]
         pixels, base, rows = pixels.take(use), base[use], rows.take(use)
-    transport = _trace(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
-    prior = _prior(photos, groups, rows, sky)[1]
+    transport = trace_rows(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
+    prior = light_prior(photos, groups, rows, sky)[1]
     problem = assemble(rows, transport, len(prior.initial), None, sky)
-    problem, found = problem.solve_object_gains(prior, _albedo_limit(photos, sky), photos.scene.n_objects, options)
+    problem, found = problem.solve_object_gains(prior, albedo_limit(photos, sky), photos.scene.n_objects, options)
     return Traced(groups, cache, prior, problem, found)
 
 
@@ -169,7 +169,7 @@ def search_emitters(
             return np.inf
         if chosen not in misfits:
             some = every.select(np.isin(family, [*chosen]))
-            found = traced(photos, gain, some, sky, threshold, _comparison_tile(photos), QUICK, left_out=weak)
+            found = traced(photos, gain, some, sky, threshold, comparison_tile(photos), QUICK, left_out=weak)
             misfits[chosen] = found.misfit
         return misfits[chosen]
 
@@ -232,7 +232,7 @@ def _raised(
     pixels, base = joined(parts), np.concatenate(materials)
     if not len(base):
         return cache
-    transport = _trace(photos, pixels, base, found.groups, found.cache, sky, 2, photos.scene.with_gains(gain).materials())
+    transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, photos.scene.with_gains(gain).materials())
     matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
     light = np.einsum("ngc,gc->nc", matrix, radiance) + cached
     of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
@@ -251,11 +251,11 @@ def _first_look(
     """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
     thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)[0]
-    pixels, base, rows = choose_rows(photos, every, threshold, thin, _comparison_tile(photos))
+    pixels, base, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
     material = photos.scene.with_gains(gain).materials()
-    transport = _trace(photos, pixels, base, every, cache, sky, 2, material)
+    transport = trace_rows(photos, pixels, base, every, cache, sky, 2, material)
     white = _white_hidden_surface(photos, every, cache, sky, material)
-    seen, prior = _prior(photos, every, rows, sky)
+    seen, prior = light_prior(photos, every, rows, sky)
     outside = len(prior.initial) - every.size
     problem = assemble(rows, transport, len(prior.initial), None, sky)
     own = np.flatnonzero(np.isin(rows.group, np.flatnonzero(lit)))
@@ -263,7 +263,7 @@ def _first_look(
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
-    limit = _albedo_limit(photos, sky), photos.scene.n_objects
+    limit = albedo_limit(photos, sky), photos.scene.n_objects
     return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, *limit)
 
 
@@ -283,13 +283,13 @@ def _white_hidden_surface(
         middle = scene.vertices[scene.faces[face]].mean(1) + 1e-3 * normal
         points = SurfacePoints(*(part.astype(np.float32) for part in (middle, normal, normal)))
         paint = np.tile(np.float32(WHITE), (len(face), 1))
-        white = _trace(photos, points, paint, groups, voxels, sky, 1, material).without_lobes()
+        white = trace_rows(photos, points, paint, groups, voxels, sky, 1, material).without_lobes()
         np.add.at(matrix, group, white.matrix[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
         np.add.at(cached, group, white.cached[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
     return WhiteSurface(np.zeros((number, 3)), matrix, cached)
 
 
-def _comparison_tile(photos: Photographs) -> int:
+def comparison_tile(photos: Photographs) -> int:
     return max(1, int(np.median([max(view.width, view.height) for view in photos.views])) // TILES_ACROSS)
 
 
@@ -338,14 +338,16 @@ def reliable(gains: ObjectGains) -> np.ndarray:
     return gains.gain if gains.level_error < PRIOR_LEVEL_ERROR else np.ones_like(gains.gain)
 
 
-def _albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
+def albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
     """(n_objects, 3) base albedos that no gain may bring above 1, where light comes from where no camera looks: its level is
     the least certain. In a closed room the gains of single objects are less certain than the light: None."""
     return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
 
 
-def _prior(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None) -> tuple[np.ndarray, EmissionPrior]:
-    """Radiance seen on the groups; and the prior of the groups, followed by those of the environment."""
+def light_prior(
+    photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky: Sky | None
+) -> tuple[np.ndarray, EmissionPrior]:
+    """Return the radiance seen on the groups; and the prior of the groups, followed by those of the environment."""
     seen = initial_radiance(rows, groups.observed, photos.sensor.is_hdr)
     seen[groups.is_hidden] = 0.0
     initial, width = expected_radiance(rows, seen), np.where(groups.is_hidden, HIDDEN_WIDTH, SINGLE_WIDTH)
@@ -357,7 +359,7 @@ def _prior(photos: Photographs, groups: EmitterGroups, rows: EmissionPixels, sky
     return seen, prior.beside(sky_prior(sky) if sky.direction is not None else EmissionPrior.independent(sky.radiance))
 
 
-def _trace(
+def trace_rows(
     photos: Photographs,
     pixels: ViewPixels | SurfacePoints,
     base: np.ndarray,
@@ -367,7 +369,7 @@ def _trace(
     stream: int,
     unseen: CellMaterials | None = None,
 ) -> TracedTransport:
-    """Two independent estimates of (A, h), by lobe.
+    """Return two independent estimates of (A, h), by lobe.
 
     unseen: materials of surface that paths meet and no photograph shows; None = the base texture."""
     job, settings = photos.job, photos.job.settings.emission
@@ -384,7 +386,9 @@ def _trace(
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None
     weight = _drawn(groups, photos.scene.areas)
-    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight)
+    columns = EmitterColumns(
+        groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight, sky.texel_weight if sky else None
+    )
     samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
     halves = []
     for half in range(2):

@@ -33,6 +33,7 @@ from workflow.scene.emission_solve import Traced, reliable, search_emitters, sol
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names
 from workflow.scene.see_through import seen_through, translucent_objects
+from workflow.scene.sun_search import find_sun
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class FoundLight:
         left_out, reasons: candidate groups that turned out to reflect, and why.
         candidates: number of groups that were looked at; dropped: [(faces, area, reason)] without a solve.
         gain: (n_objects, 3) of the albedos.
-        outside, environment: the sky, None = none, and the decision about it.
+        outside, environment: the sky, None = none, and the decision about it; sun: the decision about that, None = not asked.
         escape: share of camera rays and of rays from surface that leave the mesh; threshold: radiance of candidates.
         notes: what a person should know.
     """
@@ -61,6 +62,7 @@ class FoundLight:
     gain: np.ndarray
     outside: Sky | None
     environment: decisions.Decision
+    sun: decisions.Decision | None
     escape: tuple[float, float]
     threshold: float
     notes: list[str]
@@ -125,7 +127,10 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     is_open = secondary > decisions.ESCAPE_OPEN
     outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
     notes: list[str] = []
-    if outside is not None and is_open:
+    sun = None
+    if outside is not None and not is_open:
+        outside, sun = find_sun(photos, outside, threshold)
+    elif outside is not None:
         notes.append(
             f"{secondary:.0%} of the rays from the surface leave the mesh: light from twelve directions, as the room shows it"
         )
@@ -148,7 +153,7 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
     light = (found, solution, loss, left_out, why, candidates, groups.dropped, gain, outside, environment)
-    return FoundLight(photos, *light, (escape, secondary), threshold, notes), glowing
+    return FoundLight(photos, *light, sun, (escape, secondary), threshold, notes), glowing
 
 
 def _write_facts(
@@ -173,7 +178,8 @@ def _write_facts(
         raised = f"light raised {np.exp(level_raised):.2f} times so that albedos are at most 1"
         notes.append(f"{raised}; the error of its level does not contain that")
     found_emitters = decisions.emitters(kept, candidates - kept, candidates)
-    plan = [light.environment, *plan, *gain_plan(photos.capture, photos.gains), found_emitters]
+    outside = [light.environment, *([light.sun] if light.sun else [])]
+    plan = [*outside, *plan, *gain_plan(photos.capture, photos.gains), found_emitters]
     active_set = {"rounds": solution.iterations, "converged": solution.converged, "violated": solution.violated}
     job.writer.json(
         "emission.json",

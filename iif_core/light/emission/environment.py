@@ -22,6 +22,8 @@ OUTSIDE_SPREAD = 1.0
 """Standard deviation of the light from outside over all directions, relative to the mean of what cameras see of it."""
 SUN_WIDTH = 30.0
 """The same of what is saturated outside, relative to the bound."""
+SUN_LIGHT = 10.0
+"""Standard deviation of the irradiance from a sun, relative to that from a whole sky."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Sky:
         columns: (H, W) int32 group of every texel.
         pixels: (E,) camera pixels that see each group; radiance: (E, 3) their mean; bounded: (E,) most are saturated.
         direction: (E, 3) unit vector to the middle of each group; None = unrelated groups.
+        sun: the group that is the sun (`iif_core.light.emission.sun`); None = none.
     """
 
     columns: np.ndarray
@@ -39,6 +42,7 @@ class Sky:
     radiance: np.ndarray
     bounded: np.ndarray
     direction: np.ndarray | None = None
+    sun: int | None = None
 
     @property
     def size(self) -> int:
@@ -48,6 +52,22 @@ class Sky:
     def is_unseen(self) -> bool:
         """No camera sees any of the groups, as for those of `SkySums.directions`."""
         return not self.pixels.any()
+
+    @property
+    def mean(self) -> np.ndarray:
+        """(3,) mean over the groups that cameras see unsaturated; over all if there are none."""
+        clear = (self.pixels > 0) & ~self.bounded
+        share = np.where(clear, 1.0, 0.0) if clear.any() else np.ones(self.size)
+        return (share[:, None] * self.radiance).sum(0) / share.sum()
+
+    @property
+    def texel_weight(self) -> np.ndarray | None:
+        """(H, W) how often texels are drawn: half by solid angle, half on the sun; None = all by solid angle."""
+        if self.sun is None:
+            return None
+        solid = solid_angles(*self.columns.shape)
+        sun = np.where(self.columns == self.sun, solid, 0.0)
+        return 0.5 * solid / solid.sum() + 0.5 * sun / sun.sum()
 
 
 class SkySums:
@@ -87,7 +107,7 @@ class SkySums:
         min_pixels: that suffice for a texel to count as seen, if no other has fifty times as many.
         """
         count, saturated = self._sums[:, 3], self._sums[:, 4]
-        towards, solid = _middles(*self.shape), solid_angles(*self.shape).ravel()
+        towards, solid = middles(*self.shape), solid_angles(*self.shape).ravel()
         # Small pictures have few pixels in any texel; a texel counts that has a fiftieth of the most.
         enough = np.clip(0.02 * count.max(), 1, min_pixels)
         seen, hidden = count >= enough, 2 * saturated > count
@@ -114,21 +134,29 @@ class SkySums:
 
         A texel belongs to the nearest of the twelve vertices of an icosahedron; all start at the mean of what was seen.
         """
-        number = (_middles(*self.shape) @ _icosahedron().T).argmax(1).reshape(self.shape)
+        number = (middles(*self.shape) @ _icosahedron().T).argmax(1).reshape(self.shape)
         size = 12
         return Sky(number.astype(np.int32), np.zeros(size, np.int64), np.tile(self.mean(), (size, 1)), np.zeros(size, bool))
 
 
 def sky_prior(sky: Sky) -> EmissionPrior:
     """Return the prior of groups with directions: a field around the mean of what cameras see; what is saturated is apart."""
-    clear = (sky.pixels > 0) & ~sky.bounded
-    share = np.where(clear, 1.0, 0.0) if clear.any() else np.ones(sky.size)
-    mean = (share[:, None] * sky.radiance).sum(0) / share.sum()
-    initial = np.where(sky.bounded[:, None], sky.radiance, mean)
+    initial = np.where(sky.bounded[:, None], sky.radiance, sky.mean)
+    width = np.where(sky.bounded, SUN_WIDTH, OUTSIDE_SPREAD)
+    apart = sky.bounded.copy()
+    if sky.sun is not None:
+        solid = solid_angles(*sky.columns.shape)[sky.columns == sky.sun].sum()
+        apart[sky.sun], width[sky.sun] = True, sun_prior(sky.mean, solid).width[0]
     related = correlation(sky.direction)
-    related[sky.bounded], related[:, sky.bounded] = 0.0, 0.0
+    related[apart], related[:, apart] = 0.0, 0.0
     np.fill_diagonal(related, 1.0)
-    return EmissionPrior(initial, np.where(sky.bounded, SUN_WIDTH, OUTSIDE_SPREAD), related)
+    return EmissionPrior(initial, width, related)
+
+
+def sun_prior(mean: np.ndarray, solid_angle: float) -> EmissionPrior:
+    """Return the prior of a sun of `solid_angle` under a sky of mean radiance (3,): it gives `SUN_LIGHT` times the light of the
+    sky, or less."""
+    return EmissionPrior(mean[None], np.array([SUN_LIGHT * np.pi / solid_angle]))
 
 
 def correlation(direction: np.ndarray, reach: float = REACH) -> np.ndarray:
@@ -139,7 +167,7 @@ def correlation(direction: np.ndarray, reach: float = REACH) -> np.ndarray:
     return related
 
 
-def _middles(height: int, width: int) -> np.ndarray:
+def middles(height: int, width: int) -> np.ndarray:
     """Unit vectors (H W, 3) to the middles of all texels."""
     return np.stack(direction_in(NUMPY, *np.indices((height, width)), 0.5, 0.5, height, width), -1).reshape(-1, 3)
 

@@ -30,6 +30,13 @@ class EmitterGroups:
     count: np.ndarray
     dropped: list[tuple[int, float, str]]
 
+    @classmethod
+    def none(cls, faces: int) -> EmitterGroups:
+        """No groups on a mesh of so many faces."""
+        of_face, side = np.full(faces, -1, np.int32), np.zeros(faces, np.int32)
+        count = np.zeros(0, np.int64)
+        return cls(of_face, side, count.astype(np.int32), np.zeros(0), np.zeros((0, 3)), count, [])
+
     @property
     def size(self) -> int:
         return len(self.faces)

@@ -94,28 +94,32 @@ class Candidates:
         light[keep] = radiance
         # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.
         reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & self.hidden & keep
-        return np.inf if reflects.any() else solved.misfit(radiance), _lit(every, gains, light)
+        return np.inf if reflects.any() else solved.misfit(radiance), lit_problem(scaled_by_gains(every, gains), light)
 
     def _best_added(self, chosen: Families, lit: EmissionProblem, least: float) -> list[int]:
         """Families, not chosen, whose light would take at least `least` off the misfit if all else stayed."""
         gain = {f: 0.0 for f in np.unique(self.family[self.family >= 0]).tolist() if f not in chosen}
         for family in gain:
-            gain[family] = _decrease(lit, lit.rows.matrices[:, :, self.family == family].sum(2))
+            gain[family] = decrease(lit, lit.rows.matrices[:, :, self.family == family].sum(2))
         return [f for f in sorted(gain, key=lambda f: -gain[f]) if gain[f] > least]
 
 
-def _lit(problem: EmissionProblem, gains: ObjectGains, light: np.ndarray) -> EmissionProblem:
-    """The problem with the gains of objects, and `light` (G, 3) in what is cached."""
+def scaled_by_gains(problem: EmissionProblem, gains: ObjectGains) -> EmissionProblem:
+    """The problem with the gains of objects, lobes added up."""
     known = problem.owner >= 0
     of_row, gloss = np.ones(problem.rows.observed.shape), np.ones(len(known))
     of_row[known], gloss[known] = gains.gain[problem.owner[known]], gains.gloss_gain[problem.owner[known]]
-    rows = problem.rows.scaled(of_row, gloss)
-    lit = np.einsum("kngc,gc->knc", rows.matrices, light)[:, None]
-    return replace(problem, rows=replace(rows, cached=rows.cached + lit))
+    return replace(problem, rows=problem.rows.scaled(of_row, gloss))
 
 
-def _decrease(lit: EmissionProblem, column: np.ndarray) -> float:
-    """By how much light through one more `column` (2, n, 3), as strong as is best, lowers the misfit, to first order.
+def lit_problem(problem: EmissionProblem, light: np.ndarray) -> EmissionProblem:
+    """The problem with `light` (G, 3) in what is cached; one lobe."""
+    lit = np.einsum("kngc,gc->knc", problem.rows.matrices, light)[:, None]
+    return replace(problem, rows=replace(problem.rows, cached=problem.rows.cached + lit))
+
+
+def decrease(lit: EmissionProblem, column: np.ndarray) -> float:
+    """Return by how much light through one more `column` (2, n, 3), as strong as is best, lowers the misfit, to first order.
 
     The gains of objects follow: what the column has in common with the light that an object receives already changes nothing.
     """

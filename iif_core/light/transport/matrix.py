@@ -8,7 +8,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import solid_angles
@@ -94,8 +93,7 @@ def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumn
     Args:
         scene: geometry, materials of everything that paths meet after the points, and cache; its emitters are not used.
         points: the points, n of them, with their own materials.
-        columns: which faces and texels share an unknown radiance. Texels are drawn by solid angle; a map of one texel is found
-            by directions of the BRDF alone.
+        columns: which faces and texels share an unknown radiance. A map of one texel is found by directions of the BRDF alone.
         paths: bounces include the point.
 
     Returns:
@@ -117,7 +115,8 @@ def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumn
     weight = columns.sampling_weight
     if weight is None:
         weight = _group_weights(scene.geometry.areas, groups, n_groups)
-    scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns.side, weight, texels))
+    columns = columns._replace(of_texel=texels, sampling_weight=weight)
+    scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns))
     group_of_face, group_of_texel = mi.Int32(groups), None if texels is None else mi.Int32(texels.ravel())
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
     width = 6 * n_groups
@@ -156,16 +155,15 @@ def _checked_columns(columns: EmitterColumns, faces: int) -> tuple[Array, Array 
     return groups, texels
 
 
-def _unit_emitters(
-    geometry: Geometry, groups: Array, side: ArrayLike | None, weight: ArrayLike, columns: Array | None
-) -> Emitters:
-    """Emitters of radiance 0, drawn as if all groups had the same radiance."""
-    dark = np.zeros((len(groups), 3))
-    if columns is None or columns.size == 1:
-        return Emitters(geometry, dark, side, sampling_weight=weight)
-    sky = solid_angles(*columns.shape) * (columns >= 0)
-    share = share_of_environment(geometry, geometry.areas[groups >= 0].sum(), sky.sum() / (4 * np.pi))
-    return Emitters(geometry, dark, side, np.zeros((*columns.shape, 3)), weight, sky, share)
+def _unit_emitters(geometry: Geometry, groups: Array, columns: EmitterColumns) -> Emitters:
+    """Emitters of radiance 0, drawn as if all groups had the same radiance; `columns` with arrays, or None, for texels."""
+    dark, texels = np.zeros((len(groups), 3)), columns.of_texel
+    if texels is None or texels.size == 1:
+        return Emitters(geometry, dark, columns.side, sampling_weight=columns.sampling_weight)
+    solid = solid_angles(*texels.shape)
+    share = share_of_environment(geometry, geometry.areas[groups >= 0].sum(), (solid * (texels >= 0)).sum() / (4 * np.pi))
+    drawn = (solid if columns.texel_weight is None else columns.texel_weight) * (texels >= 0)
+    return Emitters(geometry, dark, columns.side, np.zeros((*texels.shape, 3)), columns.sampling_weight, drawn, share)
 
 
 def _group_weights(areas: Array, groups: Array, n_groups: int) -> Array:
