@@ -386,14 +386,13 @@ def trace_rows(
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None
     weight = _drawn(groups, photos.scene.areas)
-    columns = EmitterColumns(
-        groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight, sky.texel_weight if sky else None
-    )
+    columns = EmitterColumns(groups.of_face, groups.size + (sky.size if sky else 0), side, texels, weight)
+    drawn = sky.texel_weight if sky else None
     samples, seed = max(1, settings.samples // 2), ((job.seed << 32) | SEEDS) * 8 + 2 * stream
     halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half))
+        found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half), drawn)
         halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import solid_angles
@@ -85,7 +86,13 @@ def _share(part: Any, rest: Any) -> Any:
     return dr.select(whole > 0, part / whole, 0)
 
 
-def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumns, paths: PathOptions) -> tuple[Array, Array]:
+def transport_matrix(
+    scene: Scene,
+    points: ShadingPoints,
+    columns: EmitterColumns,
+    paths: PathOptions,
+    texel_weight: ArrayLike | None = None,
+) -> tuple[Array, Array]:
     """Trace the transport matrix (Eq. L.14): a point reflects A @ E + h by each lobe, for emitter radiances E (G, 3).
 
     Emission that a point sees directly is not included.
@@ -95,6 +102,7 @@ def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumn
         points: the points, n of them, with their own materials.
         columns: which faces and texels share an unknown radiance. A map of one texel is found by directions of the BRDF alone.
         paths: bounces include the point.
+        texel_weight: (H, W) how often texels are drawn, None = by solid angle.
 
     Returns:
         A (n, 2, G, 3) float32 by the diffuse (0) and the specular (1) lobe, and h (n, 2, 3) float32, the radiance that paths
@@ -116,7 +124,7 @@ def transport_matrix(scene: Scene, points: ShadingPoints, columns: EmitterColumn
     if weight is None:
         weight = _group_weights(scene.geometry.areas, groups, n_groups)
     columns = columns._replace(of_texel=texels, sampling_weight=weight)
-    scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns))
+    scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns, texel_weight))
     group_of_face, group_of_texel = mi.Int32(groups), None if texels is None else mi.Int32(texels.ravel())
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
     width = 6 * n_groups
@@ -155,14 +163,14 @@ def _checked_columns(columns: EmitterColumns, faces: int) -> tuple[Array, Array 
     return groups, texels
 
 
-def _unit_emitters(geometry: Geometry, groups: Array, columns: EmitterColumns) -> Emitters:
+def _unit_emitters(geometry: Geometry, groups: Array, columns: EmitterColumns, texel_weight: ArrayLike | None) -> Emitters:
     """Emitters of radiance 0, drawn as if all groups had the same radiance; `columns` with arrays, or None, for texels."""
     dark, texels = np.zeros((len(groups), 3)), columns.of_texel
     if texels is None or texels.size == 1:
         return Emitters(geometry, dark, columns.side, sampling_weight=columns.sampling_weight)
     solid = solid_angles(*texels.shape)
     share = share_of_environment(geometry, geometry.areas[groups >= 0].sum(), (solid * (texels >= 0)).sum() / (4 * np.pi))
-    drawn = (solid if columns.texel_weight is None else columns.texel_weight) * (texels >= 0)
+    drawn = (solid if texel_weight is None else np.asarray(texel_weight)) * (texels >= 0)
     return Emitters(geometry, dark, columns.side, np.zeros((*texels.shape, 3)), columns.sampling_weight, drawn, share)
 
 

@@ -74,8 +74,7 @@ class EmitterColumns(NamedTuple):
 
     of_face (m,) int32 column of every face, -1 = dark; count = G; side (m,) as in `Emitters`, None = both sides; of_texel
     (H, W) int32 column of every texel of the environment map, -1 = dark, None = no environment; sampling_weight (m,) how
-    often faces are drawn, None = half by area and half the same for every column; texel_weight (H, W) how often texels are drawn,
-    None = by solid angle.
+    often faces are drawn, None = half by area and half the same for every column.
     """
 
     of_face: ArrayLike
@@ -83,4 +82,3 @@ class EmitterColumns(NamedTuple):
     side: ArrayLike | None = None
     of_texel: ArrayLike | None = None
     sampling_weight: ArrayLike | None = None
-    texel_weight: ArrayLike | None = None
