@@ -80,13 +80,16 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     return _decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
 
 
+_SUN = "share by which the misfit falls with a sun"
+
+
 def sun(disc: Disc | None, without: float, with_it: float, narrow: float = 0.0) -> Decision:
     """Decide about a sun that no camera sees (docs/method/light.md#the-sun).
 
     Args:
         disc: that explains the photographs best; None = no single direction helps.
-        without, with_it: misfit of the light (Eq. L.40), if a narrow disc is as good of views that it was not found on.
-        narrow: share of what the disc explains that a narrow one does.
+        without, with_it: misfit of the light (Eq. L.40) without a sun and with the disc; of held-out views, if the disc is sharp.
+        narrow: share of what the best disc takes off the misfit that a narrow one does.
     """
     value = 1.0 - with_it / without if 0 < without < np.inf else 0.0
     included = disc is not None and is_needed(without, with_it) and narrow >= SHARP
@@ -94,8 +97,17 @@ def sun(disc: Disc | None, without: float, with_it: float, narrow: float = 0.0) 
     if disc is not None:
         towards, size = ", ".join(f"{x:.2f}" for x in disc.direction), np.degrees(disc.radius)
         reason += f", towards ({towards}), {f'a disc of radius {size:.1f} degrees' if size else 'one texel'}"
-        reason += f"; a narrow one explains {narrow:.0%} of that{'' if included else ', so that it is a part of the sky'}"
-    return _decision("sun", included, "share by which the misfit falls with a sun", value, STEP, reason)
+        sharp = f"a narrow one does {narrow:.0%} of what the best one does"
+        if narrow < SHARP:
+            reason += f"; {sharp}, so that it is a bright part of the sky"
+        else:
+            reason += f", on views that its radiance was not found on; {sharp}"
+    return _decision("sun", included, _SUN, value, STEP, reason)
+
+
+def no_place_for_a_sun() -> Decision:
+    """Cameras see light from outside in all directions, unsaturated."""
+    return _decision("sun", False, _SUN, 0.0, STEP, "cameras see the whole outside unsaturated")
 
 
 def registration(accepted: bool, gain: float, error: float, moved: float, left_out: int, views: int) -> Decision:

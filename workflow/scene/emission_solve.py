@@ -310,7 +310,9 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[Emission
     family = _families(photos, found.groups, len(initial))
     width = np.full(len(initial), FAMILY_WIDTH)
     if sky is not None and sky.is_unseen:
-        family[found.groups.size :], width[found.groups.size :] = -1 - len(initial), OUTSIDE_WIDTH
+        outside = np.arange(found.groups.size, len(initial))
+        together = outside if sky.sun is None else np.delete(outside, sky.sun)  # a sun is not like the sky around it
+        family[together], width[together] = -1 - len(initial), OUTSIDE_WIDTH
     settings = photos.job.settings.emission
     if settings.solver == "sgd":
         # Which groups emit is known by now, so `safe` has nothing to prune.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.pixels import TILE_PIXELS, EmissionPixels
@@ -45,8 +46,11 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     threshold: radiance from which surface is a candidate for an emitter. Here all surface reflects.
     """
     texels = sun_texels(sky)
+    if not len(texels):
+        return sky, decisions.no_place_for_a_sun()
     height, width = sky.columns.shape
-    coarse = _Rows.traced(photos, sky, threshold, comparison_tile(photos), FIRST_ROWS)
+    cache = radiance_cache(photos, EmitterGroups.none(len(photos.scene.faces)))[0]
+    coarse = _Rows.traced(photos, sky, cache, threshold, comparison_tile(photos), FIRST_ROWS)
     question = coarse.question(texels, (height, width))
     none = question.look()
     promising = question.decrease([np.array([i]) for i in range(len(texels))], none).argmax()
@@ -56,10 +60,10 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     texel = int(texels[promising])
     photos.job.log.info("is there a sun? misfit %.4f instead of %.4f", found.misfit, none.misfit)
     # Which disc it is shows at the borders of what it lights: small tiles.
-    fine = _Rows.traced(photos, sky, threshold, TILE_PIXELS, ROWS)
-    near = around(texel, height, width)
+    fine = _Rows.traced(photos, sky, cache, threshold, TILE_PIXELS, ROWS)
+    near = around(sky, texel)
     question = fine.question(near, (FINER * height, FINER * width))
-    shapes = discs(texel, near, height, width)
+    shapes = discs(sky, texel, near)
     lit = question.look(np.flatnonzero(np.isin(near, _members(texel, height, width))))
     decrease = question.decrease([shape.texels for shape in shapes], lit).reshape(-1, len(RADII))
     best = int(decrease.max(1).argmax())
@@ -94,12 +98,13 @@ class _Rows:
     transport: TracedTransport
 
     @classmethod
-    def traced(cls, photos: Photographs, sky: Sky, threshold: float, tile_edge: int, rows: int) -> _Rows:
-        """Trace `rows` pixels, to be averaged in tiles."""
+    def traced(
+        cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int
+    ) -> _Rows:
+        """Trace `rows` pixels, to be averaged in tiles; the cache is that of all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))
         thin = -(-photos.job.settings.emission.rows // rows)
         pixels, base, shown = choose_rows(photos, none, threshold, thin, tile_edge)
-        cache = radiance_cache(photos, none)[0]
         transport = trace_rows(photos, pixels, base, none, cache, sky, 4)
         return cls(photos, sky, _Points(pixels, base, shown), transport.without_lobes())
 
@@ -109,9 +114,10 @@ class _Rows:
         return replace(self, points=_Points(pixels.take(keep), base[keep], shown.take(keep)), transport=self.transport.take(keep))
 
     def held_out(self, disc: Disc) -> tuple[float, float]:
-        """Misfit without a sun and with it, each half of the views under the light and the gains that the other half has."""
+        """Misfit without a sun and with it: every second view under the light and the gains that the others have, and the other
+        way round. Of a single view nothing is held out, and its misfit says that there is no sun."""
         view, sun = self.points.shown.view, np.arange(len(disc.texels))
-        first = view <= np.median(np.unique(view))
+        first = np.isin(view, np.unique(view)[::2])
         shape = (FINER * self.sky.columns.shape[0], FINER * self.sky.columns.shape[1])
         halves = [self.take(np.flatnonzero(half)).question(disc.texels, shape) for half in (first, ~first)]
         pairs = [halves, halves[::-1]]

@@ -70,7 +70,7 @@ class FoundLight:
     @property
     def is_open(self) -> bool:
         """So much of the surface faces holes of the mesh that light from outside is twelve directions (`SkySums.directions`)."""
-        return self.outside is not None and self.outside.is_unseen
+        return self.outside is not None and self.outside.direction is None
 
     def misfit(self, without: np.ndarray) -> float:
         """Return the misfit (Eq. L.40) over the rows of other objects than `without`, (n_objects,) bool; inf without rows."""

@@ -24,8 +24,8 @@ RADII = (0.0, 1.0, 1.5, 2.0, 3.0)
 NARROW = 1.0
 """Radius up to which a disc is narrow, in the same unit."""
 SHARP = 0.75
-"""Share of the fall of the misfit that a narrow disc must explain: a sun casts sharp shadows, a bright part of the sky does
-not."""
+"""Share of what the best disc takes off the misfit that a narrow one must: a sun casts sharp shadows, a bright part of the sky
+does not."""
 AS_GOOD = 0.95
 """Share of it from which the smallest disc is taken."""
 
@@ -44,22 +44,30 @@ def sun_texels(sky: Sky) -> np.ndarray:
     return np.flatnonzero(~clear[sky.columns.ravel()])
 
 
-def around(texel: int, height: int, width: int) -> np.ndarray:
-    """Return (M,) int: texels of the finer map (FINER H, FINER W) up to `NEAR` texels from `texel` of the map (H, W)."""
+def around(sky: Sky, texel: int) -> np.ndarray:
+    """Return (M,) int: texels of the finer map up to `NEAR` texels from `texel` of the sky's map, in which the sun may be."""
+    height, width = sky.columns.shape
+    free = np.isin(np.arange(height * width), sun_texels(sky)).reshape(height, width).repeat(FINER, 0).repeat(FINER, 1)
     middle = middles(height, width)[texel]
-    return np.flatnonzero(middles(FINER * height, FINER * width) @ middle >= np.cos(NEAR * np.pi / height))
+    near = middles(FINER * height, FINER * width) @ middle >= np.cos(NEAR * np.pi / height)
+    return np.flatnonzero(near & free.ravel())
 
 
-def discs(texel: int, texels: np.ndarray, height: int, width: int) -> list[Disc]:
-    """Return discs of texels out of `texels` (M,) of the finer map: `RADII` around every middle that is at most one texel of the
-    map (height, width) from `texel`, one middle after another.
+def discs(sky: Sky, texel: int, texels: np.ndarray) -> list[Disc]:
+    """Return discs of texels out of `texels` (M,) of the finer map: `RADII` around middles that are at most one texel of the
+    sky's map from `texel`, one middle after another. Near the poles, where texels are narrow, middles are at least half a texel
+    apart.
 
     Their members are positions in `texels`.
     """
+    height, width = sky.columns.shape
     fine, near = middles(FINER * height, FINER * width)[texels], np.pi / height
-    found = []
+    found, apart = [], np.ones(len(texels), bool)
     for i in np.flatnonzero(fine @ middles(height, width)[texel] >= np.cos(near)):
+        if not apart[i]:
+            continue
         cosine = fine @ fine[i]
+        apart &= cosine < np.cos(0.5 * near / FINER)
         for radius in RADII:
             angle = radius * near / FINER
             own = np.flatnonzero(cosine >= np.cos(angle) - 1e-9) if radius else np.array([i])
@@ -189,5 +197,5 @@ def size_of_sun(decreases: np.ndarray) -> SunSize:
 
 
 def is_needed(without: float, with_it: float) -> bool:
-    """The misfit falls by more than `STEP`."""
-    return with_it < (1.0 - STEP) * without
+    """The misfit falls by more than `STEP`; one below zero, which noise of the traces can make, cannot fall."""
+    return without > 0 and with_it < (1.0 - STEP) * without
