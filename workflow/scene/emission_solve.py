@@ -382,8 +382,7 @@ def trace_rows(
 
     cache = RadianceCache(voxels.edge, voxels.origin, voxels.ijk, voxels.radiance)
     scene = Scene(geometry, material if unseen is None else unseen, None, cache)
-    # A wrongly predicted metal would remove the diffuse light of a whole surface; only high values are believed.
-    metallic = np.where(base[:, 4] > METAL, base[:, 4], 0.0)
+    metallic = believed_metallic(base)
     points = ShadingPoints(pixels.points, pixels.normals, pixels.wo, base[:, :3], base[:, 3], metallic)
     side = np.where(groups.of_face >= 0, groups.side, 0).astype(np.int8)
     texels = sky.columns + groups.size if sky else None
@@ -398,6 +397,12 @@ def trace_rows(
         halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))
+
+
+def believed_metallic(base: np.ndarray) -> np.ndarray:
+    """Return the metalness (n,) of base materials (n, 5), 0 unless it is high: a wrongly predicted metal would remove the diffuse
+    light of a whole surface."""
+    return np.where(base[:, 4] > METAL, base[:, 4], 0.0)
 
 
 def _drawn(groups: EmitterGroups, areas: np.ndarray) -> np.ndarray | None:

@@ -32,7 +32,7 @@ from iif_core.numerics.xp import NUMPY
 from workflow import decisions
 from workflow.scene.base_scene import ViewPixels
 from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, radiance_cache
-from workflow.scene.emission_solve import METAL, albedo_limit, comparison_tile, light_prior, trace_rows
+from workflow.scene.emission_solve import albedo_limit, believed_metallic, comparison_tile, light_prior, trace_rows
 
 ROWS = 8_000
 """Pixels from which the place and the size of the sun are found."""
@@ -146,8 +146,7 @@ class _Rows:
         pixels, base = self.points.pixels, self.points.base
         normal = pixels.normals.astype(np.float64)
         start, count = pixels.points + 1e-3 * normal, len(normal)
-        # A wrongly predicted metal would remove the diffuse light of a whole surface; only high values are believed.
-        albedo = base[:, :3] * (1.0 - np.where(base[:, 4] > METAL, base[:, 4], 0.0))[:, None]
+        albedo = base[:, :3] * (1.0 - believed_metallic(base))[:, None]
         solid, rng = solid_angles(*shape).ravel()[texels], np.random.default_rng([self.photos.job.seed, SEEDS, 4])
         out = np.zeros((2, count, len(texels), 3), np.float32)
         for half in range(2):

@@ -89,10 +89,14 @@ class EmissionProblem:
         # Without a scale the two lobes would fix one by how much they differ, for which predicted gloss is not good enough.
         rows = self.rows if identifiable else self.rows.without_lobes()
         found = estimate_object_gains(rows, self.owner, prior, identifiable, albedo, n_objects, options)
-        of_row, gloss_of_row = np.ones(rows.observed.shape), np.ones(len(rows.observed))
+        return replace(self, rows=replace(rows, weight=found.weight)).with_gains(found), found
+
+    def with_gains(self, gains: ObjectGains) -> EmissionProblem:
+        """The problem with rows scaled by the gains of their objects, lobes added up; weights stay."""
         known = self.owner >= 0
-        of_row[known], gloss_of_row[known] = found.gain[self.owner[known]], found.gloss_gain[self.owner[known]]
-        return replace(self, rows=replace(rows, weight=found.weight).scaled(of_row, gloss_of_row)), found
+        of_row, gloss_of_row = np.ones(self.rows.observed.shape), np.ones(len(known))
+        of_row[known], gloss_of_row[known] = gains.gain[self.owner[known]], gains.gloss_gain[self.owner[known]]
+        return replace(self, rows=self.rows.scaled(of_row, gloss_of_row))
 
 
 def assemble(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
-from iif_core.light.emission.gains import GainOptions, ObjectGains
+from iif_core.light.emission.gains import GainOptions
 from iif_core.light.emission.problem import ROW_FLOOR, EmissionProblem
 from iif_core.light.emission.pruning import WhiteSurface
 
@@ -94,7 +94,7 @@ class Candidates:
         light[keep] = radiance
         # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.
         reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & self.hidden & keep
-        return np.inf if reflects.any() else solved.misfit(radiance), lit_problem(scaled_by_gains(every, gains), light)
+        return np.inf if reflects.any() else solved.misfit(radiance), lit_problem(every.with_gains(gains), light)
 
     def _best_added(self, chosen: Families, lit: EmissionProblem, least: float) -> list[int]:
         """Families, not chosen, whose light would take at least `least` off the misfit if all else stayed."""
@@ -102,14 +102,6 @@ class Candidates:
         for family in gain:
             gain[family] = decrease(lit, lit.rows.matrices[:, :, self.family == family].sum(2))
         return [f for f in sorted(gain, key=lambda f: -gain[f]) if gain[f] > least]
-
-
-def scaled_by_gains(problem: EmissionProblem, gains: ObjectGains) -> EmissionProblem:
-    """The problem with the gains of objects, lobes added up."""
-    known = problem.owner >= 0
-    of_row, gloss = np.ones(problem.rows.observed.shape), np.ones(len(known))
-    of_row[known], gloss[known] = gains.gain[problem.owner[known]], gains.gloss_gain[problem.owner[known]]
-    return replace(problem, rows=problem.rows.scaled(of_row, gloss))
 
 
 def lit_problem(problem: EmissionProblem, light: np.ndarray) -> EmissionProblem:

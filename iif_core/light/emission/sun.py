@@ -12,7 +12,7 @@ from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky, middles, sun_prior
 from iif_core.light.emission.gains import ObjectGains
 from iif_core.light.emission.problem import EmissionProblem
-from iif_core.light.emission.search import QUICK, STEP, decrease, lit_problem, scaled_by_gains
+from iif_core.light.emission.search import QUICK, STEP, decrease, lit_problem
 
 FINER = 4
 """How many times finer the map of a scene with a sun is."""
@@ -149,8 +149,7 @@ class SunQuestion:
 
     def misfit(self, look: Look, sun: np.ndarray | None = None) -> float:
         """Return the misfit of light and gains that were found on other rows."""
-        problem = self._of(sun)
-        return scaled_by_gains(problem, look.gains).misfit(look.radiance)
+        return self._of(sun).with_gains(look.gains).misfit(look.radiance)
 
     def _of(self, sun: np.ndarray | None) -> EmissionProblem:
         """The problem of the other groups, and of those of a sun as one."""
@@ -166,7 +165,7 @@ class SunQuestion:
         size = len(self.prior.initial)
         light = np.zeros((self.problem.rows.groups, 3))
         light[:size] = look.radiance[:size]
-        lit = lit_problem(scaled_by_gains(self.problem, look.gains), light)
+        lit = lit_problem(self.problem.with_gains(look.gains), light)
         matrices = lit.rows.matrices
         return np.array([decrease(lit, self._together(matrices, own)) for own in suns])
 
