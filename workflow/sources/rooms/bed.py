@@ -289,7 +289,7 @@ class _Bed:
             hole=_door_hole(high, low, z),
         )
         self.room.add("other room", plain("#e4dfd2", 0.85), *beside, front, is_part=False)
-        panel = sheet((0.2, -0.9, z - 0.03), (0, -0.9, 0), (1.6, 0, 0), 0.5)
+        panel = sheet((0.2, -0.9, z - 0.03), (1.6, 0, 0), (0, -0.9, 0), 0.5)
         self.room.add_emitter("other lamp", panel, radiance=(60.0, 56.0, 50.0))
         angle = np.radians(38)
         leaf = np.array([np.cos(angle), np.sin(angle), 0]) * 0.88
