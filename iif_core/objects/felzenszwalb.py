@@ -108,7 +108,9 @@ def smooth_over_faces(values: ArrayLike, weight: ArrayLike, pairs: ArrayLike, ro
     return np.where(weight[:, None] > 0, total / np.where(weight > 0, weight, 1)[:, None], np.nan)
 
 
-def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float, min_size: int) -> Array:
+def merge_regions(
+    count: int, pairs: ArrayLike, weights: ArrayLike, scale: float, min_size: int, fill: ArrayLike | None = None
+) -> Array:
     """Merge the nodes of a graph to regions (Eq. O.6).
 
     Args:
@@ -116,6 +118,8 @@ def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float
         pairs, weights: (e, 2) int and (e,) finite; edges of equal weight are taken in the order of `pairs`.
         scale: k; larger values give larger regions.
         min_size: a region with fewer nodes joins a neighbour, if it has one.
+        fill: (count,) share of a region that is large enough which each node makes up; regions whose nodes together reach 1 stay,
+            however few they are. None = 0.
 
     Returns:
         (count,) int32 regions, numbered by their lowest node.
@@ -130,13 +134,15 @@ def merge_regions(count: int, pairs: ArrayLike, weights: ArrayLike, scale: float
         raise InputError(f"{int((~np.isfinite(weights)).sum())} edge weights are not finite; the mesh has NaN vertices")
     order = np.argsort(weights, kind="stable")
     ends = pairs[order].astype(np.int64).reshape(-1, 2)
-    parent = _merged(count, ends[:, 0].copy(), ends[:, 1].copy(), weights[order], float(scale), int(min_size))
+    filled = np.zeros(count) if fill is None else np.array(fill, np.float64)
+    parent = _merged(count, ends[:, 0].copy(), ends[:, 1].copy(), weights[order], float(scale), int(min_size), filled)
     return numbered_by_first(parent)
 
 
 @numba.njit(nogil=True, cache=True)
-def _merged(count, first, second, weight, scale, min_size):
-    """Find the root of every node: union-find with path halving over the sorted edges, and a second pass for small regions."""
+def _merged(count, first, second, weight, scale, min_size, fill):
+    """Find the root of every node: union-find with path halving over the sorted edges, and a second pass for small regions.
+    `fill` is overwritten."""
     parent, size, limit = np.arange(count), np.ones(count, np.int64), np.full(count, scale)
     for last in (False, True):
         for edge in range(len(first)):
@@ -150,7 +156,7 @@ def _merged(count, first, second, weight, scale, min_size):
             if a == b:
                 continue
             if last:
-                if size[a] >= min_size and size[b] >= min_size:
+                if (size[a] >= min_size or fill[a] >= 1.0) and (size[b] >= min_size or fill[b] >= 1.0):
                     continue
             elif weight[edge] > limit[a] or weight[edge] > limit[b]:
                 continue
@@ -158,6 +164,7 @@ def _merged(count, first, second, weight, scale, min_size):
                 a, b = b, a
             parent[b] = a
             size[a] += size[b]
+            fill[a] += fill[b]
             if not last:
                 limit[a] = weight[edge] + scale / size[a]
     for node in range(count):
@@ -176,17 +183,20 @@ def segment_mesh(
     colour: ArrayLike | None = None,
     colour_weight: float = 0.0,
     pairs: ArrayLike | None = None,
+    min_area: float = 0.01,
 ) -> Array:
     """Segment a mesh into regions.
 
-    Vertices at one position count as one. Islands with fewer than `min_faces` faces and without neighbours join the region
-    of the nearest face of a larger region, up to ISLAND_GAP mean edge lengths away, and stay alone otherwise.
+    Vertices at one position count as one. A region is small if it has fewer than `min_faces` faces and less than `min_area`:
+    furniture that somebody modelled may have very few. Small islands without neighbours join the region of the nearest face of
+    a larger region, up to ISLAND_GAP mean edge lengths away, and stay alone otherwise.
 
     Args:
         vertices, faces: (n, 3) in metres and (m, 3) int.
         scale, min_faces: `scale` and `min_size` of `merge_regions`.
         colour, colour_weight: see `edge_weights`.
         pairs: `face_adjacency(faces, vertices)`, if it is known already.
+        min_area: m^2, about that of a hundred faces of a scan; infinite = the number of faces alone counts.
 
     Returns:
         (m,) int32 regions from 0 without gaps, in the order of their lowest face; deterministic.
@@ -195,16 +205,19 @@ def segment_mesh(
     if len(faces) == 0:
         return np.zeros(0, np.int32)
     pairs = face_adjacency(faces, vertices) if pairs is None else np.asarray(pairs)
-    normal = filtered_normals(*face_geometry(vertices, faces), pairs)
+    normal, area = face_geometry(vertices, faces)
+    normal = filtered_normals(normal, area, pairs)
     weights = edge_weights(normal, vertices.astype(np.float64)[faces].mean(1), pairs, colour, colour_weight)
-    labels = merge_regions(len(faces), pairs, weights, scale, min_faces)
-    return _join_islands(vertices, faces, labels, min_faces)
+    fill = area / max(min_area, 1e-300)
+    labels = merge_regions(len(faces), pairs, weights, scale, min_faces, fill)
+    return _join_islands(vertices, faces, labels, (np.bincount(labels) < min_faces) & (np.bincount(labels, fill) < 1.0))
 
 
-def _join_islands(vertices: Array, faces: Array, labels: Array, min_faces: int) -> Array:
+def _join_islands(vertices: Array, faces: Array, labels: Array, is_small: Array) -> Array:
+    """Let regions that are small, (regions,) bool, join the nearest one that is not."""
     from scipy.spatial import cKDTree
 
-    small = np.bincount(labels)[labels] < min_faces
+    small = is_small[labels]
     if small.all() or not small.any():
         return labels
     corners = np.asarray(vertices, np.float64)[faces]

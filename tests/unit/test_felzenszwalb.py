@@ -136,6 +136,21 @@ def test_colour_splits_a_flat_sheet():
     assert labels.max() == 1 and len(np.unique(labels[left])) == 1
 
 
+def test_few_large_faces_stay_a_region():
+    """A cupboard of twelve faces before a wall, as somebody models it: it joins the wall unless its area counts."""
+    wall, tiles = sheet(12, lambda u, v: np.stack([2 * u, v, 0 * u], -1))
+    corners = np.array([[x, y, z] for x in (0.5, 1.0) for y in (0.2, 0.8) for z in (0.01, 0.3)])
+    sides = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    box = np.array([triangle for a, b, c, d in sides for triangle in ((a, b, c), (a, c, d))])
+    mesh = np.concatenate([wall, corners]), np.concatenate([tiles, box + len(wall)])
+    cupboard = np.arange(len(mesh[1])) >= len(tiles)
+    labels = segment_mesh(*mesh, 0.05, 100)
+    assert not set(labels[cupboard]) & set(labels[~cupboard]) and len(set(labels[~cupboard])) == 1
+    assert len(set(labels[cupboard])) == 6  # its sides
+    assert segment_mesh(*mesh, 0.05, 100, min_area=np.inf).max() == 0
+    assert segment_mesh(*mesh, 0.05, 100, min_area=0.16).max() == 4  # two sides have 0.145 m^2
+
+
 def test_islands():
     vertices, faces = sheet(12, lambda u, v: np.stack([u, v, 0 * u], -1))
     crumb, piece = sheet(1, lambda u, v: np.stack([0.05 * u + 0.5, 0.05 * v + 0.5, 0 * u + 0.01], -1))

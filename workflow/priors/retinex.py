@@ -23,7 +23,7 @@ SATURATED = 0.99  # sensor value
 CELL_FOOTPRINTS = 6.0  # edge of a surface cell in median pixel footprints
 REACHES = (3.0, 8.0)
 """Reach of the residual light in edges of a cell (Eq. L.58); each makes one version of the light."""
-PIECES = SimpleNamespace(scale=0.05, min_faces=100, colour=0.1)
+PIECES = SimpleNamespace(scale=0.05, min_faces=100, min_area=0.01, colour=0.1)
 """Pieces of the mesh take the place of objects where the capture names none (the defaults of segmentation `geometry`)."""
 
 

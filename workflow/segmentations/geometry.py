@@ -33,7 +33,8 @@ def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> n
     if own.colour > 0:
         mean, pixels = mean_face_colour(surface, fold)
         colour = smooth_over_faces(mean, pixels, surface.pairs, COLOUR_ROUNDS)
-    return segment_mesh(surface.vertices, surface.faces, scale, own.min_faces, colour, own.colour, surface.pairs)
+    mesh = surface.vertices, surface.faces
+    return segment_mesh(*mesh, scale, own.min_faces, colour, own.colour, surface.pairs, own.min_area)
 
 
 def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,9 @@ class PiecesOfMesh(SegmentationBase):
     scale: float = Field(0.05, gt=0)
     """Pieces of the mesh: a larger value gives fewer and larger pieces."""
     min_faces: int = Field(100, ge=1)
-    """Pieces of the mesh with fewer faces are merged into a neighbour."""
+    """Pieces of the mesh with fewer faces are merged into a neighbour, unless they have `min_area`."""
+    min_area: float = Field(0.01, ge=0)
+    """Area in m^2 from which a piece of the mesh stays as it is, however few faces it has."""
     colour: float = Field(0.1, ge=0)
     """Pieces of the mesh: weight of differences in colour between faces beside that of the angle between them (0 = shape
     alone)."""
@@ -63,7 +65,7 @@ class MaskSegmentation(PiecesOfMesh):
     sam2: Sam2 | None = None
     """Make the masks instead of reading them."""
     min_faces: int = Field(20, ge=1)
-    """Pieces of the mesh with fewer faces are merged into a neighbour."""
+    """Pieces of the mesh with fewer faces are merged into a neighbour, unless they have `min_area`."""
     visible: float = Field(0.3, gt=0, le=1)
     """Share of a mask that a view must see for its masks to be compared with it."""
     contained: float = Field(0.8, gt=0, le=1)
