@@ -133,7 +133,12 @@ def _descend_all(
             light_gain = levels.light_gain
             some = replace(some, exposure=exposure * light_gain[some.obj])
             fit = replace(fit, state=state, population=population, levels=levels)
-            fit = replace(fit, prior=_make_prior(fit, noise, roughness))
+            prior = _make_prior(fit, noise, roughness)
+            # Gains of the population go with offsets, which bounds cannot find.
+            bounded = some.unsaturated() < opt.min_pixels
+            prior.centre[bounded, :12] = 0.0
+            prior.centre[np.ix_(bounded, GAINS)] = gain_of_the_rest(levels, state.affine)[0]
+            fit = replace(fit, prior=prior)
         px.exposure = px.exposure * light_gain[px.obj]
     measured = px.target
     if not opt.population:
@@ -207,7 +212,7 @@ def _select_kinds(
     few = px.take(choose_evenly(px.obj, px.offsets, SELECTION_PIXELS))
     weigh_by_halves(few, few.target, fit.state.affine, tone, opt)
     # Bounds alone cannot tell one local minimum from another.
-    measured = texture.enough & (np.bincount(few.obj, (~few.saturated).any(1), px.n_objects) >= opt.min_pixels)
+    measured = texture.enough & (few.unsaturated() >= opt.min_pixels)
     state, _ = descend(few, fit.state, fit.prior, tone, opt, WARM_START_STEPS, start_params)
     terms = evaluate(few, state.affine, tone.at(state.params), opt, True, state.free, scores=True)
     noise = row_variance(terms, few, state.free)

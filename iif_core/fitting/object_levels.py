@@ -7,7 +7,7 @@ Both errors are learnt from the scene. What the light is believed to err by is t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -127,6 +127,9 @@ def measure_levels(
 ) -> ObjectLevels:
     """Compare both estimates of each level and learn the error of each (Eq. M.32 to M.36).
 
+    Of objects whose pixels are saturated the photographs tell no level: nothing is learnt from them, and their light is left
+    alone.
+
     Args:
         px: pixels; affine: (O, 16) current numbers; tone: curve with the current response; opt: loss and limits.
         mean_base: (O, 3) mean base albedo; scatter: (O,) of the predictions (`prediction_scatter`).
@@ -153,9 +156,11 @@ def measure_levels(
         step[part] = -slope.sum(1) / np.maximum(weight[part], 1e-100)
     away = np.clip(-gradient / np.maximum(curvature, 1e-100), -_LARGEST_STEP, _LARGEST_STEP)
     shown = light_gain[:, None] * level * np.exp(away)
-    pixels = px.usable.astype(np.float64)
+    is_told = px.unsaturated() >= opt.min_pixels
+    pixels = np.where(is_told, px.usable, 0.0)
     smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
-    return compare_levels(base, shown, scatter, smooth, pixels)
+    levels = compare_levels(base, shown, scatter, smooth, pixels)
+    return replace(levels, light_gain=np.where(is_told, levels.light_gain, 1.0))
 
 
 def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarray, pixels: np.ndarray) -> np.ndarray:

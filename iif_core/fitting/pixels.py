@@ -89,6 +89,10 @@ class Pixels:
             usable=self.usable[objects],
         )
 
+    def unsaturated(self) -> np.ndarray:
+        """Return the number of pixels of each object that are unsaturated in some channel, (O,)."""
+        return np.bincount(self.obj, (~self.saturated).any(1), self.n_objects)
+
     def sum_by_object(self, values: np.ndarray) -> np.ndarray:
         """Return the sum of values (n,) over the pixels of each object, (O,)."""
         return np.bincount(self.obj, values, self.n_objects)

@@ -78,6 +78,19 @@ def test_everything_saturated():
     _checked(everything, "ggcm")
 
 
+def test_saturated_object_takes_what_the_others_have():
+    """Bounds that are met say nothing: the object has the mean gain of the others, and they are as without it."""
+    problem, truth = problem_of(np.random.default_rng(4), 5, 300, value_of=lambda x: response("gamma")(0.5 * x))
+    own = problem.object_id == 4
+    value, saturated = problem.value.copy(), problem.saturated.copy()
+    value[own], saturated[own] = np.minimum(0.5 * value[own], 0.99), True
+    fit, _ = _checked(replace(problem, value=value, saturated=saturated), "gamma", free_response=False)
+    without, _ = _checked(replace(problem, object_id=np.where(own, -1, problem.object_id)), "gamma", free_response=False)
+    np.testing.assert_allclose(fit.affine[4, :12], without.affine[4, :12], atol=0.02)
+    np.testing.assert_allclose(fit.affine[:4], without.affine[:4], atol=0.02)
+    assert without.model[4] == "population (0 pixels)" and fit.light_gain[4] == 1
+
+
 def test_object_in_full_shadow_takes_what_the_others_have():
     """Pixels below a thousandth of the median light are left out (docs/method/numerics.md#pixels-without-light)."""
     problem, truth = problem_of(np.random.default_rng(3), 5, 300)
