@@ -14,7 +14,7 @@ from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import EmissionProblem, reflecting_rows
 from iif_core.light.emission.pruning import WhiteSurface
 from iif_core.light.emission.rows import TracedTransport
-from iif_core.light.emission.search import STEP, Candidates, search
+from iif_core.light.emission.search import STEP, Candidates, Proposal, search
 from tests.unit.emission_systems import rows_of
 
 
@@ -139,21 +139,46 @@ def _room(strip, reflects=0.1, seed=3):
     shown = np.array([lamp, patch, 0.0, 0.0])[:, None] * np.ones(3)
     hidden = np.array([False, False, True, True])
     white = WhiteSurface(np.zeros((4, 3)), np.zeros((4, 4, 3)), np.full((4, 3), reflects))
-    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, None, 5)
+    base = guess[:, None] * np.ones(3)
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, base, False)
+
+
+def _growth(candidates, *chosen, doubtful=()):
+    """Proposals as families -> the growth of the misfit that they may have, in order."""
+    return dict(candidates.proposals(frozenset(chosen), frozenset(doubtful)))
 
 
 def test_a_strip_that_no_camera_sees_takes_the_place_of_what_it_lights():
-    proposals = _room(1.0).proposals(frozenset({0, 1}))
+    proposals = [*_growth(_room(1.0), 0, 1)]
     assert proposals[0] in ({0, 2}, {0, 1, 2}) and {0, 2} in proposals
     assert not any(3 in families or 0 not in families for families in proposals)
 
 
+def test_surface_no_brighter_than_white_may_be_taken_out_though_the_misfit_grows():
+    """The patch shows 0.8 of what a white one would under lamp and strip; under the lamp alone it shows more than that."""
+    assert _growth(_room(1.0), 0, 1, 2)[frozenset({0, 2})] == pytest.approx(1.5)
+    assert _growth(_room(0.001), 0, 1, doubtful=[1])[frozenset({0})] == pytest.approx(1.5)
+    dim, lamp = _room(1.0), frozenset({0})
+    twice = replace(dim.reflecting, rows=replace(dim.reflecting.rows, observed=2 * dim.reflecting.rows.observed))
+    assert _growth(replace(dim, reflecting=twice), 0, 1, 2).get(frozenset({0, 2}), 0.0) < 1.0
+    assert lamp not in _growth(dim, 0)  # nothing else would shine
+
+
+def test_saturated_surface_is_judged_by_a_trace_of_its_own():
+    """Without the patch the misfit of the look grows, because how bright it is when it reflects is not known."""
+    room = _room(1.0)
+    bounds = replace(room.reflecting.rows, lower_bound=np.ones(room.reflecting.rows.lower_bound.shape, bool))
+    dark = replace(room, shown=room.shown * [[1.0], [0.5], [1.0], [1.0]])
+    assert frozenset({0, 2}) not in _growth(dark, 0, 1, 2)
+    assert frozenset({0, 2}) in _growth(replace(dark, reflecting=replace(room.reflecting, rows=bounds)), 0, 1, 2)
+
+
 def test_unseen_surface_that_a_white_one_could_match_is_no_lamp():
-    assert not any(2 in families for families in _room(1.0, reflects=1e3).proposals(frozenset({0, 1})))
+    assert not any(2 in families for families in _growth(_room(1.0, reflects=1e3), 0, 1))
 
 
 def test_a_room_that_is_explained_is_left_alone():
-    assert _room(0.0).proposals(frozenset({0})) == []
+    assert _growth(_room(0.0), 0) == {}
 
 
 def test_search_takes_the_simplest_of_what_is_better():
@@ -161,16 +186,26 @@ def test_search_takes_the_simplest_of_what_is_better():
     misfit = {frozenset(key): value for key, value in scores.items()}.__getitem__
     start = frozenset({0, 1})
 
-    def run(*proposed, doubtful=()):
-        found = [frozenset(p) for p in proposed]
-        return search(start, lambda chosen: found if chosen == start else [], misfit, frozenset(doubtful))
+    def run(*proposed, growth=1 - STEP):
+        found = [Proposal(frozenset(p), growth) for p in proposed]
+        return search(start, lambda chosen: found if chosen == start else [], misfit)
 
     assert run() == (start, [])
     # What takes the place of family 1 is compared with nothing in its place, which no proposal named.
     assert run((0, 2)) == (frozenset({0}), [(frozenset({0}), 1.0, 0.90)])
     assert run((0, 2, 3), (0, 3))[0] == {0, 3}
     assert run((1,))[0] == start and scores[(1,)] > 1 - STEP
-    assert run((1,), doubtful=[0])[0] == {1} and run((1,), doubtful=[1])[0] == start
+    assert run((1,), growth=1.0)[0] == {1} and run((1,), growth=0.96)[0] == start
+
+
+def test_what_was_taken_out_although_the_misfit_grew_does_not_come_back():
+    both, lamp = frozenset({0, 1}), frozenset({0})
+
+    def proposals(chosen):
+        return [Proposal(lamp, 1.5)] if chosen == both else [Proposal(both)]
+
+    assert search(both, proposals, {both: 1.0, lamp: 1.4}.__getitem__) == (lamp, [(lamp, 1.0, 1.4)])
+    assert search(both, proposals, {both: 1.0, lamp: 1.6}.__getitem__) == (both, [])
 
 
 def test_search_ends():
@@ -179,5 +214,5 @@ def test_search_ends():
     def worth(families):
         return 0.5 ** max(families, default=-9)
 
-    chosen, changes = search(frozenset({0}), lambda families: [frozenset({max(families) + 1})], worth)
+    chosen, changes = search(frozenset({0}), lambda families: [Proposal(frozenset({max(families) + 1}))], worth)
     assert len(changes) == 4 and chosen == {4}

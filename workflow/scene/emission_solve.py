@@ -55,6 +55,8 @@ SATURATED_SHARE = 0.01
 SATURATED_ROUNDS = 3
 SATURATED_PIXELS = 20_000
 """Pixels of saturated surface that are traced."""
+SATURATED_SHARE_COMPARED = 0.1
+"""The same share while emitters are compared."""
 HIDDEN_POINTS = 32
 """Points of each hidden surface at which the light that falls on it is estimated."""
 TILES_ACROSS = 8
@@ -86,9 +88,14 @@ class Traced:
     gains: ObjectGains
 
     @cached_property
+    def radiance(self) -> np.ndarray:
+        """(G, 3) the solution with this prior."""
+        return self.prior.solve(self.problem.rows).radiance
+
+    @cached_property
     def misfit(self) -> float:
-        """Misfit of the solution with this prior (Eq. L.40)."""
-        return self.problem.misfit(self.prior.solve(self.problem.rows).radiance)
+        """Misfit of that solution (Eq. L.40)."""
+        return self.problem.misfit(self.radiance)
 
 
 def trial(
@@ -170,6 +177,10 @@ def search_emitters(
         if chosen not in misfits:
             some = every.select(np.isin(family, [*chosen]))
             found = traced(photos, gain, some, sky, threshold, comparison_tile(photos), QUICK, left_out=weak)
+            # Saturated surface may be much brighter under these emitters than under others.
+            cache = _raised(photos, gain, found, found.cache, found.radiance, sky)
+            if _differs(cache, found.cache, SATURATED_SHARE_COMPARED):
+                found = traced(photos, gain, some, sky, threshold, comparison_tile(photos), QUICK, cache, weak)
             misfits[chosen] = found.misfit
         return misfits[chosen]
 
@@ -177,12 +188,13 @@ def search_emitters(
     look = _first_look(photos, gain, every, lit, family, sky, threshold)
     # Without light from outside something in the room has to shine.
     doubtful = frozenset(f for f in start if sky is not None and excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
-    chosen, changes = search(start, look.proposals, misfit, doubtful)
+    chosen, changes = search(start, lambda present: look.proposals(present, doubtful), misfit)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
         what = [f"{_names(photos, every, family, f)} {word}" for families, word in parts for f in sorted(families)]
-        told.append(f"{' and '.join(what)}: the misfit of the light falls from {old:.4f} to {new:.4f}")
+        turn = "falls" if new < old else "grows, as white surface would be no less bright,"
+        told.append(f"{' and '.join(what)}: the misfit of the light {turn} from {old:.4f} to {new:.4f}")
         before = after
     emitters = every.select(np.isin(family, [*chosen]))
     return traced(photos, gain, emitters, sky, threshold), np.isin(family[: groups.size], [*chosen]), told
@@ -200,14 +212,19 @@ def solve_with_saturated_surface(
     bounds = found.cache
     for _ in range(SATURATED_ROUNDS):
         cache = _raised(photos, gain, found, bounds, solution.radiance, sky)
-        before, after = (float(voxels.radiance.sum()) for voxels in (found.cache, cache))
-        if abs(after - before) < SATURATED_SHARE * before:
+        if not _differs(cache, found.cache, SATURATED_SHARE):
             break
-        more = after / max(float(bounds.radiance.sum()), 1e-300) - 1.0
+        more = float(cache.radiance.sum()) / max(float(bounds.radiance.sum()), 1e-300) - 1.0
         photos.job.log.info("saturated surface adds %.0f %% to the cached light", 100 * more)
         found = traced(photos, gain, found.groups, sky, threshold, voxels=cache)
         solution, loss = solve(photos, found, sky)
     return found, solution, loss
+
+
+def _differs(cache: RadianceVoxels, before: RadianceVoxels, share: float) -> bool:
+    """The light of two caches differs by at least a share."""
+    old, new = (float(voxels.radiance.sum()) for voxels in (before, cache))
+    return abs(new - old) > 0 and abs(new - old) >= share * old
 
 
 def _raised(
@@ -236,7 +253,8 @@ def _raised(
     matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
     light = np.einsum("ngc,gc->nc", matrix, radiance) + cached
     of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
-    return cache.raised(pixels.points, of_object[pixels.object_id] * light)
+    possible = 1.0 / np.maximum(base[:, :3], 1e-3)  # no surface reflects more than it receives
+    return cache.raised(pixels.points, np.minimum(of_object[pixels.object_id], possible) * light)
 
 
 def _first_look(
@@ -263,8 +281,8 @@ def _first_look(
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
-    limit = albedo_limit(photos, sky), photos.scene.n_objects
-    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, *limit)
+    base, is_limited = photos.scene.object_values[:, :3], albedo_limit(photos, sky) is not None
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base, is_limited)
 
 
 def _white_hidden_surface(

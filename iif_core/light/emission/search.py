@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +29,21 @@ _ADDED, _SWAPPED = 3, 2  # families that are tried in addition to the others, an
 _MISSED = 1.5  # growth of the misfit without a family from which nothing else can take its place
 _CONFIRMED = 2  # proposals that are traced
 _MAX_CHANGES = 4
+_DARKEST = 0.02  # albedo by which what surface reflects is divided
 QUICK = GainOptions(rounds=4)
 """Gains of objects while emitters are compared."""
+
+
+class Proposal(NamedTuple):
+    """Families that may shine instead of the present ones.
+
+    Attributes:
+        families: that shine.
+        largest_growth: factor by which the misfit of the present ones may change for these to take their place.
+    """
+
+    families: Families
+    largest_growth: float = 1.0 - STEP
 
 
 @dataclass(frozen=True)
@@ -44,7 +58,7 @@ class Candidates:
         hidden: (G,) bool, no camera sees the group.
         shown: (G, 3) radiance with which a group lights the scene that only reflects.
         white: what a white surface would show in the place of hidden groups.
-        albedo: (n_objects, 3) mean base albedo that no gain brings above 1, or None; n_objects.
+        albedo: (n_objects, 3) mean base albedo; is_limited: no gain brings it above 1.
     """
 
     problem: EmissionProblem
@@ -55,17 +69,19 @@ class Candidates:
     hidden: np.ndarray
     shown: np.ndarray
     white: WhiteSurface
-    albedo: np.ndarray | None
-    n_objects: int
+    albedo: np.ndarray
+    is_limited: bool
 
-    def proposals(self, chosen: Families) -> list[Families]:
+    def proposals(self, chosen: Families, doubtful: Families = frozenset()) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
 
         Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
-        would take off the misfit.
+        would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
+        brighter than a white surface in their place unless it grows by half.
         """
-        misfit, lit = self._look(chosen)
+        misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
+        largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a trace of its own
 
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
@@ -76,25 +92,50 @@ class Candidates:
         with_added(chosen, misfit, lit, _ADDED)
         for out in sorted(chosen):
             rest = chosen - {out}
-            found[rest], lit = self._look(rest)
+            found[rest], lit, white = self._look(rest)
             if found[rest] <= _MISSED * misfit:
                 with_added(rest, found[rest], lit, _SWAPPED)
+            # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
+            # only reflects is not known before that trace.
+            look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
+            reflects = rest and self._excess(out, white) < 1.0
+            largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
         order = sorted(found, key=lambda f: found[f] * (1.0 + PROMISING) ** len(f))
-        # Fewer families are worth a trace of their own if they explain nearly as much.
-        return [f for f in order if found[f] <= misfit * (1.0 + PROMISING if len(f) < len(chosen) else 1.0 - PROMISING)]
+        growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
+        return [Proposal(f, growth[f][1]) for f in order if found[f] <= growth[f][0] * misfit]
 
-    def _look(self, chosen: Families) -> tuple[float, EmissionProblem]:
-        """Misfit of the families, and the problem with all columns, scaled by the gains, in which their light is cached."""
+    def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
+        """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
+        what white surface would show in the place of the pixels of all groups."""
         keep = np.isin(self.family, [*chosen, -1])
         every = self.problem.beside(self.reflecting.take(~keep[self.of_group]))
         part, prior = every.columns(keep, self.shown), self.prior.only(keep)
-        solved, gains = part.solve_object_gains(prior, self.albedo, self.n_objects, QUICK)
+        limit = self.albedo if self.is_limited else None
+        solved, gains = part.solve_object_gains(prior, limit, len(self.albedo), QUICK)
         radiance = prior.solve(solved.rows, QUICK.rounds).radiance
         light = self.shown.copy()
         light[keep] = radiance
         # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.
         reflects = (replace(self.white, seen=light).excess(light) < HIDDEN_EXCESS) & self.hidden & keep
-        return np.inf if reflects.any() else solved.misfit(radiance), lit_problem(every.with_gains(gains), light)
+        misfit = np.inf if reflects.any() else solved.misfit(radiance)
+        return misfit, lit_problem(every.with_gains(gains), light), self._white(light)
+
+    def _white(self, light: np.ndarray) -> np.ndarray:
+        rows, owner = self.reflecting.rows, self.reflecting.owner
+        shown = np.einsum("ngc,gc->nc", rows.matrices.mean(0), light) + rows.cached.sum(1).mean(0)
+        albedo = np.where(owner[:, None] >= 0, self.albedo[owner], 1.0)
+        return shown / np.maximum(albedo, _DARKEST)
+
+    def _excess(self, family: int, white: np.ndarray) -> float:
+        """Brightness of what was seen of a family relative to `white` surface; infinite if it was not seen."""
+        own = np.isin(self.of_group, np.flatnonzero(self.family == family))
+        weight = self.reflecting.pixels[own] @ white[own].sum(1)
+        return float(self.reflecting.pixels[own] @ self.reflecting.rows.observed[own].sum(1) / weight) if weight > 0 else np.inf
+
+    def _is_saturated(self, family: int) -> bool:
+        """Most of what was seen of a family is a lower bound."""
+        own = np.isin(self.of_group, np.flatnonzero(self.family == family))
+        return bool(own.any()) and bool(self.reflecting.rows.lower_bound[own].any(1).mean() > 0.5)
 
     def _best_added(self, chosen: Families, lit: EmissionProblem, least: float) -> list[int]:
         """Families, not chosen, whose light would take at least `least` off the misfit if all else stayed."""
@@ -137,36 +178,36 @@ def decrease(lit: EmissionProblem, column: np.ndarray) -> float:
 
 
 def search(
-    chosen: Families,
-    proposals: Callable[[Families], list[Families]],
-    misfit: Callable[[Families], float],
-    doubtful: Families = frozenset(),
+    chosen: Families, proposals: Callable[[Families], list[Proposal]], misfit: Callable[[Families], float]
 ) -> tuple[Families, list[tuple[Families, float, float]]]:
     """Change the emitters as long as others explain the photographs better by `STEP`; of those that do, a family more must be
-    worth as much.
+    worth as much. Families that are taken out although the misfit grows do not come back.
 
     Args:
         chosen: families to begin with.
         proposals: sets of families that look better than a given one, best first.
         misfit: of a set of families, from a trace of its own.
-        doubtful: families that are taken out if the misfit does not grow.
 
     Returns:
         The families, and for each change: the families after it, and the misfit before and after.
     """
     changes: list[tuple[Families, float, float]] = []
+    gone: Families = frozenset()
     for _ in range(_MAX_CHANGES):
-        tried = proposals(chosen)[:_CONFIRMED]
+        tried = [proposal for proposal in proposals(chosen) if not proposal.families & gone][:_CONFIRMED]
         # What takes the place of a family is compared with nothing in its place.
-        tried = list(dict.fromkeys([*tried, *(families & chosen for families in tried if not families >= chosen)]))
+        known = {proposal.families for proposal in tried}
+        rest = {p.families & chosen for p in tried if not p.families >= chosen} - known
+        tried += [Proposal(families) for families in sorted(rest, key=sorted)]
         if not tried:
             break
-        before, after = misfit(chosen), [misfit(families) for families in tried]
-        fewer = [families < chosen and chosen - families <= doubtful for families in tried]
-        better = [i for i, value in enumerate(after) if value < (1.0 - STEP) * before or (fewer[i] and value <= before)]
+        before, after = misfit(chosen), [misfit(proposal.families) for proposal in tried]
+        better = [i for i, value in enumerate(after) if value <= tried[i].largest_growth * before]
         if not better:
             break
-        best = min(better, key=lambda i: after[i] * (1.0 + STEP) ** len(tried[i]))
-        chosen = tried[best]
+        best = min(better, key=lambda i: after[i] * (1.0 + STEP) ** len(tried[i].families))
+        if after[best] > before:
+            gone |= chosen - tried[best].families
+        chosen = tried[best].families
         changes.append((chosen, before, after[best]))
     return chosen, changes
