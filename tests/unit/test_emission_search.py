@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from iif_core.light.emission.direct import EmissionPrior
+from iif_core.light.emission.gains import BaseAlbedo
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import MAX_HIDDEN, MIN_HITS, with_hidden_surface
 from iif_core.light.emission.pixels import EmissionPixels
@@ -140,7 +141,7 @@ def _room(strip, reflects=0.1, seed=3):
     hidden = np.array([False, False, True, True])
     white = WhiteSurface(np.zeros((4, 3)), np.zeros((4, 4, 3)), np.full((4, 3), reflects))
     base = guess[:, None] * np.ones(3)
-    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, base, False)
+    return Candidates(problem.beside(anchors), reflecting, own, prior, np.arange(4), hidden, shown, white, BaseAlbedo(base))
 
 
 def _growth(candidates, *chosen, doubtful=()):

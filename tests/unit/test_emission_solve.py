@@ -6,7 +6,13 @@ from scipy.optimize import lsq_linear
 
 from iif_core.errors import InputError
 from iif_core.light.emission.direct import EmissionPrior, solve_emission, solve_families
-from iif_core.light.emission.gains import MAX_SHARE_ABOVE_WHITE, SHARED_LEVEL_ERROR, GainOptions, estimate_object_gains
+from iif_core.light.emission.gains import (
+    MAX_SHARE_ABOVE_WHITE,
+    SHARED_LEVEL_ERROR,
+    BaseAlbedo,
+    GainOptions,
+    estimate_object_gains,
+)
 from iif_core.light.emission.pruning import WhiteSurface, prune_groups
 from iif_core.light.emission.rows import EmissionRows, block_rows
 from tests.unit.emission_systems import rows_of
@@ -384,22 +390,54 @@ def test_light_is_raised_until_albedos_are_possible():
     h = rng.uniform(2, 20, (n, 3))  # photographed light, which determines the level: gains of 1.6
     y = 1.6 * (np.einsum("ngc,gc->nc", a, TRUE) + h)
     rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
-    plain = _gains(rows, owner, shrinkage=1e-6)
+    plain = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base))
     assert ((plain.gain * base).max(1)[owner] > 1).mean() > 0.2
-    raised = _gains(rows, owner, shrinkage=1e-6, albedo=base)
+    raised = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(base, True))
     assert raised.level_raised > 0.1
     brightest = (raised.gain * base).max(1)
     assert (brightest[owner] > 1).mean() <= MAX_SHARE_ABOVE_WHITE
     assert np.quantile(brightest, 0.97) > 0.9  # and no more than is needed
     light = [_light(rows, owner, found).sum() for found in (plain, raised)]
     assert light[0] == pytest.approx(TRUE.sum(), rel=0.05) and light[1] > 1.2 * light[0]
-    # Where albedos are possible as they are, nothing changes to the last bit.
-    dark = _gains(rows, owner, shrinkage=1e-6, albedo=0.3 * base)
-    np.testing.assert_array_equal(dark.gain, plain.gain)
+    # Where albedos are possible as they are, nothing changes.
+    dark = _gains(rows, owner, shrinkage=1e-6, albedo=BaseAlbedo(0.3 * base, True))
+    np.testing.assert_allclose(dark.gain, plain.gain, rtol=1e-12)
     assert dark.level_raised == 0
     # Nor where no level makes them possible: photographed light alone implies gains of 1.6, emitters give next to nothing.
     faint = rows_of(1e-3 * a, observed=1.6 * h, cached=[h], weight=1 / y**2)
-    assert _gains(faint, owner, shrinkage=1e-6, albedo=np.full((20, 3), 0.9)).level_raised == 0
+    assert _gains(faint, owner, shrinkage=1e-6, albedo=BaseAlbedo(np.full((20, 3), 0.9), True)).level_raised == 0
+
+
+@pytest.mark.parametrize("contrast, least, most", [(1.0, 0.8, 0.97), (0.02, 0.1, 0.5)])
+def test_colour_of_the_light_is_weighed_against_that_of_the_base(contrast, least, most):
+    """Where the share of photographed light hardly changes over an object, photographs do not know the colour of the light."""
+    rng = np.random.default_rng(14)
+    owner = np.repeat(np.arange(12), 100)
+    base = rng.uniform(0.2, 0.6, (12, 3))
+    a = np.exp(contrast * rng.standard_normal((1200, 1, 1))) * np.ones((1200, 1, 3))
+    h = np.ones((1200, 3)) * np.exp(0.03 * rng.standard_normal((12, 3)))[owner] * [1.0, 1.0, 1.3]  # too much blue
+    truth = np.array([[3.0, 2.0, 1.0]])
+    y = (np.einsum("ngc,gc->nc", a, truth) + h / [1.0, 1.0, 1.3]) * np.exp(0.02 * rng.standard_normal((1200, 3)))
+    rows = rows_of(a, observed=y, cached=[h], weight=1 / y**2)
+
+    def cast(albedo):
+        found = _gains(rows, owner, rounds=60, initial=np.ones((1, 3)), albedo=albedo)
+        gain = np.log(found.gain.mean(0))
+        return gain - gain.mean()
+
+    plain, weighed = cast(None), cast(BaseAlbedo(base))
+    assert np.abs(plain).max() > 0.02
+    assert least < np.linalg.norm(weighed) / np.linalg.norm(plain) < most
+
+
+def test_colour_of_one_object_is_that_of_the_base():
+    """A jackknife has nothing to leave out."""
+    rng = np.random.default_rng(15)
+    a = rng.uniform(0.5, 1.5, (200, 1, 1)) * np.ones((200, 1, 3))
+    y = np.einsum("ngc,gc->nc", a, [[2.0, 2.0, 1.0]]) + 1.0
+    rows = rows_of(a, observed=y, cached=[np.ones((200, 3)) * [1.0, 1.0, 1.2]], weight=1 / y**2)
+    found = _gains(rows, np.zeros(200, int), rounds=60, initial=np.ones((1, 3)), albedo=BaseAlbedo(np.full((1, 3), 0.5)))
+    assert np.ptp(np.log(found.gain)) < 0.02
 
 
 def test_level_is_unknown_where_nothing_determines_it():

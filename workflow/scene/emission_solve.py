@@ -20,7 +20,7 @@ from iif_core.light.emission.direct import (
     solve_families,
 )
 from iif_core.light.emission.environment import Sky, sky_prior
-from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, GainOptions, ObjectGains
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOptions, ObjectGains
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
 from iif_core.light.emission.loss import reference_loss
@@ -110,7 +110,7 @@ def trial(
     seen, prior = light_prior(photos, groups, rows, sky)
     n_groups = len(prior.initial)
     problem = assemble(rows, transport, n_groups, white, sky)
-    tried, gains = problem.solve_object_gains(prior, albedo_limit(photos, sky), photos.scene.n_objects)
+    tried, gains = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects)
     family, protected = _families(photos, groups, n_groups), np.arange(n_groups) >= groups.size
     evidence = white_surface(rows, np.concatenate([seen, np.zeros((n_groups - groups.size, 3))]), white)
     share = photos.job.settings.emission.prune
@@ -142,7 +142,7 @@ def traced(
     transport = trace_rows(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
     prior = light_prior(photos, groups, rows, sky)[1]
     problem = assemble(rows, transport, len(prior.initial), None, sky)
-    problem, found = problem.solve_object_gains(prior, albedo_limit(photos, sky), photos.scene.n_objects, options)
+    problem, found = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects, options)
     return Traced(groups, cache, prior, problem, found)
 
 
@@ -281,8 +281,7 @@ def _first_look(
     hidden = np.r_[every.is_hidden, np.zeros(outside, bool)]
     shown = np.concatenate([seen, np.zeros((outside, 3))])
     of_all = np.r_[family, np.full(outside, -1)]
-    base, is_limited = photos.scene.object_values[:, :3], albedo_limit(photos, sky) is not None
-    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base, is_limited)
+    return Candidates(problem, reflecting, of_group, prior, of_all, hidden, shown, white, base_albedo(photos, sky))
 
 
 def _white_hidden_surface(
@@ -358,10 +357,10 @@ def reliable(gains: ObjectGains) -> np.ndarray:
     return gains.gain if gains.level_error < PRIOR_LEVEL_ERROR else np.ones_like(gains.gain)
 
 
-def albedo_limit(photos: Photographs, sky: Sky | None) -> np.ndarray | None:
-    """(n_objects, 3) base albedos that no gain may bring above 1, where light comes from where no camera looks: its level is
-    the least certain. In a closed room the gains of single objects are less certain than the light: None."""
-    return photos.scene.object_values[:, :3] if sky is not None and sky.is_unseen else None
+def base_albedo(photos: Photographs, sky: Sky | None) -> BaseAlbedo:
+    """Mean base albedo of the objects, which no gain may bring above 1 where light comes from where no camera looks: its level is
+    the least certain. In a closed room the gains of single objects are less certain than the light."""
+    return BaseAlbedo(photos.scene.object_values[:, :3], sky is not None and sky.is_unseen)
 
 
 def light_prior(
@@ -372,7 +371,7 @@ def light_prior(
     seen[groups.is_hidden] = 0.0
     initial, width = expected_radiance(rows, seen), np.where(groups.is_hidden, HIDDEN_WIDTH, SINGLE_WIDTH)
     if groups.is_hidden.any():
-        initial[groups.is_hidden] = np.median(rows.radiance[rows.group < 0], 0)
+        initial[groups.is_hidden] = np.median(rows.radiance[rows.group < 0].mean(1))
     prior = EmissionPrior(initial, width)
     if sky is None:
         return seen, prior

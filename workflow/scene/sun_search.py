@@ -32,7 +32,7 @@ from iif_core.numerics.xp import NUMPY
 from workflow import decisions
 from workflow.scene.base_scene import ViewPixels
 from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, radiance_cache
-from workflow.scene.emission_solve import albedo_limit, believed_metallic, comparison_tile, light_prior, trace_rows
+from workflow.scene.emission_solve import base_albedo, believed_metallic, comparison_tile, light_prior, trace_rows
 
 ROWS = 8_000
 """Pixels from which the place and the size of the sun are found."""
@@ -137,7 +137,7 @@ class _Rows:
         none = EmitterGroups.none(len(self.photos.scene.faces))
         prior = light_prior(self.photos, none, self.points.shown, self.sky)[1]
         solid = solid_angles(*shape).ravel()[texels]
-        return SunQuestion(problem, prior, solid, self.sky.mean, albedo_limit(self.photos, self.sky), self.photos.scene.n_objects)
+        return SunQuestion(problem, prior, solid, self.sky.mean, base_albedo(self.photos, self.sky), self.photos.scene.n_objects)
 
     def _direct(self, texels: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
         """(2, n, T, 3) what the points reflect of each texel directly, twice with one ray into each."""

@@ -20,7 +20,7 @@ _DAMPED_AFTER = 6  # rounds of re-weighting after which steps are halved (docs/m
 _CHUNK_BYTES = 1 << 24  # of float64 rows converted at a time
 SINGLE_WIDTH = 5.0
 """Standard deviation of the radiance of a group around its initial value, relative to it."""
-HIDDEN_WIDTH = 300.0
+HIDDEN_WIDTH = 3000.0
 """The same of surface that no camera sees, around the median of what the photographs show, which says nothing about a lamp."""
 FAMILY_WIDTH = 0.3
 """Standard deviation of the groups of one object around their common radiance, relative to it."""

@@ -15,6 +15,11 @@ PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
 SHARED_LEVEL_ERROR = 0.1
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
+_COLOUR_STEPS = 8
+BASE_COLOUR_ERROR = 0.06
+"""Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
+SHARED_COLOUR_ERROR = 0.02
+"""Systematic error of the logarithm of the level of a channel, relative to that of all channels, common to all objects."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried (Eq. L.38)."""
 GAIN_BOUNDS = (0.1, 10.0)
@@ -24,6 +29,18 @@ GLOSS_PRIOR_ROWS = 30.0
 many rows of an object may err together (Eq. L.37)."""
 MAX_SHARE_ABOVE_WHITE = 0.03
 """Share of the rows whose objects may come out brighter than white: gloss, and lamps that nobody found."""
+
+
+class BaseAlbedo(NamedTuple):
+    """What the base texture says of the albedos of objects.
+
+    Attributes:
+        mean: (n_objects, 3) mean base albedo.
+        is_limited: no gain brings it above 1.
+    """
+
+    mean: np.ndarray
+    is_limited: bool = False
 
 
 @dataclass(frozen=True)
@@ -67,7 +84,7 @@ def estimate_object_gains(
     owner: np.ndarray,
     prior: EmissionPrior,
     scale_is_identifiable: bool,
-    albedo: np.ndarray | None = None,
+    albedo: BaseAlbedo | None = None,
     n_objects: int = 0,
     options: GainOptions | None = None,
 ) -> ObjectGains:
@@ -75,15 +92,16 @@ def estimate_object_gains(
 
     y = g_o (s A_d E + h_d) + t_o (s A_s E + h_s) (Eq. L.33) is solved alternately for E (non-negative least squares) and for
     gains, gloss and level s in closed form (Eq. L.34 to L.38). Each round makes the weights relative to what is predicted
-    (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, the level is raised until at most
-    `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.47).
+    (docs/method/numerics.md#weights-relative-to-noisy-rows). With `albedo`, the colour of all light is weighed
+    against the mean colour of the base (docs/method/light.md#colour-of-the-light), and if albedos are limited the level is raised
+    until at most `MAX_SHARE_ABOVE_WHITE` of the rows belong to objects with an albedo above 1 (Eq. L.47).
 
     Args:
         rows: the system; without lobes there is one factor for everything that an object reflects.
         owner: (n,) object of each row, -1 = not reflected light (a pixel on an emitter).
         prior: of the groups.
         scale_is_identifiable: the light has a scale of its own; otherwise the mean of log g over the rows stays 0.
-        albedo: (n_objects, 3) mean base albedo; None = no limit.
+        albedo: of the base; None = nothing is known of it.
         n_objects: gains for at least so many objects; an object without rows gets the common gain.
         options: None = defaults.
 
@@ -112,7 +130,7 @@ def estimate_object_gains(
             left = _by_object(used * (rows.observed - predicted) ** 2, column, count + 1)[:count].sum(1)
             gloss_weight = GLOSS_PRIOR_ROWS * left / np.maximum(np.bincount(column, (used > 0).sum(1), count + 1)[:count], 1)
         moments = of_objects.moments(used, gloss_weight, radiance)
-        level, raised = raise_to_physical_albedo(moments, column, albedo) if scale_is_identifiable else (np.zeros(3), 0.0)
+        level, raised = find_level(moments, column, albedo) if scale_is_identifiable else (np.zeros(3), 0.0)
         new, gloss_gain = moments.gains(level)
         if not scale_is_identifiable:
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
@@ -162,22 +180,46 @@ def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray
     return shown.any(0)
 
 
-def raise_to_physical_albedo(moments: _Moments, owner: np.ndarray, albedo: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Find the level of least cost, raised in all channels alike until albedos are at most 1 (Eq. L.47).
+def find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None) -> tuple[np.ndarray, float]:
+    """Find the level of least cost, its colour weighed against that of the base, and raised in all channels alike until albedos
+    are at most 1 (Eq. L.47).
 
     Returns log s (3,) and by how much it was raised, 0 if no level makes the albedos possible. owner (n,): object of each row,
     the last = anchors.
     """
-    best, objects = moments.level(), moments.objects
+    costs = moments.costs()
+    best, objects = _lowest(costs.sum(1)), moments.objects
     if albedo is None:
         return best, 0.0
-    base = np.asarray(albedo, np.float64)[:objects]
+    base = np.asarray(albedo.mean, np.float64)[:objects]
     rows = np.bincount(owner, minlength=objects + 1)[:objects].astype(np.float64)
+    if (rows @ base > 0).all():
+        best = best + _colour_shift(moments, best, base, rows, moments.colour_error(costs))
+    if not albedo.is_limited:
+        return best, 0.0
     for step in LOG_LEVELS[LOG_LEVELS >= 0.0]:
         brightest = (moments.gains(best + step)[0] * base).max(1)
         if rows[brightest > 1.0].sum() <= MAX_SHARE_ABOVE_WHITE * rows.sum():
             return best + step, float(step)
     return best, 0.0
+
+
+def _colour_shift(
+    moments: _Moments, level: np.ndarray, base: np.ndarray, rows: np.ndarray, error: np.ndarray
+) -> np.ndarray:
+    """(3,) by which log s of each channel changes if the colour of the light, of standard error `error` (3,), is weighed against
+    the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,)."""
+
+    def cast(shift: np.ndarray | float) -> np.ndarray:
+        """What the gains change of the mean colour."""
+        changed = np.log((rows @ (moments.gains(level + shift)[0] * base)) / (rows @ base))
+        return changed - changed.mean()
+
+    wanted = cast(0.0) / (1.0 + (error / BASE_COLOUR_ERROR) ** 2)
+    shift = np.zeros(3)
+    for _ in range(_COLOUR_STEPS):  # gains follow the light as far as it is modelled
+        shift = np.clip(shift + cast(shift) - wanted, -1.0, 1.0)
+    return shift
 
 
 def _relative_to(rows: EmissionRows, predicted: np.ndarray, reflects: np.ndarray) -> np.ndarray:
@@ -337,9 +379,19 @@ class _Moments:
         """(g (O, 3), t (O,)) at log s (3,)."""
         return self._solve(log_level)[1:]
 
-    def level(self) -> np.ndarray:
-        """(3,) log s of least cost (Eq. L.38)."""
-        return _lowest(self.costs().sum(1))
+    def colour_error(self, costs: np.ndarray) -> np.ndarray:
+        """(3,) standard error of log s of each channel relative to one log s of all, by the jackknife over objects."""
+        has_rows = self.observed_squared[:-1].sum(1) > 0
+        n = int(has_rows.sum())
+        if n < 2:
+            return np.full(3, np.inf)
+        whole = costs.sum(1)
+        left_out = np.moveaxis(whole[:, None] - costs[:, :-1][:, has_rows], 2, 0)  # (3, levels, n)
+        of_all = _lowest(left_out.sum(0)) - _lowest(whole.sum(1)[:, None])
+        moved = np.stack([_lowest(own) for own in left_out]) - _lowest(whole)[:, None] - of_all
+        at = left_out.argmin(1)
+        is_inside = (at > 0).all(1) & (at < len(LOG_LEVELS) - 1).all(1)
+        return np.where(is_inside, np.sqrt(SHARED_COLOUR_ERROR**2 + (n - 1) / n * (moved**2).sum(1)), np.inf)
 
     def level_error(self) -> float:
         """Standard error of one log s of all channels by the jackknife over objects (Eq. L.45)."""

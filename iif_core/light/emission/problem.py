@@ -9,7 +9,7 @@ import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky
-from iif_core.light.emission.gains import GainOptions, ObjectGains, estimate_object_gains
+from iif_core.light.emission.gains import BaseAlbedo, GainOptions, ObjectGains, estimate_object_gains
 from iif_core.light.emission.pixels import COVERAGE_ERROR, EmissionPixels
 from iif_core.light.emission.pruning import WhiteSurface, without_groups
 from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
@@ -74,14 +74,13 @@ class EmissionProblem:
     def solve_object_gains(
         self,
         prior: EmissionPrior,
-        albedo: np.ndarray | None = None,
+        albedo: BaseAlbedo | None = None,
         n_objects: int = 0,
         options: GainOptions | None = None,
     ) -> tuple[EmissionProblem, ObjectGains]:
         """Estimate the albedo gains of objects together with the light (up to 15 solves; docs/method/light.md#object-gains).
 
-        `prior` is that of the groups; no gain brings the mean base albedo (n_objects, 3), if given, above 1; options: None =
-        defaults.
+        `prior` is that of the groups, `albedo` of the base, if known; options: None = defaults.
         Returns the problem with rows scaled by the gains, without lobes, and weights relative to what the rows should show; and
         the gains.
         """

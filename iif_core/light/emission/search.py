@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
-from iif_core.light.emission.gains import GainOptions
+from iif_core.light.emission.gains import BaseAlbedo, GainOptions
 from iif_core.light.emission.problem import ROW_FLOOR, EmissionProblem
 from iif_core.light.emission.pruning import WhiteSurface
 
@@ -58,7 +58,7 @@ class Candidates:
         hidden: (G,) bool, no camera sees the group.
         shown: (G, 3) radiance with which a group lights the scene that only reflects.
         white: what a white surface would show in the place of hidden groups.
-        albedo: (n_objects, 3) mean base albedo; is_limited: no gain brings it above 1.
+        albedo: of the base.
     """
 
     problem: EmissionProblem
@@ -69,8 +69,7 @@ class Candidates:
     hidden: np.ndarray
     shown: np.ndarray
     white: WhiteSurface
-    albedo: np.ndarray
-    is_limited: bool
+    albedo: BaseAlbedo
 
     def proposals(self, chosen: Families, doubtful: Families = frozenset()) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
@@ -110,8 +109,7 @@ class Candidates:
         keep = np.isin(self.family, [*chosen, -1])
         every = self.problem.beside(self.reflecting.take(~keep[self.of_group]))
         part, prior = every.columns(keep, self.shown), self.prior.only(keep)
-        limit = self.albedo if self.is_limited else None
-        solved, gains = part.solve_object_gains(prior, limit, len(self.albedo), QUICK)
+        solved, gains = part.solve_object_gains(prior, self.albedo, len(self.albedo.mean), QUICK)
         radiance = prior.solve(solved.rows, QUICK.rounds).radiance
         light = self.shown.copy()
         light[keep] = radiance
@@ -123,7 +121,7 @@ class Candidates:
     def _white(self, light: np.ndarray) -> np.ndarray:
         rows, owner = self.reflecting.rows, self.reflecting.owner
         shown = np.einsum("ngc,gc->nc", rows.matrices.mean(0), light) + rows.cached.sum(1).mean(0)
-        albedo = np.where(owner[:, None] >= 0, self.albedo[owner], 1.0)
+        albedo = np.where(owner[:, None] >= 0, self.albedo.mean[owner], 1.0)
         return shown / np.maximum(albedo, _DARKEST)
 
     def _excess(self, family: int, white: np.ndarray) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.environment import Sky, middles, sun_prior
-from iif_core.light.emission.gains import ObjectGains
+from iif_core.light.emission.gains import BaseAlbedo, ObjectGains
 from iif_core.light.emission.problem import EmissionProblem
 from iif_core.light.emission.search import QUICK, STEP, decrease, lit_problem
 
@@ -128,14 +128,14 @@ class SunQuestion:
         problem: rows of all G groups, of which the last T may be the sun (the others are the rest of the light).
         prior: of the groups that are not the sun; solid_angle: (T,) of the others.
         mean: (3,) radiance of the sky, the scale of the sun's prior.
-        albedo: (n_objects, 3) mean base albedo that no gain brings above 1, or None; n_objects.
+        albedo: of the base, if known; n_objects.
     """
 
     problem: EmissionProblem
     prior: EmissionPrior
     solid_angle: np.ndarray
     mean: np.ndarray
-    albedo: np.ndarray | None
+    albedo: BaseAlbedo | None
     n_objects: int
 
     def look(self, sun: np.ndarray | None = None) -> Look:
