@@ -16,7 +16,7 @@ PRIOR_LEVEL_ERROR = 0.35
 SHARED_LEVEL_ERROR = 0.1
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
 _COLOUR_STEPS = 8
-BASE_COLOUR_ERROR = 0.06
+BASE_COLOUR_ERROR = 0.1
 """Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
 SHARED_COLOUR_ERROR = 0.02
 """Systematic error of the logarithm of the level of a channel, relative to that of all channels, common to all objects."""
@@ -380,11 +380,12 @@ class _Moments:
         return self._solve(log_level)[1:]
 
     def colour_error(self, costs: np.ndarray) -> np.ndarray:
-        """(3,) standard error of log s of each channel relative to one log s of all, by the jackknife over objects."""
+        """(3,) standard error of log s of each channel relative to one log s of all, by the jackknife over objects; 0, as if it
+        were known, where there is nothing to leave out."""
         has_rows = self.observed_squared[:-1].sum(1) > 0
         n = int(has_rows.sum())
         if n < 2:
-            return np.full(3, np.inf)
+            return np.zeros(3)
         whole = costs.sum(1)
         left_out = np.moveaxis(whole[:, None] - costs[:, :-1][:, has_rows], 2, 0)  # (3, levels, n)
         of_all = _lowest(left_out.sum(0)) - _lowest(whole.sum(1)[:, None])
