@@ -423,9 +423,11 @@ def test_colour_of_the_light_is_weighed_against_that_of_the_base(contrast, least
     def cast(albedo):
         found = _gains(rows, owner, rounds=60, initial=np.ones((1, 3)), albedo=albedo)
         gain = np.log(found.gain.mean(0))
-        return gain - gain.mean()
+        return gain - gain.mean(), np.array(found.colour_moved)
 
-    plain, weighed = cast(None), cast(BaseAlbedo(base))
+    (plain, unmoved), (weighed, moved) = cast(None), cast(BaseAlbedo(base))
+    # The colour of the light moves against that of the gains, by no more than they allow.
+    assert not unmoved.any() and moved @ (weighed - plain) < 0
     assert np.abs(plain).max() > 0.02
     assert least < np.linalg.norm(weighed) / np.linalg.norm(plain) < most
 

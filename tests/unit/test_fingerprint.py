@@ -60,6 +60,17 @@ def test_code_edit_changes_only_the_stage_and_below(checkout):
     assert "affines" not in changed(before, after) and "render" not in changed(before, after)
 
 
+@pytest.mark.parametrize(
+    "module, first", [("iif_core.light.emission.gains", "emission"), ("iif_core.fitting.selection", "affines")]
+)
+def test_a_change_of_a_later_part_does_not_make_earlier_ones_anew(module, first):
+    document = {"source": {"kind": "folder"}, "prior": {"kind": "simulated"}, "segmentation": {"kind": "given"}}
+    names = list(STAGES)
+    earlier = [s for s in names[: names.index(first)] if s != "base_scores"]
+    assert earlier and not [s for s in earlier if module in fp.stage_modules(s, document)]
+    assert module in fp.stage_modules(first, document)
+
+
 def test_touch_and_comments_change_nothing(checkout):
     code, run = checkout
     before = fingerprints(code, run)

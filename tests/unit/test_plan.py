@@ -3,7 +3,7 @@ import json
 import numpy as np
 import pytest
 
-from workflow import decisions
+from workflow.decisions import camera, light, materials, objects
 
 CHOSEN = {
     "candidates": [{"family": "srgb", "behind": 60.0, "error": 20.0}, {"family": "gamma", "behind": 0.0, "error": 0.0}],
@@ -15,35 +15,35 @@ KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
 @pytest.mark.parametrize(
     ("decision", "included"),
     [
-        (decisions.environment("auto", 0.0, 0.0005, None), False),
-        (decisions.environment("auto", 0.0, 0.05, None), True),
-        (decisions.environment("auto", 0.01, 0.0, 0.5), True),
-        (decisions.environment("auto", 0.01, 0.05, 0.001), False),
-        (decisions.environment("on", 0.0, 0.0, None), True),
-        (decisions.environment("off", 0.5, 0.5, 3.0), False),
-        (decisions.radiance_cache("auto", 0.7, 0.01), True),
-        (decisions.radiance_cache("auto", 0.1, 0.0), False),
-        (decisions.radiance_cache("path", 0.9, 0.0), False),
-        (decisions.radiance_cache("cache", 0.0, 1.0), True),
-        (decisions.emitters(3, 1, 4), True),
-        (decisions.emitters(0, 0, 0), False),
-        (decisions.emitters(0, 2, 2), False),
-        (decisions.camera_response("hdr", {"candidates": [], "reason": "linear"}), False),
-        (decisions.camera_response("ldr", {"candidates": [], "reason": "too few"}), True),
-        (decisions.camera_response("ldr", CHOSEN), True),
-        (decisions.exposure("given", np.array([1.0, -1.0]), 0), False),
-        (decisions.exposure("estimate", np.array([1.0, -1.0]), 2), True),
-        (decisions.exposure("estimate", np.array([0.01, -0.01]), 2), False),
-        (decisions.exposure("estimate", np.zeros(0), 0), False),
-        (decisions.metallic(np.array([True, False]), np.array([0.1, 0.9])), True),
-        (decisions.metallic(np.zeros(0, bool), np.zeros(0)), False),
-        (decisions.specular(np.array([0.9, 0.95]), np.zeros(2, bool)), False),
-        (decisions.specular(np.array([0.9, 0.4]), np.zeros(2, bool)), True),
-        (decisions.specular(np.zeros(0), np.zeros(0, bool)), False),
-        (decisions.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.03, 0.04)), True),
-        (decisions.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.04, 0.03)), False),
-        (decisions.affine_size(["full, roughness", "gain", "identity (3 pixels)"]), True),
-        (decisions.affine_size([]), False),
+        (light.environment("auto", 0.0, 0.0005, None), False),
+        (light.environment("auto", 0.0, 0.05, None), True),
+        (light.environment("auto", 0.01, 0.0, 0.5), True),
+        (light.environment("auto", 0.01, 0.05, 0.001), False),
+        (light.environment("on", 0.0, 0.0, None), True),
+        (light.environment("off", 0.5, 0.5, 3.0), False),
+        (light.radiance_cache("auto", 0.7, 0.01), True),
+        (light.radiance_cache("auto", 0.1, 0.0), False),
+        (light.radiance_cache("path", 0.9, 0.0), False),
+        (light.radiance_cache("cache", 0.0, 1.0), True),
+        (light.emitters(3, 1, 4), True),
+        (light.emitters(0, 0, 0), False),
+        (light.emitters(0, 2, 2), False),
+        (camera.camera_response("hdr", {"candidates": [], "reason": "linear"}), False),
+        (camera.camera_response("ldr", {"candidates": [], "reason": "too few"}), True),
+        (camera.camera_response("ldr", CHOSEN), True),
+        (camera.exposure("given", np.array([1.0, -1.0]), 0), False),
+        (camera.exposure("estimate", np.array([1.0, -1.0]), 2), True),
+        (camera.exposure("estimate", np.array([0.01, -0.01]), 2), False),
+        (camera.exposure("estimate", np.zeros(0), 0), False),
+        (materials.metallic(np.array([True, False]), np.array([0.1, 0.9])), True),
+        (materials.metallic(np.zeros(0, bool), np.zeros(0)), False),
+        (materials.specular(np.array([0.9, 0.95]), np.zeros(2, bool)), False),
+        (materials.specular(np.array([0.9, 0.4]), np.zeros(2, bool)), True),
+        (materials.specular(np.zeros(0), np.zeros(0, bool)), False),
+        (materials.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.03, 0.04)), True),
+        (materials.specular(np.array([0.9, 0.4]), np.zeros(2, bool), (0.04, 0.03)), False),
+        (materials.affine_size(["full, roughness", "gain", "identity (3 pixels)"]), True),
+        (materials.affine_size([]), False),
     ],
 )
 def test_decisions(decision, included):
@@ -52,19 +52,19 @@ def test_decisions(decision, included):
 
 
 def test_values_say_what_was_measured():
-    assert decisions.camera_response("ldr", CHOSEN)["value"] == 3.0
-    assert decisions.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
-    assert "1 because it pays" in decisions.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
-    assert decisions.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
-    assert decisions.environment("auto", np.nan, np.nan, None)["value"] == 0.0
+    assert camera.camera_response("ldr", CHOSEN)["value"] == 3.0
+    assert camera.camera_response("ldr", CHOSEN)["reason"] == "gamma it is"
+    assert "1 because it pays" in materials.metallic(np.array([True, False]), np.array([0.1, 0.9]))["reason"]
+    assert materials.affine_size(["full", "gain+bias", "full"])["reason"] == "2 full, 1 gain+bias"
+    assert light.environment("auto", np.nan, np.nan, None)["value"] == 0.0
 
 
 def test_objects_say_how_stable_they_are():
-    firm = decisions.segmentation("masks", 40, 0.9, "views left out", {"masks": 100, "masks_undersegmented": 7})
+    firm = objects.segmentation("masks", 40, 0.9, "views left out", {"masks": 100, "masks_undersegmented": 7})
     assert firm["included"] and firm["value"] == 0.9 and firm["measure"].endswith("views left out")
     assert "7 of 100 masks" in firm["reason"] and "overlay" not in firm["reason"]
-    assert "overlay" in decisions.segmentation("geometry", 40, 0.5, "views left out", {})["reason"]
-    assert decisions.segmentation("given", 40, None, "", {})["measure"] == "ids taken as they are"
+    assert "overlay" in objects.segmentation("geometry", 40, 0.5, "views left out", {})["reason"]
+    assert objects.segmentation("given", 40, None, "", {})["measure"] == "ids taken as they are"
 
 
 def test_light_passes_unless_it_explains_the_room_worse():
@@ -76,7 +76,7 @@ def test_light_passes_unless_it_explains_the_room_worse():
         (float("inf"), float("inf"), True, False),
         (0.0, 0.0, True, False),
     ):
-        found = decisions.transmission("curtain", shines, passes, possible)
+        found = light.transmission("curtain", shines, passes, possible)
         assert found["included"] == expected
         assert ("no light passes" in found["reason"]) != expected and "curtain" in found["reason"]
         assert np.isfinite(found["value"])

@@ -22,7 +22,7 @@ from iif_core.light.emission.sun import (
 )
 from iif_core.light.environment import solid_angles
 from tests.unit.emission_systems import rows_of
-from workflow import decisions
+from workflow.decisions import light as decisions
 
 FINE = (FINER * HEIGHT, FINER * WIDTH)
 

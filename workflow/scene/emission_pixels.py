@@ -35,7 +35,7 @@ from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.pixels import ANCHOR_PIXELS, TILE_PIXELS, EmissionPixels, choose_pixels, tile_of
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.cells import grid_origin
-from workflow import decisions
+from workflow.decisions import camera as decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene, ViewPixels, base_maps, cache_origin, decode_view, pixel_gains, view_pixels
 from workflow.scene.normal_form import CaptureReader, View

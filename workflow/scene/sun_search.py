@@ -29,7 +29,7 @@ from iif_core.light.emission.sun import (
 )
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
-from workflow import decisions
+from workflow.decisions import light as decisions
 from workflow.scene.base_scene import ViewPixels
 from workflow.scene.emission_pixels import SEEDS, Photographs, choose_rows, radiance_cache
 from workflow.scene.emission_solve import base_albedo, believed_metallic, comparison_tile, light_prior, trace_rows

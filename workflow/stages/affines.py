@@ -20,8 +20,9 @@ from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptio
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import CHANNELS, MATTE_GLOSS, NUMBERS_OF, apply_affines
-from workflow import decisions
 from workflow.artifacts.store import ids_from_disk, split_rgb
+from workflow.decisions import camera, materials
+from workflow.decisions.record import Decision
 from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
@@ -59,7 +60,7 @@ def run(job: Job) -> None:
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
     direct = job.settings.affines.solver == "direct"  # only the direct solver can fit without gloss
     scatter = textures.scatter(fit) if textures is not None and direct else None
-    if scatter is not None and decisions.gloss_is_idle(*scatter):
+    if scatter is not None and materials.gloss_is_idle(*scatter):
         fit, free = _fitted(job, problem, start, prior, places, find_gauge, matte=True)
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
@@ -108,7 +109,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
     return lambda problem, start: fit_affines_sgd(problem, start, own)
 
 
-def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[decisions.Decision]) -> None:
+def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Decision]) -> None:
     """Write affines.json."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
@@ -390,7 +391,7 @@ def _plan(
     calibration: dict[str, Any],
     dynamic_range: str,
     scatter: tuple[float, float] | None,
-) -> list[decisions.Decision]:
+) -> list[Decision]:
     """Return the decisions of this stage with their measured reasons."""
     object_id = problem.object_id
     fitted = apply_affines(fit.affine, object_id, problem.base)
@@ -404,9 +405,9 @@ def _plan(
             glossy[o] = np.quantile(fitted[own, 3], 0.05)
     metal = np.any(fit.affine[:, 14:] != 0, 1)  # also objects whose metallic is as predicted, which is not fitted
     return [
-        decisions.camera_response(dynamic_range, calibration),
-        decisions.metallic(metal & fit.free.any(1), medians),
-        decisions.specular(glossy, metal, scatter),
-        decisions.affine_size(fit.model),
-        decisions.scale(**fit.facts["scale"]),
+        camera.camera_response(dynamic_range, calibration),
+        materials.metallic(metal & fit.free.any(1), medians),
+        materials.specular(glossy, metal, scatter),
+        materials.affine_size(fit.model),
+        materials.scale(**fit.facts["scale"]),
     ]

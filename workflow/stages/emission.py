@@ -16,7 +16,7 @@ from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group
 from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.segments import face_adjacency
-from workflow import decisions
+from workflow.decisions import light as decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.emission_pixels import (
@@ -193,6 +193,7 @@ def _write_facts(
             "reference_loss": light.loss,
             "level_error": level_error if np.isfinite(level_error) else None,
             "level_raised": level_raised,
+            "colour_moved": list(found.gains.colour_moved),
             "active_set": active_set,
             "escape_share": {"primary": light.escape[0], "secondary": light.escape[1]},
             "threshold": light.threshold if np.isfinite(light.threshold) else None,

@@ -10,8 +10,8 @@ from iif_core.camera.pinhole import direction_derivatives, pixel_directions
 from iif_core.errors import InputError
 from iif_core.evaluation.consistency import held_out_gain
 from iif_core.reflectance.material import BLACK
-from workflow import decisions
 from workflow.artifacts.store import rgb, split_rgb
+from workflow.decisions import light as decisions
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import pixel_gains, read_gains

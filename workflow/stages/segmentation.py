@@ -12,8 +12,8 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.surface.segments import interior, partition_agreement, segment_table
 from iif_core.surface.triangles import face_geometry
-from workflow import decisions
 from workflow.artifacts.store import ids_to_disk
+from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface

@@ -10,8 +10,8 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
-from workflow import decisions
 from workflow.artifacts.store import split_rgb
+from workflow.decisions import light as decisions
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,

@@ -69,6 +69,8 @@ class ObjectGains:
         weight: (n, 3) of the rows, relative to what they are predicted to show.
         level_raised: logarithm by which all light was raised above the level of least cost so that albedos are at most 1; it is
             not part of the errors.
+        colour_moved: (3,) logarithm by which the light of each channel was moved from the level of least cost towards the mean
+            colour of the base.
     """
 
     gain: np.ndarray
@@ -77,6 +79,7 @@ class ObjectGains:
     error_of_group: np.ndarray
     weight: np.ndarray
     level_raised: float = 0.0
+    colour_moved: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def estimate_object_gains(
@@ -130,8 +133,8 @@ def estimate_object_gains(
             left = _by_object(used * (rows.observed - predicted) ** 2, column, count + 1)[:count].sum(1)
             gloss_weight = GLOSS_PRIOR_ROWS * left / np.maximum(np.bincount(column, (used > 0).sum(1), count + 1)[:count], 1)
         moments = of_objects.moments(used, gloss_weight, radiance)
-        level, raised = find_level(moments, column, albedo) if scale_is_identifiable else (np.zeros(3), 0.0)
-        new, gloss_gain = moments.gains(level)
+        level = _find_level(moments, column, albedo) if scale_is_identifiable else _Level(np.zeros(3))
+        new, gloss_gain = moments.gains(level.log_level)
         if not scale_is_identifiable:
             new /= np.exp((share * np.log(new)).sum(0) / np.maximum(share.sum(0), 1e-300))
         done = np.abs(np.log(new / gain)).max() < 1e-3
@@ -141,7 +144,7 @@ def estimate_object_gains(
     errors = float("inf"), np.full((rows.groups, 3), np.inf)
     if scale_is_identifiable:
         errors = _level_errors(of_objects, weight, gloss_weight, radiance)
-    return ObjectGains(gain, gloss_gain, *errors, weight, raised)
+    return ObjectGains(gain, gloss_gain, *errors, weight, level.raised, tuple(np.broadcast_to(level.colour, 3).tolist()))
 
 
 def _level_errors(
@@ -180,28 +183,34 @@ def _seen_unsaturated(rows: EmissionRows, weight: np.ndarray, anchor: np.ndarray
     return shown.any(0)
 
 
-def find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None) -> tuple[np.ndarray, float]:
-    """Find the level of least cost, its colour weighed against that of the base, and raised in all channels alike until albedos
-    are at most 1 (Eq. L.47).
+class _Level(NamedTuple):
+    """Logarithm of the level of each channel (3,); what of it comes from the colour of the base (3,); and by how much all
+    channels were raised so that albedos are at most 1."""
 
-    Returns log s (3,) and by how much it was raised, 0 if no level makes the albedos possible. owner (n,): object of each row,
-    the last = anchors.
+    log_level: np.ndarray
+    colour: np.ndarray | float = 0.0
+    raised: float = 0.0
+
+
+def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None) -> _Level:
+    """Find the level of least cost, its colour weighed against that of the base, and raised in all channels alike until albedos
+    are at most 1 (Eq. L.47), or not at all if no level makes them possible. owner (n,): object of each row, the last = anchors.
     """
     costs = moments.costs()
     best, objects = _lowest(costs.sum(1)), moments.objects
     if albedo is None:
-        return best, 0.0
+        return _Level(best)
     base = np.asarray(albedo.mean, np.float64)[:objects]
     rows = np.bincount(owner, minlength=objects + 1)[:objects].astype(np.float64)
+    colour = np.zeros(3)
     if (rows @ base > 0).all():
-        best = best + _colour_shift(moments, best, base, rows, moments.colour_error(costs))
-    if not albedo.is_limited:
-        return best, 0.0
-    for step in LOG_LEVELS[LOG_LEVELS >= 0.0]:
+        colour = _colour_shift(moments, best, base, rows, moments.colour_error(costs))
+        best = best + colour
+    for step in LOG_LEVELS[LOG_LEVELS >= 0.0] if albedo.is_limited else ():
         brightest = (moments.gains(best + step)[0] * base).max(1)
         if rows[brightest > 1.0].sum() <= MAX_SHARE_ABOVE_WHITE * rows.sum():
-            return best + step, float(step)
-    return best, 0.0
+            return _Level(best + step, colour, float(step))
+    return _Level(best, colour)
 
 
 def _colour_shift(

@@ -97,7 +97,7 @@ class Candidates:
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
-            reflects = rest and self._excess(out, white) < 1.0
+            reflects = bool(rest) and self._excess(out, white) < 1.0
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
         order = sorted(found, key=lambda f: found[f] * (1.0 + PROMISING) ** len(f))
         growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
@@ -119,6 +119,7 @@ class Candidates:
         return misfit, lit_problem(every.with_gains(gains), light), self._white(light)
 
     def _white(self, light: np.ndarray) -> np.ndarray:
+        """(n, 3) what white surface would show in the place of the pixels of all groups that radiate `light` (G, 3)."""
         rows, owner = self.reflecting.rows, self.reflecting.owner
         shown = np.einsum("ngc,gc->nc", rows.matrices.mean(0), light) + rows.cached.sum(1).mean(0)
         albedo = np.where(owner[:, None] >= 0, self.albedo.mean[owner], 1.0)

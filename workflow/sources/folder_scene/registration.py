@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.registration import MIN_VIEWS, Photo, Registration, register
-from workflow import decisions
+from workflow.decisions import camera as decisions
 from workflow.sources.folder_scene.transforms import Frame
 
 WIDTH = 200  # pixels; photographs are reduced to at most this width before they are compared

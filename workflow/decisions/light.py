@@ -1,0 +1,125 @@
+"""Decisions about light: what shines, what comes from outside, what is reflected more than once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iif_core.light.emission.search import STEP
+from iif_core.light.emission.sun import SHARP, Disc, is_needed
+from iif_core.light.emission.translucent import TRANSMITTANCE
+from workflow.decisions.record import Decision, decision
+
+ESCAPE_PRIMARY = 1e-3
+"""Share of camera rays that leave the mesh, above which an environment is considered."""
+ESCAPE_SECONDARY = 2e-3
+"""The same for rays from the surface."""
+ESCAPE_BRIGHTNESS = 0.02
+"""Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
+ESCAPE_OPEN = 0.3
+"""Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
+and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
+(docs/method/light.md#open-meshes)."""
+CACHE_COVERAGE = 0.3
+"""Share of secondary hits that must have been photographed for the radiance cache."""
+
+
+def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
+    """Decide about light from outside, needed if rays leave the mesh and do not meet black.
+
+    See docs/method/light.md#when-an-environment-is-included.
+
+    Args:
+        setting: `on`, `off` or `auto`.
+        primary_escape: share of camera rays without a hit.
+        secondary_escape: share of cosine-distributed rays from the surface that leave.
+        relative_brightness: mean radiance of escaping camera rays over that of the photographs; None = none escaped.
+
+    Returns:
+        The decision.
+    """
+    measure = "share of cosine-distributed rays from the surface that leave the mesh"
+    if setting != "auto":
+        return decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
+    leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
+    dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
+    if not leaves:
+        reason = f"the mesh is closed: {primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    elif dark:
+        reason = f"rays escape into {relative_brightness:.1%} of the mean brightness: no light comes in from outside"
+    else:
+        reason = f"{primary_escape:.2%} of camera rays and {secondary_escape:.2%} of others escape"
+    return decision("environment", leaves and not dark, measure, secondary_escape, ESCAPE_SECONDARY, reason)
+
+
+_SUN = "share by which the misfit falls with a sun"
+
+
+def sun(disc: Disc | None, without: float, with_it: float, narrow: float = 0.0) -> Decision:
+    """Decide about a sun that no camera sees (docs/method/light.md#the-sun).
+
+    Args:
+        disc: that explains the photographs best; None = no single direction helps.
+        without, with_it: misfit of the light (Eq. L.40) without a sun and with the disc; of held-out views, if the disc is sharp.
+        narrow: share of what the best disc takes off the misfit that a narrow one does.
+    """
+    value = 1.0 - with_it / without if 0 < without < np.inf else 0.0
+    included = disc is not None and is_needed(without, with_it) and narrow >= SHARP
+    reason = f"misfit {without:.4f}, and {with_it:.4f} with the best sun"
+    if disc is not None:
+        towards, size = ", ".join(f"{x:.2f}" for x in disc.direction), np.degrees(disc.radius)
+        reason += f", towards ({towards}), {f'a disc of radius {size:.1f} degrees' if size else 'one texel'}"
+        sharp = f"a narrow one does {narrow:.0%} of what the best one does"
+        if narrow < SHARP:
+            reason += f"; {sharp}, so that it is a bright part of the sky"
+        else:
+            reason += f", on views that its radiance was not found on; {sharp}"
+    return decision("sun", included, _SUN, value, STEP, reason)
+
+
+def no_place_for_a_sun() -> Decision:
+    """Cameras see light from outside in all directions, unsaturated."""
+    return decision("sun", False, _SUN, 0.0, STEP, "cameras see the whole outside unsaturated")
+
+
+def emitters(groups: int, dropped: int, candidates: int) -> Decision:
+    """Decide about emitters: groups of faces that were found and kept by the solver."""
+    if groups:
+        reason = f"{groups} groups emit light ({dropped} candidates dropped)"
+    elif candidates:
+        reason = f"none of the {candidates} candidate groups emits light; light comes from cache and environment"
+    else:
+        reason = "no face was seen saturated often enough; light comes from cache and environment"
+    return decision("emitters", groups > 0, "emitter groups", groups, 1, reason)
+
+
+def transmission(names: str, shines: float, passes: float, possible: bool) -> Decision:
+    """Decide whether objects that show what is behind them shine, or let light from outside through.
+
+    That they show it speaks for the latter, unless it explains the other objects clearly worse
+    (docs/method/light.md#surface-that-lets-light-through).
+
+    Args:
+        names: of the objects.
+        shines, passes: misfit of the light (Eq. L.40) under either assumption, on the rows of other objects.
+        possible: light comes from outside where the objects let it through, and the mesh stays closed otherwise.
+    """
+    measure = "share by which the misfit falls if light passes"
+    value = 1.0 - passes / shines if 0 < shines < np.inf and np.isfinite(passes) else 0.0
+    included = possible and passes < (1 + STEP) * shines
+    what = f"{TRANSMITTANCE:.0%} of the light passes through {names}" if included else f"no light passes through {names}"
+    reason = f"{what}: misfit {passes:.4f}, and {shines:.4f} if it shines"
+    return decision("transmission", included, measure, value, -STEP, reason)
+
+
+def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
+    """Decide between photographed radiance and further bounces for indirect light (Eq. S.14); `setting` is `cache`, `path` or
+    `auto`.
+
+    `coverage` is the share of cosine-distributed rays from the surface that meet a known voxel, among those that meet no emitter;
+    `censored` the share of the voxels that were seen by saturated pixels only.
+    """
+    measure = "share of secondary hits whose radiance was photographed"
+    if setting != "auto":
+        return decision("radiance_cache", setting == "cache", measure, coverage, CACHE_COVERAGE, f"set to {setting}")
+    reason = f"{coverage:.0%} of secondary hits were photographed ({censored:.1%} of the voxels only saturated)"
+    return decision("radiance_cache", coverage > CACHE_COVERAGE, measure, coverage, CACHE_COVERAGE, reason)

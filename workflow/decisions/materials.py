@@ -1,0 +1,64 @@
+"""Decisions about materials and their scale."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from workflow.decisions.record import Decision, decision
+
+METALLIC_PRIOR = 0.25
+"""Median predicted metallic above which an object counts as predicted metal."""
+SPECULAR_ROUGHNESS = 0.85
+"""Roughness below which an object counts as glossy."""
+
+
+def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
+    """Decide about metallic: objects (`free`, not dielectrics) that the photographs show to be metals, at least in parts."""
+    count = int(np.count_nonzero(free))
+    predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
+    value = float(np.max(prior_median)) if len(prior_median) else 0.0
+    paying = count - predicted
+    reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {paying} because it pays)"
+    return decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
+
+
+def gloss_is_idle(glossy: float, matte: float) -> bool:
+    """Return whether the views of a cell differ as much with the fitted gloss as without (Eq. M.50); 0 = no cell can tell."""
+    return 0 < glossy and matte <= glossy
+
+
+def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
+    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic.
+
+    `scatter`: how much the views of a cell differ with the fitted gloss and without (Eq. M.50); None = not compared.
+    """
+    if scatter is not None and gloss_is_idle(*scatter):
+        measure = "how much more the views of a cell differ without gloss than with it (root mean square)"
+        reason = f"they differ by {scatter[0]:.4f} with the gloss that was fitted, by {scatter[1]:.4f} with none: fitted without"
+        return decision("specular", False, measure, scatter[1] - scatter[0], 0.0, reason)
+    value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
+    needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
+    reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
+    return decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
+
+
+def affine_size(models: list[str]) -> Decision:
+    """Describe the sizes of the albedo maps, which follow the texture of each object (Eq. M.19)."""
+    kinds = [m.split(",")[0].split(" (")[0] for m in models]
+    counts = {kind: kinds.count(kind) for kind in ("full", "gain+bias", "gain", "population", "identity")}
+    value = counts["full"] / len(kinds) if kinds else 0.0
+    reason = ", ".join(f"{number} {kind}" for kind, number in counts.items() if number) or "no objects"
+    return decision("affine_size", counts["full"] > 0, "share of objects with the full 3x4 map", value, 0.0, reason)
+
+
+def scale(kind: str, factor: float, relative_error: float) -> Decision:
+    """Describe what fixes the scale between light and albedo (docs/method/fitting.md#level-of-all-albedos)."""
+    reasons = {
+        "found": "the light as it was found, by how much of it is indirect, weighed against the mean albedo of the base texture",
+        "prior": "a convention: the mean albedo of the base texture; only ratios of albedos and of lights were measured",
+        "mean_albedo": "the given mean albedo",
+        "white_patch": "the given albedo of a patch",
+        "lamp": "the given radiance of a lamp",
+    }
+    reason = f"{reasons[kind]}; the light was multiplied by {factor:.4g} (standard error {100 * relative_error:.2g} %)"
+    return decision("scale", abs(factor - 1.0) > 1e-3, "factor on the light that the fit was given", factor, 1.0, reason)
