@@ -201,7 +201,7 @@ def albedo_uncertainty(
         object_id: (n,) int, -1 = no fit; base: (n, 5); base_deviation: (n, 3) standard deviation of the base albedo.
 
     Returns:
-        (n,) float64 standard deviation, mean over the channels.
+        (n,) float64 standard deviation, mean over the channels; at most 0.5, because no distribution on [0, 1] has a larger one.
     """
     known = object_id >= 0
     o = np.where(known, object_id, 0)
@@ -214,4 +214,4 @@ def albedo_uncertainty(
             fit = np.einsum("ni,nij,nj->n", one, covariance[:, rows, rows][o], one)
             through = (affine[:, 4 * c : 4 * c + 3][o] ** 2 * spread).sum(1)
             variance[:, c] = np.where(known, np.maximum(fit, 0) + through, spread[:, c])
-    return np.sqrt(variance).mean(1)
+    return np.minimum(np.sqrt(variance), 0.5).mean(1)

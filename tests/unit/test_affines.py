@@ -354,6 +354,9 @@ def test_uncertainty_and_application_without_objects():
     t = IDENTITY[None] * 2.0
     double = albedo_uncertainty(t, np.zeros((1, 16, 16)), np.zeros(4, int), base, np.full((4, 3), 0.1))
     np.testing.assert_allclose(double, 0.2)
+    # No distribution on [0, 1] has a larger standard deviation than 0.5, whatever the numbers say.
+    unknown = albedo_uncertainty(t, np.full((1, 16, 16), 9.0), np.zeros(4, int), base, np.full((4, 3), 0.1))
+    np.testing.assert_allclose(unknown, 0.5)
 
 
 def test_nothing_to_fit():
