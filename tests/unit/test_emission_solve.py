@@ -13,7 +13,7 @@ from iif_core.light.emission.gains import (
     GainOptions,
     estimate_object_gains,
 )
-from iif_core.light.emission.pruning import WhiteSurface, prune_groups
+from iif_core.light.emission.pruning import WhiteSurface, insignificant, prune_groups
 from iif_core.light.emission.rows import EmissionRows, block_rows
 from tests.unit.emission_systems import rows_of
 
@@ -430,6 +430,21 @@ def test_colour_of_the_light_is_weighed_against_that_of_the_base(contrast, least
     assert not unmoved.any() and moved @ (weighed - plain) < 0
     assert np.abs(plain).max() > 0.02
     assert least < np.linalg.norm(weighed) / np.linalg.norm(plain) < most
+
+
+def test_emitters_within_their_error_are_insignificant():
+    """Groups of a family are judged together, and the error that all light shares does not count."""
+    radiance = np.array([[9.0], [1.0], [1.0], [4.0]]) * np.ones(3)
+    own = np.array([[1.0], [0.6], [0.3], [1.0]]) * np.ones(3)
+
+    def found(level, area=(1.0, 1.0, 1.0, 1.0), family=(0, 1, 2, 3)):
+        error = np.hypot(own, level * radiance)
+        return insignificant(radiance, error, np.full((4, 3), level), np.array(area), np.array(family)).tolist()
+
+    assert found(0.0) == found(0.7) == [False, True, False, False]
+    assert found(0.1, family=(0, 7, 7, 3)) == [False] * 4  # 2 against 0.9
+    assert found(0.1, area=(1.0, 9.0, 1.0, 1.0), family=(0, 7, 7, 3)) == [False, True, True, False]
+    assert insignificant(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, int)).shape == (0,)
 
 
 def test_colour_of_one_object_is_left_to_the_photographs():

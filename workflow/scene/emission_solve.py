@@ -33,7 +33,7 @@ from iif_core.light.emission.problem import (
     reflecting_rows,
     white_surface,
 )
-from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, prune_groups
+from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, insignificant, prune_groups
 from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
@@ -86,6 +86,11 @@ class Traced:
     prior: EmissionPrior
     problem: EmissionProblem
     gains: ObjectGains
+
+    @property
+    def level_error(self) -> np.ndarray:
+        """(G, 3) error of the logarithm of the light of each group that comes from the level, no larger than the prior's."""
+        return np.minimum(self.gains.error_of_group, PRIOR_LEVEL_ERROR)
 
     @cached_property
     def radiance(self) -> np.ndarray:
@@ -221,6 +226,13 @@ def solve_with_saturated_surface(
     return found, solution, loss
 
 
+def in_doubt(photos: Photographs, found: Traced, solution: EmissionSolution) -> np.ndarray:
+    """Return the groups of faces that radiate too little to be emitters, (G,) bool (`insignificant`)."""
+    n = found.groups.size
+    family = _families(photos, found.groups, n)
+    return insignificant(solution.radiance[:n], solution.error[:n], found.level_error[:n], found.groups.area, family)
+
+
 def _differs(cache: RadianceVoxels, before: RadianceVoxels, share: float) -> bool:
     """The light of two caches differs by at least a share."""
     old, new = (float(voxels.radiance.sum()) for voxels in (before, cache))
@@ -338,7 +350,7 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[Emission
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
         solution = solve_families(problem.rows, prior, family, width)
-    solution = solution.with_level_error(np.minimum(found.gains.error_of_group, PRIOR_LEVEL_ERROR))
+    solution = solution.with_level_error(found.level_error)
     return solution, reference_loss(problem.rows, solution.radiance)
 
 

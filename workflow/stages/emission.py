@@ -13,7 +13,7 @@ from iif_core.light.emission.candidates import emitter_candidates
 from iif_core.light.emission.direct import EmissionSolution
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.groups import EmitterGroups, GroupingOptions, group_emitters
-from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN
+from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN, SIGNIFICANT
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
@@ -29,7 +29,15 @@ from workflow.scene.emission_pixels import (
     statistics_of_faces,
     view_exposures,
 )
-from workflow.scene.emission_solve import Traced, reliable, search_emitters, solve_with_saturated_surface, trial
+from workflow.scene.emission_solve import (
+    Traced,
+    in_doubt,
+    reliable,
+    search_emitters,
+    solve_with_saturated_surface,
+    traced,
+    trial,
+)
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names
 from workflow.scene.see_through import seen_through, translucent_objects
@@ -150,6 +158,13 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     reasons[np.flatnonzero(offered)[shines]] = ""
     candidates = groups.size + len(groups.dropped) + int(found.groups.is_hidden.sum())
     found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)
+    weak = in_doubt(photos, found, solution)
+    if weak.any() and (outside is not None or not weak.all()):  # without light from outside something in the room has to shine
+        job.log.info("%d groups radiate no more than their error allows, and are taken out", weak.sum())
+        visible = np.flatnonzero(offered)[shines]
+        reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
+        found = traced(photos, gain, found.groups.select(~weak), outside, threshold)
+        found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
     light = (found, solution, loss, left_out, why, candidates, groups.dropped, gain, outside, environment)

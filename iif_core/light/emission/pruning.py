@@ -21,6 +21,8 @@ brighter than a white surface under the mean light."""
 MAX_RESIDUAL_GROWTH = 0.03
 """Growth of the residual from which the scene needs a group; with albedos that are only predicted, one more free column always
 explains something."""
+SIGNIFICANT = 2.0
+"""Standard errors of its radiance that an emitter must exceed."""
 _TRIAL_ROUNDS = 6  # of re-weighting in a trial, which only says which groups are needed
 
 
@@ -170,3 +172,22 @@ def without_groups(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> E
     """Return the system of the `kept` groups (G,) bool; the light of the others, `shown` (G, 3), is added to what is cached."""
     light = np.einsum("klngc,gc->klnc", rows.matrix[:, :, :, ~kept], shown[~kept])
     return replace(rows.columns(kept), cached=rows.cached + light)
+
+
+def insignificant(
+    radiance: np.ndarray, error: np.ndarray, level_error: np.ndarray, area: np.ndarray, family: np.ndarray
+) -> np.ndarray:
+    """Return the groups that radiate less than `SIGNIFICANT` standard errors, (G,) bool
+    (docs/method/light.md#groups-that-only-reflect).
+
+    The error of the level is left out: it is one factor on all light and does not say whether a group shines. Groups of a family
+    are judged together, by the sums of their power and of its errors.
+
+    Args:
+        radiance, error: (G, 3) of the solution; level_error: (G, 3) the part of the error, as a logarithm, that groups share.
+        area: (G,) m^2; family: (G,) int.
+    """
+    own = np.sqrt(np.maximum(error**2 - (level_error * radiance) ** 2, 0.0))
+    member = np.unique(family, return_inverse=True)[1]
+    power, spread = (np.bincount(member, area * values.sum(1)) for values in (radiance, own))
+    return (power < SIGNIFICANT * spread)[member] if len(member) else np.zeros(0, bool)
