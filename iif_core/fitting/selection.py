@@ -34,6 +34,14 @@ EVIDENCE_DISCOUNT = 10.0
 """Factor on the variance of a row in the evidence (Eq. M.21). The scatter between clusters shows what varies over an object, but
 not the errors of light and geometry that the whole object shares."""
 
+FEWEST_OBJECTS = 4
+"""Objects from which the brightness relative to the base is compared."""
+LEAST_SPREAD = 0.1
+"""Least spread over the objects of the logarithm of their brightness relative to the base."""
+_NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median deviation
+_DEGREES_OF_FREEDOM = 4.0  # of Student's t of that brightness
+_DARKEST = 0.01  # brightness below which a level counts as this
+
 
 @dataclass(frozen=True)
 class Texture:
@@ -212,10 +220,14 @@ class Choice:
     allowed_share: np.ndarray
 
 
-def choose_kinds(found: Profile, counts: np.ndarray) -> Choice:
+def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    `counts` (O,) bool: objects that enter the histogram.
+    A metal must be as bright as its base suggests, or at least no less so than as a dielectric
+    (docs/method/fitting.md#selection-of-kind-and-roughness).
+
+    Args:
+        found: the evidence; counts: (O,) bool, objects that enter the histogram; mean_base: (O, 3) mean base albedo.
     """
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
@@ -226,9 +238,11 @@ def choose_kinds(found: Profile, counts: np.ndarray) -> Choice:
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
     flat = _PRIOR_OF_KINDS / len(ROUGHNESS_GRID) * np.ones(len(ROUGHNESS_GRID))
-    prior = flat
+    prior, brightness = flat, _log_brightness(found, mean_base)
     for _ in range(50):
         posterior = likelihood * prior
+        if counts.sum() >= FEWEST_OBJECTS:
+            posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
         posterior /= posterior.sum((1, 2), keepdims=True)
         seen = np.stack([np.convolve(row, _SMOOTHING, "same") for row in posterior[counts].sum(0)])
         prior = seen + _PSEUDO_OBJECTS * flat * flat.size
@@ -243,6 +257,29 @@ def choose_kinds(found: Profile, counts: np.ndarray) -> Choice:
     level = float(prior.sum(0) @ ROUGHNESS_GRID)
     width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
     return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+
+
+def _log_brightness(found: Profile, mean_base: np.ndarray) -> np.ndarray:
+    """Logarithm of the brightness of the fitted albedo over that of the base, (O, 3, R); 0 where nothing was tried."""
+    base = np.maximum(np.asarray(mean_base, np.float64), _DARKEST)
+    numbers = found.affine[..., :12].reshape(*found.cost.shape, 3, 4)
+    fitted = np.einsum("okrci,oi->okr", numbers[..., :3], base) + numbers[..., 3].sum(-1)
+    log_ratio = np.log(np.maximum(fitted, _DARKEST) / base.sum(1)[:, None, None])
+    return np.where(np.isfinite(found.cost), log_ratio, 0.0)
+
+
+def _agreement_with_base(posterior: np.ndarray, brightness: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """(O, 3) at most 1, by how much less likely each kind is than a dielectric for being too bright or too dark.
+
+    posterior: (O, 3, R) up to a factor; brightness: (O, 3, R) relative to the base; counts: (O,) objects that tell what is usual.
+    """
+    total = np.maximum(posterior.sum((1, 2)), 1e-300)
+    of_object = ((posterior * brightness).sum((1, 2)) / total)[counts]
+    of_kind = (posterior * brightness).sum(2) / np.maximum(posterior.sum(2), 1e-300)
+    usual = np.median(of_object)
+    width = max(_NORMAL_MEDIAN * float(np.median(np.abs(of_object - usual))), LEAST_SPREAD)
+    agreement = (1.0 + ((of_kind - usual) / width) ** 2 / _DEGREES_OF_FREEDOM) ** (-0.5 * (_DEGREES_OF_FREEDOM + 1.0))
+    return np.where(counts[:, None], np.minimum(agreement / agreement[:, :1], 1.0), 1.0)
 
 
 def describe_models(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:

@@ -11,8 +11,9 @@ from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
+from iif_core.fitting.selection import ROUGHNESS_GRID, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
-from iif_core.reflectance.material import IDENTITY, apply_affines
+from iif_core.reflectance.material import GAINS, IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(
@@ -342,6 +343,29 @@ def test_covariance_is_of_the_right_size():
         gains.append(out.affine[0, 0])
         reported.append(np.sqrt(out.covariance[0, 0, 0]))
     assert 0.6 < np.mean(reported) / np.std(gains) < 1.7
+
+
+@pytest.mark.parametrize("as_metal, kind", [(1.0, 1), (4.0, 0), (0.2, 0)])
+def test_a_metal_must_be_as_bright_as_its_base_suggests(as_metal, kind):
+    """The photographs prefer a metal a little; it is refused if its albedo would be several times that of its base."""
+    objects, base = 8, np.full((8, 3), 0.4)
+    cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, 0] = 5.0
+    cost[1:, 1] = 9.0
+    cost[0, 1, :5] = 0.0
+    affine = np.zeros((*cost.shape, 16))
+    affine[..., GAINS] = np.exp(0.05 * np.arange(objects))[:, None, None, None]
+    affine[0, 1][:, GAINS] = as_metal
+    found = choose_kinds(Profile(cost, affine, np.full(objects, 0.1)), np.ones(objects, bool), base)
+    assert found.kind.tolist() == [kind] + [0] * (objects - 1)
+    # A dielectric that is too dark does not become a metal.
+    cost[0, 1, :5], affine[0, 0][:, GAINS] = 9.0, 0.2
+    found = choose_kinds(Profile(cost, affine, np.full(objects, 0.1)), np.ones(objects, bool), base)
+    assert found.kind.tolist() == [0] * objects
+    # Of three objects none tells what is usual.
+    cost[0, 1, :5], affine[0, 0][:, GAINS] = 0.0, 1.0
+    few = Profile(cost[:3], affine[:3], np.full(3, 0.1))
+    assert choose_kinds(few, np.ones(3, bool), base[:3]).kind.tolist() == [1, 0, 0]
 
 
 def test_uncertainty_and_application_without_objects():

@@ -1,0 +1,238 @@
+"""How much the result depends on each constant of the method: every constant is halved and doubled, one at a time, and the
+stages that read it are made anew from the artefacts of finished rooms.
+
+    python tests/benchmarks/screening.py FOLDER ROOM... --of iif_core.fitting iif_core.light.emission.gains:BASE_COLOUR_ERROR
+
+FOLDER is the working folder of runs that this very code has finished; ROOM is the name of a derived scene in it, such as
+`sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses. `--keep FILE.csv` adds a row
+for each constant, factor and room as it is done, and skips those that the file has. Two rooms are worked on at a time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from workflow.artifacts.store import StageReader
+from workflow.runtime.fingerprint import import_closure
+from workflow.scene.normal_form import CaptureReader
+from workflow.scoring.scores import material_maps, material_truth
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+CODE = ("iif_core", "workflow", "config")
+STAGES = ("base", "emission", "shading", "affines")
+OTHER_SOLVERS = ("baselines", "hashgrid", "sgd", "adam", "reference_loss")
+"""Packages and modules that the default solvers do not use."""
+FACTORS = (0.5, 2.0)
+SCORES = (
+    ("albedo", "psnr", "scaled"),
+    ("albedo", "psnr", "raw"),
+    ("roughness", "l2", "raw"),
+    ("metallic", "l2", "raw"),
+)
+COLUMNS = ("module", "constant", "value", "factor", "room", *("/".join(s) for s in SCORES), "changed")
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A number in the source of a module; `span`: first line, first column, last line, last column (AST, bytes)."""
+
+    module: str
+    name: str
+    value: float
+    span: tuple[int, int, int, int]
+
+    @property
+    def path(self) -> Path:
+        return Path(*self.module.split(".")).with_suffix(".py")
+
+    def times(self, factor: float) -> float:
+        """The value times a factor; whole numbers stay whole, and at least 1 away from what they were."""
+        if not isinstance(self.value, int):
+            return self.value * factor
+        new = round(self.value * factor)
+        return new if new != self.value else self.value + (1 if factor > 1 else -1)
+
+    def written_into(self, source: str, factor: float) -> str:
+        """The source of the module with the constant times the factor."""
+        lines = source.encode().splitlines(keepends=True)
+        first, start, last, end = self.span
+        head, tail = lines[first - 1][:start], lines[last - 1][end:]
+        lines[first - 1 : last] = [head + repr(self.times(factor)).encode() + tail]
+        return b"".join(lines).decode()
+
+
+def number(node: ast.expr | None) -> float | int | None:
+    """The value of an expression of literal numbers that can be scaled; None for anything else."""
+    if node is None or not all(
+        isinstance(part, ast.Constant | ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop) for part in ast.walk(node)
+    ):
+        return None
+    value = eval(compile(ast.Expression(node), "constant", "eval"))  # literals and operators alone
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return value if plain and np.isfinite(value) and value != 0 else None
+
+
+def constants_of(module: str) -> list[Constant]:
+    """Numbers at the top of a module, and defaults of the fields of its dataclasses."""
+    path = REPOSITORY / Path(*module.split(".")).with_suffix(".py")
+    found = []
+    for node in ast.parse(path.read_text()).body:
+        pairs: list[tuple[str, ast.expr | None]] = []
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            pairs = [(node.targets[0].id, node.value)]
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple):
+            pairs = [(t.id, v) for t, v in zip(node.targets[0].elts, node.value.elts, strict=True) if isinstance(t, ast.Name)]
+        elif isinstance(node, ast.ClassDef):
+            fields = [field for field in node.body if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)]
+            pairs = [(f"{node.name}.{field.target.id}", field.value) for field in fields]
+        for name, value in pairs:
+            plain = number(value)
+            if value is not None and plain is not None:
+                span = (value.lineno, value.col_offset, value.end_lineno, value.end_col_offset)
+                found.append(Constant(module, name, plain, span))
+    return found
+
+
+def chosen(names: list[str]) -> list[Constant]:
+    """Constants of modules, of packages, or `module:NAME`."""
+    found = []
+    for name in names:
+        module, _, only = name.partition(":")
+        path = REPOSITORY / Path(*module.split("."))
+        files = sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+        modules = [".".join(file.relative_to(REPOSITORY).with_suffix("").parts) for file in files if file.name != "__init__.py"]
+        used = [m for m in modules if not set(m.split(".")) & set(OTHER_SOLVERS)]
+        every = [constant for m in used for constant in constants_of(m)]
+        here = [constant for constant in every if not only or constant.name == only]
+        if not here:
+            raise SystemExit(f"{name}: no such constant; {module} has {', '.join(c.name for c in every) or 'none'}")
+        found.extend(here)
+    return found
+
+
+def first_stage(module: str) -> str | None:
+    """The first stage that reads a module; None if none of them does."""
+    return next((stage for stage in STAGES if module in import_closure(f"workflow.stages.{stage}")), None)
+
+
+def scores(folder: Path, scene: str) -> list[float]:
+    """The scores of the result, means over the views."""
+
+    def reader(stage: str) -> StageReader:
+        return StageReader(folder / "results" / scene / stage, stage, scene)
+
+    capture, segmentation, result = CaptureReader(reader("capture")), reader("segmentation"), reader("affines")
+    values: dict[tuple[str, str, str], list[float]] = {key: [] for key in SCORES}
+    for view in capture.views:
+        file = f"maps/{view.name}.exr"
+        if not result.has(file):
+            continue
+        truth, maps = material_truth(capture, segmentation, view), material_maps(result.exr(file))
+        for quantity in dict.fromkeys(key[0] for key in SCORES):
+            for score in truth.scores(maps, quantity, ("psnr", "l2"), ("raw", "scaled")):
+                if (quantity, score.metric, score.protocol) in values:
+                    values[quantity, score.metric, score.protocol].append(score.value)
+    return [float(np.mean(values[key])) for key in SCORES]
+
+
+def linked(folder: Path, scene: str, into: Path) -> None:
+    """The finished run of a scene elsewhere, without copying its files; stages replace files and never write into them."""
+    shutil.rmtree(into / "results", ignore_errors=True)
+    shutil.copytree(folder / "results" / scene, into / "results" / scene, copy_function=os.link)
+    for name in ("data", "config"):
+        if (folder / name).exists() and not (into / name).exists():
+            (into / name).symlink_to((folder / name).resolve())
+
+
+def digests(folder: Path, scene: str, stage: str) -> dict[str, str]:
+    files = json.loads((folder / "results" / scene / stage / "manifest.json").read_text())["files"]
+    return {name: facts["sha256"] for name, facts in files.items() if not name.endswith(".json")}
+
+
+def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: float) -> tuple[list[float], bool]:
+    """The scores with the constant times the factor, and whether anything changed."""
+    file = code / constant.path
+    source, state = file.read_text(), file.stat()
+    file.write_text(constant.written_into(source, factor))
+    place = code.with_name(f"{code.name}-run")
+    try:
+        linked(folder, scene, place)
+        first = first_stage(constant.module)
+        changed = False
+        for stage in STAGES[STAGES.index(first) :]:
+            shutil.rmtree(place / "results" / scene / stage)
+            command = [sys.executable, "-m", "workflow", stage, scene]
+            environment = {**os.environ, "PYTHONPATH": str(code)}
+            done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
+            if done.returncode:
+                print(f"{constant.module}:{constant.name} x {factor}, {scene}, {stage}: {done.stderr[-300:]}", file=sys.stderr)
+                return [float("nan")] * len(SCORES), True
+            changed = changed or digests(place, scene, stage) != digests(folder, scene, stage)
+            if not changed:  # everything below is the same, too
+                return scores(folder, scene), False
+        return scores(place, scene), True
+    finally:
+        file.write_text(source)
+        os.utime(file, ns=(state.st_atime_ns, state.st_mtime_ns))  # compiled kernels of this file stay valid
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("rooms", nargs="+")
+    parser.add_argument("--of", nargs="+", default=["iif_core.fitting"], help="packages, modules, or module:NAME")
+    parser.add_argument("--keep", type=Path, default=Path("screening.csv"))
+    arguments = parser.parse_args()
+    # Whole numbers of compiled kernels are sizes of arrays.
+    constants = [c for c in chosen(arguments.of) if first_stage(c.module) and not c.module.endswith("kernels")]
+    known = set()
+    if arguments.keep.exists():
+        with arguments.keep.open() as file:
+            known = {(row["module"], row["constant"], float(row["factor"]), row["room"]) for row in csv.DictReader(file)}
+    todo = [(c, f, r) for c in constants for r in arguments.rooms for f in FACTORS if (c.module, c.name, f, r) not in known]
+    plain = {room: scores(arguments.folder, room) for room in arguments.rooms}
+    folder = arguments.folder.resolve()
+    with tempfile.TemporaryDirectory(dir=folder, prefix="screening-") as root, ThreadPoolExecutor(2) as pool:
+        free: Queue[Path] = Queue()
+        for lane in range(2):
+            for name in CODE:
+                shutil.copytree(REPOSITORY / name, Path(root) / f"code{lane}" / name)
+            free.put(Path(root) / f"code{lane}")
+
+        def work(case: tuple[Constant, float, str]) -> tuple[list[float], bool]:
+            code = free.get()
+            try:
+                return tried(folder, code, case[2], case[0], case[1])
+            finally:
+                free.put(code)
+
+        with arguments.keep.open("a", newline="") as file:
+            table = csv.writer(file)
+            if not file.tell():
+                table.writerow(COLUMNS)
+            for (constant, factor, room), (values, changed) in zip(todo, pool.map(work, todo), strict=True):
+                row = [constant.module, constant.name, constant.value, factor, room, *(f"{v:.6g}" for v in values), changed]
+                table.writerow(row)
+                file.flush()
+                moved = " ".join(f"{v - p:+.4f}" for v, p in zip(values, plain[room], strict=True))
+                print(f"{constant.module}:{constant.name} x {factor:g} {room}: {moved if changed else 'the same'}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
