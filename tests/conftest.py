@@ -21,6 +21,13 @@ except InputError as error:  # only the tests that need LLVM shall fail
     _llvm_problem = str(error)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files with long tests first, so that both processes of pytest-xdist end at about the same time. One begins with the
+    kitchen of the snapshot, and the other meanwhile makes the tiny scene that the rest of `tests/workflow` shares."""
+    long = REPOSITORY / "tests/workflow"
+    items.sort(key=lambda item: (long not in item.path.parents, item.path != long / "test_snapshot.py"))
+
+
 @pytest.fixture(scope="session")
 def repository() -> Path:
     """Root of the checkout."""
