@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from iif_core.errors import InputError
 from workflow.sources import mitsuba as source
 from workflow.sources.mitsuba_scene import document
 
+ROOT = Path(__file__).resolve().parents[2]
 SENSOR = """<sensor type="perspective"><float name="fov" value="70"/>
   <transform name="to_world"><lookat origin="{0}" target="{1}" up="0,0,1"/></transform>
   <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/>
@@ -212,6 +217,26 @@ def test_a_textured_light_is_averaged_over_its_faces(load, tmp_path):
     centre, _ = normals_of(mesh)
     assert len(mesh.faces) == 2 * 16 * 16
     assert np.allclose(mesh.emission[centre[:, 0] > 0.0], 4) and np.allclose(mesh.emission[centre[:, 0] < 0.0], 0)
+
+
+def test_exr_textures_load_in_a_job_of_one_thread(tmp_path):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.ones((64, 32, 3), np.float32)}) as picture:
+        picture.write(str(tmp_path / "sky.exr"))
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><shape type="rectangle"/>'
+        '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter></scene>'
+    )
+    program = (
+        "from pathlib import Path; from workflow.runtime import native; native.prepare(); native.limit_threads(1)\n"
+        "import drjit, mitsuba; mitsuba.set_variant('llvm_ad_rgb')\n"
+        "from workflow.sources.mitsuba_scene import scene\n"
+        "assert scene.load(Path('scene.xml')).scene.environment() is not None\n"
+        "assert drjit.thread_count() == 1"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, timeout=60, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_scene_without_triangles_is_refused(load):

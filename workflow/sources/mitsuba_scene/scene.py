@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -84,14 +87,15 @@ def load(xml: Path) -> LoadedScene:
     before = [str(resolver[i]) for i in range(len(resolver))]
     resolver.prepend(str(xml.parent.resolve()))
     try:
-        state = parser.parse_file(config, str(xml))
-        parser.transform_all(config, state)
-        entries, notes = _name_shapes(state), _notes(state)
-        built = parser.instantiate(config, state)  # empties `state`
-        scene = built[0] if isinstance(built, list) else built
-        if not isinstance(scene, mi.Scene):
-            raise InputError(f"{xml}: holds a {type(scene).__name__}, expected a scene")
-        shapes = _shapes(scene, entries)
+        with _threads_for_exr():
+            state = parser.parse_file(config, str(xml))
+            parser.transform_all(config, state)
+            entries, notes = _name_shapes(state), _notes(state)
+            built = parser.instantiate(config, state)  # empties `state`
+            scene = built[0] if isinstance(built, list) else built
+            if not isinstance(scene, mi.Scene):
+                raise InputError(f"{xml}: holds a {type(scene).__name__}, expected a scene")
+            shapes = _shapes(scene, entries)
     except RuntimeError as error:
         raise InputError(f"{xml}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
     finally:
@@ -99,6 +103,17 @@ def load(xml: Path) -> LoadedScene:
         for folder in before:
             resolver.append(folder)
     return LoadedScene(scene, shapes, notes)
+
+
+@contextmanager
+def _threads_for_exr() -> Iterator[None]:
+    """Give Dr.Jit at least two threads: with one, Mitsuba waits forever for the blocks of an EXR file."""
+    count = dr.thread_count()
+    dr.set_thread_count(max(count, 2))
+    try:
+        yield
+    finally:
+        dr.set_thread_count(count)
 
 
 def _references(node: Any) -> list[int]:
