@@ -47,8 +47,8 @@ from iif_core.fitting.tone import Tone
 from iif_core.reflectance.brdf import R_MIN
 from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_GLOSS, NUMBERS
 
-SELECTION_PIXELS = 300
-"""Pixels of an object in the selection; enough to choose between local minima in roughness."""
+SELECTION_PIXELS = 3000
+"""Pixels of an object in the selection. With few pixels in each cluster, the errors that its pixels share would go unseen."""
 MAX_PIXELS_PER_OBJECT = 12000
 """Pixels of an object in the fit. The error is dominated by what neighbouring pixels have in common, so more do not reduce it."""
 POPULATION_PIXELS = 1500

@@ -30,7 +30,7 @@ ROUGHEST_METAL = 0.6
 best metal is rougher are taken for dielectrics."""
 _PRIOR_OF_KINDS = np.array([[0.85], [0.1], [0.05]])
 """Shares of the kinds before any object was fitted."""
-EVIDENCE_DISCOUNT = 10.0
+EVIDENCE_DISCOUNT = 20.0
 """Factor on the variance of a row in the evidence (Eq. M.21). The scatter between clusters shows what varies over an object, but
 not the errors of light and geometry that the whole object shares."""
 

@@ -11,7 +11,7 @@ from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
-from iif_core.fitting.selection import ROUGHNESS_GRID, Profile, choose_kinds
+from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import GAINS, IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
@@ -356,11 +356,11 @@ def test_a_metal_must_be_as_bright_as_its_base_suggests(as_metal, kind):
     affine = np.zeros((*cost.shape, 16))
     affine[..., GAINS] = np.exp(0.05 * np.arange(objects))[:, None, None, None]
     affine[0, 1][:, GAINS] = as_metal
-    found = choose_kinds(Profile(cost, affine, np.full(objects, 0.1)), np.ones(objects, bool), base)
+    found = choose_kinds(Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT)), np.ones(objects, bool), base)
     assert found.kind.tolist() == [kind] + [0] * (objects - 1)
     # A dielectric that is too dark does not become a metal.
     cost[0, 1, :5], affine[0, 0][:, GAINS] = 9.0, 0.2
-    found = choose_kinds(Profile(cost, affine, np.full(objects, 0.1)), np.ones(objects, bool), base)
+    found = choose_kinds(Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT)), np.ones(objects, bool), base)
     assert found.kind.tolist() == [0] * objects
     # Of three objects none tells what is usual.
     cost[0, 1, :5], affine[0, 0][:, GAINS] = 0.0, 1.0
