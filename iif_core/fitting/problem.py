@@ -66,7 +66,7 @@ class FitProblem:
         """Return some of the pixels."""
         changed: dict[str, Any] = {}
         for name, value in self.__dict__.items():
-            if name in ("n_objects", "levels") or value is None:
+            if name in ("n_objects", "levels", "scatter") or value is None:
                 continue
             changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
         return replace(self, **changed)
