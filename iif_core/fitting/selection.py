@@ -39,7 +39,13 @@ FEWEST_OBJECTS = 4
 LEAST_SPREAD = 0.1
 """Least spread over the objects of the logarithm of their brightness relative to the base."""
 _NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median deviation
-_DEGREES_OF_FREEDOM = 4.0  # of Student's t of that brightness
+_DEGREES_OF_FREEDOM = 4.0  # of Student's t of that brightness, and of the roughness of the base
+_UNRELATED_OBJECTS = 2.0
+"""Weight of the assumption that the roughness of the base says nothing, in objects."""
+_ROUGHNESS_SPREAD = 0.25
+"""Standard deviation of the roughness of those objects."""
+_LEAST_BASE_SCATTER = 1e-3
+"""Least scatter of the roughness of the base around its line."""
 _DARKEST = 0.01  # brightness below which a level counts as this
 
 
@@ -220,14 +226,15 @@ class Choice:
     allowed_share: np.ndarray
 
 
-def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray) -> Choice:
+def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixels: np.ndarray) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    A metal must be as bright as its base suggests, or at least no less so than as a dielectric
-    (docs/method/fitting.md#selection-of-kind-and-roughness).
+    Which of two objects has the rougher base counts as an observation of their roughness. A metal must be as bright as its base
+    suggests, or at least no less so than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:
-        found: the evidence; counts: (O,) bool, objects that enter the histogram; mean_base: (O, 3) mean base albedo.
+        found: the evidence; counts: (O,) bool, objects that enter the histogram.
+        mean_base: (O, 5) mean base material; pixels: (O,) usable pixels.
     """
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
@@ -238,15 +245,18 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray) -> C
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
     flat = _PRIOR_OF_KINDS / len(ROUGHNESS_GRID) * np.ones(len(ROUGHNESS_GRID))
-    prior, brightness = flat, _log_brightness(found, mean_base)
+    prior, brightness = flat, _log_brightness(found, mean_base[:, :3])
+    of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
     for _ in range(50):
-        posterior = likelihood * prior
+        posterior = likelihood * prior * of_base[:, None]
         if counts.sum() >= FEWEST_OBJECTS:
             posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
         posterior /= posterior.sum((1, 2), keepdims=True)
         seen = np.stack([np.convolve(row, _SMOOTHING, "same") for row in posterior[counts].sum(0)])
         prior = seen + _PSEUDO_OBJECTS * flat * flat.size
         prior /= prior.sum()
+        if counts.sum() >= FEWEST_OBJECTS:
+            of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])
     probability = posterior.sum(2)
     kind = probability.argmax(1)
     given = posterior[np.arange(len(kind)), kind]
@@ -257,6 +267,28 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray) -> C
     level = float(prior.sum(0) @ ROUGHNESS_GRID)
     width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
     return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+
+
+def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Fit the line that the roughness of the base follows over the objects and return its likelihood at each roughness.
+
+    Args:
+        posterior: (O, R) of `ROUGHNESS_GRID`, rows sum to 1; roughness: (O,) of the base; pixels: (O,) by which objects count.
+
+    Returns:
+        (O, R), at most 1; all 1 where a rougher base does not go with a rougher object.
+    """
+    share = pixels / pixels.sum()
+    count = 1.0 / float((share**2).sum())
+    expected = posterior @ ROUGHNESS_GRID
+    middle, usual = share @ expected, share @ roughness
+    spread = count * (share @ (posterior @ (ROUGHNESS_GRID - middle) ** 2)) + _UNRELATED_OBJECTS * _ROUGHNESS_SPREAD**2
+    slope = max(count * float(share @ ((roughness - usual) * (expected - middle))) / spread, 0.0)
+    away = (roughness - usual)[:, None] - slope * (ROUGHNESS_GRID - middle)
+    square = count * (share @ (posterior * away**2).sum(1)) + _UNRELATED_OBJECTS * (share @ (roughness - usual) ** 2)
+    scatter = max(float(np.sqrt(square / (count + _UNRELATED_OBJECTS))), _LEAST_BASE_SCATTER)
+    likelihood = (1.0 + (away / scatter) ** 2 / _DEGREES_OF_FREEDOM) ** (-0.5 * (_DEGREES_OF_FREEDOM + 1.0))
+    return likelihood / likelihood.max(1, keepdims=True)
 
 
 def _log_brightness(found: Profile, mean_base: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.levels import interpolate_levels
 from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
-from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
+from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from iif_core.reflectance.material import GAINS, IDENTITY, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
@@ -348,7 +348,7 @@ def test_covariance_is_of_the_right_size():
 @pytest.mark.parametrize("as_metal, kind", [(1.0, 1), (4.0, 0), (0.2, 0)])
 def test_a_metal_must_be_as_bright_as_its_base_suggests(as_metal, kind):
     """The photographs prefer a metal a little; it is refused if its albedo would be several times that of its base."""
-    objects, base = 8, np.full((8, 3), 0.4)
+    objects, base = 8, np.full((8, 5), 0.4)
     cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
     cost[:, 0] = 5.0
     cost[1:, 1] = 9.0
@@ -356,16 +356,36 @@ def test_a_metal_must_be_as_bright_as_its_base_suggests(as_metal, kind):
     affine = np.zeros((*cost.shape, 16))
     affine[..., GAINS] = np.exp(0.05 * np.arange(objects))[:, None, None, None]
     affine[0, 1][:, GAINS] = as_metal
-    found = choose_kinds(Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT)), np.ones(objects, bool), base)
-    assert found.kind.tolist() == [kind] + [0] * (objects - 1)
+    assert chosen(cost, affine, base).kind.tolist() == [kind] + [0] * (objects - 1)
     # A dielectric that is too dark does not become a metal.
     cost[0, 1, :5], affine[0, 0][:, GAINS] = 9.0, 0.2
-    found = choose_kinds(Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT)), np.ones(objects, bool), base)
-    assert found.kind.tolist() == [0] * objects
+    assert chosen(cost, affine, base).kind.tolist() == [0] * objects
     # Of three objects none tells what is usual.
     cost[0, 1, :5], affine[0, 0][:, GAINS] = 0.0, 1.0
-    few = Profile(cost[:3], affine[:3], np.full(3, 0.1))
-    assert choose_kinds(few, np.ones(3, bool), base[:3]).kind.tolist() == [1, 0, 0]
+    assert chosen(cost[:3], affine[:3], base[:3]).kind.tolist() == [1, 0, 0]
+
+
+@pytest.mark.parametrize("slope, tells", [(0.1, True), (0.0, False), (-0.1, False)])
+def test_the_base_tells_which_of_two_objects_is_rougher(slope, tells):
+    """Two objects of which the photographs say nothing, among forty whose roughness they tell."""
+    rng = np.random.default_rng(7)
+    truth = rng.choice(ROUGHNESS_GRID, 42)
+    truth[:2] = 0.22, 0.84
+    cost = np.full((42, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, 0] = 50.0 * (ROUGHNESS_GRID - truth[:, None]) ** 2
+    cost[:2, 0] = 0.0
+    base = np.full((42, 5), 0.4)
+    base[:, 3] = 0.45 + slope * (truth - 0.5) + 0.01 * rng.standard_normal(42)
+    base[:2, 3] = 0.45 + slope * (truth[:2] - 0.5)
+    found = chosen(cost, np.zeros((*cost.shape, 16)), base).roughness
+    assert found[1] - found[0] == pytest.approx(truth[1] - truth[0], abs=0.15) if tells else abs(found[1] - found[0]) < 0.05
+    np.testing.assert_allclose(found[2:], truth[2:], atol=0.1)
+
+
+def chosen(cost: np.ndarray, affine: np.ndarray, base: np.ndarray) -> Choice:
+    objects = len(cost)
+    found = Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT))
+    return choose_kinds(found, np.ones(objects, bool), base, np.full(objects, 100))
 
 
 def test_uncertainty_and_application_without_objects():
