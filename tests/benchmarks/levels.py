@@ -4,8 +4,8 @@
 
 FOLDER is the working folder of the runs; ROOM is the name of a derived scene in it, such as `sky--rooms-ours-s0`. Objects count
 with their interior pixels, of which they need more than 100; metals do not count. The error of the level of the room is the mean
-over those pixels of the logarithm of each object's mean albedo over the true one. An object is held if its mean albedo, divided by
-that level, is within the mean of the map `uncertainty` of the true one.
+over those pixels of the logarithm of each object's mean albedo over the true one. An object is held if its mean albedo, divided
+by that level, is within the mean of the map `uncertainty` of the true one.
 """
 
 from __future__ import annotations
