@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import signal
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -20,6 +21,7 @@ from workflow.registry import STAGES
 if TYPE_CHECKING:
     from workflow.runtime.job_state import JobState
 
+INTERRUPTED = "it was interrupted; the same command continues"
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m workflow", description=__doc__)
@@ -73,6 +75,7 @@ def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) 
     """Call `run`; log an error, record it in `state`, and return the exit code."""
     if state:
         state.started()
+    code = 1
     try:
         run()
     except InputError as error:
@@ -81,13 +84,16 @@ def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) 
     except Exception as error:
         logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
         reason = f"{type(error).__name__}: {error} (a bug: please report it with the log)"
+    except KeyboardInterrupt:
+        logging.getLogger("error").error("%s was interrupted", what)
+        reason, code = INTERRUPTED, 128 + signal.SIGINT
     else:
         if state:
             state.done()
         return 0
     if state:
         state.failed(reason)
-    return 1
+    return code
 
 
 def _run_stage(arguments: argparse.Namespace) -> int:

@@ -15,7 +15,7 @@ from workflow.artifacts.files import write_exr, write_json, write_parquet
 from workflow.batch import plan as batch_plan
 from workflow.batch import summary
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import JobState
+from workflow.runtime.job_state import JobState, reasons
 from workflow.settings import batch_table
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
@@ -361,3 +361,14 @@ def test_the_shipped_table_can_be_read(repository):
     assert [line.name for line in lines if line.is_plain] and all(
         settings.load(line.name, quality, repository) for line in lines for quality in settings.QUALITIES
     )
+
+
+def test_an_interrupted_job_does_not_look_like_one_without_memory(tmp_path, monkeypatch):
+    from workflow.__main__ import _guarded
+
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(tmp_path)
+    assert _guarded("base of x", interrupted, JobState("x", "base")) == 130
+    assert [message.endswith("it was interrupted; the same command continues") for message in reasons(0.0)] == [True]

@@ -38,6 +38,8 @@ def test_scene_over_preset_over_default(scene):
     ("text", "words"),
     [
         (GOOD + "capture: {veiws: 3}\n", ["x.yaml", "capture.veiws", "unknown key", "Did you mean `views`?", "Allowed here"]),
+        (GOOD + "capture: {Views: 3}\n", ["x.yaml", "capture.Views", "unknown key", "Did you mean `views`?"]),
+        (GOOD + "affines: {VIEWS: 3}\n", ["x.yaml", "affines.VIEWS", "unknown key", "Allowed here"]),
         (GOOD + "colour: 3\n", ["colour", "unknown key", "capture"]),
         (GOOD + "capture: {views: 0}\n", ["capture.views", "found 0", "greater than or equal to 1"]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),

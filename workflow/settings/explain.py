@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 from pydantic import ValidationError
@@ -41,7 +42,16 @@ def _dotted(where: tuple[str | int, ...]) -> str:
 
 def _is_alternative(parts: list[str], i: int) -> bool:
     """Return whether part `i` is no key but names one of several types of a value (`literal['found','prior']`, `WhitePatch`)."""
-    return i > 0 and ("[" in parts[i] or parts[i] == "float" or parts[i][:1].isupper())
+    return i > 0 and ("[" in parts[i] or parts[i] == "float" or parts[i] in _names_of_sections())
+
+
+@cache
+def _names_of_sections() -> set[str]:
+    found, new = set(), [Section]
+    while new:
+        new = [child for parent in new for child in parent.__subclasses__()]
+        found |= {child.__name__ for child in new}
+    return found
 
 
 def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
