@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "it was interrupted; the same command continues"
 
+
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m workflow", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
