@@ -18,6 +18,11 @@ from iif_core.errors import InputError
 
 Array = np.ndarray
 
+ALIGNMENT = 64
+"""Bytes; what the widest vector load of a CPU wants."""
+
+_DTYPES = {dr.VarType.Float32: np.float32, dr.VarType.Int32: np.int32, dr.VarType.UInt32: np.uint32}
+
 
 def chunks(count: int, size: int) -> Iterator[slice]:
     """Consecutive slices of at most `size` that cover range(count)."""
@@ -27,14 +32,24 @@ def chunks(count: int, size: int) -> Iterator[slice]:
         yield slice(start, min(start + size, count))
 
 
-def table(rows: ArrayLike) -> Any:
-    """Flat device float32 table of a NumPy array, row-major."""
-    return mi.Float(np.ascontiguousarray(rows, np.float32).ravel())
+def on_device(values: ArrayLike, kind: Any = None) -> Any:
+    """Flat device array of type `kind` (None = Float) with the values, row-major.
+
+    Dr.Jit takes the memory of a NumPy array as it is, and kernels depend on whether it is aligned: without this copy every call
+    would compile a kernel of its own (docs/development/architecture.md#compiled-kernels).
+    """
+    kind, values = mi.Float if kind is None else kind, np.asarray(values)
+    size = 4 * values.size
+    memory = np.empty(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    aligned = memory[start : start + size].view(_DTYPES[dr.type_v(kind)])
+    aligned.reshape(values.shape)[...] = values
+    return kind(aligned)
 
 
 def vectors(kind: Any, rows: Array) -> Any:
     """Device vectors of type `kind` from (n, width) rows."""
-    return kind(*(mi.Float(np.ascontiguousarray(rows[:, axis], np.float32)) for axis in range(rows.shape[1])))
+    return kind(*(on_device(rows[:, axis]) for axis in range(rows.shape[1])))
 
 
 def to_numpy(value: Any) -> Array:
@@ -109,10 +124,8 @@ class Batch:
 
     def spread(self, kind: Any, rows: Array) -> Any:
         """Device values of the batch's points out of all `rows` ((n,) or (n, width)), repeated for the lanes of a point."""
-        rows = rows[self.part]
-        columns = [rows] if rows.ndim == 1 else [rows[:, axis] for axis in range(rows.shape[1])]
-        parts = [dr.repeat(mi.Float(np.ascontiguousarray(column, np.float32)), self.split) for column in columns]
-        return kind(*parts)
+        rows = rows[self.part].reshape(self.part.stop - self.part.start, -1)
+        return kind(*(dr.repeat(on_device(rows[:, axis]), self.split) for axis in range(rows.shape[1])))
 
     def samples(self, count: int) -> tuple[Any, Any]:
         """(first, end) sample number of every lane, so that the lanes of a point share `count` samples."""

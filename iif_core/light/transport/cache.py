@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import rows_of, table
+from iif_core.light.transport.arrays import on_device, rows_of
 from iif_core.surface.cells import CellTable, hash_words, inverse_edge, pack_keys, probe_step, voxel_indices
 
 Array = np.ndarray
@@ -21,10 +21,11 @@ class VoxelRows:
 
     def __init__(self, edge: float, origin: ArrayLike, ijk: ArrayLike, object_id: ArrayLike):
         self.table = CellTable.build(pack_keys(ijk, object_id))
-        self._mask = len(self.table.slots) - 1
-        self._slots = mi.UInt32(self.table.slots.ravel())
-        self._inverse_edge = float(inverse_edge(edge))
-        self._origin = [float(value) for value in np.asarray(origin, np.float32).reshape(3)]
+        self._slots = on_device(self.table.slots, mi.UInt32)
+        # Opaque: kernels do not differ by scene.
+        self._mask, self._probes = (dr.opaque(mi.UInt32, value) for value in (len(self.table.slots) - 1, self.table.probes))
+        self._inverse_edge = dr.opaque(mi.Float, float(inverse_edge(edge)))
+        self._origin = [dr.opaque(mi.Float, float(value)) for value in np.asarray(origin, np.float32).reshape(3)]
 
     def find(self, point: Any, object_id: Any, active: Any) -> tuple[Any, Any]:
         """(found, row) of the cell around `point`; row is 0 where nothing is found."""
@@ -34,16 +35,22 @@ class VoxelRows:
         low = mi.UInt32(i) | (mi.UInt32(j) << 16)
         high = mi.UInt32(k) | (mi.UInt32(object_id + 1) << 16)
         h = hash_words(low, high)
-        step = probe_step(h)
-        searching, found, row = active & inside, mi.Bool(False), mi.UInt32(0)
-        for _ in range(self.table.probes):
-            entry = dr.gather(mi.Vector4u, self._slots, h & self._mask, searching)
-            match = searching & (entry.x == low) & (entry.y == high) & (entry.z != 0xFFFFFFFF)
-            row = dr.select(match, entry.z, row)
-            found |= match
-            searching &= ~match & (entry.z != 0xFFFFFFFF)
-            h += step
-        return found, row
+        return _probe(self._slots, self._mask, self._probes, low, high, h, probe_step(h), active & inside)
+
+
+@dr.syntax
+def _probe(slots: Any, mask: Any, probes: Any, low: Any, high: Any, h: Any, step: Any, searching: Any) -> tuple[Any, Any]:
+    """(found, row) of the keys (low, high) in the slots of a `CellTable`; row is 0 where nothing is found."""
+    found, row, probe = mi.Bool(False), mi.UInt32(0), mi.UInt32(0)
+    while searching:
+        entry = dr.gather(mi.Vector4u, slots, h & mask, searching)
+        match = (entry.x == low) & (entry.y == high) & (entry.z != 0xFFFFFFFF)
+        row = dr.select(match, entry.z, row)
+        found |= match
+        h += step
+        probe += 1
+        searching &= ~match & (entry.z != 0xFFFFFFFF) & (probe < probes)
+    return found, row
 
 
 class RadianceCache:
@@ -71,7 +78,7 @@ class RadianceCache:
         self.count = len(ijk)
         self.edge, self.origin = edge, np.asarray(origin, np.float32)
         self._rows = VoxelRows(edge, origin, ijk, -1)
-        self._radiance = table(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
+        self._radiance = on_device(np.column_stack([radiance, np.zeros(len(ijk))])) if len(ijk) else mi.Float(0, 0, 0, 0)
 
     def covers(self, points: ArrayLike) -> Array:
         """(n,) bool: the voxel around each point (n, 3) is in the table."""

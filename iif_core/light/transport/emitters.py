@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import as_map, direction_in, solid_angles, texel_of, texel_weights
-from iif_core.light.transport.arrays import rows_of, table
+from iif_core.light.transport.arrays import on_device, rows_of
 from iif_core.light.transport.geometry import Geometry, cosine_directions, trace
 from iif_core.numerics.xp import DRJIT
 
@@ -86,11 +86,12 @@ class Emitters:
         self.pdf_sky = pdf[faces:].reshape(sky.shape) if sky.any() else np.zeros(sky.shape, np.float32)
         self.can_be_sampled = len(self.slots) > 0
         self.sky_is_sampled = bool(self.pdf_sky.any())
-        self._faces, self._slots = faces, mi.UInt32(self.slots) if self.can_be_sampled else None
-        self._radiance_pdf = table(np.column_stack([radiance, self.pdf_area]))
-        self._side = table(self.side) if np.any(self.side) else None
+        self._slots = on_device(self.slots, mi.UInt32) if self.can_be_sampled else None
+        self._faces, self._last_slot = (dr.opaque(mi.UInt32, value) for value in (faces, max(len(self.slots), 1) - 1))
+        self._radiance_pdf = on_device(np.column_stack([radiance, self.pdf_area]))
+        self._side = on_device(self.side) if np.any(self.side) else None
         self._constant = [dr.opaque(mi.Float, float(value)) for value in self.environment[0, 0]]
-        self._texels = table(np.concatenate([self.environment, self.pdf_sky[..., None]], -1))
+        self._texels = on_device(np.concatenate([self.environment, self.pdf_sky[..., None]], -1))
 
     def texel(self, texel: Any, active: Any) -> tuple[Any, Any]:
         """Return (radiance, density per steradian) of a texel, row x W + column; density 0 where it is never drawn."""
@@ -127,8 +128,7 @@ class Emitters:
 
     def sample(self, u: Any, active: Any) -> tuple[Any, Any, Any]:
         """Draw (face, on_sky, texel) with the densities that `surface` and `texel` report, from a uniform u in [0, 1)."""
-        count = len(self.slots)
-        slot = dr.minimum(mi.UInt32(u * count), count - 1)
+        slot = dr.minimum(mi.UInt32(u * mi.Float(self._last_slot + 1)), self._last_slot)
         drawn = dr.gather(mi.UInt32, self._slots, slot, active)
         if not self.sky_is_sampled:
             return drawn, mi.Bool(False), mi.UInt32(0)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import chunks, rows_of, table, to_numpy, vectors
+from iif_core.light.transport.arrays import chunks, on_device, rows_of, to_numpy, vectors
 
 Array = np.ndarray
 
@@ -53,11 +53,11 @@ class Geometry:
         parameters.update()
         self.scene = mi.load_dict({"type": "scene", "mesh": mesh})
 
-        self._face_of_primitive = None if solid.all() else mi.UInt32(primitives.astype(np.uint32))
-        self._normal_object = table(np.column_stack([self.normals, object_id.view(np.float32)]))
-        self._corner = table(_padded(corners[:, 0]))
-        self._edge1, self._edge2 = table(_padded(edge1)), table(_padded(edge2))
-        self._transmittance = None if transmittance is None else table(transmittance)
+        self._face_of_primitive = None if solid.all() else on_device(primitives, mi.UInt32)
+        self._normal_object = on_device(np.column_stack([self.normals, object_id.view(np.float32)]))
+        self._corner = on_device(_padded(corners[:, 0]))
+        self._edge1, self._edge2 = on_device(_padded(edge1)), on_device(_padded(edge2))
+        self._transmittance = None if transmittance is None else on_device(transmittance)
 
     def normal_and_object(self, face: Any, active: Any) -> tuple[Any, Any]:
         """Unit right-hand normal and object id of a face (device types)."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
-from iif_core.light.transport.arrays import rows_of, table
+from iif_core.light.transport.arrays import on_device, rows_of
 from iif_core.light.transport.cache import VoxelRows
 from iif_core.reflectance.brdf import R_MIN
 from iif_core.reflectance.material import LOWEST
@@ -28,7 +28,7 @@ class _Rows:
         values = rows_of(values, len(values), 5, name)
         clamped = np.clip(values, LOWEST, 1)
         self.count = len(values)
-        self._table = table(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
+        self._table = on_device(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
 
     def read(self, row: Any, active: Any) -> tuple[Any, Any, Any]:
         first = dr.gather(mi.Vector4f, self._table, row * 2, active)
@@ -70,10 +70,10 @@ class CellMaterials:
         if not len(object_values):
             raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
         self._cells = VoxelRows(edge, origin, ijk, object_id)
-        self._objects = len(object_values)
+        self._objects = dr.opaque(mi.Int32, len(object_values))
         coarse_ijk, coarse_object, coarse = coarse_cells(ijk, object_id, values)
         self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
-        self._first_coarse, self._first_object = len(ijk), len(ijk) + len(coarse)
+        self._first_coarse, self._first_object = (dr.opaque(mi.UInt32, row) for row in (len(ijk), len(ijk) + len(coarse)))
         # One table of cells, coarse cells, objects and the overall mean: a miss only changes which row is read.
         parts = [values, coarse, object_values, object_values.mean(axis=0, keepdims=True)]
         self._rows = _Rows(np.concatenate(parts), "values")
@@ -82,6 +82,6 @@ class CellMaterials:
         found, row = self._cells.find(point, object_id, active)
         near, around = self._coarse.find(point, object_id, active & ~found)
         known = (object_id >= 0) & (object_id < self._objects)
-        fallback = self._first_object + dr.select(known, mi.UInt32(object_id), self._objects)
+        fallback = self._first_object + dr.select(known, mi.UInt32(object_id), mi.UInt32(self._objects))
         row = dr.select(found, row, dr.select(near, self._first_coarse + around, fallback))
         return self._rows.read(row, active)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
 from iif_core.light.environment import solid_angles
-from iif_core.light.transport.arrays import batches, checked_points, rows_of, to_numpy
+from iif_core.light.transport.arrays import batches, checked_points, on_device, rows_of, to_numpy
 from iif_core.light.transport.emitters import Emitters, share_of_environment
 from iif_core.light.transport.geometry import Geometry, offset_from
 from iif_core.light.transport.kernels import Vertex, World, incoming, light_by_lobe, scatter_by_lobe
@@ -31,7 +31,7 @@ class _ColumnCollector:
     """
 
     def __init__(self, rows: Any, lane: Any, groups: int, group_of_face: Any, group_of_texel: Any):
-        self.rows, self.lane, self.groups = rows, lane, groups
+        self.rows, self.lane, self.groups = rows, lane, dr.opaque(mi.UInt32, groups)
         self.group_of_face, self.group_of_texel = group_of_face, group_of_texel
         self.specular: Any = None
 
@@ -125,7 +125,7 @@ def transport_matrix(
         weight = _group_weights(scene.geometry.areas, groups, n_groups)
     columns = columns._replace(of_texel=texels, sampling_weight=weight)
     scene = scene._replace(emitters=_unit_emitters(scene.geometry, groups, columns, texel_weight))
-    group_of_face, group_of_texel = mi.Int32(groups), None if texels is None else mi.Int32(texels.ravel())
+    group_of_face, group_of_texel = on_device(groups, mi.Int32), None if texels is None else on_device(texels, mi.Int32)
     kd, ks = brdf.kd_ks(base_color, metallic[:, None])
     width = 6 * n_groups
     for batch in batches(count, paths.samples, width, paths.chunk):

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from iif_core.camera.pinhole import direction_derivatives
+from iif_core.light.transport.arrays import on_device, vectors
 from workflow.scene.normal_form import View
 from workflow.sources.mitsuba_scene.flatten import texture_at
 from workflow.sources.mitsuba_scene.scene import children
@@ -70,13 +71,15 @@ def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int
     """
     directions = view.directions().reshape(-1, 3)
     d_du, d_dv = direction_derivatives(view.fx, view.fy, view.world_from_camera)
-    origin = mi.Point3f(*view.world_from_camera[:3, 3].astype(np.float32).tolist())
+    origin = mi.Point3f(*view.world_from_camera[:3, 3].tolist())
+    right, down = mi.Vector3f(*d_du.tolist()), mi.Vector3f(*d_dv.tolist())
+    dr.make_opaque(origin, right, down)  # the kernel, which takes long to compile, is the same for all views
     radiance = np.zeros((len(directions), 3), np.float64)
     finite = np.zeros(len(directions), np.int64)
     for first in range(0, len(directions), PATHS_AT_ONCE):
         rows = slice(first, min(first + PATHS_AT_ONCE, len(directions)))
         count = rows.stop - rows.start
-        device = [mi.Float(np.ascontiguousarray(directions[rows, axis])) for axis in range(3)]
+        device = [on_device(directions[rows, axis]) for axis in range(3)]
         done = 0
         while done < samples:
             repeat = min(max(1, PATHS_AT_ONCE // count), samples - done)
@@ -85,7 +88,7 @@ def render_view(scene: Any, integrator: Any, view: View, samples: int, seed: int
             sampler.seed(int(key), count * repeat)
             toward = mi.Vector3f(*(dr.repeat(axis, repeat) for axis in device))
             du, dv = sampler.next_1d() - 0.5, sampler.next_1d() - 0.5
-            toward = dr.normalize(toward + du * mi.Vector3f(*d_du.tolist()) + dv * mi.Vector3f(*d_dv.tolist()))
+            toward = dr.normalize(toward + du * right + dv * down)
             value, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(mi.Ray3f(origin, toward)))
             good = dr.all(dr.isfinite(value))
             value = dr.select(good, value, 0)
@@ -105,7 +108,8 @@ def original_distance(scene: Any, origin: Array, directions: Array) -> Array:
     """Return t (n,) of the first surface of the original scene along rays, inf = none; the mesh may lack that surface."""
     if not len(directions):  # an empty launch aborts the process
         return np.zeros(0, np.float32)
-    d = [mi.Float(np.ascontiguousarray(directions[:, axis], np.float32)) for axis in range(3)]
-    ray = mi.Ray3f(mi.Point3f(*np.asarray(origin, np.float32).tolist()), mi.Vector3f(*d))
+    start = mi.Point3f(*np.asarray(origin, np.float32).tolist())
+    dr.make_opaque(start)
+    ray = mi.Ray3f(start, vectors(mi.Vector3f, np.asarray(directions)))
     found = scene.ray_intersect_preliminary(ray)
     return np.array(dr.select(found.is_valid(), found.t, dr.inf))
