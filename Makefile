@@ -49,6 +49,10 @@ relight results:
 config envs iif_core profiles tests workflow:
 	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1
 
+# Anything else: the plural is what most people miss.
+.DEFAULT:
+	@echo "$@: not a target$(if $(filter scene/%,$@),; did you mean $(@:scene/%=scenes/%)?); make help lists the targets" >&2; exit 1
+
 scenes verify: setup
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 

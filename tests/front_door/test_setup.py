@@ -238,6 +238,11 @@ class TestMake:
         assert result.returncode == 2 and "Nothing to be done" not in result.stdout + result.stderr
         assert result.stderr.startswith(f"{folder}: ") and "not a target" in result.stderr
 
+    @pytest.mark.parametrize(("target", "hint"), [("scene/kitchen", "did you mean scenes/kitchen?"), ("kitchen", "make help")])
+    def test_an_unknown_target_is_answered(self, repository, clean_environment, target, hint):
+        result = run(["make", target], repository, clean_environment)
+        assert result.returncode == 2 and result.stderr.startswith(f"{target}: not a target") and hint in result.stderr
+
     def test_suite_and_continuous_integration(self, repository, clean_environment):
         lines = self.commands(repository, clean_environment, "test")
         assert lines[0] == "bash envs/setup.sh"

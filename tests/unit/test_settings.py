@@ -142,6 +142,13 @@ def test_a_folder_with_scenes_of_its_own_uses_these_alone_with_the_presets_of_th
         settings.load("kitchen", "draft", root)
 
 
+def test_a_scene_file_with_the_other_suffix_is_named(scene):
+    root = scene(GOOD)
+    (root / "config/scenes/x.yaml").rename(root / "config/scenes/room.yml")
+    with pytest.raises(InputError, match="room.yaml: not found. room.yml is there: rename it to room.yaml. Known"):
+        settings.load("room", "draft", root)
+
+
 def test_a_path_with_a_similar_name_beside_it_is_suggested(tmp_path):
     (tmp_path / "data/office-3/images").mkdir(parents=True)
     assert did_you_mean_path(tmp_path / "data/ofice-3/images") == f" Did you mean {tmp_path}/data/office-3/images?"
