@@ -4,8 +4,9 @@ stages that read it are made anew from the artefacts of finished rooms.
     python tests/benchmarks/screening.py FOLDER ROOM... --of iif_core.fitting iif_core.light.emission.gains:BASE_COLOUR_ERROR
 
 FOLDER is the working folder of runs that this very code has finished; ROOM is the name of a derived scene in it, such as
-`sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses. `--keep FILE.csv` adds a row
-for each constant, factor and room as it is done, and skips those that the file has. Two rooms are worked on at a time.
+`sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses; `--without` leaves out those
+that are no choice. `--keep FILE.csv` adds a row for each constant, factor and room as it is done, and skips those that the file
+has; the rows of factor 1 are the scores of the runs as they are. Two cases are worked on at a time.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from queue import Queue
 
@@ -31,7 +33,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from workflow.artifacts.store import StageReader
 from workflow.runtime.fingerprint import import_closure
 from workflow.scene.normal_form import CaptureReader
-from workflow.scoring.scores import material_maps, material_truth
+from workflow.scoring.scores import MaterialTruth, material_maps, material_truth
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CODE = ("iif_core", "workflow", "config")
@@ -131,19 +133,26 @@ def first_stage(module: str) -> str | None:
     return next((stage for stage in STAGES if module in import_closure(f"workflow.stages.{stage}")), None)
 
 
-def scores(folder: Path, scene: str) -> list[float]:
+def reader(folder: Path, scene: str, stage: str) -> StageReader:
+    return StageReader(folder / "results" / scene / stage, stage, scene)
+
+
+@cache
+def truths(folder: Path, scene: str) -> dict[str, MaterialTruth]:
+    """The truth of the views, by name of the view; the runs differ in what comes after it."""
+    capture, segmentation = CaptureReader(reader(folder, scene, "capture")), reader(folder, scene, "segmentation")
+    return {view.name: material_truth(capture, segmentation, view) for view in capture.views}
+
+
+def scores(folder: Path, scene: str, truth_of: dict[str, MaterialTruth]) -> list[float]:
     """The scores of the result, means over the views."""
-
-    def reader(stage: str) -> StageReader:
-        return StageReader(folder / "results" / scene / stage, stage, scene)
-
-    capture, segmentation, result = CaptureReader(reader("capture")), reader("segmentation"), reader("affines")
+    result = reader(folder, scene, "affines")
     values: dict[tuple[str, str, str], list[float]] = {key: [] for key in SCORES}
-    for view in capture.views:
-        file = f"maps/{view.name}.exr"
+    for name, truth in truth_of.items():
+        file = f"maps/{name}.exr"
         if not result.has(file):
             continue
-        truth, maps = material_truth(capture, segmentation, view), material_maps(result.exr(file))
+        maps = material_maps(result.exr(file))
         for quantity in dict.fromkeys(key[0] for key in SCORES):
             for score in truth.scores(maps, quantity, ("psnr", "l2"), ("raw", "scaled")):
                 if (quantity, score.metric, score.protocol) in values:
@@ -179,14 +188,15 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
             shutil.rmtree(place / "results" / scene / stage)
             command = [sys.executable, "-m", "workflow", stage, scene]
             environment = {**os.environ, "PYTHONPATH": str(code)}
+            environment.pop("PYTHONDONTWRITEBYTECODE", None)  # or every run compiles all modules
             done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
             if done.returncode:
                 print(f"{constant.module}:{constant.name} x {factor}, {scene}, {stage}: {done.stderr[-300:]}", file=sys.stderr)
                 return [float("nan")] * len(SCORES), True
             changed = changed or digests(place, scene, stage) != digests(folder, scene, stage)
             if not changed:  # everything below is the same, too
-                return scores(folder, scene), False
-        return scores(place, scene), True
+                return scores(folder, scene, truths(folder, scene)), False
+        return scores(place, scene, truths(folder, scene)), True
     finally:
         file.write_text(source)
         os.utime(file, ns=(state.st_atime_ns, state.st_mtime_ns))  # compiled kernels of this file stay valid
@@ -197,17 +207,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("rooms", nargs="+")
     parser.add_argument("--of", nargs="+", default=["iif_core.fitting"], help="packages, modules, or module:NAME")
+    parser.add_argument("--without", nargs="+", default=[], help="names of constants, or parts of them")
     parser.add_argument("--keep", type=Path, default=Path("screening.csv"))
     arguments = parser.parse_args()
     # Whole numbers of compiled kernels are sizes of arrays.
     constants = [c for c in chosen(arguments.of) if first_stage(c.module) and not c.module.endswith("kernels")]
+    constants = [c for c in constants if not any(part in c.name for part in arguments.without)]
     known = set()
     if arguments.keep.exists():
         with arguments.keep.open() as file:
             known = {(row["module"], row["constant"], float(row["factor"]), row["room"]) for row in csv.DictReader(file)}
     todo = [(c, f, r) for c in constants for r in arguments.rooms for f in FACTORS if (c.module, c.name, f, r) not in known]
-    plain = {room: scores(arguments.folder, room) for room in arguments.rooms}
     folder = arguments.folder.resolve()
+    plain = {room: scores(folder, room, truths(folder, room)) for room in arguments.rooms}
     with tempfile.TemporaryDirectory(dir=folder, prefix="screening-") as root, ThreadPoolExecutor(2) as pool:
         free: Queue[Path] = Queue()
         for lane in range(2):
@@ -226,6 +238,8 @@ def main() -> None:
             table = csv.writer(file)
             if not file.tell():
                 table.writerow(COLUMNS)
+            for room in [room for room in arguments.rooms if ("", "", 1.0, room) not in known]:
+                table.writerow(["", "", "", 1, room, *(f"{v:.6g}" for v in plain[room]), False])
             for (constant, factor, room), (values, changed) in zip(todo, pool.map(work, todo), strict=True):
                 row = [constant.module, constant.name, constant.value, factor, room, *(f"{v:.6g}" for v in values), changed]
                 table.writerow(row)

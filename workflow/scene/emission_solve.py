@@ -124,7 +124,7 @@ def trial(
 
 def traced(
     photos: Photographs,
-    gain: np.ndarray,
+    unseen: CellMaterials,
     groups: EmitterGroups,
     sky: Sky | None,
     threshold: float,
@@ -135,16 +135,16 @@ def traced(
 ) -> Traced:
     """Trace the rows of groups that emit light, and estimate the gains of objects under it.
 
-    `gain` (n_objects, 3), from the trial, multiplies the albedo of surface that paths meet and no photograph shows; `tile_edge`
-    and `options` as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs; left_out: (F,) bool, faces
-    whose pixels are no rows unless they shine.
+    unseen: materials of surface that paths meet and no photograph shows, with the gains of the trial; `tile_edge` and `options`
+    as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs; left_out: (F,) bool, faces whose pixels are
+    no rows unless they shine.
     """
     cache = radiance_cache(photos, groups)[0] if voxels is None else voxels
     pixels, base, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
     if left_out is not None:
         use = (rows.group >= 0) | ~left_out[pixels.face]
         pixels, base, rows = pixels.take(use), base[use], rows.take(use)
-    transport = trace_rows(photos, pixels, base, groups, cache, sky, 3, photos.scene.with_gains(gain).materials())
+    transport = trace_rows(photos, pixels, base, groups, cache, sky, 3, unseen)
     prior = light_prior(photos, groups, rows, sky)[1]
     problem = assemble(rows, transport, len(prior.initial), None, sky)
     problem, found = problem.solve_object_gains(prior, base_albedo(photos, sky), photos.scene.n_objects, options)
@@ -153,7 +153,7 @@ def traced(
 
 def search_emitters(
     photos: Photographs,
-    gain: np.ndarray,
+    unseen: CellMaterials,
     groups: EmitterGroups,
     lit: np.ndarray,
     excess: np.ndarray,
@@ -181,16 +181,16 @@ def search_emitters(
             return np.inf
         if chosen not in misfits:
             some = every.select(np.isin(family, [*chosen]))
-            found = traced(photos, gain, some, sky, threshold, comparison_tile(photos), QUICK, left_out=weak)
+            found = traced(photos, unseen, some, sky, threshold, comparison_tile(photos), QUICK, left_out=weak)
             # Saturated surface may be much brighter under these emitters than under others.
-            cache = _raised(photos, gain, found, found.cache, found.radiance, sky)
+            cache = _raised(photos, unseen, found, found.cache, found.radiance, sky)
             if _differs(cache, found.cache, SATURATED_SHARE_COMPARED):
-                found = traced(photos, gain, some, sky, threshold, comparison_tile(photos), QUICK, cache, weak)
+                found = traced(photos, unseen, some, sky, threshold, comparison_tile(photos), QUICK, cache, weak)
             misfits[chosen] = found.misfit
         return misfits[chosen]
 
     start = frozenset(family[: groups.size][lit].tolist())
-    look = _first_look(photos, gain, every, lit, family, sky, threshold)
+    look = _first_look(photos, unseen, every, lit, family, sky, threshold)
     # Without light from outside something in the room has to shine.
     doubtful = frozenset(f for f in start if sky is not None and excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
     chosen, changes = search(start, lambda present: look.proposals(present, doubtful), misfit)
@@ -202,11 +202,11 @@ def search_emitters(
         told.append(f"{' and '.join(what)}: the misfit of the light {turn} from {old:.4f} to {new:.4f}")
         before = after
     emitters = every.select(np.isin(family, [*chosen]))
-    return traced(photos, gain, emitters, sky, threshold), np.isin(family[: groups.size], [*chosen]), told
+    return traced(photos, unseen, emitters, sky, threshold), np.isin(family[: groups.size], [*chosen]), told
 
 
 def solve_with_saturated_surface(
-    photos: Photographs, gain: np.ndarray, found: Traced, sky: Sky | None, threshold: float
+    photos: Photographs, unseen: CellMaterials, found: Traced, sky: Sky | None, threshold: float
 ) -> tuple[Traced, EmissionSolution, float]:
     """Solve, and solve once more if saturated surface that only reflects turns out to be much brighter than its bound.
 
@@ -216,12 +216,12 @@ def solve_with_saturated_surface(
     solution, loss = solve(photos, found, sky)
     bounds = found.cache
     for _ in range(SATURATED_ROUNDS):
-        cache = _raised(photos, gain, found, bounds, solution.radiance, sky)
+        cache = _raised(photos, unseen, found, bounds, solution.radiance, sky)
         if not _differs(cache, found.cache, SATURATED_SHARE):
             break
         more = float(cache.radiance.sum()) / max(float(bounds.radiance.sum()), 1e-300) - 1.0
         photos.job.log.info("saturated surface adds %.0f %% to the cached light", 100 * more)
-        found = traced(photos, gain, found.groups, sky, threshold, voxels=cache)
+        found = traced(photos, unseen, found.groups, sky, threshold, voxels=cache)
         solution, loss = solve(photos, found, sky)
     return found, solution, loss
 
@@ -240,7 +240,7 @@ def _differs(cache: RadianceVoxels, before: RadianceVoxels, share: float) -> boo
 
 
 def _raised(
-    photos: Photographs, gain: np.ndarray, found: Traced, cache: RadianceVoxels, radiance: np.ndarray, sky: Sky | None
+    photos: Photographs, unseen: CellMaterials, found: Traced, cache: RadianceVoxels, radiance: np.ndarray, sky: Sky | None
 ) -> RadianceVoxels:
     """The cache of the photographs, with its bounds raised to what surface reflects of the light `radiance` (G, 3)."""
     bounds = pack_keys(cache.ijk[cache.censored])
@@ -261,7 +261,7 @@ def _raised(
     pixels, base = joined(parts), np.concatenate(materials)
     if not len(base):
         return cache
-    transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, photos.scene.with_gains(gain).materials())
+    transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, unseen)
     matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
     light = np.einsum("ngc,gc->nc", matrix, radiance) + cached
     of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
@@ -271,7 +271,7 @@ def _raised(
 
 def _first_look(
     photos: Photographs,
-    gain: np.ndarray,
+    unseen: CellMaterials,
     every: EmitterGroups,
     lit: np.ndarray,
     family: np.ndarray,
@@ -282,9 +282,8 @@ def _first_look(
     thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
     cache = radiance_cache(photos, every)[0]
     pixels, base, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
-    material = photos.scene.with_gains(gain).materials()
-    transport = trace_rows(photos, pixels, base, every, cache, sky, 2, material)
-    white = _white_hidden_surface(photos, every, cache, sky, material)
+    transport = trace_rows(photos, pixels, base, every, cache, sky, 2, unseen)
+    white = _white_hidden_surface(photos, every, cache, sky, unseen)
     seen, prior = light_prior(photos, every, rows, sky)
     outside = len(prior.initial) - every.size
     problem = assemble(rows, transport, len(prior.initial), None, sky)
@@ -297,7 +296,7 @@ def _first_look(
 
 
 def _white_hidden_surface(
-    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, material: CellMaterials
+    photos: Photographs, groups: EmitterGroups, voxels: RadianceVoxels, sky: Sky | None, unseen: CellMaterials
 ) -> WhiteSurface:
     """What both sides together of each hidden group would show if they were white; nothing for the other groups."""
     scene, rng = photos.scene, np.random.default_rng([photos.job.seed, SEEDS, 3])
@@ -312,7 +311,7 @@ def _white_hidden_surface(
         middle = scene.vertices[scene.faces[face]].mean(1) + 1e-3 * normal
         points = SurfacePoints(*(part.astype(np.float32) for part in (middle, normal, normal)))
         paint = np.tile(np.float32(WHITE), (len(face), 1))
-        white = trace_rows(photos, points, paint, groups, voxels, sky, 1, material).without_lobes()
+        white = trace_rows(photos, points, paint, groups, voxels, sky, 1, unseen).without_lobes()
         np.add.at(matrix, group, white.matrix[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
         np.add.at(cached, group, white.cached[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
     return WhiteSurface(np.zeros((number, 3)), matrix, cached)

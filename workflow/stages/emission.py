@@ -144,27 +144,28 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
         )
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
+    unseen = scene.with_gains(gain).materials()
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
     # What was dropped for giving little light, and not for being no brighter than a white surface, may be needed after all.
     offered = pruned.kept[: groups.size] | (pruned.excess[: groups.size] >= certain)
     hits = np.bincount(met[met >= 0], minlength=len(scene.faces))
     lit = pruned.kept[: groups.size][offered]
     excess, some = pruned.excess[: groups.size][offered], groups.select(offered)
-    found, shines, changes = search_emitters(photos, gain, some, lit, excess, outside, threshold, hits)
+    found, shines, changes = search_emitters(photos, unseen, some, lit, excess, outside, threshold, hits)
     for change in changes:
         job.log.info("emitters: %s", change)
     notes.extend(changes)
     reasons[np.flatnonzero(offered)[lit & ~shines]] = "the photographs are explained better without it"
     reasons[np.flatnonzero(offered)[shines]] = ""
     candidates = groups.size + len(groups.dropped) + int(found.groups.is_hidden.sum())
-    found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)
+    found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     weak = in_doubt(photos, found, solution)
     if weak.any() and (outside is not None or not weak.all()):  # without light from outside something in the room has to shine
         job.log.info("%d groups radiate no more than their error allows, and are taken out", weak.sum())
         visible = np.flatnonzero(offered)[shines]
         reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
-        found = traced(photos, gain, found.groups.select(~weak), outside, threshold)
-        found, solution, loss = solve_with_saturated_surface(photos, gain, found, outside, threshold)
+        found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
+        found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     gain = reliable(found.gains) if len(found.prior.initial) else gain  # without emitters those of the trial stay
     left_out, why = groups.select(reasons != ""), [reason for reason in reasons if reason]
     light = (found, solution, loss, left_out, why, candidates, groups.dropped, gain, outside, environment)
