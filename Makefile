@@ -49,7 +49,7 @@ relight results:
 config envs iif_core profiles tests workflow:
 	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1
 
-# Anything else: the plural is what most people miss.
+# Anything else; scene/x is taken for a slip of scenes/x.
 .DEFAULT:
 	@echo "$@: not a target$(if $(filter scene/%,$@),; did you mean $(@:scene/%=scenes/%)?); make help lists the targets" >&2; exit 1
 
