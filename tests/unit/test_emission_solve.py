@@ -126,6 +126,18 @@ def test_all_saturated_rises_to_the_bound_and_no_further():
     assert high.converged
 
 
+@pytest.mark.parametrize("bounded", [False, True])
+def test_radiance_alone_is_that_of_the_solution(bounded):
+    rng = np.random.default_rng(5)
+    a = rng.random((200, 3, 3))
+    y = np.einsum("ngc,gc->nc", a, TRUE) * rng.uniform(0.8, 1.2, (200, 1))
+    bound = (y > np.quantile(y, 0.7)) if bounded else None
+    prior = EmissionPrior(np.ones((3, 3)), np.array([5.0, 0.3, 2.0]), 0.5 * np.eye(3) + 0.5)
+    rows = _rows(a, a + 0.05 * rng.standard_normal(a.shape), y, bound=bound)
+    for some in (rows, rows.take(np.zeros(0, int))):
+        np.testing.assert_array_equal(prior.radiance(some), prior.solve(some).radiance)
+
+
 def test_no_rows_and_no_groups():
     none = _rows(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros((0, 3)))
     out = solve_emission(none, np.full((2, 3), 4.0))

@@ -187,9 +187,9 @@ def test_limit_threads_reaches_libraries_imported_before_and_after(repository):
         "counts = [torch.get_num_threads(), drjit.thread_count(), pyarrow.cpu_count()]\n"
         "print(os.environ['OMP_NUM_THREADS'], end=' ')\n"
         "native.limit_threads(3)\n"
-        "print(counts, torch.get_num_threads(), drjit.thread_count(), pyarrow.cpu_count())"
+        "print(counts, torch.get_num_threads(), drjit.thread_count(), pyarrow.cpu_count(), os.environ['OPENBLAS_NUM_THREADS'])"
     )
-    assert python(code, repository).stdout.strip() == "1 [1, 1, 1] 3 3 3"
+    assert python(code, repository).stdout.strip() == "1 [1, 1, 1] 3 3 3 1"
 
 
 def test_limit_threads_refuses_none():

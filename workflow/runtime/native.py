@@ -39,13 +39,15 @@ SYSTEM_FOLDERS = (
 )
 THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
     "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "ARROW_IO_THREADS",
 )
+SMALL_MATRICES = "OPENBLAS_NUM_THREADS"
+"""Always 1: NumPy's and SciPy's matrices are small here, and threads that wait for one another doubled the CPU time of stages.
+Sums in another order would also make results depend on the number of threads."""
 _LIBRARY_NAME = re.compile(r"libLLVM(?:-[\d.]+)?\.(?:so|dylib)[\d.]*$")
 _NAMED_VERSION = re.compile(r"libLLVM[-.](?:so\.)?(\d+)")
 # LLVMGetVersion exists from LLVM 16 on: its absence is the answer "older".
@@ -174,8 +176,8 @@ def limit_threads(count: int) -> None:
     """Let numerical libraries use `count` threads, the calling one included.
 
     Libraries that are not yet imported read it from environment variables, as do child processes; torch and pyarrow are set
-    directly if they are imported already. Dr.Jit reads no variable, so after prepare() it is imported here and set. An OpenBLAS
-    that NumPy has already started keeps its threads.
+    directly if they are imported already. Dr.Jit reads no variable, so after prepare() it is imported here and set. OpenBLAS has
+    one thread whatever `count` is (SMALL_MATRICES); one that NumPy has already started keeps its own.
 
     Raises:
         InputError: `count` is below 1.
@@ -184,6 +186,7 @@ def limit_threads(count: int) -> None:
         raise InputError(f"threads: found {count}, allowed is 1 or more")
     for variable in THREAD_VARIABLES:
         os.environ[variable] = str(count)
+    os.environ[SMALL_MATRICES] = "1"
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(count)
     if pyarrow := sys.modules.get("pyarrow"):

@@ -95,7 +95,7 @@ class Traced:
     @cached_property
     def radiance(self) -> np.ndarray:
         """(G, 3) the solution with this prior."""
-        return self.prior.solve(self.problem.rows).radiance
+        return self.prior.radiance(self.problem.rows)
 
     @cached_property
     def misfit(self) -> float:

@@ -86,11 +86,12 @@ class RadianceSums:
         row = np.concatenate([self._value, row])
         if not len(key):
             return
-        order = np.argsort(key, kind="stable")
-        starts = np.flatnonzero(np.r_[True, key[order][1:] != key[order][:-1]])
-        self._key = key[order][starts]
-        sums = np.add.reduceat(row[order], starts, 0)
-        sums[:, 4:7] = np.maximum.reduceat(row[order][:, 4:7], starts, 0)
+        self._key, voxel = np.unique(key, return_inverse=True)
+        sums = np.stack([np.bincount(voxel, column, len(self._key)) for column in row.T], 1)
+        order = np.flatnonzero(row[:, 7])  # bounds are few, and their largest is what counts
+        largest = np.zeros((len(self._key), 3))
+        np.maximum.at(largest, voxel[order], row[order, 4:7])
+        sums[:, 4:7] = largest
         self._value = sums
 
     def finish(self) -> RadianceVoxels:

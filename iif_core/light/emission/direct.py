@@ -16,6 +16,8 @@ from iif_core.light.emission.rows import EmissionRows
 
 TRUSTED_RELIABILITY = 1.5
 """Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
+RIDGE = 1e-4
+"""Weight of the initial value relative to the diagonal of the normal matrix."""
 _DAMPED_AFTER = 6  # rounds of re-weighting after which steps are halved (docs/method/numerics.md#answers-that-alternate)
 _CHUNK_BYTES = 1 << 24  # of float64 rows converted at a time
 SINGLE_WIDTH = 5.0
@@ -95,12 +97,17 @@ class EmissionPrior:
         """Solve with this prior, see `solve_emission`."""
         return solve_emission(rows, self.initial, max_rounds=max_rounds, prior_width=self.width, correlation=self.correlation)
 
+    def radiance(self, rows: EmissionRows, max_rounds: int = 20) -> np.ndarray:
+        """Return (G, 3) the radiance of `solve` alone, for about half of its cost."""
+        channels = _channels(rows, np.asarray(self.initial, np.float64), True, RIDGE, self.width, self.correlation)
+        return np.stack([channel.solve(max_rounds).radiance for channel in channels], 1) if channels else self.initial.copy()
+
 
 def solve_emission(
     rows: EmissionRows,
     initial: np.ndarray,
     cross: bool = True,
-    ridge: float = 1e-4,
+    ridge: float = RIDGE,
     max_rounds: int = 20,
     prior_width: float | np.ndarray = SINGLE_WIDTH,
     family: np.ndarray | None = None,
@@ -128,33 +135,52 @@ def solve_emission(
     Raises:
         InputError: `initial` of the wrong shape, negative or non-finite; non-finite rows.
     """
+    groups, initial = rows.groups, np.asarray(initial, np.float64)
+    channels = _channels(rows, initial, cross, ridge, prior_width, correlation)
+    if not channels:
+        return EmissionSolution(initial.copy(), initial.copy(), np.zeros(groups), 1.0, 0.0, 0, 0, True)
+    found = [channel.solve(max_rounds) for channel in channels]
+    errors = [channel.uncertainty(f.radiance, f.variance, family) for channel, f in zip(channels, found, strict=True)]
+    error, shares = zip(*errors, strict=True)
+    square, square_target = sum(f.square for f in found), sum(f.square_target for f in found)
+    residual = float(np.sqrt(square / square_target)) if square_target > 0 else 0.0
+    return EmissionSolution(
+        np.stack([f.radiance for f in found], 1),
+        np.stack(error, 1),
+        np.stack(shares, 1).min(1),
+        max(1.0, *(f.condition for f in found)),
+        residual,
+        sum(f.violated for f in found),
+        max(f.rounds for f in found),
+        all(f.converged for f in found),
+    )
+
+
+def _channels(
+    rows: EmissionRows,
+    initial: np.ndarray,
+    cross: bool,
+    ridge: float,
+    prior_width: float | np.ndarray,
+    correlation: np.ndarray | None,
+) -> list[_ChannelRows]:
+    """The checked system of each channel; none without groups or rows."""
     groups = rows.groups
-    initial = np.asarray(initial, np.float64)
     if initial.shape != (groups, 3) or not np.isfinite(initial).all() or (initial < 0).any():
         raise InputError(f"emission: initial radiance of shape {initial.shape}, needed ({groups}, 3), finite and >= 0")
     for name in ("matrix", "observed", "cached", "weight"):
         if not np.isfinite(getattr(rows, name)).all():
             raise InputError(f"emission rows: {name} holds non-finite values; drop those pixels first")
-    radiance, error, shares = initial.copy(), initial.copy(), np.zeros((groups, 3))
-    condition, violated, iterations, converged = 1.0, 0, 0, True
     if groups == 0 or len(rows.observed) == 0:
-        return EmissionSolution(radiance, error, shares.min(1) if groups else np.zeros(0), 1.0, 0.0, 0, 0, True)
-    square, square_target = 0.0, 0.0
+        return []
     matrices, targets = rows.matrices, rows.targets
     cluster = np.full(len(rows.observed), -1) if rows.cluster is None else rows.cluster
+    found = []
     for c in range(3):
         prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
         data = *(a[:, :, c] for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
-        channel = _ChannelRows(*data, cluster, rows.noise, *prior).solve(max_rounds, family)
-        radiance[:, c], error[:, c], shares[:, c] = channel.radiance, channel.error, channel.share
-        condition = max(condition, channel.condition)
-        violated += channel.violated
-        iterations = max(iterations, channel.rounds)
-        converged &= channel.converged
-        square += channel.square
-        square_target += channel.square_target
-    residual = float(np.sqrt(square / square_target)) if square_target > 0 else 0.0
-    return EmissionSolution(radiance, error, shares.min(1), condition, residual, violated, iterations, converged)
+        found.append(_ChannelRows(*data, cluster, rows.noise, *prior))
+    return found
 
 
 def solve_families(
@@ -186,7 +212,7 @@ def solve_families(
         matrix[:, :, :, member] += rows.matrix[:, :, :, group]
     shared = replace(rows, matrix=matrix)
     of_first = None if correlation is None else correlation[np.ix_(first, first)]
-    start = EmissionPrior(joint, prior.width[first], of_first).solve(shared).radiance[members]
+    start = EmissionPrior(joint, prior.width[first], of_first).radiance(shared)[members]
     together = size[members] > 1
     start = np.where(together[:, None], np.maximum(start, 0.1 * initial), initial)
     return solve_emission(rows, start, prior_width=np.where(together, width, prior.width), family=family, correlation=correlation)
@@ -241,8 +267,7 @@ def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class _Channel:
     radiance: np.ndarray
-    error: np.ndarray
-    share: np.ndarray
+    variance: np.ndarray
     condition: float
     violated: int
     rounds: int
@@ -396,7 +421,7 @@ class _ChannelRows:
             prior = each[:, None] * np.linalg.inv(self.correlation[pick]) * each
         return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
 
-    def solve(self, max_rounds: int, family: np.ndarray | None) -> _Channel:
+    def solve(self, max_rounds: int) -> _Channel:
         """Solve and re-weight until the answer rests, then once more with the prior weighed by the design effect."""
         bound, weight, target = self.bound, self.weight, self.mean_target
         mean_a = 0.5 * (self.first + self.second)
@@ -427,11 +452,9 @@ class _ChannelRows:
             converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
         difference = target - mean_a @ answer
         counted = np.where(bound & (difference < 0), 0.0, weight)
-        error, share = self._uncertainty(answer, variance, family)
         return _Channel(
             answer,
-            error,
-            share,
+            variance,
             condition,
             int((bound & (difference > 1e-6 * np.abs(target))).sum()),
             rounds,
@@ -465,7 +488,7 @@ class _ChannelRows:
         """`scores` of the known groups in units of the system's scale."""
         return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
 
-    def _uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def uncertainty(self, answer: np.ndarray, variance: np.ndarray, family: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(standard error of Eq. L.29 without the level, share of the answer that comes from data), both (G,)."""
         error, share = self.initial.copy(), np.zeros(len(answer))
         system = self.system(self.sure, np.zeros(len(self.target)), variance)

@@ -125,7 +125,7 @@ def estimate_object_gains(
     for _ in range(options.rounds):
         of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
         scaled = replace(rows, weight=weight).scaled(of_row, gloss_of_row)
-        radiance = prior.solve(scaled, max_rounds=5).radiance
+        radiance = prior.radiance(scaled, max_rounds=5)
         predicted = np.einsum("ngc,gc->nc", scaled.matrices.mean(0), radiance) + scaled.cached.sum(1).mean(0)
         weight = _relative_to(rows, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)

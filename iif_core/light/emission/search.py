@@ -110,7 +110,7 @@ class Candidates:
         every = self.problem.beside(self.reflecting.take(~keep[self.of_group]))
         part, prior = every.columns(keep, self.shown), self.prior.only(keep)
         solved, gains = part.solve_object_gains(prior, self.albedo, len(self.albedo.mean), QUICK)
-        radiance = prior.solve(solved.rows, QUICK.rounds).radiance
+        radiance = prior.radiance(solved.rows, QUICK.rounds)
         light = self.shown.copy()
         light[keep] = radiance
         # Unseen surface that a white one could match is no lamp: the rest of the light is wrong.

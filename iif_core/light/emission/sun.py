@@ -144,7 +144,7 @@ class SunQuestion:
         if sun is not None:
             prior = prior.beside(sun_prior(self.mean, self.solid_angle[sun].sum()))
         rows, gains = self._of(sun).solve_object_gains(prior, self.albedo, self.n_objects, QUICK)
-        radiance = prior.solve(rows.rows, QUICK.rounds).radiance
+        radiance = prior.radiance(rows.rows, QUICK.rounds)
         return Look(rows.misfit(radiance), radiance, gains)
 
     def misfit(self, look: Look, sun: np.ndarray | None = None) -> float:
