@@ -60,6 +60,7 @@ class ObjectLevels:
         light_gain: (O,) factor by which the light is brighter than computed, posterior mean (Eq. M.36).
         deviation: (O,) half the width of the central 68 % interval of its logarithm.
         pixels: (O,) usable pixels.
+        is_divided: discrepancies were divided between both; otherwise the photographs alone tell the levels.
     """
 
     base: np.ndarray
@@ -71,9 +72,11 @@ class ObjectLevels:
     light_gain: np.ndarray
     deviation: np.ndarray
     pixels: np.ndarray
+    is_divided: bool = True
 
     def facts(self) -> dict[str, object]:
-        """Return both errors, root mean squares over the pixels, and the mean square of the normalised discrepancy."""
+        """Return both errors, root mean squares over the pixels, the mean square of the normalised discrepancy, and whether
+        discrepancies were divided."""
         share = self.pixels / max(self.pixels.sum(), 1)
         # The variance of Student's t of four degrees of freedom is twice the square of its scale.
         away = self.discrepancy**2 / (2.0 * (self.light_error**2 + self.base_error**2))
@@ -81,6 +84,7 @@ class ObjectLevels:
             "base": float(np.sqrt(share @ self.base_error**2)),
             "light": float(np.sqrt(share @ self.light_error**2)),
             "normalised_discrepancy": float(share @ np.minimum(away, 10.0)),
+            "divided": self.is_divided,
         }
 
 
@@ -159,7 +163,7 @@ def measure_levels(
     is_told = px.unsaturated() >= opt.min_pixels
     pixels = np.where(is_told, px.usable, 0.0)
     smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
-    levels = compare_levels(base, shown, scatter, smooth, pixels)
+    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels)
     return replace(levels, light_gain=np.where(is_told, levels.light_gain, 1.0))
 
 
@@ -191,7 +195,12 @@ def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarr
 
 
 def compare_levels(
-    base: np.ndarray, shown: np.ndarray, scatter: np.ndarray, smooth: np.ndarray, pixels: np.ndarray
+    base: np.ndarray,
+    shown: np.ndarray,
+    scatter: np.ndarray,
+    smooth: np.ndarray,
+    pixels: np.ndarray,
+    base_tells_levels: bool = True,
 ) -> ObjectLevels:
     """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
 
@@ -202,6 +211,7 @@ def compare_levels(
         base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
         scatter: (O,) of the logarithm of the brightness over predictions; smooth: (O,) smooth error of the light.
         pixels: (O,) by which objects count.
+        base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
     base, shown, smooth = np.maximum(base, _DARKEST_LEVEL), np.maximum(shown, _DARKEST_LEVEL), np.maximum(smooth, _SMALLEST_ERROR)
@@ -213,8 +223,8 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, _BASE_FACTOR, _LIGHT_FACTOR, np.ones(3))
-    for of_base in _BASE_FACTORS:
-        for of_light in _LIGHT_FACTORS:
+    for of_base in _BASE_FACTORS if base_tells_levels else (_BASE_FACTOR,):
+        for of_light in _LIGHT_FACTORS if base_tells_levels else (_LIGHT_FACTOR,):
             own, light = of_base * scatter[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
             log_prior = -0.5 * (np.log(of_base / _BASE_FACTOR) / _BASE_FACTOR_WIDTH) ** 2
@@ -225,6 +235,9 @@ def compare_levels(
     _, of_base, of_light, gain = best
     discrepancy = np.log(shown.sum(1) / (base @ gain))
     base_error, light_error = of_base * scatter, of_light * smooth
+    if not base_tells_levels:
+        found = np.ones(len(base)), _T_INTERVAL * light_error
+        return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, *found, pixels, is_divided=False)
     _, mean, deviation = _divide(discrepancy, base_error, light_error)
     return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, np.exp(mean), deviation, pixels)
 

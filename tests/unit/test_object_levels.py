@@ -55,6 +55,18 @@ def test_claimed_deviations_hold_the_error():
     assert 0.6 < np.mean(inside) < 0.76
 
 
+def test_where_the_base_tells_no_levels_the_photographs_do():
+    """Nothing is divided, whatever the base says; the light keeps its whole error, which holds in 60 to 76 % of objects."""
+    inside = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        _, base, shown, smooth, log_light, _ = _room(rng, 40, 0.12, 0.5, kappa=1.5)
+        levels = compare_levels(base, shown, np.full(40, 0.1), smooth, np.full(40, 100.0), base_tells_levels=False)
+        assert (levels.light_gain == 1).all() and not levels.facts()["divided"]
+        inside.append(np.abs(log_light - np.mean(log_light)) < levels.deviation)
+    assert 0.6 < np.mean(inside) < 0.76
+
+
 def test_strong_disagreement_is_decided_by_the_smaller_claim():
     """A factor of three between both: the photographs are believed in steady light, the base where the light is uneven."""
     rng = np.random.default_rng(3)
@@ -120,10 +132,11 @@ _values = hnp.arrays(np.float64, (5, 3), elements=st.floats(1e-8, 1e6))
     scatter=hnp.arrays(np.float64, 5, elements=st.floats(0, 1e3)),
     smooth=hnp.arrays(np.float64, 5, elements=st.floats(0, 1e3)),
     pixels=hnp.arrays(np.float64, 5, elements=st.sampled_from([0.0, 1.0, 1e9])),
+    base_tells_levels=st.booleans(),
 )
-def test_any_levels_give_finite_gains(base, shown, scatter, smooth, pixels):
+def test_any_levels_give_finite_gains(base, shown, scatter, smooth, pixels, base_tells_levels):
     """No estimate, however far off, gives a factor that is not finite, or that goes beyond both estimates."""
-    levels = compare_levels(base, shown, scatter, smooth, pixels)
+    levels = compare_levels(base, shown, scatter, smooth, pixels, base_tells_levels)
     for array in (levels.light_gain, levels.deviation, levels.gain, levels.discrepancy):
         assert np.isfinite(array).all()
     assert (levels.light_gain > 0).all() and (levels.deviation >= 0).all()

@@ -102,6 +102,8 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
             robust_width=settings.robust_width,
             response_prior=prior,
             matte=matte,
+            # This prior read the brightness of objects from the same photographs (docs/results/real-scenes.md).
+            base_tells_levels=job.settings.prior.kind != "retinex",
             threads=job.threads,
         )
         return lambda problem, start: fit_affines(problem, start, options)
