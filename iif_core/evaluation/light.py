@@ -20,14 +20,20 @@ class LightSpread:
     def __init__(self) -> None:
         self.sums = np.zeros((0, 3))  # pixels, L, P
 
-    def add(self, true: NDArray, predicted: NDArray, object_id: NDArray) -> None:
-        """Add the pixels of one view: linear radiance (n, 3) and (n, 3), object (n,) int >= 0; non-finite pixels are left out."""
+    def add(self, true: NDArray, predicted: NDArray, object_id: NDArray, shown: NDArray | None = None) -> None:
+        """Add pixels of one view: linear radiance (n, 3) and (n, 3), object (n,) int >= 0; non-finite pixels are left out of
+        the sums.
+
+        shown: (k,) objects of all pixels of the view, where light is known for some of them alone; None = `object_id`.
+        """
         use = np.isfinite(true).all(-1) & np.isfinite(predicted).all(-1)
         own = np.asarray(object_id, np.int64)[use]
-        count = max(len(self.sums), int(own.max(initial=-1)) + 1)
+        every = own if shown is None else np.asarray(shown, np.int64)
+        count = max(len(self.sums), int(own.max(initial=-1)) + 1, int(every.max(initial=-1)) + 1)
         sums = np.zeros((count, 3))
         sums[: len(self.sums)] = self.sums
-        for i, values in enumerate((None, true[use].mean(-1, dtype=np.float64), predicted[use].mean(-1, dtype=np.float64))):
+        sums[:, 0] += np.bincount(every, minlength=count)
+        for i, values in enumerate((true[use].mean(-1, dtype=np.float64), predicted[use].mean(-1, dtype=np.float64)), 1):
             sums[:, i] += np.bincount(own, values, count)
         self.sums = sums
 

@@ -134,7 +134,7 @@ def test_as_found_is_the_truth_and_light_adds_up(toy):
     from PIL import Image
 
     assert Image.open(folder / "found/frame_0000.png").size == (40, 32)
-    assert Image.open(folder / "contact_sheet.png").size == (48, 4 * 36 + 4)
+    assert Image.open(folder / "contact_sheet.png").size == (48, 4 * (relight.CAPTION + 36) + 4)
 
 
 def test_flight_denoised_and_lamp_that_moves(toy):

@@ -23,6 +23,7 @@ from workflow.registry import STAGES
 from workflow.report import pictures as pic
 from workflow.report.page import number, score_table
 from workflow.runtime.timings import read_timings
+from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
 from workflow.scene.recovered import read_recovered, read_response, response_samples
 from workflow.stages import export, metrics, publish, render, report
@@ -205,9 +206,10 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job = FakeJob("shading", root)
     for view, p, _, _ in seen:
         light = np.repeat(1 + 0.3 * p[:, :1], 3, 1).reshape(HEIGHT, WIDTH, 3).astype(np.float32)
-        layers = {layer: np.zeros_like(light) for layer in ("s0.00", "s0.01", "s1.00", "s1.01")} | {"diffuse": light}
-        halves = (split_rgb(value, f"half{half}.{layer}") for half in range(2) for layer, value in layers.items())
+        halves = (split_rgb(light, f"half{half}.diffuse") for half in range(2))
         job.writer.exr(f"maps/{view.name}.exr", {name: value for half in halves for name, value in half.items()})
+        dark = np.zeros((2, HEIGHT * WIDTH, 2, 3), np.float32)
+        job.writer.table(table_of(view), SpecularLight(np.arange(HEIGHT * WIDTH), dark, dark).columns())
     job.writer.table("levels.parquet", {"level": np.arange(2, dtype=np.int32), "roughness": [0.02, 1.0]})
     job.writer.json("shading.json", {"diffuse": {"cell_edge_m": 0.1}, "plan": []})
     job.writer.finish()

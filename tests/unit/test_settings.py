@@ -28,6 +28,39 @@ def scene(tmp_path):
     return write
 
 
+@pytest.mark.parametrize(
+    ("text", "pixels"),
+    [
+        ("affines: {pixels: 5000}", 5000),
+        ("affines: {model: object_mean}", 200_000),
+        ("affines: {texture: photographs}", "all"),
+        ("affines: {model: fipt}", "all"),
+        ("shading: {pixels: all}", "all"),
+        ("shading: {pixels: 300000}", 300_000),
+    ],
+)
+def test_what_is_read_decides_where_specular_light_is_traced(scene, text, pixels):
+    assert settings.load("x", "draft", scene(f"{GOOD}{text}\n")).shading.pixels == pixels
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("shading: {pixels: 1000}\naffines: {pixels: 5000}", ["`shading: pixels` is 1000", "reads 5000", "at least `5000`"]),
+        ("shading: {pixels: 1000}\naffines: {model: iris}", ["`shading: pixels` is 1000", "model: iris", "`all`"]),
+        ("shading: {pixels: 1000}\naffines: {texture: photographs}", ["texture from the photographs reads every pixel"]),
+        ("shading: {pixels: some}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "some"]),
+        ("shading: {pixels: 5}", ["shading.pixels", "'auto', 'all' or a whole number of at least 100", "found 5"]),
+        ("shading: {pixels: true}", ["'auto', 'all' or a whole number of at least 100"]),
+    ],
+)
+def test_pixels_of_specular_light_that_cannot_be(scene, text, words):
+    with pytest.raises(InputError) as caught:
+        settings.load("x", "draft", scene(f"{GOOD}{text}\n"))
+    assert all(word in str(caught.value) for word in words), caught.value
+    assert "constrained" not in str(caught.value)
+
+
 def test_scene_over_preset_over_default(scene):
     root = scene(GOOD + "shading: {samples: 7}\n", "shading: {samples: 5, levels: 4}\n")
     got = settings.load("x", "draft", root)

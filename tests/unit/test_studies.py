@@ -121,13 +121,13 @@ common: {base: {predictions: 2}, affines: {robust_width: 0.2}}
 variants:
   first: {}
   same: {row: prior_k0}
-  other: {overrides: {affines: {model: fipt}}}
+  other: {overrides: {affines: {model: object_mean}}}
   far: {overrides: {base: {ridge: 0.5}, affines: {robust_width: 0.3}}}
 """
 
 
 def test_variants_share_what_an_earlier_one_made(folder):
-    folder("studies/late", LATE)
+    folder("studies/late", LATE.replace("  far:", "  every: {overrides: {affines: {model: fipt}}}\n  far:"))
 
     def home(variant, seed, stage):
         return fp.home(stage, f"t--late-{variant}-s{seed}", "draft")
@@ -140,6 +140,9 @@ def test_variants_share_what_an_earlier_one_made(folder):
             assert home("other", seed, stage) == f"t--late-first-s{seed}"
         for stage in ("affines", "render", "metrics"):
             assert home("other", seed, stage) == f"t--late-other-s{seed}"
+        # It reads the light of every pixel.
+        assert home("every", seed, "emission") == f"t--late-first-s{seed}"
+        assert home("every", seed, "shading") == f"t--late-every-s{seed}"
         assert home("far", seed, "capture") == "t--s0" and home("far", seed, "base") == f"t--late-far-s{seed}"
     assert settings.load("t--late-far-s0").base.predictions == 2 and settings.load("t--late-far-s0").affines.robust_width == 0.3
     # What depends on the variant but not on the seed is made once.
@@ -157,7 +160,7 @@ def test_variants_share_what_an_earlier_one_made(folder):
         (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
         (LATE.replace("predictions: 2}", "predictions: 0}"), ["late.yaml, `common`", "`base.predictions`: found 0"]),
         (
-            LATE.replace("model: fipt", "model: fipt, solver: sgd"),
+            LATE.replace("model: object_mean", "model: fipt, solver: sgd"),
             ["late.yaml, variant other", "`solver: sgd` does not fit `model: fipt`"],
         ),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -135,7 +136,8 @@ class StubJob:
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
         self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
         self.document = {"seed": seed}
-        self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in settings.items()})
+        known = {"prior": {"kind": "simulated"}, **settings}
+        self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
         self.log = logging.getLogger(stage)
         provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}
         self.writer = StageWriter(folder / stage, provenance)
@@ -166,11 +168,12 @@ def build(
     bounces: int = 10,
     retouch: Callable[[int, np.ndarray], np.ndarray] | None = None,
     truth: bool = False,
+    held_out: tuple[int, ...] = (),
 ) -> Room:
     """Write capture, segmentation and base; `spoil` is the size of the affine errors of the base texture.
 
     `sky`: radiance of what is outside the mesh, one number or a map (H, W, 3); `retouch(view, image)`: the photograph
-    as it is stored.
+    as it is stored; `held_out`: numbers of views that nothing is fitted to.
     """
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry, trace
@@ -183,6 +186,7 @@ def build(
     rng = np.random.default_rng(seed + 1)
     exposures = np.ones(views) if exposures is None else exposures
     cameras = room.views(views, size, exposures)
+    cameras = [replace(view, split="test") if i in held_out else view for i, view in enumerate(cameras)]
     geometry = build_geometry(room.vertices, room.faces, room.object_id, room.transmittance)
     scanned = build_geometry(room.vertices, room.faces, room.object_id)
     material = FaceMaterials(room.material)
@@ -324,6 +328,7 @@ EMISSION = {
     "iterations": 2000,
 }
 SHADING = {
+    "pixels": "all",
     "samples": 32,
     "levels": 10,
     "cell_edge": 0.05,

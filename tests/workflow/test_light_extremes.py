@@ -20,13 +20,13 @@ STAGES = {
 }
 
 
-def _run(folder, dynamic_range, upto="metrics", **emission_settings):
+def _run(folder, dynamic_range, upto="metrics", pixels="all", **emission_settings):
     """The stages with few samples; every artefact is checked as it is read back."""
     settings = {
         "capture": {"dynamic_range": dynamic_range},
         "emission": {**EMISSION, "rows": 2000, "samples": 4, **emission_settings},
-        "shading": {**SHADING, "samples": 4, "levels": 5, "max_samples": 32},
-        "affines": {**AFFINES, "iterations": 20},
+        "shading": {**SHADING, "pixels": pixels, "samples": 4, "levels": 5, "max_samples": 32},
+        "affines": {**AFFINES, "iterations": 20, **({} if pixels == "all" else {"pixels": pixels})},
         "render": {"samples": 8, "max_bounces": 8, "denoise": False},
         "metrics": {"views": "all", "lpips_vgg": False},
         "export": {"max_faces_glb": 100_000},
@@ -160,6 +160,17 @@ def test_hard_room(tmp_path, llvm):
     assert _fitted(found, room, "metal")[0][:, :3].max() < 0.1
     assert _fitted(found, room, "wall_b")[0][:, 3].mean() > 0.6 > 0.4 > _fitted(found, room, "glossy")[0][:, 3].mean()
     assert _fitted(found, room, "inside")[1].startswith(("population", "identity"))
+
+
+@pytest.mark.parametrize("pixels", ["all", 400])
+def test_views_that_are_held_out(tmp_path, llvm, pixels):
+    """No specular light is traced for them, and every stage goes on."""
+    build(tmp_path, truth=True, views=4, size=24, samples=16, held_out=(1,))
+    _run(tmp_path, "hdr", upto="report" if pixels == "all" else "metrics", pixels=pixels)
+    shading = StubJob("reader", tmp_path, {}).read("shading")
+    traced = [shading.rows(f"pixels/v{i:03d}.parquet") for i in range(4)]
+    assert traced[1] == 0 and min(traced[:1] + traced[2:]) > 0
+    assert 0 < StubJob("reader", tmp_path, {}).read("affines").json("affines.json")["pixels"] <= sum(traced)
 
 
 @pytest.mark.long

@@ -84,7 +84,9 @@ def test_tables_and_maps_are_complete(hdr):
     objects = _reader(folder, "affines").table("objects.parquet")
     assert objects["T_albedo"].shape == (len(room.names), 12) and (objects["std_albedo"] >= 0).all()
     channels = _reader(folder, "shading").exr("maps/v000.exr")
-    assert {"half0.diffuse.R", "half1.s0.09.B", "half1.s1.00.G"} <= set(channels)
+    assert {f"half{h}.diffuse.{c}" for h in range(2) for c in "RGB"} == set(channels)
+    specular = _reader(folder, "shading").table("pixels/v000.parquet")
+    assert specular["half1_s0"].shape == specular["half0_s1"].shape == (len(specular["index"]), 30)
     levels = _reader(folder, "shading").table("levels.parquet")["roughness"]
     assert levels[0] == pytest.approx(0.02) and levels[-1] == 1 and (np.diff(levels) > 0).all()
     facts = _reader(folder, "affines").json("affines.json")
@@ -101,6 +103,25 @@ def test_halves_are_independent(hdr):
     lit = (first > 0) & (second > 0)
     assert abs(np.log(first[lit].mean() / second[lit].mean())) < 0.05
     assert not np.array_equal(first, second)
+
+
+def test_specular_light_is_traced_where_the_fit_reads_it(hdr):
+    """A draw of 600 pixels: no more are traced, evenly over the objects, and the fit has exactly these."""
+    folder, _ = hdr
+    every = _reader(folder, "shading")
+    diffuse = every.exr("maps/v000.exr")["half0.diffuse.G"]
+    try:
+        _run(folder, "hdr", upto="affines", shading={"pixels": 600}, affines={**AFFINES, "pixels": 600})
+        drawn = _reader(folder, "shading")
+        count = sum(drawn.rows(name) for name in drawn.names("pixels/"))
+        assert count == drawn.json("shading.json")["specular"]["pixels"] and 500 < count < 800
+        of_objects = _reader(folder, "affines").table("objects.parquet")["pixels"]
+        assert count == _reader(folder, "affines").json("affines.json")["pixels"] == of_objects.sum()
+        largest = np.sort(of_objects)[-4:]
+        assert largest.min() > 0.6 * largest.max()
+        assert ((drawn.exr("maps/v000.exr")["half0.diffuse.G"] > 0) == (diffuse > 0)).all()
+    finally:
+        _run(folder, "hdr")
 
 
 def test_same_bytes_twice(hdr):

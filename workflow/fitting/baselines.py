@@ -20,7 +20,7 @@ from iif_core.fitting.baselines.loss import FIPT, IRIS, CellFit, albedo_deviatio
 from iif_core.fitting.baselines.problem import DARK, CellSums, PixelRows
 from iif_core.fitting.baselines.texture import AlbedoSums, BlockLight, blocks_of
 from iif_core.reflectance.material import CHANNELS, IDENTITY, NEUTRAL, NUMBERS_OF
-from workflow.artifacts.store import ids_from_disk, rgb, split_rgb
+from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
@@ -34,8 +34,10 @@ from workflow.scene.base_scene import (
     sensor_bounds,
     view_pixels,
 )
+from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import object_names, write_response
+from workflow.settings.affines import FREE_CELLS
 
 BORDER_WEIGHT = 0.1
 """Weight of a pixel on the border of an object."""
@@ -73,7 +75,7 @@ def run(job: Job) -> None:
     mixed = light.emits | scene.is_sheer
     if model == "texture_average":
         result = _texture_average(job, capture, scene, mixed)
-    elif model in ("fipt", "iris"):
+    elif model in FREE_CELLS:
         result = _free_cells(job, capture, scene, mixed, model)
     else:
         result = _given(job, capture, scene, model)
@@ -144,7 +146,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene, mixed: 
             for c in range(3):
                 sums[:, c] += np.bincount(row, radiance[:, c], len(sums))
             sums[:, 3] += np.bincount(row, minlength=len(sums))
-        lit.append((cell, _mean_of_halves(job.read("shading").exr(f"maps/{view.name}.exr"), "diffuse", pixels.index), radiance))
+        lit.append((cell, read_diffuse(job, view).mean(0).reshape(-1, 3)[pixels.index], radiance))
     of_object = objects[:, :3] / np.maximum(objects[:, 3:], 1)
     of_cell = np.where(cells[:, 3:] > 0, cells[:, :3] / np.maximum(cells[:, 3:], 1), of_object[scene.cell_object])
     across = sum(float((of_cell[cell] * light * radiance).sum()) for cell, light, radiance in lit)
@@ -254,13 +256,13 @@ class CellPixels:
             pixels = view_pixels(job, capture, self.scene, view)
             cell = cells_of(job, view)[pixels.index]
             use = pixels.valid & (cell >= 0) & ~self.mixed[pixels.face]
-            channels = job.read("shading").exr(f"maps/{view.name}.exr")
-            d = _denoised(channels, view, pixels)[use] if diffuse is None else np.zeros(0)
+            d = _denoised(read_diffuse(job, view), view, pixels)[use] if diffuse is None else np.zeros(0)
             pixels, cell = pixels.take(use), cell[use]
             block = self.block_of[cell]
-            levels = self.levels if diffuse is not None else 0
-            s0, s1 = (_lobes(channels, name, levels, pixels.index) for name in ("s0", "s1"))
-            d = d if diffuse is None else diffuse[block]
+            s0 = s1 = np.zeros((len(cell), 0, 3), np.float32)
+            if diffuse is not None:
+                specular = read_specular(job, view).at(pixels.index)
+                s0, s1, d = specular.s0.mean(0), specular.s1.mean(0), diffuse[block]
             value = np.asarray(pixels.value, np.float32)
             value, saturated = sensor_bounds(value, capture.is_hdr, job.settings.emission.saturation)
             exposure, balance = exposure_and_balance(capture, gains, view, pixels.index)
@@ -272,26 +274,12 @@ class CellPixels:
             job.progress(done + 1, len(views), "views read")
 
 
-def _denoised(channels: dict[str, np.ndarray], view: View, pixels: ViewPixels) -> np.ndarray:
-    """Return the denoised diffuse light of pixels, (n, 3), as FIPT does; a free albedo would keep all noise of the light."""
+def _denoised(light: np.ndarray, view: View, pixels: ViewPixels) -> np.ndarray:
+    """Return the denoised diffuse light (2, H, W, 3) of pixels, (n, 3), as FIPT does; a free albedo would keep all its noise."""
     normals = np.zeros((view.height * view.width, 3), np.float32)
     normals[pixels.index] = pixels.normals
     shape = (view.height, view.width, 3)
-    both = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
-    return denoise(both, np.ones(shape, np.float32), normals.reshape(shape)).reshape(-1, 3)[pixels.index]
-
-
-def _mean_of_halves(channels: dict[str, np.ndarray], layer: str, index: np.ndarray) -> np.ndarray:
-    """Return the mean over the halves of a cached layer at some pixels, (n, 3)."""
-    halves = [rgb(channels, f"half{half}.{layer}").reshape(-1, 3)[index] for half in range(2)]
-    return 0.5 * (halves[0] + halves[1])
-
-
-def _lobes(channels: dict[str, np.ndarray], name: str, levels: int, index: np.ndarray) -> np.ndarray:
-    """Return S0 or S1 of some pixels, (n, J, 3)."""
-    if not levels:
-        return np.zeros((len(index), 0, 3), np.float32)
-    return np.stack([_mean_of_halves(channels, f"{name}.{j:02d}", index) for j in range(levels)], 1)
+    return denoise(light.mean(0), np.ones(shape, np.float32), normals.reshape(shape)).reshape(-1, 3)[pixels.index]
 
 
 def _joined(parts: list[PixelRows]) -> PixelRows:

@@ -7,9 +7,10 @@ import numpy as np
 from iif_core.evaluation.light import LightSpread
 from iif_core.evaluation.metrics import Score
 from iif_core.reflectance.brdf import compose, kd_ks
-from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.artifacts.store import ids_from_disk
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene
+from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader, View
 
 
@@ -30,26 +31,27 @@ def light_error(job: Job, capture: CaptureReader) -> list[Score]:
 
 def _pixels(
     job: Job, capture: CaptureReader, view: View, sheer: np.ndarray, levels: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True radiance and that of the true materials under the computed light, (n, 3) each, and objects (n,)."""
-    file, truth = f"maps/{view.name}.exr", capture.truth(view)
-    channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """True radiance and that of the true materials under the computed light, (n, 3) each, and objects (n,), where specular light
+    was traced; and the objects of all pixels that count."""
+    truth, maps = capture.truth(view), job.read("segmentation").exr(f"maps/{view.name}.exr")
     face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
     use = truth.valid & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~sheer[np.maximum(face, 0)]
     use &= ~truth.emission.any(-1)
+    traced = read_specular(job, view)
+    some = traced.index[use.ravel()[traced.index]]
+    specular = traced.at(some)
 
-    def both(layer: str) -> np.ndarray:
-        return 0.5 * (rgb(channels, f"half0.{layer}")[use] + rgb(channels, f"half1.{layer}")[use])
+    def flat(image: np.ndarray) -> np.ndarray:
+        return image.reshape(use.size, *image.shape[2:])[some]
 
-    r = np.clip(truth.roughness[use], levels[0], levels[-1])
+    r = np.clip(flat(truth.roughness), levels[0], levels[-1])
     lower = np.clip(np.searchsorted(levels, r, side="right") - 1, 0, len(levels) - 2)
     upper = ((r - levels[lower]) / (levels[lower + 1] - levels[lower]))[:, None]
+    row = np.arange(len(some))
     lobes = []
-    for name in ("s0", "s1"):
-        value = np.zeros((len(r), 3))
-        for j in range(len(levels)):
-            weight = np.where(lower == j, 1 - upper[:, 0], np.where(lower == j - 1, upper[:, 0], 0.0))
-            value += weight[:, None] * both(f"{name}.{j:02d}")
-        lobes.append(value)
-    predicted = compose(*kd_ks(truth.albedo[use], truth.metallic[use][:, None]), both("diffuse"), *lobes)
-    return truth.radiance[use], predicted, object_id[use]
+    for cached in (specular.s0.mean(0), specular.s1.mean(0)):
+        lobes.append((1 - upper) * cached[row, lower] + upper * cached[row, lower + 1])
+    material = kd_ks(flat(truth.albedo), flat(truth.metallic)[:, None])
+    predicted = compose(*material, flat(read_diffuse(job, view).mean(0)), *lobes)
+    return flat(truth.radiance), predicted, flat(object_id), object_id[use]

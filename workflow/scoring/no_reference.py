@@ -12,6 +12,7 @@ from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from workflow.artifacts.store import ids_from_disk, rgb
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene
+from workflow.scene.cached_light import read_diffuse
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.scores import prediction_numbers
 
@@ -70,8 +71,7 @@ def _scores(left: ShadingLeft, spread: ViewSpread) -> list[Score]:
 def _light(job: Job, capture: CaptureReader, view: View, mixed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Diffuse light (H, W, 3), which pixels count (H, W), and object (H, W)."""
     file = f"maps/{view.name}.exr"
-    channels, maps = job.read("shading").exr(file), job.read("segmentation").exr(file)
-    light = 0.5 * (rgb(channels, "half0.diffuse") + rgb(channels, "half1.diffuse"))
+    light, maps = read_diffuse(job, view).mean(0), job.read("segmentation").exr(file)
     face, object_id = capture.gbuffer(view)[1], ids_from_disk(maps["object.id"])
     use = capture.photo(view)[1] & (face >= 0) & (object_id >= 0) & (maps["interior"] > 0.5) & ~mixed[np.maximum(face, 0)]
     brightness = light.mean(-1)

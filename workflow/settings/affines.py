@@ -12,9 +12,16 @@ from workflow.settings.section import Section
 
 _DIRECT, _DESCENT = FitOptions(), SgdOptions()
 _BASELINES = ("base", "object_mean", "texture_average", "fipt", "iris")
+FREE_CELLS = ("fipt", "iris")
+"""Models that read every pixel."""
 _DIRECT_ALONE = ("iterations", "population", "robust_width")
 _DESCENT_ALONE = ("epochs", "batch", "rate")
 _OBJECTS_ALONE = (*_DIRECT_ALONE, *_DESCENT_ALONE, "scale", "texture")  # `pixels` too, but it comes with a quality
+
+
+def textures_cells(texture: str, prior_kind: str) -> bool:
+    """Return whether `affines.texture` asks for texture from the photographs, with the prior of a kind."""
+    return texture == "photographs" or (texture == "auto" and prior_kind == "retinex")
 
 
 class ResponseFile(Section):

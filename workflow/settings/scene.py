@@ -6,7 +6,7 @@ from typing import Any, get_args
 
 from pydantic import Field, field_validator, model_validator
 
-from workflow.settings.affines import Affines
+from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import Emission, Shading
 from workflow.settings.outputs import Export, Metrics, Render, Report
@@ -52,6 +52,20 @@ class SceneSettings(Section):
             raise ValueError(
                 f"`base: predictions` is {used}, but `prior: samples` makes {made}; lower the one or raise the other"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _lit_pixels(self) -> SceneSettings:
+        """Put the number, or `all`, in the place of `shading: {pixels: auto}`: what is traced follows from what is read."""
+        textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
+        every = textured or self.affines.model in FREE_CELLS
+        asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
+        if asked == "auto":
+            object.__setattr__(self, "shading", self.shading.model_copy(update={"pixels": needed}))
+        elif asked != "all" and (every or asked < self.affines.pixels):
+            reader = "texture from the photographs" if textured else f"`affines: model: {self.affines.model}`"
+            why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
+            raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
         return self
 
 

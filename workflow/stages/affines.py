@@ -15,7 +15,6 @@ from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import level_deviation, prediction_scatter
-from iif_core.fitting.pixels import fair_shares
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
@@ -25,6 +24,7 @@ from workflow.decisions import camera, materials
 from workflow.decisions.record import Decision
 from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
+from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.fitting.inputs import balanced, cells_of, exposure_and_balance, roughness_levels
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
@@ -35,14 +35,10 @@ from workflow.scene.base_scene import (
     sensor_bounds,
     view_pixels,
 )
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.cached_light import read_diffuse, read_specular
+from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names, write_response
 from workflow.settings.affines import KnownLamp
-
-THIN_PIXELS = 50
-"""Objects with fewer interior pixels are fitted with their border pixels too, which mix with the neighbouring surface."""
-_STREAM = 0x616666
-"""Random stream of this stage."""
 
 
 def run(job: Job) -> None:
@@ -214,26 +210,6 @@ def _starting_response(job: Job) -> tuple[Response, tuple[np.ndarray, np.ndarray
     return start, (start.params.ravel(), np.linalg.inv(np.asarray(known["covariance"], np.float64))), known
 
 
-@dataclass(frozen=True)
-class _Chosen:
-    """Pixels of one view that enter the fit."""
-
-    index: np.ndarray
-    object_id: np.ndarray
-    value: np.ndarray
-
-
-def _eligible(
-    job: Job, capture: CaptureReader, scene: BaseScene, view: View, mixed: np.ndarray, thin: np.ndarray | None = None
-) -> _Chosen:
-    """Return the valid pixels of faces that are not `mixed` (m,) bool, as emitters are: interior ones, and all of those of `thin`
-    objects (O,) bool."""
-    pixels = view_pixels(job, capture, scene, view)
-    use = pixels.valid & (pixels.object_id >= 0) & ~mixed[pixels.face]
-    use &= pixels.interior if thin is None else pixels.interior | thin[np.maximum(pixels.object_id, 0)]
-    return _Chosen(pixels.index[use], pixels.object_id[use], pixels.value[use])
-
-
 def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
@@ -241,28 +217,26 @@ def _problem(
     views = capture.used
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
-        counts += np.bincount(_eligible(job, capture, scene, view, mixed).object_id, minlength=len(counts))
-    thin = counts < THIN_PIXELS
-    share = fair_shares(counts, job.settings.affines.pixels)
-    shading, levels = job.read("shading"), roughness_levels(job)
+        counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
+    drawn = FitPixels.evenly(counts, job.settings.affines.pixels, mixed, job.seed)
+    levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
     for done, view in enumerate(views):
-        chosen = _eligible(job, capture, scene, view, mixed, thin)
-        rng = np.random.default_rng([job.seed, _STREAM, view.view_id])
-        keep = rng.random(len(chosen.index)) < share[chosen.object_id]
-        index = chosen.index[keep]
-        rows["object"].append(chosen.object_id[keep])
+        pixels, specular = view_pixels(job, capture, scene, view), read_specular(job, view)
+        pixels = pixels.take(drawn.of(pixels, view))
+        index = pixels.index
+        rows["object"].append(pixels.object_id)
         rows["base"].append(base_maps(job, view)[index])
-        rows["value"].append(chosen.value[keep])
+        rows["value"].append(pixels.value)
         exposure, balance = exposure_and_balance(capture, gains, view, index)
         rows["exposure"].append(exposure)
         rows["view"].append(np.full(len(index), view.view_id, np.int32))
         rows["index"].append(index.astype(np.int32))
         rows["cell"].append(cells_of(job, view)[index])
-        channels = shading.exr(f"maps/{view.name}.exr")
+        specular, diffuse = specular.at(index), read_diffuse(job, view).reshape(2, -1, 3)[:, index]
         for half in range(2):
-            for layer, part in enumerate(_cached(channels, half, len(levels), index)):
+            for layer, part in enumerate((diffuse[half], specular.s0[half], specular.s1[half])):
                 cached[half][layer].append(balanced(part, balance))
         job.progress(done + 1, len(views), "views read")
     joined = {name: np.concatenate(parts) for name, parts in rows.items()}
@@ -302,18 +276,6 @@ def _scatter(job: Job, n_objects: int) -> np.ndarray:
     mean = np.stack([means[f"albedo_{c}"] for c in "rgb"], 1)[:n_objects]
     seen = owner >= 0
     return prediction_scatter(affine.reshape(-1, samples, 3, 4)[seen], weight[seen], owner[seen], mean)
-
-
-def _cached(
-    channels: dict[str, np.ndarray], half: int, levels: int, index: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return D (n, 3), S0 and S1 (n, J, 3) of some pixels in one half of the cache."""
-
-    def read(layer: str) -> np.ndarray:
-        return np.stack([channels[f"half{half}.{layer}.{c}"].reshape(-1)[index] for c in "RGB"], -1)
-
-    lobes = [np.stack([read(f"{name}.{j:02d}") for j in range(levels)], 1) for name in ("s0", "s1")]
-    return read("diffuse"), lobes[0], lobes[1]
 
 
 # ------------------------------------------------------------------------------------------------------------- output

@@ -33,6 +33,7 @@ _SEEDS = 0x72656C69  # keeps the random streams of this stage apart from those o
 MAP_ROWS = 128
 """Environment files are averaged down to at most this many rows."""
 SHEET_COLUMNS = 6  # frames of each relighting on the contact sheet
+CAPTION = 16  # pixels above each of its rows for a name
 
 
 def run(job: Job) -> None:
@@ -48,7 +49,7 @@ def run(job: Job) -> None:
         made, pictures = _relight(job, capture, scene, curve, up, number, _settings(entry))
         facts.append(made)
         shown = np.unique(np.linspace(0, len(pictures) - 1, min(SHEET_COLUMNS, len(pictures))).round().astype(int))
-        sheet.append([pictures[i] for i in shown])
+        sheet.append((made["name"], [pictures[i] for i in shown]))
     job.writer.bytes("contact_sheet.png", _png(_sheet(sheet)))
     job.writer.json("relight.json", {"relightings": facts, "up": up.tolist()})
 
@@ -200,16 +201,19 @@ def _png(picture: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def _sheet(rows: list[list[np.ndarray]], gap: int = 4) -> np.ndarray:
-    """One row for each relighting, on white."""
-    height = sum(max(p.shape[0] for p in row) + gap for row in rows) + gap
-    width = max(sum(p.shape[1] + gap for p in row) for row in rows) + gap
-    out = np.full((height, width, 3), 255, np.uint8)
+def _sheet(rows: list[tuple[str, list[np.ndarray]]], gap: int = 4) -> np.ndarray:
+    """One row for each relighting, on white, under its name."""
+    from PIL import Image, ImageDraw
+
+    heights = [CAPTION + max(p.shape[0] for p in pictures) + gap for _, pictures in rows]
+    width = max(sum(p.shape[1] + gap for p in pictures) for _, pictures in rows) + gap
+    sheet = Image.new("RGB", (width, sum(heights) + gap), "white")
     y = gap
-    for row in rows:
+    for (name, pictures), height in zip(rows, heights, strict=True):
+        ImageDraw.Draw(sheet).text((gap, y), name, fill="black")
         x = gap
-        for picture in row:
-            out[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
+        for picture in pictures:
+            sheet.paste(Image.fromarray(np.ascontiguousarray(picture)), (x, y + CAPTION))
             x += picture.shape[1] + gap
-        y += max(p.shape[0] for p in row) + gap
-    return out
+        y += height
+    return np.asarray(sheet)

@@ -12,6 +12,7 @@ from iif_core.surface.cells import grid_origin
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
 from workflow.artifacts.store import split_rgb
 from workflow.decisions import light as decisions
+from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,
@@ -21,6 +22,7 @@ from workflow.scene.base_scene import (
     read_radiance_cache,
     view_pixels,
 )
+from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from iif_core.light.transport.scene import Scene
 
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
+UNITS = {f"half{half}_{lobe}": "relative" for half in range(2) for lobe in ("s0", "s1")}
 COVERAGE_RAYS = 8192  # by which the share of surface that the radiance cache knows is measured
 
 
@@ -42,33 +45,40 @@ def roughness_levels(count: int) -> np.ndarray:
 
 
 def run(job: Job) -> None:
-    """Write maps/<view>.exr with two independent halves of the integrals (0 where nothing was hit), levels.parquet and
-    shading.json."""
+    """Write maps/<view>.exr with the diffuse integral of every pixel (0 where nothing was hit), pixels/<view>.parquet with the
+    specular integrals of the pixels that are read, both in two independent halves, levels.parquet and shading.json."""
     from iif_core.light.transport.scene import Scene
 
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     levels = roughness_levels(job.settings.shading.levels)
-    cells = _cells(job, capture, scene)
+    mixed = light.emits | scene.is_sheer
+    cells, counts = _cells(job, capture, scene, mixed)
+    pixels = job.settings.shading.pixels
+    drawn = None if pixels == "all" else FitPixels.evenly(counts, int(pixels), mixed, job.seed)
     # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
-    decision = _indirect(job, geometry, cache, light.emits | scene.is_sheer, cells)
+    decision = _indirect(job, geometry, cache, mixed, cells)
     world = Scene(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
     with job.timed("diffuse"):
         diffuse = _diffuse(job, world, cells)
     with job.timed("specular"):
-        _views(job, capture, scene, world, levels, cells, diffuse)
+        traced = _views(job, capture, scene, world, levels, cells, diffuse, drawn)
     job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
-    job.writer.json("shading.json", {"diffuse": _facts(cells, diffuse), "plan": [decision]})
+    job.writer.json("shading.json", {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [decision]})
 
 
-def _cells(job: Job, capture: CaptureReader, scene: BaseScene) -> ShadingCells:
+def _cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> tuple[ShadingCells, np.ndarray]:
+    """Cells of all views; and how many pixels of each object may enter the fit, (O,)."""
     edge = job.settings.shading.cell_edge
     builder = ShadingCellBuilder(edge, grid_origin(scene.vertices[scene.faces.ravel()], edge))
+    counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in capture.views:
         pixels = view_pixels(job, capture, scene, view)
         builder.add(pixels.points, pixels.normals, pixels.object_id, _seed(job, view.view_id))
-    return builder.finish()
+        if view.split != "test":
+            counts += count_eligible(pixels, mixed, scene.n_objects)
+    return builder.finish(), counts
 
 
 def _indirect(
@@ -129,24 +139,29 @@ def _views(
     levels: np.ndarray,
     cells: ShadingCells,
     diffuse: DiffuseShading,
-) -> None:
-    """Write specular levels of every pixel, and the diffuse light of its cell averaged with that of its own paths (Eq. S.19)."""
+    drawn: FitPixels | None,
+) -> int:
+    """Write the specular light of the pixels that are `drawn`, None = of all, and the diffuse light of the cells, averaged with
+    that of the own paths of these pixels (Eq. S.19). Nothing is traced for held-out views. Returns the number of pixels."""
+    count = 0
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
         pixels = view_pixels(job, capture, scene, view)
-        cell = cells.find(pixels.points, pixels.normals, pixels.object_id)
-        own, s0, s1 = _traced(job, world, levels, view, pixels)
-        parts = combine_estimates(diffuse.diffuse[:, cell], diffuse.noise_last, own), s0, s1
-        if not all(np.isfinite(part).all() for part in parts):
+        light = diffuse.diffuse[:, cells.find(pixels.points, pixels.normals, pixels.object_id)].astype(np.float32)
+        own = np.arange(len(pixels.index)) if drawn is None else drawn.of(pixels, view)
+        own = own[:0] if view.split == "test" else own
+        traced, s0, s1 = _traced(job, world, levels, view, pixels.take(own))
+        light[:, own] = combine_estimates(light[:, own], diffuse.noise_last, traced)
+        if not all(np.isfinite(part).all() for part in (light, s0, s1)):
             raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
         channels: dict[str, np.ndarray] = {}
         for half in range(2):
-            channels |= _channels(f"half{half}.diffuse", parts[0][half], pixels.index, view.height, view.width)
-            for j in range(len(levels)):
-                channels |= _channels(f"half{half}.s0.{j:02d}", s0[half, :, j], pixels.index, view.height, view.width)
-                channels |= _channels(f"half{half}.s1.{j:02d}", s1[half, :, j], pixels.index, view.height, view.width)
+            channels |= _channels(f"half{half}.diffuse", light[half], pixels.index, view.height, view.width)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
+        job.writer.table(table_of(view), SpecularLight(pixels.index[own], s0, s1).columns(), UNITS)
+        count += len(own)
     job.progress(len(capture.views), len(capture.views), "views cached")
+    return count
 
 
 def _traced(job: Job, world: Scene, levels: np.ndarray, view: View, pixels: ViewPixels) -> tuple[np.ndarray, ...]:

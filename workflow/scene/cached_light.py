@@ -1,0 +1,69 @@
+"""The light that stage shading cached: diffuse for every pixel, specular for those that are read (docs/method/shading.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.errors import InputError
+from workflow.artifacts.store import rgb
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import View
+
+
+@dataclass(frozen=True)
+class SpecularLight:
+    """Cached specular light of some pixels of a view.
+
+    Attributes:
+        index: (n,) flattened indices of the pixels, increasing.
+        s0, s1: (2, n, J, 3) float32 in two independent halves, at the J roughness levels.
+    """
+
+    index: np.ndarray
+    s0: np.ndarray
+    s1: np.ndarray
+
+    def at(self, index: np.ndarray) -> SpecularLight:
+        """Return the light of some pixels, in their order.
+
+        Raises:
+            InputError: the light of a pixel was not traced.
+        """
+        place = np.minimum(np.searchsorted(self.index, index), max(len(self.index) - 1, 0))
+        if len(index) and (not len(self.index) or (self.index[place] != index).any()):
+            raise InputError(
+                "shading.pixels: specular light was traced at fewer pixels than are read now; set `shading: {pixels: all}`"
+            )
+        return SpecularLight(index, self.s0[:, place], self.s1[:, place])
+
+    def columns(self) -> dict[str, np.ndarray]:
+        """Return the columns of the table of a view."""
+        lobes = {f"half{h}_{name}": value[h] for h in range(2) for name, value in (("s0", self.s0), ("s1", self.s1))}
+        width = 3 * self.s0.shape[2]  # a view may have no pixels here
+        flat = {name: value.reshape(len(self.index), width).astype(np.float32) for name, value in lobes.items()}
+        return {"index": self.index.astype(np.int32), **flat}
+
+
+def table_of(view: View) -> str:
+    """Return the name of the table of a view in stage shading."""
+    return f"pixels/{view.name}.parquet"
+
+
+def read_specular(job: Job, view: View) -> SpecularLight:
+    """Read the specular light of the pixels of a view at which it was traced."""
+    table = job.read("shading").table(table_of(view))
+    index = table["index"]
+
+    def lobes(name: str) -> np.ndarray:
+        halves = np.stack([table[f"half{h}_{name}"] for h in range(2)])
+        return halves.reshape(2, len(index), halves.shape[2] // 3, 3)
+
+    return SpecularLight(index.astype(np.int64), lobes("s0"), lobes("s1"))
+
+
+def read_diffuse(job: Job, view: View) -> np.ndarray:
+    """Read the diffuse light of every pixel of a view, (2, H, W, 3) float32 in two independent halves; 0 where nothing is hit."""
+    channels = job.read("shading").exr(f"maps/{view.name}.exr")
+    return np.stack([rgb(channels, f"half{h}.diffuse") for h in range(2)])
