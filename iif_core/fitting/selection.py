@@ -19,8 +19,8 @@ ROUGHNESS_GRID = np.array([0.05, 0.13, 0.22, 0.32, 0.44, 0.57, 0.7, 0.84, 0.98])
 """Roughness values of the profile."""
 _STEPS_PER_POINT = 3
 """Gauss-Newton steps of the albedo at each point of the profile, from the result of its neighbour."""
-_SMOOTHING = np.array([0.25, 0.5, 0.25])
-"""Kernel over neighbouring roughness values of the histogram (Eq. M.23)."""
+_SMOOTHING = (0.25, 0.5)
+"""Share of a bin that goes to each neighbour, and that stays, when the histogram is smoothed over roughness (Eq. M.23)."""
 _PSEUDO_OBJECTS = 0.5
 """Weight of the first histogram, in objects for each pair."""
 KINDS = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
@@ -252,8 +252,7 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixe
         if counts.sum() >= FEWEST_OBJECTS:
             posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
         posterior /= posterior.sum((1, 2), keepdims=True)
-        seen = np.stack([np.convolve(row, _SMOOTHING, "same") for row in posterior[counts].sum(0)])
-        prior = seen + _PSEUDO_OBJECTS * flat * flat.size
+        prior = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
         prior /= prior.sum()
         if counts.sum() >= FEWEST_OBJECTS:
             of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])
@@ -267,6 +266,12 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixe
     level = float(prior.sum(0) @ ROUGHNESS_GRID)
     width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
     return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+
+
+def _smoothed(histogram: np.ndarray) -> np.ndarray:
+    """Smooth a histogram (..., R) over roughness. What would fall off an end stays in the last bin there, so that sums stay."""
+    padded = np.pad(histogram, [(0, 0)] * (histogram.ndim - 1) + [(1, 1)], "edge")
+    return _SMOOTHING[0] * (padded[..., :-2] + padded[..., 2:]) + _SMOOTHING[1] * padded[..., 1:-1]
 
 
 def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np.ndarray) -> np.ndarray:

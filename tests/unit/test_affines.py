@@ -382,6 +382,15 @@ def test_the_base_tells_which_of_two_objects_is_rougher(slope, tells):
     np.testing.assert_allclose(found[2:], truth[2:], atol=0.1)
 
 
+def test_what_is_as_likely_at_every_roughness_stays_so():
+    """Without evidence the posterior stays that of the first histogram, which is flat: smoothing loses nothing at its ends."""
+    cost = np.full((30, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, 0] = 0.0
+    found = chosen(cost, np.zeros((*cost.shape, 16)), np.full((30, 5), 0.4))
+    np.testing.assert_allclose(found.roughness, ROUGHNESS_GRID.mean(), rtol=1e-12)
+    np.testing.assert_allclose(found.deviation, ROUGHNESS_GRID.std(), rtol=1e-12)
+
+
 def chosen(cost: np.ndarray, affine: np.ndarray, base: np.ndarray) -> Choice:
     objects = len(cost)
     found = Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT))
