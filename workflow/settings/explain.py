@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -17,6 +18,12 @@ REMOVED = {
     "affines.ridge": " It was removed, because it had no effect; delete it.",
 }
 """Keys of earlier versions: what to do about them."""
+NEEDED = {
+    **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "Needed: a whole number"),
+    **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
+    **dict.fromkeys(("bool_type", "bool_parsing"), "Needed: true or false"),
+}
+"""What a value of the wrong type should have been, by the type of pydantic's error."""
 
 
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
@@ -96,10 +103,13 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             union = UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
             said = "missing. Add it;" if got is None else f"found {got!r},"
-            lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.")
+            hint = did_you_mean(got, union) if got is not None else ""
+            lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.{hint}")
         elif kind == "value_error" and isinstance(found, dict):  # keys that do not go together: the message says which
             lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
         else:
             shown = found if not isinstance(found, dict) else "a mapping"
-            lines.append(f"{path}: `{dotted}`: found {shown!r}. {problem['msg']}.")
+            needed = NEEDED.get(kind) or problem["msg"].removeprefix("Value error, ")
+            hint = did_you_mean(found, re.findall(r"'([^']*)'", needed)) if isinstance(found, str) else ""
+            lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed}.{hint}")
     return "\n".join(lines)

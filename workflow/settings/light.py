@@ -46,7 +46,7 @@ class Emission(Section):
 def _whole_number(value: object) -> object:
     if value in ("auto", "all") or (isinstance(value, int) and not isinstance(value, bool) and value >= 100):
         return value
-    raise ValueError(f"found {value}; allowed: 'auto', 'all' or a whole number of at least 100")
+    raise ValueError("Needed: 'auto', 'all' or a whole number of at least 100")
 
 
 class Shading(Section):
