@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import colmap, exposure, images, mesh, transforms
 from workflow.sources.folder_scene.transforms import Frame
 
@@ -68,6 +69,11 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
     model = None
     if not (str(stated).endswith(".json") or (stated is None and (folder / "transforms.json").is_file())):
         model = colmap.find(folder, stated)
+        if model is None and stated is None:
+            raise InputError(
+                f"{folder}: neither transforms.json nor a COLMAP model; a `folder` scene needs one of them (docs/guide/own-data.md"
+                f" shows how to make one).{did_you_mean_path(folder / 'transforms.json')}"
+            )
     listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
     if capture["test_every"] == 1:
         raise InputError("`capture.test_every: 1` keeps every view for testing; give 0 (none) or 2 and more")
