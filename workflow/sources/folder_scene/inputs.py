@@ -71,8 +71,8 @@ def find_inputs(source: dict[str, Any], capture: dict[str, Any], points: bool = 
         model = colmap.find(folder, stated)
         if model is None and stated is None:
             raise InputError(
-                f"{folder}: neither transforms.json nor a COLMAP model; a `folder` scene needs one of them (docs/guide/own-data.md"
-                f" shows how to make one).{did_you_mean_path(folder / 'transforms.json')}"
+                f"{folder}: neither transforms.json nor a COLMAP model; a `folder` scene needs one of them"
+                f" (docs/guide/own-data.md shows how to make one).{did_you_mean_path(folder / 'transforms.json')}"
             )
     listed = transforms.read(source, capture) if model is None else colmap.frames_of(folder, model, source, capture, points)
     if capture["test_every"] == 1:
