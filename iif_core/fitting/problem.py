@@ -104,7 +104,6 @@ class FitOptions:
         select: choose between dielectric and metal, and the local minimum of the roughness, by their evidence; otherwise start at
             the identity, with metallic free where its predicted mean exceeds `metallic_prior`.
         metallic_prior: see `select`.
-        matte: fit no gloss: roughness 1 and no metal.
         base_tells_levels: the base knows the brightness of objects by itself, beside the photographs.
         texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
         brightest: largest albedo in the fit. It exceeds 1 because in light that is a little too dim a white wall would otherwise
@@ -125,7 +124,6 @@ class FitOptions:
     ridge: float = 2e-3
     select: bool = True
     metallic_prior: float = 0.25
-    matte: bool = False
     base_tells_levels: bool = True
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25

@@ -30,8 +30,6 @@ BIASES = np.array([3, 7, 11])
 CROSS_TERMS = np.array([1, 2, 4, 6, 8, 9])
 ROUGHNESS = np.array([12, 13])
 METALLIC = np.array([14, 15])
-MATTE_GLOSS = np.array([0.0, 1.0, 0.0, 0.0])
-"""The last four numbers of an object without gloss: roughness 1 and no metal."""
 
 
 def unclamped_material(affine: NDArray, base: NDArray) -> NDArray:

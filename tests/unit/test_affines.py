@@ -45,18 +45,6 @@ def test_planted_affines_and_gamma_from_clean_ldr(halves):
     assert np.all(np.diff(out.history) <= 0)
 
 
-@pytest.mark.parametrize("plain", [True, False])
-def test_matte_fits_no_gloss(plain):
-    """Objects that show gloss are fitted without it: roughness 1 and no metal, and the albedo still moves."""
-    problem, _ = problem_of(np.random.default_rng(2))
-    options = replace(EXACT, matte=True) if plain else FitOptions(matte=True)
-    out = fit_affines(problem, response("identity"), options)
-    assert (out.affine[:, 12:] == [0, 1, 0, 0]).all() and not out.free[:, 12:].any() and out.free[:, :12].any(1).all()
-    assert np.abs(out.affine[:, :12] - IDENTITY[:12]).max() > 0.01
-    fitted = apply_affines(out.affine, problem.object_id, problem.base)
-    assert (fitted[:, 3] == 1).all() and (fitted[:, 4] == 0).all()
-
-
 def test_calibrated_response_is_a_prior():
     """A precise prior holds the response; with a vague one the photographs decide."""
     problem, _ = problem_of(np.random.default_rng(1), value_of=lambda x: response("gamma", [1.9])(x))

@@ -323,28 +323,6 @@ def test_albedo_of_cells_in_known_blocks():
     assert 0 < shrunk < 0.5 * np.abs(truth[clear, :3] - 0.3).mean()
 
 
-def test_scatter_is_what_no_albedo_of_a_cell_explains():
-    """Against a plain sum over pixels; with the wrong gloss it is larger than with the right one."""
-    rows, _, _, truth, curve = plant(cells=40, family="srgb", noise=0.01)
-    found = {}
-    for name, r in (("right", truth[:, 3]), ("wrong", np.where(truth[:, 3] > 0.4, 0.02, 1.0))):
-        fine, m = AlbedoSums(41), truth[rows.cell, 4]
-        fine.add(rows, LEVELS, r[rows.cell], m, curve)
-        y, slope = rows.radiance(curve)
-        slope = slope * np.where(rows.saturated, 1e-3, 1.0)
-        s0, s1 = (interpolate_levels(s, LEVELS, r[rows.cell])[0] for s in (rows.s0, rows.s1))
-        gain, rest = (1 - m[:, None]) * rows.diffuse + m[:, None] * s0, y - 0.04 * (1 - m[:, None]) * s0 - s1
-        total = 0.0
-        for cell in range(40):
-            own = rows.cell == cell
-            albedo = (slope * gain * rest)[own].sum(0) / (slope * gain**2)[own].sum(0)
-            total += (slope * (rest - gain * albedo) ** 2)[own].sum()
-        found[name] = fine.scatter()
-        assert found[name] == pytest.approx(np.sqrt(total / (3 * rows.weight[rows.cell < 40].sum())), rel=1e-6)
-        assert fine.scatter(least=7.0) == 0.0  # six pixels a cell
-    assert found["right"] < 0.7 * found["wrong"]
-
-
 def test_cells_of_blocks_survive_the_extremes():
     rows, object_id, objects, truth, curve = plant(cells=20)
     d, value = np.array(rows.diffuse), np.array(rows.value)

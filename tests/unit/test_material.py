@@ -28,8 +28,6 @@ def test_every_number_belongs_to_one_group():
 def test_special_values_are_materials_and_maps():
     for value in (material.NEUTRAL, material.BLACK):
         np.testing.assert_array_equal(material.apply_affines(material.IDENTITY[None], np.zeros(1, int), value[None])[0], value)
-    matte = np.r_[material.IDENTITY[:12], material.MATTE_GLOSS]
-    assert material.apply_affines(matte[None], np.zeros(1, int), np.full((1, 5), 0.3))[0, 3:].tolist() == [1.0, 0.0]
 
 
 def test_single_precision_copies_of_the_fusion_agree():

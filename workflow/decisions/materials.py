@@ -22,20 +22,8 @@ def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
     return decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
 
 
-def gloss_is_idle(glossy: float, matte: float) -> bool:
-    """Return whether the views of a cell differ as much with the fitted gloss as without (Eq. M.50); 0 = no cell can tell."""
-    return 0 < glossy and matte <= glossy
-
-
-def specular(low_roughness: np.ndarray, free_metallic: np.ndarray, scatter: tuple[float, float] | None = None) -> Decision:
-    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic.
-
-    `scatter`: how much the views of a cell differ with the fitted gloss and without (Eq. M.50); None = not compared.
-    """
-    if scatter is not None and gloss_is_idle(*scatter):
-        measure = "how much more the views of a cell differ without gloss than with it (root mean square)"
-        reason = f"they differ by {scatter[0]:.4f} with the gloss that was fitted, by {scatter[1]:.4f} with none: fitted without"
-        return decision("specular", False, measure, scatter[1] - scatter[0], 0.0, reason)
+def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
+    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic."""
     value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
     needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
     reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"

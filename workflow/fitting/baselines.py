@@ -124,7 +124,7 @@ def _object_means(job: Job, capture: CaptureReader, scene: BaseScene) -> np.ndar
 
 
 def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> _Result:
-    """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.56).
+    """Take the mean radiance that photographs show of every cell as its albedo, without gloss (Eq. M.55).
 
     Cells that no photograph shows have the mean of their object. One gain for all cells makes albedo times diffuse light match
     the radiance in least squares. The response is that of stage emission; saturated values are used as they are.
@@ -164,7 +164,7 @@ def _texture_average(job: Job, capture: CaptureReader, scene: BaseScene, mixed: 
 
 
 def _free_cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, model: str) -> _Result:
-    """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.52, M.55)."""
+    """Fit roughness and metallic of blocks of cells, then the albedo of every cell (Eq. M.51, M.54)."""
     levels = roughness_levels(job)
     options = FIPT if model == "fipt" else IRIS
     edge = max(1, round(BLOCK_FOOTPRINTS * _footprint(capture) / scene.cell_edge))

@@ -9,7 +9,7 @@ import numpy as np
 from iif_core.fitting.baselines.texture import AlbedoSums
 from iif_core.fitting.cell_texture import smooth_light, textured_albedo
 from iif_core.fitting.problem import FitResult
-from iif_core.reflectance.material import MATTE_GLOSS, apply_affines
+from iif_core.reflectance.material import apply_affines
 from iif_core.surface.cells import neighbour_pairs, pack_keys
 from workflow.fitting.baselines import CellPixels
 from workflow.fitting.inputs import roughness_levels
@@ -44,18 +44,10 @@ class CellTextures:
         views.diffuse = smooth_light(views.diffuse, _points(job), scene.cell_object)
         return cls(job, scene, views, roughness_levels(job))
 
-    def scatter(self, fit: FitResult) -> tuple[float, float]:
-        """Return how much the views of a cell differ with the fitted gloss, and without gloss (Eq. M.50).
-
-        The comparison decides whether the scene has gloss (docs/method/fitting.md#gloss-has-to-pay)."""
-        fitted = self._fitted(fit)
-        glossy, matte = (sums.scatter() for sums in self._sums(fit, (fitted[:, 3:], np.tile(MATTE_GLOSS[1:3], (len(fitted), 1)))))
-        return glossy, matte
-
     def albedo(self, fit: FitResult) -> np.ndarray:
         """Return the albedo of the cells with the texture of the photographs, (C, 3)."""
         fitted, scene = self._fitted(fit), self.scene
-        (sums,) = self._sums(fit, (fitted[:, 3:],))
+        sums = self._sums(fit, fitted[:, 3:])
         pairs = neighbour_pairs(pack_keys(scene.cell_ijk, scene.cell_object))
         return textured_albedo(fitted[:, :3], *sums.sums, scene.cell_ijk, pairs, _points(self.job), scene.cell_object)
 
@@ -63,11 +55,10 @@ class CellTextures:
         """Return the materials of the cells under the fit, (C, 5)."""
         return apply_affines(fit.affine, self.scene.cell_object.astype(np.int64), self.scene.cell_values)
 
-    def _sums(self, fit: FitResult, glosses: tuple[np.ndarray, ...]) -> list[AlbedoSums]:
-        """Collect the albedo sums for each given roughness and metallic of the cells (C, 2)."""
-        out, scale = [AlbedoSums(len(gloss)) for gloss in glosses], np.float32(fit.light_scale)
+    def _sums(self, fit: FitResult, gloss: np.ndarray) -> AlbedoSums:
+        """Collect the albedo sums, given roughness and metallic of the cells (C, 2)."""
+        sums, scale = AlbedoSums(len(gloss)), np.float32(fit.light_scale)
         for rows, cell in self.views:
             rows = replace(rows, diffuse=rows.diffuse * scale, s0=rows.s0 * scale, s1=rows.s1 * scale)
-            for sums, gloss in zip(out, glosses, strict=True):
-                sums.add(rows, self.levels, *gloss[cell].T, fit.response, self.views.dark * float(scale))
-        return out
+            sums.add(rows, self.levels, *gloss[cell].T, fit.response, self.views.dark * float(scale))
+        return sums

@@ -18,7 +18,7 @@ from iif_core.fitting.object_levels import level_deviation, prediction_scatter
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
-from iif_core.reflectance.material import CHANNELS, MATTE_GLOSS, NUMBERS_OF, apply_affines
+from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.decisions import camera, materials
 from workflow.decisions.record import Decision
@@ -54,10 +54,6 @@ def run(job: Job) -> None:
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     textures = CellTextures.of(job, capture, scene, mixed)
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
-    direct = job.settings.affines.solver == "direct"  # only the direct solver can fit without gloss
-    scatter = textures.scatter(fit) if textures is not None and direct else None
-    if scatter is not None and materials.gloss_is_idle(*scatter):
-        fit, free = _fitted(job, problem, start, prior, places, find_gauge, matte=True)
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
     _write_objects(job, names, fit)
@@ -66,7 +62,7 @@ def run(job: Job) -> None:
     albedo = textures.albedo(fit) if textures is not None else None
     _write_cells(job, fit, albedo)
     _write_maps(job, capture, fit, albedo)
-    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], scatter)
+    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
     loss = reference_loss(problem, free.affine, free.response)
     _write_facts(job, fit, loss.__dict__, plan)
 
@@ -78,17 +74,14 @@ def _fitted(
     prior: tuple[np.ndarray, np.ndarray] | None,
     places: _Places,
     find_gauge: Callable[[FitProblem, _Places], Gauge],
-    matte: bool = False,
 ) -> tuple[FitResult, FitResult]:
     """Return the fit in its gauge, and in the gauge of the given light."""
     with job.timed("solve"):
-        free = _solver(job, prior, matte)(problem, start)
-    if matte:
-        free.affine[:, 12:] = MATTE_GLOSS
+        free = _solver(job, prior)(problem, start)
     return apply_gauge(problem, free, find_gauge(problem, places)), free
 
 
-def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) -> Callable[[FitProblem, Response], FitResult]:
+def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[FitProblem, Response], FitResult]:
     """Return the solver that the settings name; `prior` is mean and precision of the response."""
     settings = job.settings.affines
     if settings.solver == "direct":
@@ -97,7 +90,6 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None, matte: bool) 
             population=settings.population,
             robust_width=settings.robust_width,
             response_prior=prior,
-            matte=matte,
             # This prior read the brightness of objects from the same photographs (docs/results/real-scenes.md).
             base_tells_levels=job.settings.prior.kind != "retinex",
             threads=job.threads,
@@ -354,7 +346,6 @@ def _plan(
     fit: FitResult,
     calibration: dict[str, Any],
     dynamic_range: str,
-    scatter: tuple[float, float] | None,
 ) -> list[Decision]:
     """Return the decisions of this stage with their measured reasons."""
     object_id = problem.object_id
@@ -371,7 +362,7 @@ def _plan(
     return [
         camera.camera_response(dynamic_range, calibration),
         materials.metallic(metal & fit.free.any(1), medians),
-        materials.specular(glossy, metal, scatter),
+        materials.specular(glossy, metal),
         materials.affine_size(fit.model),
         materials.scale(**fit.facts["scale"]),
     ]

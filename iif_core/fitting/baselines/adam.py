@@ -80,7 +80,7 @@ def gradient(
 
     Args:
         problem: the cells; value: (C, 5) materials; options: weights of the loss; target: (C, 3) prior albedo.
-        scale: s of Eq. M.52; means: (O, 2) mean roughness and metallic of the parts; both are held.
+        scale: s of Eq. M.51; means: (O, 2) mean roughness and metallic of the parts; both are held.
 
     Returns:
         (C, 5); 0 for unknown cells.

@@ -1,4 +1,4 @@
-"""Free cells solved by search: albedo in closed form, roughness and metallic from candidates, parts by fixed point (Eq. M.54).
+"""Free cells solved by search: albedo in closed form, roughness and metallic from candidates, parts by fixed point (Eq. M.53).
 
 The search over the levels of roughness and the mean of the part is exact, because the minimum over the albedo is concave between.
 """
@@ -36,7 +36,7 @@ def solve_direct(
     rounds: int = 4,
     scales: int = 2,
 ) -> CellFit:
-    """Minimise the loss of every cell (Eq. M.52).
+    """Minimise the loss of every cell (Eq. M.51).
 
     Args:
         problem: the cells; options: weights of the loss; prior: (C, 3) albedo of each cell's object, if the loss has that term.

@@ -1,4 +1,4 @@
-"""The loss of free cells: data, regulariser, propagation within parts, distance from a prior (Eq. M.51 to M.54)."""
+"""The loss of free cells: data, regulariser, propagation within parts, distance from a prior (Eq. M.50 to M.53)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from iif_core.reflectance.brdf import F0_DIELECTRIC as F0
 from iif_core.reflectance.brdf import R_MIN
 
 _PART_FLOOR = 1e-4
-"""Added to the weight of a cell in the means of its part (Eq. M.53)."""
+"""Added to the weight of a cell in the means of its part (Eq. M.52)."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def lobes_at(problem: CellProblem, roughness: np.ndarray) -> np.ndarray:
 
 
 def data_loss(dd: np.ndarray, lobes: np.ndarray, albedo: np.ndarray, metallic: np.ndarray) -> np.ndarray:
-    """Return the squared error of sensor values, summed over the pixels of each cell (Eq. M.51).
+    """Return the squared error of sensor values, summed over the pixels of each cell (Eq. M.50).
 
     Args:
         dd: (..., 3); lobes: (..., 5, 3) sums of the cells at their roughness.
@@ -88,7 +88,7 @@ def data_loss(dd: np.ndarray, lobes: np.ndarray, albedo: np.ndarray, metallic: n
 def best_albedo(
     dd: np.ndarray, lobes: np.ndarray, metallic: np.ndarray, weight: np.ndarray | float, target: np.ndarray | float
 ) -> np.ndarray:
-    """Return the albedo that minimises `data_loss` + weight (a - target)^2 (Eq. M.54).
+    """Return the albedo that minimises `data_loss` + weight (a - target)^2 (Eq. M.53).
 
     Args:
         dd: (..., 3); lobes: (..., 5, 3) sums of the cells; metallic: (..., 1).
@@ -115,7 +115,7 @@ def part_means(problem: CellProblem, value: np.ndarray, options: CellOptions) ->
 
 
 def part_weights(problem: CellProblem, value: np.ndarray, options: CellOptions) -> np.ndarray:
-    """Return the weight of each cell in the means of its part (Eq. M.53), (C,)."""
+    """Return the weight of each cell in the means of its part (Eq. M.52), (C,)."""
     if options.part_weight == "gloss":
         return problem.pixels * (1.0 - value[:, 3] + _PART_FLOOR)
     j, share = bracket(problem.levels, value[:, 3])
@@ -126,7 +126,7 @@ def part_weights(problem: CellProblem, value: np.ndarray, options: CellOptions) 
 
 
 def prior_scale(problem: CellProblem, value: np.ndarray, prior: np.ndarray) -> float:
-    """Return the scale s that minimises sum |s a - prior|^2 over the pixels (Eq. M.53); 1 for black cells."""
+    """Return the scale s that minimises sum |s a - prior|^2 over the pixels (Eq. M.52); 1 for black cells."""
     weight = np.where(problem.known, problem.pixels, 0.0)[:, None]
     square = float((weight * value[:, :3] ** 2).sum())
     return float((weight * value[:, :3] * prior).sum() / square) if square > 0 else 1.0
@@ -135,7 +135,7 @@ def prior_scale(problem: CellProblem, value: np.ndarray, prior: np.ndarray) -> f
 def losses(
     problem: CellProblem, value: np.ndarray, options: CellOptions, prior: np.ndarray | None = None, scale: float | None = None
 ) -> np.ndarray:
-    """Return the loss of each object, summed over its pixels, by which all solvers are judged (Eq. M.52).
+    """Return the loss of each object, summed over its pixels, by which all solvers are judged (Eq. M.51).
 
     Args:
         problem: the cells; value: (C, 5) materials; options: weights.

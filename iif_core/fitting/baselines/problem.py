@@ -1,4 +1,4 @@
-"""The loss of a free material in every surface cell, reduced to sums over the pixels of the cell (Eq. M.1, M.51).
+"""The loss of a free material in every surface cell, reduced to sums over the pixels of the cell (Eq. M.1, M.50).
 
 A cell is 15 J + 3 numbers, whatever the number of photographs. Between levels the loss, not the shading, is interpolated.
 """

@@ -1,4 +1,4 @@
-"""Albedo of surface cells, once roughness and metallic are known for blocks of cells, which share their light (Eq. M.55)."""
+"""Albedo of surface cells, once roughness and metallic are known for blocks of cells, which share their light (Eq. M.54)."""
 
 from __future__ import annotations
 
@@ -40,11 +40,10 @@ class BlockLight:
 
 
 class AlbedoSums:
-    """Collects the sums of Eq. M.55 from pixels in any number of pieces; 8 numbers for each cell."""
+    """Collects the sums of Eq. M.54 from pixels in any number of pieces; 8 numbers for each cell."""
 
     def __init__(self, cells: int):
         self._square, self._cross, self._pixels = np.zeros((cells, 3)), np.zeros((cells, 3)), np.zeros(cells)
-        self._rest = np.zeros(cells)
 
     def add(
         self, rows: PixelRows, levels: np.ndarray, roughness: np.ndarray, metallic: np.ndarray, curve: Response, dark: float = 0.0
@@ -66,21 +65,11 @@ class AlbedoSums:
             self._square[:, c] += np.bincount(rows.cell, slope[:, c] * gain[:, c] ** 2, len(self._square))
             self._cross[:, c] += np.bincount(rows.cell, slope[:, c] * gain[:, c] * rest[:, c], len(self._cross))
         self._pixels += np.bincount(rows.cell, rows.weight, len(self._pixels))
-        self._rest += np.bincount(rows.cell, (slope * rest**2).sum(1), len(self._rest))
 
     @property
     def sums(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Sums of w G^2 (C, 3), of w G (y - h) (C, 3) and of the pixels' weights (C,), for L = a G + h."""
         return self._square, self._cross, self._pixels
-
-    def scatter(self, least: float = 3.0) -> float:
-        """Return the root mean square of y - h - a G at the best albedo a of each cell (Eq. M.50): how much the views of a cell
-        differ beyond what the gloss h explains. Over cells whose pixels weigh at least `least`; 0 without such a cell."""
-        seen = (self._pixels >= least)[:, None] & (self._square > 0)
-        fitted = np.where(seen, self._cross**2 / np.where(seen, self._square, 1.0), 0.0).sum(1)
-        judged = seen.all(1)
-        total = float(np.maximum(self._rest - fitted, 0.0)[judged].sum())
-        return float(np.sqrt(total / max(3.0 * float(self._pixels[judged].sum()), 1e-300)))
 
     def albedo(
         self, block: np.ndarray, prior: np.ndarray | None = None, weight: float = 0.0, shrink: float = BLOCK_WEIGHT
