@@ -40,7 +40,7 @@ class BlockLight:
 
 
 class AlbedoSums:
-    """Collects the sums of Eq. M.54 from pixels in any number of pieces; 8 numbers for each cell."""
+    """Collects the sums of Eq. M.54 from pixels in any number of pieces; 7 numbers for each cell."""
 
     def __init__(self, cells: int):
         self._square, self._cross, self._pixels = np.zeros((cells, 3)), np.zeros((cells, 3)), np.zeros(cells)
