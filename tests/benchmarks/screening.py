@@ -3,6 +3,9 @@ stages that read it are made anew from the artefacts of finished rooms.
 
     python tests/benchmarks/screening.py FOLDER ROOM... --of iif_core.fitting iif_core.light.emission.gains:BASE_COLOUR_ERROR
 
+`--factors 0.25 0.5 2 4` gives a curve instead of two points. `--table` prints such a file instead: the change of albedo PSNR,
+mean and range over its rooms, the constants that matter most first.
+
 FOLDER is the working folder of runs that this very code has finished; ROOM is the name of a derived scene in it, such as
 `sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses; `--without` leaves out those
 that are no choice. `--keep FILE.csv` adds a row for each constant, factor and room as it is done, and skips those that the file
@@ -27,6 +30,7 @@ from pathlib import Path
 from queue import Queue
 
 import numpy as np
+import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -202,14 +206,48 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
         os.utime(file, ns=(state.st_atime_ns, state.st_mtime_ns))  # compiled kernels of this file stay valid
 
 
+def printed(file: Path) -> None:
+    """Print the changes of albedo PSNR up to scale and as it is, in dB, as a table in Markdown: mean (least to largest) over the
+    rooms; `same` where no room has another result."""
+    rows = pd.read_csv(file)
+    plain = rows[rows.constant.isna()].set_index("room")
+    rows = rows[rows.constant.notna()].copy()
+    columns = {"scaled": "/".join(SCORES[0]), "raw": "/".join(SCORES[1])}
+    for name, column in columns.items():
+        rows[name] = rows[column].to_numpy() - plain.loc[rows.room, column].to_numpy()
+    factors = sorted(rows.factor.unique())
+    heads = [f"x {factor:g}, {name}" for factor in factors for name in ("up to scale", "as it is")]
+    print("| constant | rooms | " + " | ".join(heads) + " |\n" + "|---" * (len(heads) + 2) + "|")
+    largest = rows.assign(size=rows[list(columns)].abs().max(axis=1)).groupby(["module", "constant"])["size"].max()
+    for module, constant in largest.sort_values(ascending=False).index:
+        mine = rows[(rows.module == module) & (rows.constant == constant)]
+        cells = []
+        for factor in factors:
+            here = mine[mine.factor == factor]
+            for name in columns:
+                value = here[name]
+                mean, least, most = (round(float(v), 1) + 0.0 for v in (value.mean(), value.min(), value.max()))  # + 0: no -0
+                spread = f"{mean:+.1f} ({least:.1f} to {most:.1f})" if len(here) else ""
+                cells.append("same" if len(here) and not here.changed.any() else spread)
+        rooms = mine.groupby("factor").room.nunique()
+        count = f"{rooms.min()}" if rooms.min() == rooms.max() else f"{rooms.min()} to {rooms.max()}"
+        print(f"| `{constant}` ({mine.value.iloc[0]:g}) | {count} | " + " | ".join(cells) + " |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("rooms", nargs="+")
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("rooms", nargs="*")
     parser.add_argument("--of", nargs="+", default=["iif_core.fitting"], help="packages, modules, or module:NAME")
     parser.add_argument("--without", nargs="+", default=[], help="names of constants, or parts of them")
+    parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
     parser.add_argument("--keep", type=Path, default=Path("screening.csv"))
+    parser.add_argument("--table", type=Path, metavar="FILE.csv", help="print this file and do nothing else")
     arguments = parser.parse_args()
+    if arguments.table:
+        return printed(arguments.table)
+    if not arguments.rooms:
+        parser.error("FOLDER and ROOM are needed")
     # Whole numbers of compiled kernels are sizes of arrays.
     constants = [c for c in chosen(arguments.of) if first_stage(c.module) and not c.module.endswith("kernels")]
     constants = [c for c in constants if not any(part in c.name for part in arguments.without)]
@@ -217,7 +255,8 @@ def main() -> None:
     if arguments.keep.exists():
         with arguments.keep.open() as file:
             known = {(row["module"], row["constant"], float(row["factor"]), row["room"]) for row in csv.DictReader(file)}
-    todo = [(c, f, r) for c in constants for r in arguments.rooms for f in FACTORS if (c.module, c.name, f, r) not in known]
+    every = [(c, f, r) for c in constants for r in arguments.rooms for f in arguments.factors]
+    todo = [(c, f, r) for c, f, r in every if (c.module, c.name, f, r) not in known]
     folder = arguments.folder.resolve()
     plain = {room: scores(folder, room, truths(folder, room)) for room in arguments.rooms}
     with tempfile.TemporaryDirectory(dir=folder, prefix="screening-") as root, ThreadPoolExecutor(2) as pool:
