@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -339,11 +340,31 @@ def test_absent_weights_of_vgg_are_said(toy, tmp_path, monkeypatch, caplog):
     assert "snakemake --cores 1 results/weights/lpips_vgg.npz" in caplog.text
 
 
+def test_some_views_stand_for_all(toy, tmp_path):
+    """Each score of a chosen view is the one that it has among all views."""
+    job = FakeJob("metrics", tmp_path)
+    job.readers = {stage: StageReader(toy / "results/toy" / stage, stage, "toy") for stage in job.stage.upstream}
+    job.settings.metrics.views = 1
+    metrics.run(job)
+    job.writer.finish()
+    some, every = (pd.DataFrame(read_parquet(root / "results/toy/metrics/metrics.parquet")) for root in (tmp_path, toy))
+    views = set(some.view) - {"all"}
+    capture = CaptureReader(job.read("capture"))
+    held_out = {view.name for view in capture.views if view.split == "test"}
+    assert len(views - held_out) == 1 and len(views & held_out) == min(1, len(held_out))
+    keys = ["view", "quantity", "metric", "protocol"]
+    both = some[some.view != "all"].merge(every, on=keys, suffixes=("", "_every"))
+    assert len(both) == (some.view != "all").sum() == every.view.isin(views).sum()
+    np.testing.assert_allclose(both.value, both.value_every, rtol=1e-6)
+    summary = json.loads((tmp_path / "results/toy/metrics/summary.json").read_text())
+    assert summary["views"] == {"scored": len(views), "of": len(capture.views)}
+
+
 def test_object_mean_is_the_mean_of_the_predictions(toy):
     job = FakeJob("metrics", toy / "again")
     job.root = toy
     capture = CaptureReader(job.read("capture"))
-    means = metrics._PredictionMeans(job, capture)
+    means = metrics._PredictionMeans(job, capture.views)
     total, count = np.zeros(3), 0
     for view in capture.views:
         channels = job.read("prior").exr(f"maps/{view.name}.exr")

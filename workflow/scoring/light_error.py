@@ -14,8 +14,8 @@ from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader, View
 
 
-def light_error(job: Job, capture: CaptureReader) -> list[Score]:
-    """Score the light of stage shading at interior pixels, in the views that were used.
+def light_error(job: Job, capture: CaptureReader, views: list[View]) -> list[Score]:
+    """Score the light of stage shading at interior pixels of the `views`, none of which is held out.
 
     Left out is surface that emits in truth, whatever was found, and surface that was found to let light through.
     """
@@ -23,7 +23,7 @@ def light_error(job: Job, capture: CaptureReader) -> list[Score]:
         return [Score("light_spread", "raw", None, "8-bit photographs of a folder are no true radiance")]
     sheer, spread = read_lit_scene(job)[0].is_sheer, LightSpread()
     levels = job.read("shading").table("levels.parquet")["roughness"]
-    for view in capture.used:
+    for view in views:
         spread.add(*_pixels(job, capture, view, sheer, levels))
     found = spread.finish()
     return [Score("light_spread", "raw", found, "" if found is not None else "fewer than two objects are large enough")]

@@ -22,11 +22,12 @@ DARK = 0.02
 """Share of the median light below which pixels are left out, because light and albedo are noise there."""
 
 
-def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, str, str, list[Score]]]:
+def truth_free_scores(job: Job, capture: CaptureReader, views: list[View]) -> Iterator[tuple[str, str, str, list[Score]]]:
     """Score the albedo of `result`, `base` and `prior_k0`, and the mean of the scores of all predictions (`prior_mean_k`).
 
     The light is the diffuse light of stage shading (mean of its halves) at interior pixels of surface that neither emits nor lets
-    light through, in the views that were used. The surface cells are those of its edge. Yields (variant, view, quantity, scores).
+    light through, in the `views`, none of which is held out. The surface cells are those of its edge. Yields (variant, view,
+    quantity, scores).
     """
     vertices, faces = capture.mesh()
     scene, emitters = read_lit_scene(job)
@@ -35,7 +36,7 @@ def truth_free_scores(job: Job, capture: CaptureReader) -> Iterator[tuple[str, s
     origin = grid_origin(vertices[faces.ravel()], edge)
     left: dict[str, ShadingLeft] = {}
     spread: dict[str, ViewSpread] = {}
-    for view in capture.used:
+    for view in views:
         light, use, object_id = _light(job, capture, view, mixed)
         if not use.any():
             continue

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -95,6 +95,18 @@ class MaterialTruth:
             Scores in the order of the protocols.
         """
         return self.targets[quantity].scores(maps[quantity], only, perceptual)
+
+
+def scored_views(capture: CaptureReader, count: int | Literal["all"]) -> list[View]:
+    """Choose `count` of the used and `count` of the held-out views, each spread evenly, in the order of the capture."""
+    if count == "all":
+        return list(capture.views)
+    chosen: set[int] = set()
+    for held_out in (False, True):
+        group = [i for i, view in enumerate(capture.views) if (view.split == "test") == held_out]
+        places = np.linspace(0, len(group) - 1, min(count, len(group))).round().astype(int)
+        chosen.update(group[place] for place in places)
+    return [capture.views[i] for i in sorted(chosen)]
 
 
 def material_truth(

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-from pydantic import Field
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator, Field
 
 from workflow.settings.section import Section
+
+
+def _all_or_count(value: object) -> object:
+    if value == "all" or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
+        return value
+    raise ValueError("Needed: 'all' or a whole number of at least 1")
 
 
 class Render(Section):
@@ -19,8 +27,11 @@ class Render(Section):
 
 
 class Metrics(Section):
-    """Scores of the result. All views and all metrics are always computed; only an optional one is set here."""
+    """Scores of the result."""
 
+    views: Annotated[Literal["all"] | Annotated[int, Field(ge=1)], BeforeValidator(_all_or_count)] = "all"
+    """Views that are scored, spread evenly over those that were used; of the held-out ones as many again. `summary.json` says
+    how many there were of how many."""
     lpips_vgg: bool = False
     """Also score the albedo of the result, of the base and of the first prediction with LPIPS on VGG16, raw and scaled, as in
     the paper. This needs weights (`snakemake --cores 1 results/weights/lpips_vgg.npz`) and triples the time of the stage."""

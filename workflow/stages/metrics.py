@@ -26,13 +26,14 @@ from workflow.scoring.scores import (
     material_truth,
     perceptual_networks,
     prediction_numbers,
+    scored_views,
 )
 
 BASELINES = {
     "prior_k0": "the first prediction of each view, as the prior gave it",
     "prior_mean_k": "mean L2 and PSNR of all predictions of each view (not those of their mean)",
-    "object_mean": "one value an object: mean of all predictions of all views",
-    "texel_mean": "one value a surface cell: mean of all predictions of all views",
+    "object_mean": "one value an object: mean of all predictions of all scored views",
+    "texel_mean": "one value a surface cell: mean of all predictions of all scored views",
     "base": "the fused base texture, before the fit to the photographs",
     "result": "what is published",
 }
@@ -46,7 +47,7 @@ LEARNED = dict.fromkeys(("result", "base", "prior_k0"), tuple(LPIPS_NETWORKS))
 
 
 def run(job: Job) -> None:
-    """Score every view; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
+    """Score the views; write metrics.parquet (the result), variants.parquet (with the baselines) and summary.json."""
     capture = CaptureReader(job.read("capture"))
     rows = ScoreRows()
     networks = perceptual_networks(with_vgg=job.settings.metrics.lpips_vgg)
@@ -54,25 +55,27 @@ def run(job: Job) -> None:
     if job.settings.metrics.lpips_vgg and capture.has_truth and "vgg" not in networks:
         job.log.warning("metrics.lpips_vgg: %s; the other scores are computed without", FETCH_VGG)
         rows.missing.append({"quantity": "albedo", "metric": "lpips_vgg", "reason": FETCH_VGG})
-    means = _PredictionMeans(job, capture) if capture.has_truth else None
-    exposures = capture.exposures()
+    views = scored_views(capture, job.settings.metrics.views)
+    used = [view for view in views if view.split != "test"]
+    means = _PredictionMeans(job, views) if capture.has_truth else None
+    exposure_of = {view.view_id: float(e) for view, e in zip(capture.views, capture.exposures(), strict=True)}
 
-    def scores_of(index: int) -> list[tuple[str, str, str, list[metrics.Score]]]:
-        return list(_view_scores(job, capture, capture.views[index], float(exposures[index]), means, networks_of))
+    def scores_of(view: View) -> list[tuple[str, str, str, list[metrics.Score]]]:
+        return list(_view_scores(job, capture, view, exposure_of[view.view_id], means, networks_of))
 
     with ThreadPoolExecutor(job.threads) as pool:
         # `map` keeps the order of the views, so the tables do not depend on the number of threads.
-        for done, scored in enumerate(pool.map(scores_of, range(len(capture.views)))):
+        for done, scored in enumerate(pool.map(scores_of, views)):
             for entry in scored:
                 rows.add(*entry)
-            job.progress(done + 1, len(capture.views), "views scored")
-    for entry in truth_free_scores(job, capture):
+            job.progress(done + 1, len(views), "views scored")
+    for entry in truth_free_scores(job, capture, used):
         rows.add(*entry)
     if capture.has_truth:
-        rows.add("result", EVERY_VIEW, "rgb", light_error(job, capture))
+        rows.add("result", EVERY_VIEW, "rgb", light_error(job, capture, used))
     job.writer.table("metrics.parquet", rows.table(job.scene, {"result"}), UNITS)
     job.writer.table("variants.parquet", rows.table(job.scene), UNITS)
-    job.writer.json("summary.json", _summary(rows, capture))
+    job.writer.json("summary.json", _summary(rows, capture, len(views)))
 
 
 def _view_scores(
@@ -168,11 +171,11 @@ def _mean_scores(lists: list[list[metrics.Score]]) -> list[metrics.Score]:
 class _PredictionMeans:
     """The two baselines that average predictions over objects and over surface cells, from one pass over the views."""
 
-    def __init__(self, job: Job, capture: CaptureReader):
+    def __init__(self, job: Job, views: list[View]):
         base: StageReader = job.read("base")
         n_objects = int(job.read("segmentation").table("objects.parquet")["object_id"].max(initial=-1)) + 1
         sums = {"object_mean": np.zeros((n_objects, 6)), "texel_mean": np.zeros((base.rows("cells.parquet"), 6))}
-        for done, view in enumerate(capture.views):
+        for done, view in enumerate(views):
             file = f"maps/{view.name}.exr"
             if not (job.read("prior").has(file) and base.has(file)):
                 continue
@@ -190,7 +193,7 @@ class _PredictionMeans:
                 for i in range(5):
                     sums[name][touched, i] += np.bincount(rows, weights[i])
                 sums[name][touched, 5] += np.bincount(rows)
-            job.progress(done + 1, len(capture.views), "views averaged for the baselines")
+            job.progress(done + 1, len(views), "views averaged for the baselines")
         # Id -1 reads the last row.
         self.means = {
             name: np.concatenate([table[:, :5] / np.maximum(table[:, 5:], 1), np.zeros((1, 5))]).astype(np.float32)
@@ -210,7 +213,7 @@ def _stack(maps: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([maps["albedo"], maps["roughness"][..., None], maps["metallic"][..., None]], -1)
 
 
-def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
+def _summary(rows: ScoreRows, capture: CaptureReader, scored: int) -> dict[str, Any]:
     """Return the means over the views for each variant, and the gain of the result over the raw predictions."""
     means = rows.means()
 
@@ -227,6 +230,7 @@ def _summary(rows: ScoreRows, capture: CaptureReader) -> dict[str, Any]:
     gains = {q: {p: gain(q, p) for p in PROTOCOLS_OF[q]} for q in PROPERTIES}
     return {
         "has_truth": capture.has_truth,
+        "views": {"scored": scored, "of": len(capture.views)},
         "variants": {name: BASELINES[name] for name in means if name in BASELINES},
         "means": means,
         "gain_over_raw_predictions": {

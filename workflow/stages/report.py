@@ -156,6 +156,12 @@ def _objects_fact(job: Job, count: int) -> str:
     return f"{text}; stability {facts['stability']:.2f} (adjusted Rand index with {facts['perturbed']}; 1 = unmoved)"
 
 
+def _scored(summary: dict[str, Any]) -> str:
+    """Which views the scores are of."""
+    views = summary["views"]
+    return "the views" if views["scored"] == views["of"] else f"{views['scored']} of the {views['of']} views, spread evenly"
+
+
 def _tables(summary: dict[str, Any]) -> list[Table]:
     means = summary["means"]
     any_held_out = "rgb_held_out" in means.get("result", {})
@@ -167,7 +173,7 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
     light += [("emission", "raw", m) for m in ("l2", "log_l2", "iou")] + [("emission", "scaled", m) for m in ("l2", "log_l2")]
     tables = [
         score_table(
-            "Materials against ground truth, mean over the views",
+            f"Materials against ground truth, mean over {_scored(summary)}",
             means,
             materials,
             "Linear values. Emitters, pixels without meaningful truth and (albedo) mirrors are left out, by the truth."
