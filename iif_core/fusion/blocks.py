@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -74,19 +74,21 @@ def make_block(problem: FusionProblem, view: int) -> tuple[Block, list[Dropped]]
 
 
 class Blocks:
-    """Blocks of all views; `memory` bytes of them stay in memory, the others are read again each time."""
+    """Blocks of all views; `memory` bytes of them stay in memory, the others go through `spill`, or are read again each time."""
 
-    def __init__(self, problem: FusionProblem, memory: int):
-        self.problem, self._left, self._kept = problem, memory, {}
+    def __init__(self, problem: FusionProblem, memory: int, spill: Callable[[NDArray], NDArray] | None = None):
+        self.problem, self._left, self._kept, self._spill = problem, memory, {}, spill
 
     def __call__(self, view: int) -> Block:
         return self._kept[view] if view in self._kept else make_block(self.problem, view)[0]
 
     def keep(self, view: int, block: Block) -> None:
-        """Keep a block if there is room. Call in the order of the views, so that the same ones are kept each time."""
+        """Keep a block, in memory if there is room. Call in the order of the views, so that the same ones are kept each time."""
         if block.nbytes <= self._left:
             self._left -= block.nbytes
             self._kept[view] = block
+        elif self._spill is not None:
+            self._kept[view] = replace(block, values=self._spill(block.values), inside=self._spill(block.inside))
 
 
 def map_in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T]:

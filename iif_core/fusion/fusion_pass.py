@@ -57,7 +57,7 @@ def first_pass(problem: FusionProblem, options: FusionOptions, threads: int) -> 
         InputError: shapes that do not match, ids out of range, a segment in two views.
     """
     counts = CellCounts(*(np.zeros(problem.n_cells, t) for t in (np.int32, np.int32, np.int32, np.float64)))
-    blocks, cells, n_k = Blocks(problem, options.memory), CellSums(problem.n_cells), 0
+    blocks, cells, n_k = Blocks(problem, options.memory, options.spill), CellSums(problem.n_cells), 0
     dropped: list[Dropped] = []
     known: set[bytes] = set()
     pairs = []

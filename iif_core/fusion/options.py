@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+
+from numpy.typing import NDArray
 
 from iif_core.numerics import laplace
 
@@ -28,7 +31,9 @@ class FusionOptions:
         polish: sweeps on the paper's loss.
         single_view_weight: weight in the fit of the maps of cells that one viewpoint sees (Eq. F.24); must not be 0.
         seams: close seams between the parts of an object (needs `FusionProblem.neighbours`).
-        memory: bytes of predictions that stay in memory between sweeps; further views are read again every time.
+        memory: bytes of predictions that stay in memory between sweeps.
+        spill: puts an array where it takes no memory, such as into a mapped file, and returns it from there; it gets the
+            predictions of the views beyond `memory`. None = these views are read again every time.
     """
 
     variant: str = "full"
@@ -42,6 +47,7 @@ class FusionOptions:
     clip_pixels: int = 50
     scale_floor: float = laplace.SCALE_FLOOR
     memory: int = 1 << 30
+    spill: Callable[[NDArray], NDArray] | None = None
     final_temperature: float = 0.1
     objective: str = "least_squares"
     polish: int = 25

@@ -13,6 +13,7 @@ from iif_core.fusion.problem import LOWEST, FusionProblem, one_segment_per_view
 from iif_core.fusion.selection import selection_weights
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
 from tests.unit.test_fusion_direct import finite, oracle_psnr, simulated
+from workflow.artifacts.scratch import Scratch
 
 
 def every_array_is_finite(result):
@@ -124,8 +125,8 @@ def test_one_correction_an_image_underfits():
     assert by_image.object_value.shape[0] == by_object.object_value.shape[0]
 
 
-def test_memory_bound_changes_nothing():
-    """Predictions that do not fit into memory are read again and give the same bytes."""
+def test_memory_bound_changes_nothing(tmp_path):
+    """Predictions that do not fit into memory are read again, or mapped from a file, and give the same bytes."""
     problem, _ = simulated()
     reads = []
 
@@ -137,9 +138,14 @@ def test_memory_bound_changes_nothing():
     kept, again = (solve_direct(streamed, FusionOptions(sweeps=4, memory=m)) for m in (1 << 30, 0))
     n_views = len(problem.cell_of_pixel)
     assert len(reads) == n_views + n_views * 7  # once; then start, sums, four sweeps, scales
+    reads.clear()
+    spilt = solve_direct(streamed, FusionOptions(sweeps=4, memory=0, spill=Scratch(tmp_path)), threads=2)
+    assert len(reads) == n_views
+    assert not list(tmp_path.iterdir())  # the file has no name
     for name, value in vars(kept).items():
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(again, name), err_msg=name)
+            np.testing.assert_array_equal(value, getattr(spilt, name), err_msg=name)
 
 
 def test_tangents_lead_to_the_point_of_the_next_pixel():

@@ -21,12 +21,13 @@ from iif_core.reflectance.material import CHANNELS, PROPERTIES
 from iif_core.surface.cell_grid import CellGrid, CellValues, build_cell_grid, median_footprint, smallest_edge
 from iif_core.surface.cells import neighbour_pairs, unpack_keys
 from iif_core.surface.triangles import face_geometry
+from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 
 MEMORY_BYTES = 1 << 30
-"""Predictions that stay in memory between sweeps; further views are read again every sweep."""
+"""Predictions that stay in memory between sweeps; those of further views are mapped from a file without a name."""
 
 
 def run(job: Job) -> None:
@@ -140,6 +141,7 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
         variant,
         temperature=max(settings.temperature, settings.final_temperature),
         memory=MEMORY_BYTES,
+        spill=Scratch(job.writer.directory),
         **{name: getattr(settings, name) for name in same},
     )
     return solve_direct(problem, options, progress, job.threads), None
