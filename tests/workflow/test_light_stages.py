@@ -1,6 +1,7 @@
 """emission, shading and affines on a room whose light and materials are known."""
 
 import logging
+import shutil
 from collections import Counter
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
 from iif_core.camera.simulation import response_curve
 from workflow.artifacts import files
 from workflow.scene import emission_pixels
+from workflow.scene.base_scene import read_base_scene
 from workflow.scene.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
@@ -70,6 +72,35 @@ def test_hdr_emission_is_recovered(hdr):
     np.testing.assert_allclose(radiance[kept], TRUE, rtol=0.03)
     faces = _reader(folder, "emission").table("emitter_faces.parquet")
     assert set(faces["face_id"]) == set(np.flatnonzero(room.emission.any(1))) and (faces["side"] == 1).all()
+
+
+def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
+    """Where photographs have more pixels than the stage looks at, a part of each stands for it."""
+    folder, _ = hdr
+    for stage in ("capture", "segmentation", "base"):
+        shutil.copytree(folder / stage, tmp_path / stage)
+    _run(tmp_path, "hdr", upto="emission", emission={"pixels": 6 * 48 * 48 // 3})
+    table, radiance = _emitters(tmp_path)
+    kept = np.flatnonzero(table["kept"])
+    assert len(kept) == 2
+    np.testing.assert_allclose(radiance[kept], TRUE, rtol=0.06)
+    assert _emitters(folder)[0]["observations"].sum() > 2 * table["observations"].sum()
+
+
+def test_faces_between_the_chosen_pixels_are_seen(hdr):
+    """No lamp may hide in a face that a photograph shows, though none of the pixels that are looked at lies on it."""
+    folder, _ = hdr
+    job = StubJob("reader", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
+    capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
+    records = emission_pixels.ViewRecords(job, capture, scene)
+    of_pixels, seen = set(), set()
+    for view in capture.views:
+        record = records[view]
+        assert len(record.pixels.index) < 300
+        of_pixels |= set(record.pixels.face)
+        seen |= set(record.seen)
+        assert set(np.unique(capture.gbuffer(view)[1])) - {-1} == set(record.seen)
+    assert of_pixels < seen
 
 
 def test_hdr_albedo_comes_closer_to_the_truth(hdr):

@@ -187,7 +187,14 @@ def decode_view(job: Job, capture: CaptureReader, view: View) -> DecodedView:
     return DecodedView(photo, valid, depth, face, ids_from_disk(maps["object.id"]), maps["interior"] > 0.5)
 
 
-def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View, decoded: DecodedView | None = None) -> ViewPixels:
+def view_pixels(
+    job: Job,
+    capture: CaptureReader,
+    scene: BaseScene,
+    view: View,
+    decoded: DecodedView | None = None,
+    among: np.ndarray | None = None,
+) -> ViewPixels:
     """Collect the pixels of a view that hit the mesh; no pixel of a held-out view is valid.
 
     Args:
@@ -196,12 +203,14 @@ def view_pixels(job: Job, capture: CaptureReader, scene: BaseScene, view: View, 
         scene: mesh.
         view: of the capture.
         decoded: what the files of the view hold; None = read them.
+        among: (H * W,) bool, pixels that may be collected; None = all.
 
     Returns:
         One row for each pixel that hits the mesh.
     """
     photo, valid, depth, face, object_id, interior = decoded or decode_view(job, capture, view)
-    hit = np.flatnonzero((face.ravel() >= 0) & (depth.ravel() > 0))
+    hit = (face.ravel() >= 0) & (depth.ravel() > 0)
+    hit = np.flatnonzero(hit if among is None else hit & among)
     directions = view.directions().reshape(-1, 3)[hit]
     points = (view.world_from_camera[:3, 3] + depth.reshape(-1, 1)[hit] * directions).astype(np.float32)
     wo = -directions / np.linalg.norm(directions, axis=1, keepdims=True)

@@ -66,6 +66,7 @@ class ViewRecord:
         escaping: (k,) flattened indices of the valid pixels that meet no surface.
         escaping_value, escaping_direction: (k, 3) what these pixels show, and their directions in the world.
         escaping_share: (k,) share of the light from outside that reaches these pixels; 1 but behind curtains.
+        seen: faces that valid pixels of the whole photograph show; None = those of `pixels`, which are all.
     """
 
     pixels: ViewPixels
@@ -76,6 +77,7 @@ class ViewRecord:
     escaping_value: np.ndarray
     escaping_direction: np.ndarray
     escaping_share: np.ndarray
+    seen: np.ndarray | None = None
 
     @property
     def megabytes(self) -> float:
@@ -86,11 +88,15 @@ class ViewRecord:
 class ViewRecords:
     """Records of views, read from disk once as far as they fit into VIEW_MEMORY_MB.
 
+    Where the photographs have more pixels than `emission.pixels`, a record is of a random choice of those of its view, the same
+    share of every view; nothing but `seen` and `median_depth` is then of the whole view.
+
     Passes visit the views in the same order, so the first views are kept and the later ones are decoded again.
     """
 
     def __init__(self, job: Job, capture: CaptureReader, scene: BaseScene):
         self.job, self.capture, self.scene = job, capture, scene
+        self.share = min(1.0, job.settings.emission.pixels / max(sum(view.width * view.height for view in capture.used), 1))
         self._kept: dict[int, ViewRecord] = {}
         self._megabytes = 0.0
 
@@ -104,17 +110,22 @@ class ViewRecords:
         return record
 
     def _decoded(self, view: View) -> ViewRecord:
-        decoded = decode_view(self.job, self.capture, view)
-        pixels = view_pixels(self.job, self.capture, self.scene, view, decoded)
+        decoded, among, seen = decode_view(self.job, self.capture, view), None, None
+        if self.share < 1:
+            rng = np.random.default_rng([self.job.seed, SEEDS, 4, view.view_id])
+            among = rng.random(decoded.face.size) < self.share
+            seen = np.unique(decoded.face[decoded.valid & (decoded.face >= 0) & (decoded.depth > 0)])
+        pixels = view_pixels(self.job, self.capture, self.scene, view, decoded, among)
         base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
         values = decoded.photo.reshape(-1, 3)
-        out = decoded.valid.ravel() & np.isfinite(values).all(1)
+        counted = decoded.valid.ravel() if among is None else decoded.valid.ravel() & among
+        out = counted & np.isfinite(values).all(1)
         out[pixels.index] = False
         direction = view.directions().reshape(-1, 3)[out]
         deep = decoded.depth[decoded.depth > 0]
         median = np.median(deep) if deep.size else None
         outside = np.flatnonzero(out), values[out], direction, np.ones(int(out.sum()), np.float32)
-        return ViewRecord(pixels, base, median, int(decoded.valid.sum()), *outside)
+        return ViewRecord(pixels, base, median, int(counted.sum()), *outside, seen)
 
 
 @dataclass(frozen=True)
@@ -207,11 +218,12 @@ def _shared_surface(photos: Photographs) -> PatchRows:
     """Patches of interior surface as all views show them."""
     scene, views = photos.scene, photos.capture.views
     medians = [(photos.records[view].median_depth, view.fx) for view in views]
-    footprints = [depth / focal for depth, focal in medians if depth is not None]
+    apart = photos.records.share**-0.5  # pixels that are looked at, in pixels
+    footprints = [apart * depth / focal for depth, focal in medians if depth is not None]
     extent = float(np.ptp(scene.vertices, axis=0).max())
     edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
     origin = grid_origin(scene.vertices[scene.faces.ravel()], edge)
-    share = min(1.0, STATISTICS_PIXELS / max(sum(view.width * view.height for view in views), 1))
+    share = min(1.0, STATISTICS_PIXELS / max(photos.records.share * sum(view.width * view.height for view in views), 1))
     saturation = photos.job.settings.emission.saturation
     parts = [no_rows()]
     for number, view in enumerate(views):
@@ -231,7 +243,7 @@ def statistics_of_faces(photos: Photographs, adjacency: np.ndarray) -> tuple[Fac
     `adjacency`: (E, 2) pairs of neighbouring faces.
     """
     scene, views, least = photos.scene, photos.views, photos.job.settings.emission.min_observations
-    total = sum(view.width * view.height for view in views)
+    total = photos.records.share * sum(view.width * view.height for view in views)
     stride = max(1, round(total / STATISTICS_PIXELS))
     parts = []
     for done, view in enumerate(views):
@@ -298,8 +310,8 @@ def seen_faces(photos: Photographs) -> np.ndarray:
     """Return (F,) bool: a pixel shows the face, or light passes through it, so that no lamp can hide in it."""
     shown = photos.scene.passes > 0
     for view in photos.views:
-        pixels = photos.records[view].pixels
-        shown[pixels.face[pixels.valid]] = True
+        record = photos.records[view]
+        shown[record.pixels.face[record.pixels.valid] if record.seen is None else record.seen] = True
     return shown
 
 
