@@ -10,6 +10,9 @@ FOLDER is the working folder of runs that this very code has finished; ROOM is t
 `sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses; `--without` leaves out those
 that are no choice. `--keep FILE.csv` adds a row for each constant, factor and room as it is done, and skips those that the file
 has; the rows of factor 1 are the scores of the runs as they are. Two cases are worked on at a time.
+
+A run ends early where a stage leaves equal files, and where stage `emission` finds the same light: then nothing, or too little to
+be seen, would change below it. Column `changed` is False or `slight` there.
 """
 
 from __future__ import annotations
@@ -45,6 +48,12 @@ STAGES = ("base", "emission", "shading", "affines")
 OTHER_SOLVERS = ("baselines", "hashgrid", "sgd", "adam", "reference_loss")
 """Packages and modules that the default solvers do not use."""
 FACTORS = (0.5, 2.0)
+SAME_LIGHT = 0.005
+"""Emitters, gains of objects and the error of the level that differ by less than this share are the same light: a change of all
+light by it is 0.04 dB of an albedo at 20 dB."""
+UNCHANGED = (False, "False", "slight")
+DIM = 0.01
+"""Emitters of a kind that are dimmer than this share of its brightest one may differ by more."""
 SCORES = (
     ("albedo", "psnr", "scaled"),
     ("albedo", "psnr", "raw"),
@@ -178,8 +187,22 @@ def digests(folder: Path, scene: str, stage: str) -> dict[str, str]:
     return {name: facts["sha256"] for name, facts in files.items() if not name.endswith(".json")}
 
 
-def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: float) -> tuple[list[float], bool]:
-    """The scores with the constant times the factor, and whether anything changed."""
+def same_light(folder: Path, other: Path, scene: str) -> bool:
+    """Whether two runs of stage `emission` found the same emitters, of the same radiance, and the same gains (`SAME_LIGHT`)."""
+    one, two = reader(folder, scene, "emission"), reader(other, scene, "emission")
+    tables = [pd.DataFrame(stage.table("emitters.parquet")) for stage in (one, two)]
+    if len(tables[0]) != len(tables[1]) or (tables[0].kept != tables[1].kept).any():
+        return False
+    brightest = tables[0].groupby("kind").radiance_g.transform("max") * DIM
+    bright = (tables[0].radiance_g > brightest).to_numpy()
+    pairs = [tuple(table.loc[bright, f"radiance_{c}"].to_numpy() for table in tables) for c in "rgb"]
+    pairs += [tuple(stage.table("object_gains.parquet")[f"gain_{c}"] for stage in (one, two)) for c in "rgb"]
+    pairs += [tuple(np.array([stage.json("emission.json")["level_error"] or 0.0]) for stage in (one, two))]
+    return all(np.allclose(a, b, rtol=SAME_LIGHT, atol=1e-6) for a, b in pairs)
+
+
+def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: float) -> tuple[list[float], bool | str]:
+    """The scores with the constant times the factor, and whether anything changed: `slight`, if the light is the same."""
     file = code / constant.path
     source, state = file.read_text(), file.stat()
     file.write_text(constant.written_into(source, factor))
@@ -190,7 +213,7 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
         changed = False
         for stage in STAGES[STAGES.index(first) :]:
             shutil.rmtree(place / "results" / scene / stage)
-            command = [sys.executable, "-m", "workflow", stage, scene]
+            command = [sys.executable, "-m", "workflow", stage, scene, "--threads", "1"]
             environment = {**os.environ, "PYTHONPATH": str(code)}
             environment.pop("PYTHONDONTWRITEBYTECODE", None)  # or every run compiles all modules
             done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True)
@@ -200,6 +223,8 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
             changed = changed or digests(place, scene, stage) != digests(folder, scene, stage)
             if not changed:  # everything below is the same, too
                 return scores(folder, scene, truths(folder, scene)), False
+            if stage == "emission" and same_light(folder, place, scene):
+                return scores(folder, scene, truths(folder, scene)), "slight"
         return scores(place, scene, truths(folder, scene)), True
     finally:
         file.write_text(source)
@@ -228,7 +253,7 @@ def printed(file: Path) -> None:
                 value = here[name]
                 mean, least, most = (round(float(v), 1) + 0.0 for v in (value.mean(), value.min(), value.max()))  # + 0: no -0
                 spread = f"{mean:+.1f} ({least:.1f} to {most:.1f})" if len(here) else ""
-                cells.append("same" if len(here) and not here.changed.any() else spread)
+                cells.append("same" if len(here) and here.changed.isin(UNCHANGED).all() else spread)
         rooms = mine.groupby("factor").room.nunique()
         count = f"{rooms.min()}" if rooms.min() == rooms.max() else f"{rooms.min()} to {rooms.max()}"
         print(f"| `{constant}` ({mine.value.iloc[0]:g}) | {count} | " + " | ".join(cells) + " |")
@@ -266,7 +291,7 @@ def main() -> None:
                 shutil.copytree(REPOSITORY / name, Path(root) / f"code{lane}" / name)
             free.put(Path(root) / f"code{lane}")
 
-        def work(case: tuple[Constant, float, str]) -> tuple[list[float], bool]:
+        def work(case: tuple[Constant, float, str]) -> tuple[list[float], bool | str]:
             code = free.get()
             try:
                 return tried(folder, code, case[2], case[0], case[1])

@@ -14,7 +14,6 @@ from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
 
 REMOVED = {
-    "metrics.views": " It was removed, because all views are always scored; delete it.",
     "affines.ridge": " It was removed, because it had no effect; delete it.",
 }
 """Keys of earlier versions: what to do about them."""
