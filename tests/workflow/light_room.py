@@ -319,7 +319,7 @@ EMISSION = {
     "min_observations": 8,
     "cache_edge": 0.06,
     "max_bounces": 6,
-    "pixels": 8_000_000,
+    "pixels": 4_000_000,
     "rows": 12000,
     "samples": 16,
     "prune": 0.01,

@@ -25,7 +25,7 @@ class Emission(Section):
     """Edge of a radiance-cache voxel in metres."""
     max_bounces: int = Field(6, ge=1, le=64)
     """Longest path, in bounces, where the radiance cache holds no value."""
-    pixels: int = Field(8_000_000, ge=1000)
+    pixels: int = Field(4_000_000, ge=1000)
     """Pixels of all photographs together that the stage looks at. Where there are more, a random choice of each photograph
     stands for it."""
     rows: int = Field(40000, ge=100)
