@@ -4,7 +4,8 @@ stages that read it are made anew from the artefacts of finished rooms.
     python tests/benchmarks/screening.py FOLDER ROOM... --of iif_core.fitting iif_core.light.emission.gains:BASE_COLOUR_ERROR
 
 `--factors 0.25 0.5 2 4` gives a curve instead of two points. `--table` prints such a file instead: the change of albedo PSNR,
-mean and range over its rooms, the constants that matter most first.
+mean and range over its rooms, the constants that matter most first. `--plot` draws it: a panel for each constant, a line for
+each room.
 
 FOLDER is the working folder of runs that this very code has finished; ROOM is the name of a derived scene in it, such as
 `sky--rooms-ours-s0`. Constants are numbers at the top of a module and defaults of its dataclasses; `--without` leaves out those
@@ -234,16 +235,11 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
 def printed(file: Path) -> None:
     """Print the changes of albedo PSNR up to scale and as it is, in dB, as a table in Markdown: mean (least to largest) over the
     rooms; `same` where no room has another result."""
-    rows = pd.read_csv(file)
-    plain = rows[rows.constant.isna()].set_index("room")
-    rows = rows[rows.constant.notna()].copy()
-    columns = {"scaled": "/".join(SCORES[0]), "raw": "/".join(SCORES[1])}
-    for name, column in columns.items():
-        rows[name] = rows[column].to_numpy() - plain.loc[rows.room, column].to_numpy()
+    rows, columns = _changes(file)[0], ["scaled", "raw"]
     factors = sorted(rows.factor.unique())
     heads = [f"x {factor:g}, {name}" for factor in factors for name in ("up to scale", "as it is")]
     print("| constant | rooms | " + " | ".join(heads) + " |\n" + "|---" * (len(heads) + 2) + "|")
-    largest = rows.assign(size=rows[list(columns)].abs().max(axis=1)).groupby(["module", "constant"])["size"].max()
+    largest = rows.assign(size=rows[columns].abs().max(axis=1)).groupby(["module", "constant"])["size"].max()
     for module, constant in largest.sort_values(ascending=False).index:
         mine = rows[(rows.module == module) & (rows.constant == constant)]
         cells = []
@@ -259,6 +255,52 @@ def printed(file: Path) -> None:
         print(f"| `{constant}` ({mine.value.iloc[0]:g}) | {count} | " + " | ".join(cells) + " |")
 
 
+def drawn(file: Path, picture: Path) -> None:
+    """Draw the change of albedo PSNR up to scale over the factor: a panel for each constant, a line for each room."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rows, plain = _changes(file)
+    largest = rows.groupby(["module", "constant"]).scaled.agg(lambda change: change.abs().max()).sort_values(ascending=False)
+    columns = min(4, len(largest))
+    lines = -(-len(largest) // columns)
+    figure, axes = plt.subplots(lines, columns, figsize=(3.1 * columns, 2.5 * lines), sharex=True, squeeze=False)
+    for axis in axes.flat[len(largest) :]:
+        axis.axis("off")
+    unchanged = pd.DataFrame({"factor": [1.0], "scaled": [0.0]})
+    for axis, (module, constant) in zip(axes.flat, largest.index, strict=False):
+        mine = rows[(rows.module == module) & (rows.constant == constant)]
+        every: list[pd.DataFrame] = []
+        for _, room in mine.groupby("room"):
+            curve = pd.concat([room[["factor", "scaled"]], unchanged]).sort_values("factor")
+            axis.plot(curve.factor, curve.scaled, color="0.7", linewidth=0.8)
+            every = [*every, curve]
+        mean = pd.concat(every).groupby("factor").scaled.mean()
+        axis.plot(mean.index, mean, color="C0", linewidth=2, marker="o", markersize=3)
+        axis.axhline(0, color="0.3", linewidth=0.5)
+        axis.set_xscale("log", base=2)
+        axis.set_title(f"{constant} = {mine.value.iloc[0]:g}, {mine.room.nunique()} rooms", fontsize=8)
+        axis.tick_params(labelsize=7)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("albedo, change in dB", fontsize=8)
+    for axis in axes[-1]:
+        axis.set_xlabel("factor on the constant", fontsize=8)
+    figure.tight_layout()
+    figure.savefig(picture, dpi=130)
+
+
+def _changes(file: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows of a file with the change of albedo PSNR against the runs as they are, `scaled` and `raw` in dB; and those runs."""
+    rows = pd.read_csv(file)
+    plain = rows[rows.constant.isna()].drop_duplicates("room", keep="last").set_index("room")
+    rows = rows[rows.constant.notna()].copy()
+    for name, column in {"scaled": "/".join(SCORES[0]), "raw": "/".join(SCORES[1])}.items():
+        rows[name] = rows[column].to_numpy() - plain.loc[rows.room, column].to_numpy()
+    return rows, plain
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?")
@@ -268,9 +310,12 @@ def main() -> None:
     parser.add_argument("--factors", nargs="+", type=float, default=FACTORS)
     parser.add_argument("--keep", type=Path, default=Path("screening.csv"))
     parser.add_argument("--table", type=Path, metavar="FILE.csv", help="print this file and do nothing else")
+    parser.add_argument("--plot", type=Path, nargs=2, metavar=("FILE.csv", "PICTURE"), help="draw this file and do nothing else")
     arguments = parser.parse_args()
     if arguments.table:
         return printed(arguments.table)
+    if arguments.plot:
+        return drawn(*arguments.plot)
     if not arguments.rooms:
         parser.error("FOLDER and ROOM are needed")
     # Whole numbers of compiled kernels are sizes of arrays.

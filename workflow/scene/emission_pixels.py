@@ -32,7 +32,7 @@ from iif_core.light.emission.candidates import (
 )
 from iif_core.light.emission.environment import SkySums, cosine_directions
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.pixels import ANCHOR_PIXELS, TILE_PIXELS, EmissionPixels, choose_pixels, tile_of
+from iif_core.light.emission.pixels import ANCHOR_PIXELS, EmissionPixels, choose_pixels, row_tile, tile_of
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.cells import grid_origin
 from workflow.decisions import camera as decisions
@@ -316,15 +316,16 @@ def seen_faces(photos: Photographs) -> np.ndarray:
 
 
 def choose_rows(
-    photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1, tile_edge: int = TILE_PIXELS
+    photos: Photographs, groups: EmitterGroups, rest: float, thin: int = 1, tile_edge: int | None = None
 ) -> tuple[ViewPixels, np.ndarray, EmissionPixels]:
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
-    `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge` will be averaged.
+    `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge`, None = `row_tile`,
+    will be averaged.
     Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
     """
     rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
-    elsewhere = -(-photos.job.settings.emission.rows // (thin * len(photos.views)))
+    elsewhere, per_view = (-(-photos.job.settings.emission.rows // (t * len(photos.views))) for t in (thin, 1))
     per_group = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
     parts: list[tuple[ViewPixels, np.ndarray, EmissionPixels]] = []
     for view in photos.views:
@@ -338,7 +339,7 @@ def choose_rows(
         part = pixels.take(choice)
         shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
         covered = _coverage(photos, groups, view, part.index, group[choice], rng)
-        tile = tile_of(part.index, view.width, tile_edge)
+        tile = tile_of(part.index, view.width, tile_edge or row_tile(view.width * view.height, per_view))
         rows = EmissionPixels(*shown, part.object_id, number, tile, group[choice], covered)
         parts.append((part, record.base[choice], rows))
     pixels, base, rows = (list(part) for part in zip(*parts, strict=True))

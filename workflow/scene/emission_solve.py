@@ -24,7 +24,7 @@ from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, BaseAlbedo, GainOpt
 from iif_core.light.emission.groups import EmitterGroups
 from iif_core.light.emission.hidden import with_hidden_surface
 from iif_core.light.emission.loss import reference_loss
-from iif_core.light.emission.pixels import TILE_PIXELS, EmissionPixels
+from iif_core.light.emission.pixels import EmissionPixels
 from iif_core.light.emission.problem import (
     EmissionProblem,
     assemble,
@@ -59,7 +59,7 @@ SATURATED_SHARE_COMPARED = 0.1
 """The same share while emitters are compared."""
 HIDDEN_POINTS = 32
 """Points of each hidden surface at which the light that falls on it is estimated."""
-TILES_ACROSS = 8
+COMPARED_TILES_ACROSS = 8
 """Tiles across a picture whose pixels are averaged while emitters are compared: light changes slowly."""
 
 
@@ -128,7 +128,7 @@ def traced(
     groups: EmitterGroups,
     sky: Sky | None,
     threshold: float,
-    tile_edge: int = TILE_PIXELS,
+    tile_edge: int | None = None,
     options: GainOptions | None = None,
     voxels: RadianceVoxels | None = None,
     left_out: np.ndarray | None = None,
@@ -318,7 +318,7 @@ def _white_hidden_surface(
 
 
 def comparison_tile(photos: Photographs) -> int:
-    return max(1, int(np.median([max(view.width, view.height) for view in photos.views])) // TILES_ACROSS)
+    return max(1, int(np.median([max(view.width, view.height) for view in photos.views])) // COMPARED_TILES_ACROSS)
 
 
 def _names(photos: Photographs, groups: EmitterGroups, family: np.ndarray, number: int) -> str:

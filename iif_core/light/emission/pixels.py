@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 TILE_PIXELS = 8
-"""Pixels of one object in one tile of this edge are averaged into one row."""
+"""Pixels of one object in one tile of this edge are averaged into one row, or in a larger one of PIXELS_PER_TILE."""
+PIXELS_PER_TILE = 2.4
+"""Pixels that are traced for each tile, at least: the noise of a row is that of their mean, however large a photograph is."""
 FULL_COVERAGE = 0.95
 """Share of a pixel from which an emitter counts as filling it."""
 COVERAGE_ERROR = 0.05
@@ -90,6 +92,15 @@ def choose_pixels(
         inner = own[interior[own]]
         chosen.append(rng.permutation(inner if len(inner) else own)[:per_group])
     return np.sort(np.concatenate(chosen))
+
+
+def row_tile(pixels: int, traced: int) -> int:
+    """Return the edge in pixels of the tiles of a photograph of so many pixels, of which `traced` are rows.
+
+    >>> row_tile(192 * 192, 40000 // 24), row_tile(512 * 512, 80000 // 25), row_tile(512 * 512, 80000 // 200)
+    (8, 14, 40)
+    """
+    return max(TILE_PIXELS, round((PIXELS_PER_TILE * pixels / traced) ** 0.5))
 
 
 def tile_of(index: np.ndarray, width: int, edge: int = TILE_PIXELS) -> np.ndarray:
