@@ -6,6 +6,10 @@ FOLDER is the working folder of the runs; ROOM is the name of a derived scene in
 with their interior pixels, of which they need more than 100; metals do not count. The error of the level of the room is the mean
 over those pixels of the logarithm of each object's mean albedo over the true one. An object is held if its mean albedo, divided
 by that level, is within the mean of the map `uncertainty` of the true one.
+
+`--shared` prints instead how far the levels of the rooms would be off with other values of SHARED_LEVEL_ERROR, the error of the
+level of the light that all objects share. That follows from the runs as they are: the error enters through the weights of
+Eq. M.43 alone.
 """
 
 from __future__ import annotations
@@ -18,11 +22,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, SHARED_LEVEL_ERROR
 from workflow.artifacts.store import StageReader, ids_from_disk
 from workflow.scene.normal_form import CaptureReader
 from workflow.scoring.scores import material_maps
 
 FEWEST_PIXELS = 100
+SHARED_ERRORS = (0.05, 0.1, 0.15, 0.2, 0.3)
 DARKEST = 1e-3  # objects with a darker mean albedo have no ratio
 
 
@@ -51,22 +57,49 @@ def sums_of_objects(folder: Path) -> np.ndarray:
     return np.stack([np.bincount(owner, column) for column in values.T], 1)
 
 
+def level_error(sums: np.ndarray) -> tuple[np.ndarray, float]:
+    """Which objects (O,) count, and the error of the level of the room."""
+    fitted, true, _, metal = (sums[:, :4] / np.maximum(sums[:, 4:], 1)).T
+    use = (sums[:, 4] > FEWEST_PIXELS) & (metal < 0.5) & (true > DARKEST)
+    pixels = sums[use, 4]
+    return use, float(pixels @ np.log(np.maximum(fitted[use], DARKEST) / true[use]) / pixels.sum())
+
+
+def with_other_errors(folders: list[Path]) -> None:
+    """Print the error of the levels over the rooms for several values of SHARED_LEVEL_ERROR."""
+    rooms = []
+    for folder in folders:
+        error = level_error(sums_of_objects(folder))[1]
+        scale = read(folder, "affines").json("affines.json")["scale"]
+        share = min((scale["relative_error"] / PRIOR_LEVEL_ERROR) ** 2, 1 - 1e-12)
+        squared = PRIOR_LEVEL_ERROR**2 * share / (1 - share)
+        apart = np.log(scale["factor"]) / share  # of the levels of light and base
+        rooms.append((error + share * apart, apart, max(squared - SHARED_LEVEL_ERROR**2, 0.0)))
+    with_light, apart, own = np.array(rooms).T
+    print("| shared error | root mean square error of the level | mean | largest | error over claim |\n|---|---|---|---|---|")
+    for shared in SHARED_ERRORS:
+        share = 1 / (1 + PRIOR_LEVEL_ERROR**2 / (own + shared**2))
+        error = with_light - share * apart
+        over = np.sqrt(np.mean((error / (PRIOR_LEVEL_ERROR * np.sqrt(share))) ** 2))
+        print(f"| {shared} | {np.sqrt(np.mean(error**2)):.3f} | {error.mean():+.3f} | {np.abs(error).max():.3f} | {over:.2f} |")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("rooms", nargs="+")
+    parser.add_argument("--shared", action="store_true", help="other values of SHARED_LEVEL_ERROR instead")
     given = parser.parse_args()
+    if given.shared:
+        return with_other_errors([given.folder / "results" / room for room in given.rooms])
     held = []
     print("| room | level too bright by | claimed error | objects | held | normalised discrepancy |")
     print("|---|---|---|---|---|---|")
     for room in given.rooms:
         folder = given.folder / "results" / room
         sums = sums_of_objects(folder)
-        sums = sums[sums[:, 4] > FEWEST_PIXELS]
-        fitted, true, claimed, metal = (sums[:, :4] / sums[:, 4:]).T
-        use = (metal < 0.5) & (true > DARKEST)
-        fitted, true, claimed, pixels = fitted[use], true[use], claimed[use], sums[use, 4]
-        level = float(pixels @ np.log(np.maximum(fitted, DARKEST) / true) / pixels.sum())
+        use, level = level_error(sums)
+        fitted, true, claimed = (sums[use, :3] / sums[use, 4:]).T
         held.append(np.abs(fitted * np.exp(-level) - true) <= claimed)
         facts = read(folder, "affines").json("affines.json")
         discrepancy = facts.get("level_errors", {}).get("normalised_discrepancy", float("nan"))
