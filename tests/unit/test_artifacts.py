@@ -1,6 +1,7 @@
 """Artefacts: what is written is read back; what changed on disk is found and named."""
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow.artifacts import DamagedArtefact, StageReader, StageWriter
+from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, scratch
 from workflow.artifacts.store import ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import absent, damaged
 
@@ -254,3 +255,19 @@ def test_verify_of_an_unknown_scene_is_one_error(tmp_path, monkeypatch, capsys):
     )
     monkeypatch.setattr("sys.argv", ["workflow", "verify", "kitchen"])
     assert main() == 0
+
+
+def test_scratch_keeps_many_arrays_in_few_mappings(tmp_path, monkeypatch):
+    """Arrays of odd sizes and several types come back as they were, from one file without a name."""
+    monkeypatch.setattr(scratch, "REGION", 4096)
+    keep, rng = scratch.Scratch(tmp_path), np.random.default_rng(0)
+    arrays = [rng.random((3, n)).astype(t) for n in (0, 1, 7, 333, 2000) for t in (np.float32, np.float16, bool)] * 20
+    open_before = len(os.listdir("/proc/self/fd"))
+    kept = [keep(array) for array in arrays]
+    assert len(os.listdir("/proc/self/fd")) - open_before < len(arrays)
+    assert not list(tmp_path.iterdir())
+    for before, after in zip(arrays, kept, strict=True):
+        assert after.dtype == before.dtype and after.flags.aligned
+        np.testing.assert_array_equal(before, after)
+    with pytest.raises(ValueError, match="read-only"):
+        kept[-1][0, 0] = 1

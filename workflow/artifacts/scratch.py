@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import tempfile
 from pathlib import Path
 from typing import IO
 
 import numpy as np
+
+REGION = 1 << 30
+"""Bytes that are mapped at a time: each mapping takes a file descriptor, of which a process may have only a thousand."""
+ALIGNMENT = 64
 
 
 class Scratch:
@@ -16,14 +21,28 @@ class Scratch:
     def __init__(self, folder: Path):
         self._folder = folder
         self._file: IO[bytes] | None = None
+        self._map: mmap.mmap | None = None
+        self._start = self._used = 0  # of the mapped region in the file; in that region
 
     def __call__(self, array: np.ndarray) -> np.ndarray:
-        """Write an array to the file, and return it mapped from there, to be read only."""
+        """Write an array to the file, and return it mapped from there, to be read only. A full disk raises OSError."""
         if not array.size:
             return array
-        if self._file is None:
-            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (its arrays are read until the job ends)
-        start = self._file.seek(0, os.SEEK_END)
+        if self._map is None or self._used + array.nbytes > len(self._map):
+            self._map = self._next_region(max(REGION, array.nbytes))
+        assert self._file is not None
+        self._file.seek(self._start + self._used)
         self._file.write(np.ascontiguousarray(array).data)
         self._file.flush()
-        return np.memmap(self._file, array.dtype, "r", start, array.shape)
+        out = np.frombuffer(self._map, array.dtype, array.size, self._used).reshape(array.shape)
+        self._used += -(-array.nbytes // ALIGNMENT) * ALIGNMENT
+        return out
+
+    def _next_region(self, size: int) -> mmap.mmap:
+        """Lengthen the file, which takes no space before it is written, and map the new part."""
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (its arrays are read until the job ends)
+        end = self._file.seek(0, os.SEEK_END)
+        self._start, self._used = -(-end // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY, 0
+        self._file.truncate(self._start + size)
+        return mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ, offset=self._start)

@@ -112,9 +112,10 @@ class ViewRecords:
     def _decoded(self, view: View) -> ViewRecord:
         decoded, among, seen = decode_view(self.job, self.capture, view), None, None
         if self.share < 1:
-            rng = np.random.default_rng([self.job.seed, SEEDS, 4, view.view_id])
+            rng = np.random.default_rng([self.job.seed, SEEDS, 5, view.view_id])
             among = rng.random(decoded.face.size) < self.share
-            seen = np.unique(decoded.face[decoded.valid & (decoded.face >= 0) & (decoded.depth > 0)])
+            shown = decoded.valid & (decoded.face >= 0) & (decoded.depth > 0) & np.isfinite(decoded.photo).all(-1)
+            seen = np.unique(decoded.face[shown])
         pixels = view_pixels(self.job, self.capture, self.scene, view, decoded, among)
         base = np.zeros((0, 5), np.float32) if view.split == "test" else base_maps(self.job, view)[pixels.index]
         values = decoded.photo.reshape(-1, 3)

@@ -27,7 +27,7 @@ class Emission(Section):
     """Longest path, in bounces, where the radiance cache holds no value."""
     pixels: int = Field(4_000_000, ge=1000)
     """Pixels of all photographs together that the stage looks at. Where there are more, a random choice of each photograph
-    stands for it."""
+    stands for it, and `min_observations` counts pixels of that choice."""
     rows: int = Field(40000, ge=100)
     """Number of pixels whose light transport is traced."""
     samples: int = Field(16, ge=2)
