@@ -12,8 +12,8 @@ FOLDER is the working folder of runs that this very code has finished; ROOM is t
 that are no choice. `--keep FILE.csv` adds a row for each constant, factor and room as it is done, and skips those that the file
 has; the rows of factor 1 are the scores of the runs as they are. Two cases are worked on at a time.
 
-A run ends early where a stage leaves equal files, and where stage `emission` finds the same light: then nothing, or too little to
-be seen, would change below it. Column `changed` is False or `slight` there.
+Stages below equal files that do not import the module of the constant are not made anew, nor is anything where stage `emission`
+alone imports it and finds the same light: nothing, or too little to be seen, would change. Column `changed` is False or `slight` there.
 """
 
 from __future__ import annotations
@@ -142,9 +142,14 @@ def chosen(names: list[str]) -> list[Constant]:
     return found
 
 
+def reads(stage: str, module: str) -> bool:
+    """Whether a stage imports a module; it may then read any constant of it."""
+    return module in import_closure(f"workflow.stages.{stage}")
+
+
 def first_stage(module: str) -> str | None:
     """The first stage that reads a module; None if none of them does."""
-    return next((stage for stage in STAGES if module in import_closure(f"workflow.stages.{stage}")), None)
+    return next((stage for stage in STAGES if reads(stage, module)), None)
 
 
 def reader(folder: Path, scene: str, stage: str) -> StageReader:
@@ -210,9 +215,11 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
     place = code.with_name(f"{code.name}-run")
     try:
         linked(folder, scene, place)
-        first = first_stage(constant.module)
+        reading = [stage for stage in STAGES if reads(stage, constant.module)]
         changed = False
-        for stage in STAGES[STAGES.index(first) :]:
+        for stage in STAGES[STAGES.index(reading[0]) :]:
+            if not changed and stage not in reading:
+                continue
             shutil.rmtree(place / "results" / scene / stage)
             command = [sys.executable, "-m", "workflow", stage, scene, "--threads", "1"]
             environment = {**os.environ, "PYTHONPATH": str(code)}
@@ -222,11 +229,9 @@ def tried(folder: Path, code: Path, scene: str, constant: Constant, factor: floa
                 print(f"{constant.module}:{constant.name} x {factor}, {scene}, {stage}: {done.stderr[-300:]}", file=sys.stderr)
                 return [float("nan")] * len(SCORES), True
             changed = changed or digests(place, scene, stage) != digests(folder, scene, stage)
-            if not changed:  # everything below is the same, too
-                return scores(folder, scene, truths(folder, scene)), False
-            if stage == "emission" and same_light(folder, place, scene):
+            if stage == "emission" and changed and reading[-1] == stage and same_light(folder, place, scene):
                 return scores(folder, scene, truths(folder, scene)), "slight"
-        return scores(place, scene, truths(folder, scene)), True
+        return scores(place if changed else folder, scene, truths(folder, scene)), changed
     finally:
         file.write_text(source)
         os.utime(file, ns=(state.st_atime_ns, state.st_mtime_ns))  # compiled kernels of this file stay valid
