@@ -13,7 +13,8 @@ that are no choice. `--keep FILE.csv` adds a row for each constant, factor and r
 has; the rows of factor 1 are the scores of the runs as they are. Two cases are worked on at a time.
 
 Stages below equal files that do not import the module of the constant are not made anew, nor is anything where stage `emission`
-alone imports it and finds the same light: nothing, or too little to be seen, would change. Column `changed` is False or `slight` there.
+alone imports it and finds the same light: nothing, or too little to be seen, would change. Column `changed` is False or `slight`
+there.
 """
 
 from __future__ import annotations
