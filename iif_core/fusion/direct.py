@@ -2,9 +2,9 @@
 
 A sweep is one pass over the views, which fits the affine maps to the texture of the previous sweep (Eq. F.25), sets the
 selection weights (Eqs. F.27 to F.29) and averages the mixture in each cell (Eq. F.30). Levels are fixed after every sweep
-(Eq. F.40). Memory holds the predictions of one view per thread, the sums, and what `memory` allows to keep;
-`spill` may keep the rest elsewhere. The bytes of the
-result do not depend on the number of threads; the order of the predictions changes it by rounding only.
+(Eq. F.40). Memory holds the predictions of one view per thread, the sums, and what `memory` allows to keep; `spill` may keep the
+rest elsewhere. The bytes of the result do not depend on the number of threads; the order of the predictions changes it by
+rounding only.
 """
 
 from __future__ import annotations

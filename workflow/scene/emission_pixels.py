@@ -322,8 +322,7 @@ def choose_rows(
     """Draw the pixels of the linear system: a fixed number, evenly over views (one in `thin`), plus enough on every emitter.
 
     `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge`, None = `row_tile`,
-    will be averaged.
-    Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
+    will be averaged. Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
     """
     rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
     elsewhere, per_view = (-(-photos.job.settings.emission.rows // (t * len(photos.views))) for t in (thin, 1))

@@ -10,7 +10,7 @@ import numpy as np
 from iif_core.light.emission.cache import RadianceVoxels
 from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.groups import EmitterGroups
-from iif_core.light.emission.pixels import EmissionPixels
+from iif_core.light.emission.pixels import TILE_PIXELS, EmissionPixels
 from iif_core.light.emission.problem import assemble
 from iif_core.light.emission.rows import TracedTransport
 from iif_core.light.emission.sun import (
@@ -60,7 +60,7 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     texel = int(texels[promising])
     photos.job.log.info("is there a sun? misfit %.4f instead of %.4f", found.misfit, none.misfit)
     # Which disc it is shows at the borders of what it lights: small tiles.
-    fine = _Rows.traced(photos, sky, cache, threshold, None, ROWS)
+    fine = _Rows.traced(photos, sky, cache, threshold, TILE_PIXELS, ROWS)
     near = around(sky, texel)
     question = fine.question(near, (FINER * height, FINER * width))
     shapes = discs(sky, texel, near)
@@ -99,7 +99,7 @@ class _Rows:
 
     @classmethod
     def traced(
-        cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int | None, rows: int
+        cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int
     ) -> _Rows:
         """Trace `rows` pixels, to be averaged in tiles; the cache is that of all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))

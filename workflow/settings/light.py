@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from iif_core.light.emission.sgd import SgdOptions
-from workflow.settings.section import Section
+from workflow.settings.section import Section, word_or_count
 
 _SGD = SgdOptions()
 
@@ -46,16 +46,10 @@ class Emission(Section):
     """`sgd`: steps, of 1024 pixels each."""
 
 
-def _whole_number(value: object) -> object:
-    if value in ("auto", "all") or (isinstance(value, int) and not isinstance(value, bool) and value >= 100):
-        return value
-    raise ValueError("Needed: 'auto', 'all' or a whole number of at least 100")
-
-
 class Shading(Section):
     """Incident light that is cached for the fits: diffuse, and specular at several roughness levels."""
 
-    pixels: Annotated[Literal["auto", "all"] | Annotated[int, Field(ge=100)], BeforeValidator(_whole_number)] = "auto"
+    pixels: Annotated[Literal["auto", "all"] | Annotated[int, Field(ge=100)], word_or_count("auto", "all", least=100)] = "auto"
     """Pixels of which specular light is traced, drawn evenly over the objects. `auto`: as many as the fit reads
     (`affines.pixels`), or `all` where it reads every pixel: for texture from the photographs, and for `model: fipt` and `iris`.
     Studies that compare models on the same light set `all`. A number must be at least `affines.pixels`."""

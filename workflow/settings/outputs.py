@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from workflow.settings.section import Section
-
-
-def _all_or_count(value: object) -> object:
-    if value == "all" or (isinstance(value, int) and not isinstance(value, bool) and value >= 1):
-        return value
-    raise ValueError("Needed: 'all' or a whole number of at least 1")
+from workflow.settings.section import Section, word_or_count
 
 
 class Render(Section):
@@ -29,7 +23,7 @@ class Render(Section):
 class Metrics(Section):
     """Scores of the result."""
 
-    views: Annotated[Literal["all"] | Annotated[int, Field(ge=1)], BeforeValidator(_all_or_count)] = "all"
+    views: Annotated[Literal["all"] | Annotated[int, Field(ge=1)], word_or_count("all", least=1)] = "all"
     """Views that are scored, spread evenly over those that were used; of the held-out ones as many again. `summary.json` says
     how many there were of how many."""
     lpips_vgg: bool = False

@@ -4,7 +4,18 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
+
+
+def word_or_count(*words: str, least: int) -> BeforeValidator:
+    """Return a check with one message for a setting that is one of some words or a whole number of at least `least`."""
+
+    def checked(value: object) -> object:
+        if value in words or (isinstance(value, int) and not isinstance(value, bool) and value >= least):
+            return value
+        raise ValueError(f"Needed: {', '.join(map(repr, words))} or a whole number of at least {least}")
+
+    return BeforeValidator(checked)
 
 
 class Section(BaseModel):
