@@ -122,6 +122,22 @@ def test_stale_files_of_an_earlier_run_are_removed(stage):
     assert sorted(p.name for p in folder.rglob("*") if p.is_file()) == ["base.json", "manifest.json"]
 
 
+def test_parts_that_the_same_job_finished_are_kept(tmp_path):
+    writer = StageWriter(tmp_path, provenance())
+    for view in "abc":
+        writer.json(f"{view}.json", view)
+        writer.part_done(view, [f"{view}.json"], {"view": view})
+    (tmp_path / "b.json").write_text("cut")
+    (tmp_path / "unfinished/c.json").write_text("{")
+    other = StageWriter(tmp_path, {**provenance(), "fingerprint": "other"})
+    assert other.part_kept("a") is None and other.files == {}
+    again = StageWriter(tmp_path, provenance())
+    assert [again.part_kept(view) for view in "abcd"] == [{"view": "a"}, None, None, None]
+    assert again.files == {"a.json": writer.files["a.json"]}
+    again.finish()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.json", "manifest.json"]
+
+
 @pytest.mark.parametrize("name", ["../evil", "maps/../../evil", "/tmp/evil", "", "link/evil"])
 def test_names_that_leave_the_folder_are_refused(tmp_path, name):
     """Whatever the kind of file: relative parts, absolute paths, and links that lead out."""
@@ -135,12 +151,13 @@ def test_names_that_leave_the_folder_are_refused(tmp_path, name):
         lambda: writer.table(name, {"a": np.zeros(1)}),
         lambda: writer.json(name, {}),
         lambda: writer.bytes(name, b"x"),
-        lambda: writer.note(name, {}),
-        lambda: writer.noted(name),
-        lambda: writer.keep(name, {"sha256": ""}),
+        lambda: writer.channels(name),
     ):
         with pytest.raises(InputError, match="would leave this folder"):
             write()
+    for part in (lambda: writer.part_done("../../evil", [], {}), lambda: writer.part_kept("../../evil")):
+        with pytest.raises(InputError, match="would leave this folder"):
+            part()
     assert sorted(path for path in tmp_path.rglob("*")) == before and not Path("/tmp/evil").exists()
 
 

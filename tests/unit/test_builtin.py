@@ -377,7 +377,7 @@ def _run(folder, monkeypatch, dynamic_range="ldr", seed=0):
     from workflow.runtime.job import run_stage
     from workflow.scene.normal_form import CaptureReader
 
-    (folder / "config/scenes").mkdir(parents=True)
+    (folder / "config/scenes").mkdir(parents=True, exist_ok=True)
     (folder / "config/scenes/tiny.yaml").write_text(SCENE % (dynamic_range, seed))
     monkeypatch.chdir(folder)
     for cached in (fingerprint.resolved, fingerprint.fingerprint):
@@ -407,6 +407,25 @@ def _digests(capture):
 def test_capture_is_the_same_to_the_last_byte(captured, tmp_path, monkeypatch):
     again = _run(tmp_path / "again", monkeypatch)
     assert _digests(again) == _digests(captured)
+
+
+def test_a_killed_capture_goes_on_where_it_was(captured, tmp_path, monkeypatch):
+    from iif_core.light.transport import render
+
+    whole, calls = render.render, []
+
+    def killed(*arguments, **options):
+        calls.append(len(calls))
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(render, "render", killed)
+    with pytest.raises(KeyboardInterrupt):
+        _run(tmp_path, monkeypatch)
+    resumed = _run(tmp_path, monkeypatch)
+    assert len(calls) == 1 + len(resumed.views)  # the killed view twice, the first one once
+    assert _digests(resumed) == _digests(captured)
 
 
 def test_another_seed_gives_other_noise_alone(captured, tmp_path, monkeypatch):

@@ -661,6 +661,33 @@ def test_capture_of_a_tiny_scene(llvm, tmp_path, monkeypatch):
     assert digests(again) == digests(reader)
 
 
+def test_a_killed_capture_goes_on_where_it_was(llvm, tmp_path, monkeypatch):
+    """Also where a pixel has no finite sample and where a finished view was damaged meanwhile."""
+    from workflow.sources.mitsuba_scene import render
+
+    whole, calls = render.render_view, []
+
+    def spoilt(scene, integrator, view, *rest):
+        calls.append(view.name)
+        if calls == ["000", "001", "002"]:
+            raise KeyboardInterrupt
+        image, valid, dropped = whole(scene, integrator, view, *rest)
+        valid[3, view.view_id] = False
+        return image, valid, dropped + 1
+
+    monkeypatch.setattr(render, "render_view", spoilt)
+    with pytest.raises(KeyboardInterrupt):
+        capture(tmp_path / "a", monkeypatch, ROOM + TABLE)
+    damaged = tmp_path / "a/results/s/capture/truth/001.exr"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    resumed = capture(tmp_path / "a", monkeypatch, ROOM + TABLE)
+    assert calls == ["000", "001", "002", "001", "002"]
+    assert not resumed.photo(resumed.views[1])[1][3, 1] and any("3 path samples" in note for note in resumed.facts["notes"])
+    undisturbed = capture(tmp_path / "b", monkeypatch, ROOM + TABLE)
+    assert digests(resumed) == digests(undisturbed)
+    assert resumed.reader.manifest["files"] == undisturbed.reader.manifest["files"]
+
+
 def test_capture_hdr_with_glass_kept(llvm, tmp_path, monkeypatch):
     reader = capture(tmp_path, monkeypatch, ROOM + PANE, ", dynamic_range: hdr", ", drop_transparent: false")
     assert len(reader.mesh()[1]) == 12 + 2 + 2 and reader.is_hdr and "response_truth" not in reader.facts

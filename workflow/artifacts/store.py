@@ -13,6 +13,7 @@ from workflow.artifacts import files as io
 
 SCHEMA = "iif.stage/1"
 MANIFEST = "manifest.json"
+UNFINISHED = "unfinished"
 
 
 def command(scene: str, stage: str, quality: str | None) -> str:
@@ -85,25 +86,42 @@ class StageWriter:
         io.write_atomically(io.inside(self.directory, name), lambda temporary: _write_bytes(temporary, data))
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
-    def note(self, name: str, document: Any) -> None:
-        """Write a small document that only this job reads, after it was killed and started again; `finish` removes it."""
-        io.write_json(io.inside(self.directory, name), document)
+    def part_done(self, part: str, names: list[str], facts: dict[str, Any]) -> None:
+        """Note that a part of the stage is finished, so that a job that is killed need not repeat it; `finish` removes the note.
 
-    def noted(self, name: str) -> Any | None:
-        """Return what an earlier run of this job noted; None if there is no readable note."""
-        path = io.inside(self.directory, name)
+        Args:
+            part: name of the part, such as that of a view.
+            names: the files that were written for it.
+            facts: small document that `part_kept` gives back.
+        """
+        files = {name: self.files[name] for name in names}
+        document = {"by": self.provenance["fingerprint"], "files": files, "facts": facts}
+        io.write_json(io.inside(self.directory, f"{UNFINISHED}/{part}.json"), document)
+
+    def part_kept(self, part: str) -> dict[str, Any] | None:
+        """Take over the files of a part that an earlier run of the same job finished.
+
+        Returns:
+            What `part_done` noted; None if the part is to be made, because it was not finished, or under another fingerprint, or
+            a file is gone or has changed.
+        """
+        note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
-            return json.loads(path.read_text())
+            done = json.loads(note.read_text())
         except (OSError, ValueError):
             return None
+        if done["by"] != self.provenance["fingerprint"]:
+            return None
+        for name, facts in done["files"].items():
+            path = io.inside(self.directory, name)
+            if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
+                return None
+        self.files |= done["files"]
+        return done["facts"]
 
-    def keep(self, name: str, facts: dict[str, Any]) -> bool:
-        """Take over a file of an earlier run, which recorded `facts` of it. Returns False if it is gone or has changed."""
-        path = io.inside(self.directory, name)
-        if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
-            return False
-        self.files[name] = facts
-        return True
+    def channels(self, name: str) -> dict[str, np.ndarray]:
+        """Return the channels of a raster that this stage has written or taken over."""
+        return io.read_exr(io.inside(self.directory, name))
 
     def _record(self, name: str, **facts: Any) -> None:
         path = self.directory / name

@@ -16,7 +16,6 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.objects.mask_clustering import flatten_masks
 from iif_core.objects.mask_proposals import point_grid, suppress_overlaps, threshold_stability
-from workflow.artifacts.files import read_exr
 from workflow.models.checkpoint import (
     Checkpoint,
     Origin,
@@ -171,12 +170,13 @@ def label_maps(job: Job, capture: CaptureReader) -> dict[str, np.ndarray]:
     rows, labels = [], {}
     for done, view in enumerate(views):
         job.progress(done, len(views), "views cut into masks")
-        row = _kept(job, view)
-        if row is None:
+        kept = job.writer.part_kept(view.name)
+        if kept is None:
             generator = generator or Generator(own)
-            row = _made(job, capture, view, generator)
-        rows.append(row)
-        stored = read_exr(job.writer.directory / f"masks/{view.name}.exr")["mask.id"]
+            rows.append(_made(job, capture, view, generator))
+        else:
+            rows.append(tuple(kept["row"]))
+        stored = job.writer.channels(f"masks/{view.name}.exr")["mask.id"]
         labels[view.name] = stored.astype(np.int32 if stored.max(initial=0) >= 2**16 else np.uint16)
     ids, proposals, masks, wrong = (list(column) for column in zip(*rows, strict=True))
     if not any(masks):
@@ -204,16 +204,8 @@ def _made(job: Job, capture: CaptureReader, view: View, generator: Generator) ->
     name = f"masks/{view.name}.exr"
     job.writer.exr(name, {"mask.id": labels.astype(np.uint32)})
     row = view.view_id, proposals, len(np.unique(labels[labels > 0])), wrong
-    job.writer.note(f"unfinished/{view.name}.json", {"by": job.fingerprint, "row": row, "file": job.writer.files[name]})
+    job.writer.part_done(view.name, [name], {"row": row})
     return row
-
-
-def _kept(job: Job, view: View) -> Row | None:
-    """Return the row of a view that an interrupted run of the same job has finished, else None."""
-    done = job.writer.noted(f"unfinished/{view.name}.json")
-    if done is None or done.get("by") != job.fingerprint or not job.writer.keep(f"masks/{view.name}.exr", done["file"]):
-        return None
-    return tuple(done["row"])
 
 
 def _described(own: SimpleNamespace) -> dict[str, Any]:

@@ -98,6 +98,13 @@ class _Capture:
 
     def _view(self, view: View, radiance: Array) -> tuple[Array, Array]:
         """Write G-buffer and truth and fill in `radiance`; return radiance and mask of the pixels for metering."""
+        kept = self.writer.kept(view.name)
+        radiance[:], emits = self._render(view) if kept is None else kept[:2]
+        step = max(1, emits.size // METERING_PIXELS)
+        return np.array(radiance).reshape(-1, 3)[::step], ~emits.ravel()[::step]
+
+    def _render(self, view: View) -> tuple[Array, Array]:
+        """Write G-buffer and truth; return the radiance (H, W, 3) and where it shows emitters (H, W)."""
         from iif_core.camera.pinhole import direction_derivatives
         from iif_core.light.transport.geometry import trace
         from iif_core.light.transport.render import render
@@ -121,22 +128,16 @@ class _Capture:
         if self.settings.denoise:
             normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
             image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
-        radiance[:] = image.reshape(*shape, 3)
-
-        self.writer.gbuffer(view.name, depth.reshape(shape), face.reshape(shape))
-        self.writer.truth(
-            view.name,
-            Truth(
-                np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
-                np.where(hit, roughness, 0).reshape(shape),
-                np.where(hit, metallic, 0).reshape(shape),
-                emission.reshape(*shape, 3),
-                image.reshape(*shape, 3),
-                hit.reshape(shape),
-            ),
+        truth = Truth(
+            np.where(hit[:, None], albedo, 0).reshape(*shape, 3),
+            np.where(hit, roughness, 0).reshape(shape),
+            np.where(hit, metallic, 0).reshape(shape),
+            emission.reshape(*shape, 3),
+            image.reshape(*shape, 3),
+            hit.reshape(shape),
         )
-        step = max(1, len(image) // METERING_PIXELS)
-        return image[::step], ~emission.any(1)[::step]
+        self.writer.rendered(view.name, depth.reshape(shape), face.reshape(shape), truth, {})
+        return truth.radiance, truth.emission.any(-1)
 
     def _photographs(self, views: list[View], radiance: Array, meters: list[tuple[Array, Array]]) -> list[View]:
         """Write the photographs and return the views with their exposures."""

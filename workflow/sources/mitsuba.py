@@ -196,21 +196,30 @@ class _Capture:
         self.usable: list[Array] = []
         self.meter: list[tuple[Array, Array]] = []
         for i, view in enumerate(views):
-            depth, face, truth = self._gbuffer(view)
-            if i == 0 and not (face >= 0).any():
-                raise InputError(f"{self.source.path}: the scene's sensor sees no surface; point it into the room")
-            image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
-            if self.settings.denoise:
-                image = denoise(image, truth.albedo, self._normals(view, face))
-            self.dropped += dropped
-            self.writer.gbuffer(view.name, depth, face)
-            self.writer.truth(view.name, replace(truth, radiance=image))
+            kept = self.writer.kept(view.name)
+            image, emits, facts = self._render(view, integrator) if kept is None else kept
+            self.dropped += facts["dropped"]
+            valid = np.ones(image.shape[:2], bool)
+            valid.ravel()[facts["invalid"]] = False
             radiance[i] = image
             self.usable.append(np.packbits(valid))
             step = max(1, image.shape[0] * image.shape[1] // METERING_PIXELS)
-            dark = (valid & ~truth.emission.any(-1)).ravel()[::step]
+            dark = (valid & ~emits).ravel()[::step]
             self.meter.append((image.reshape(-1, 3)[::step], dark))
             self.job.progress(i + 1, len(views), "rendered views")
+
+    def _render(self, view: View, integrator: Any) -> tuple[Array, Array, dict[str, Any]]:
+        """Write G-buffer and truth of a view; return its radiance (H, W, 3), where it shows emitters (H, W), and what else is
+        needed of it: the number of samples that were dropped and the pixels without any."""
+        from workflow.sources.mitsuba_scene import render
+
+        depth, face, truth = self._gbuffer(view)
+        image, valid, dropped = render.render_view(self.loaded.scene, integrator, view, self.settings.samples, self.job.seed)
+        if self.settings.denoise:
+            image = denoise(image, truth.albedo, self._normals(view, face))
+        facts = {"dropped": dropped, "invalid": np.flatnonzero(~valid).tolist()}
+        self.writer.rendered(view.name, depth, face, replace(truth, radiance=image), facts)
+        return image, truth.emission.any(-1), facts
 
     def _gbuffer(self, view: View) -> tuple[Array, Array, Truth]:
         """Return z-depth, face ids and material truth at the pixel centres; the radiance of the truth is still 0."""

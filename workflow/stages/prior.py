@@ -34,8 +34,8 @@ def run(job: Job) -> None:
     rows: list[Row] = []
     for done, view in enumerate(views):
         job.progress(done, len(views), "views predicted")
-        kept = _kept(job, view)
-        rows += _predicted(job, prior, capture, view, seed) if kept is None else kept
+        kept = job.writer.part_kept(view.name)
+        rows += _predicted(job, prior, capture, view, seed) if kept is None else map(tuple, kept["rows"])
     _write_table(job, rows)
     if hasattr(prior, "describe"):
         job.writer.json("model.json", prior.describe(job.settings))
@@ -59,19 +59,8 @@ def _predicted(job: Job, prior: ModuleType, capture: CaptureReader, view: View, 
     name = f"maps/{view.name}.exr"
     if channels:
         job.writer.exr(name, channels)
-    done = {"by": job.fingerprint, "rows": rows, "file": job.writer.files[name] if channels else None}
-    job.writer.note(f"unfinished/{view.name}.json", done)
+    job.writer.part_done(view.name, [name] if channels else [], {"rows": rows})
     return rows
-
-
-def _kept(job: Job, view: View) -> list[Row] | None:
-    """Return the rows of a view that an interrupted run of the same job has finished, else None."""
-    done = job.writer.noted(f"unfinished/{view.name}.json")
-    if done is None or done.get("by") != job.fingerprint:
-        return None
-    if done["file"] is not None and not job.writer.keep(f"maps/{view.name}.exr", done["file"]):
-        return None
-    return [tuple(row) for row in done["rows"]]
 
 
 def _write_table(job: Job, rows: list[Row]) -> None:
