@@ -19,6 +19,7 @@ PAGE_OF_LETTER = {
     "R": "reflectance",
     "C": "camera",
     "P": "priors",
+    "T": "published",
     "O": "objects",
     "F": "fusion",
     "L": "light",

@@ -86,7 +86,7 @@ def test_scene_over_preset_over_default(scene):
         ("source: {kind: mitsuba, path: 3}\nprior: {kind: simulated}\n", ["source.path", "found 3"]),
         ("source: {kind: builtn}\nprior: {kind: simulated}\n", ["source.kind", "found 'builtn'", "Did you mean builtin?"]),
         (f"{GOOD}affines: {{solver: dirct}}\n", ["affines.solver", "found 'dirct'", "Did you mean direct?"]),
-        (f"{GOOD}affines: {{pixels: all}}\n", ["affines.pixels", "found 'all'", "Needed: a whole number."]),
+        (f"{GOOD}affines: {{pixels: some}}\n", ["affines.pixels", "found 'some'", "'all' or a whole number of at least 100"]),
         ("prior: {kind: simulated}\n", ["`source`: missing"]),
         ("source: {kind: builtin\n", ["x.yaml", "line", "not valid YAML"]),
         ("- a\n- b\n", ["found list", "key: value"]),
@@ -135,7 +135,7 @@ def test_scene_file_that_is_not_utf8(scene):
 
 
 def test_a_value_that_equals_the_default_is_never_idle(scene):
-    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nemission: {iterations: 10000}\nbase: {solver: sgd, sweeps: 9}\n")
+    root = scene(GOOD + "affines: {model: fipt, iterations: 60}\nbase: {solver: sgd, sweeps: 9}\n")
     assert settings.load("x", "draft", root).affines.iterations == 60
 
 
@@ -159,7 +159,7 @@ def test_defaults_are_those_of_the_solvers(repository):
     ):
         shared = set(type(section).model_fields) & {field.name for field in fields(options)}
         assert {name: getattr(section, name) for name in shared} == {name: getattr(options, name) for name in shared}
-    assert (tree.emission.preset, tree.emission.iterations) == (sgd.SgdOptions().preset, sgd.SgdOptions().steps)
+    assert tree.emission.preset == sgd.SgdOptions().preset
 
 
 def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, repository):
@@ -230,3 +230,22 @@ def test_registry_is_ordered_and_its_settings_exist(repository):
     document = settings.dump(settings.load("kitchen", "draft", repository))
     for stage in STAGES.values():
         settings.select(document, stage.settings)
+
+
+def test_a_preset_lies_between_the_quality_and_the_scene(scene):
+    root = scene(GOOD + "preset: published\nemission: {iterations: 7}\n", "affines: {pixels: 500}\nemission: {samples: 4}\n")
+    got = settings.load("x", "draft", root)
+    solvers = got.base.solver, got.emission.solver, got.affines.solver
+    assert (got.preset, *solvers) == ("published", "sgd", "published", "published")
+    assert (got.emission.samples, got.emission.iterations, got.affines.pixels, got.shading.pixels) == (128, 7, "all", "all")
+    repaired = settings.load("x", "draft", scene(GOOD + "preset: published_repaired\n"))
+    assert (repaired.base.preset, repaired.base.texture, repaired.emission.solver) == ("safe", "hashgrid", "published_repaired")
+
+
+def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
+    with pytest.raises(InputError, match=r"`prune`: read by `solver: direct` or `sgd` alone"):
+        settings.load("x", "draft", scene(GOOD + "preset: published\nemission: {prune: 0.2}\n"))
+    with pytest.raises(InputError, match="8-bit photographs"):
+        settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
+    with pytest.raises(InputError, match="preset"):
+        settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))

@@ -123,6 +123,10 @@ class StageWriter:
         """Return the channels of a raster that this stage has written or taken over."""
         return io.read_exr(io.inside(self.directory, name))
 
+    def columns(self, name: str) -> dict[str, np.ndarray]:
+        """Return the columns of a table that this stage has written or taken over."""
+        return io.read_parquet(io.inside(self.directory, name))
+
     def _record(self, name: str, **facts: Any) -> None:
         path = self.directory / name
         self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}

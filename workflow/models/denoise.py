@@ -1,4 +1,5 @@
-"""Denoising of rendered pictures: photographs, re-renderings and the light of the baselines, but never data of the solvers."""
+"""Denoising of rendered pictures: photographs, re-renderings and the light of the baselines, but never data of
+our solvers."""
 
 from __future__ import annotations
 
@@ -26,3 +27,10 @@ def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.
 
     images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]
     return np.maximum(pyoidn.denoise(*images, hdr=True, clean_aux=True), 0)
+
+
+def denoise_alone(radiance: np.ndarray) -> np.ndarray:
+    """Denoise a linear HDR picture (H, W, 3) without guides."""
+    import pyoidn
+
+    return np.maximum(pyoidn.denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)

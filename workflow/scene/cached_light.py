@@ -11,6 +11,9 @@ from workflow.artifacts.store import rgb
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import View
 
+UNITS = {f"half{half}_{lobe}": "relative" for half in range(2) for lobe in ("s0", "s1")}
+"""Units of the columns of a table of specular light."""
+
 
 @dataclass(frozen=True)
 class SpecularLight:

@@ -345,7 +345,7 @@ def solve(photos: Photographs, found: Traced, sky: Sky | None) -> tuple[Emission
     if settings.solver == "sgd":
         # Which groups emit is known by now, so `safe` has nothing to prune.
         prune = ((100, 0.0), (1000, 0.05)) if settings.preset == "paper" else ()
-        options = SgdOptions(settings.preset, settings.iterations, prune=prune, seed=photos.job.seed)
+        options = SgdOptions(settings.preset, settings.iterations or SgdOptions.steps, prune=prune, seed=photos.job.seed)
         solution = solve_emission_sgd(problem.rows, initial, options)
     else:
         solution = solve_families(problem.rows, prior, family, width)

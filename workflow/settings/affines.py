@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from iif_core.fitting.problem import FitOptions, SgdOptions
-from workflow.settings.section import Section
+from workflow.settings.section import Section, word_or_count
 
 _DIRECT, _DESCENT = FitOptions(), SgdOptions()
 _BASELINES = ("base", "object_mean", "texture_average", "fipt", "iris")
@@ -94,6 +94,7 @@ class Affines(Section):
             "direct": ("solver: sgd", _DESCENT_ALONE),
             "sgd": ("solver: direct", _DIRECT_ALONE),
             "adam": ("solver: direct", _DIRECT_ALONE),
+            "published": ("solver: direct", _DIRECT_ALONE),
         },
     }
 
@@ -101,28 +102,29 @@ class Affines(Section):
     """`objects`: one affine map per object. Baselines under the same light (docs/development/studies.md): `base`: nothing is
     fitted; `object_mean`: mean prediction of each object; `texture_average`: mean photographed colour of each cell as albedo;
     `fipt`, `iris`: a free BRDF in every cell."""
-    solver: Literal["direct", "sgd", "adam"] = "direct"
+    solver: Literal["direct", "sgd", "adam", "published"] = "direct"
     """With `objects`: `direct`: Gauss-Newton; `sgd`: stochastic gradient descent on the paper's loss; `adam`: Adam on the same
-    loss. With `fipt`, `iris`: `direct`: exact for every cell; `adam`: gradient descent on the same loss."""
+    loss; `published`: the paper's descent to the letter (docs/method/published.md#materials). With `fipt`, `iris`: `direct`:
+    exact for every cell; `adam`: gradient descent on the same loss."""
     response: Literal["auto", "identity", "srgb", "gamma", "ggcm", "spline"] | ResponseFile = "auto"
     """Family of the camera response, or `{file: curve.csv}` for a measured one (CSV or Parquet with columns `x, R, G, B`, or NPY
     of shape (3, samples)). `auto`: identity for HDR; for LDR the simplest of srgb, gamma, ggcm and spline that explains how
     photographs of different exposure show the same surface, and srgb where no surface is shown by several exposures."""
     iterations: int = Field(_DIRECT.iterations, ge=1, le=500)
     """`direct`: largest number of Gauss-Newton steps; the fit ends earlier when a step changes nothing."""
-    pixels: int = Field(200000, ge=100)
-    """`objects`: pixels in the fit, drawn evenly over the objects."""
+    pixels: Annotated[Literal["all"] | Annotated[int, Field(ge=100)], word_or_count("all", least=100)] = 200000
+    """`objects`: pixels in the fit, drawn evenly over the objects, or `all`."""
     population: bool = _DIRECT.population
     """`direct`: the prior of every object is the distribution of the well-determined objects of the scene (empirical Bayes);
     `false`: a fixed, weak prior."""
     robust_width: float = Field(_DIRECT.robust_width, gt=0)
     """`direct`: width of the Cauchy loss of the residual, in sensor units."""
     epochs: int = Field(_DESCENT.epochs, ge=1)
-    """`sgd`, `adam`: passes over the pixels; the step size falls to a fifth after each."""
+    """`sgd`, `adam`, `published`: passes over the pixels; the step size falls to a fifth after each."""
     batch: int = Field(_DESCENT.batch, ge=1)
-    """`sgd`, `adam`: pixels in one step."""
+    """`sgd`, `adam`, `published`: pixels in one step."""
     rate: float | None = Field(_DESCENT.rate, gt=0)
-    """`sgd`, `adam`: step size; the default is 10 for `sgd` and 0.01 for `adam`."""
+    """`sgd`, `adam`, `published`: step size; the default is 10, and 0.01 for `adam`."""
     scale: Literal["found", "prior"] | KnownScale = "found"
     """`objects`: what fixes the factor between light and albedo: `found`: the share of indirect light; `prior`: the prior's mean
     albedo (`found` for HDR); or a known quantity: {white_patch: {object: NAME, albedo: 0.9}}, {white_patch: {view:
@@ -134,7 +136,7 @@ class Affines(Section):
 
     @model_validator(mode="after")
     def _known_pairs(self) -> Affines:
-        allowed = {"objects": ("direct", "sgd", "adam"), "fipt": ("direct", "adam"), "iris": ("direct", "adam")}
+        allowed = {"objects": ("direct", "sgd", "adam", "published"), "fipt": ("direct", "adam"), "iris": ("direct", "adam")}
         solvers = allowed.get(self.model, ("direct",))
         if self.solver not in solvers:
             raise ValueError(f"`solver: {self.solver}` does not fit `model: {self.model}`; allowed with it: {', '.join(solvers)}")

@@ -10,12 +10,20 @@ from iif_core.light.emission.sgd import SgdOptions
 from workflow.settings.section import Section, word_or_count
 
 _SGD = SgdOptions()
+PUBLISHED = ("published", "published_repaired")
+"""Solvers that are the published method from the photographs on."""
+_OURS_ALONE = ("min_observations", "cache_edge", "max_bounces", "prune", "environment")  # sizes come with a quality
 
 
 class Emission(Section):
     """Which faces of the mesh emit light, and how bright they are."""
 
-    IDLE: ClassVar = {"solver": {"direct": ("solver: sgd", ("preset", "iterations"))}}
+    IDLE: ClassVar = {
+        "solver": {
+            "direct": ("solver: sgd", ("preset", "iterations")),
+            **{name: ("solver: direct` or `sgd", (*_OURS_ALONE, "preset")) for name in PUBLISHED},
+        }
+    }
 
     saturation: float = Field(0.99, gt=0, le=1)
     """Sensor value from which a pixel counts as saturated."""
@@ -37,17 +45,28 @@ class Emission(Section):
     environment: Literal["auto", "on", "off"] = "auto"
     """Light from outside the mesh: 42 directions, what is seen apart, or twelve where the mesh is open. `auto`: included when
     enough rays leave the mesh and what they meet is not black."""
-    solver: Literal["direct", "sgd"] = "direct"
-    """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison."""
+    solver: Literal["direct", "sgd", "published", "published_repaired"] = "direct"
+    """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison. `published`:
+    the paper's method from the photographs on, a radiance for every bright triangle found on fresh paths;
+    `published_repaired`: the same without its errors (docs/method/published.md#emission)."""
     preset: Literal["safe", "paper"] = _SGD.preset
     """`sgd`: `paper`: the published step size and pruning; `safe`: steps scaled by the diagonal of the normal matrix, and the
     average of the last iterates."""
-    iterations: int = Field(_SGD.steps, ge=1)
-    """`sgd`: steps, of 1024 pixels each."""
+    iterations: int | None = Field(None, ge=1)
+    """Steps. `sgd`: of 1024 pixels each, default 10,000; `published`: of 8192 pixels each, default one pass over all pixels."""
 
 
 class Shading(Section):
     """Incident light that is cached for the fits: diffuse, and specular at several roughness levels."""
+
+    IDLE: ClassVar = {
+        "method": {"published": ("method: shared_paths", ("cell_edge", "max_samples", "max_bounces", "indirect"))},
+    }
+
+    method: Literal["shared_paths", "published"] = "shared_paths"
+    """`shared_paths`: all lobes from one set of paths, diffuse light once for every surface cell; `published`: as the paper has
+    it, at every pixel 256 paths for diffuse light and 64 to 128 for each of 6 levels, of one bounce, and the denoiser
+    (docs/method/published.md#shading)."""
 
     pixels: Annotated[Literal["auto", "all"] | Annotated[int, Field(ge=100)], word_or_count("auto", "all", least=100)] = "auto"
     """Pixels of which specular light is traced, drawn evenly over the objects. `auto`: as many as the fit reads

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from iif_core.errors import InputError
 from workflow.settings import batch_table, study_files
 from workflow.settings.explain import explain
-from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
+from workflow.settings.names import PRESETS, QUALITIES, RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
 from workflow.settings.scene import SECTIONS_THAT_CHOOSE, SceneSettings
 from workflow.settings.yaml_file import read_yaml
 
@@ -79,7 +79,7 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
     preset = read_yaml(configuration(f"quality/{quality}.yaml", root))
     if line := batch_table.find(scene, root):
-        layers = [(f"config/quality/{quality}.yaml", preset), *batch_table.layers(line, root)]
+        layers = _with_preset([(f"config/quality/{quality}.yaml", preset), *batch_table.layers(line, root)], root)
         try:
             return SceneSettings.model_validate(_merged(layers))
         except ValidationError as error:
@@ -91,15 +91,27 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         layers.append((str(shown), read_yaml(path)))
     if parts := study_files.derived(scene, root):
         layers += study_files.layers(parts, root)
+    given = len(layers)
+    layers = _with_preset(layers, root)
     try:
         return SceneSettings.model_validate(_merged(layers))
     except ValidationError:
-        for count in range(2, len(layers) + 1):  # blame the first layer that spoils it
+        below = 1 + len(layers) - given  # what comes before the file of the scene
+        for count in range(below + 1, len(layers) + 1):  # blame the first layer that spoils it
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
             except ValidationError as error:
                 raise InputError(explain(error, lambda _, blamed=layers[count - 1][0]: blamed)) from None
         raise
+
+
+def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Return the layers with the file of the `preset` that the uppermost of them names, right above the quality."""
+    named = [layer["preset"] for _, layer in layers if "preset" in layer]
+    if not named or named[-1] not in PRESETS:
+        return layers
+    file = configuration(f"presets/{named[-1]}.yaml", root)
+    return [layers[0], (f"config/presets/{named[-1]}.yaml", read_yaml(file)), *layers[1:]]
 
 
 def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:

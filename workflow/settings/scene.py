@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
 from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
-from workflow.settings.light import Emission, Shading
+from workflow.settings.light import PUBLISHED, Emission, Shading
 from workflow.settings.outputs import Export, Metrics, Render, Report
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting
@@ -20,6 +20,9 @@ from workflow.settings.source import Capture, Source
 class SceneSettings(Section):
     """All settings of one scene."""
 
+    preset: Literal["ours", "published", "published_repaired"] = "ours"
+    """`published`: every stage as the paper has it, to compare with; `published_repaired`: the same without its errors
+    (docs/method/published.md). Presets are files of settings, config/presets/, between the quality and the scene."""
     source: Source
     """Where photographs, cameras and mesh come from."""
     capture: Capture = Capture()
@@ -55,15 +58,25 @@ class SceneSettings(Section):
         return self
 
     @model_validator(mode="after")
+    def _published_photographs(self) -> SceneSettings:
+        if self.emission.solver in PUBLISHED and self.capture.dynamic_range == "hdr":
+            raise ValueError(
+                f"`emission: solver: {self.emission.solver}` knows the loss of 8-bit photographs alone; set"
+                " `capture: {dynamic_range: ldr}`, or another solver"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _lit_pixels(self) -> SceneSettings:
         """Put the number, or `all`, in the place of `shading: {pixels: auto}`: what is traced follows from what is read."""
         textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
-        every = textured or self.affines.model in FREE_CELLS
+        every = textured or self.affines.model in FREE_CELLS or self.affines.pixels == "all"
         asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
         if asked == "auto":
             object.__setattr__(self, "shading", self.shading.model_copy(update={"pixels": needed}))
         elif asked != "all" and (every or asked < self.affines.pixels):
-            reader = "texture from the photographs" if textured else f"`affines: model: {self.affines.model}`"
+            whole = "pixels: all" if self.affines.pixels == "all" else f"model: {self.affines.model}"
+            reader = "texture from the photographs" if textured else f"`affines: {whole}`"
             why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
             raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
         return self

@@ -16,6 +16,7 @@ from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import level_deviation, prediction_scatter
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
+from iif_core.fitting.published import PublishedOptions, fit_published
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
@@ -95,6 +96,10 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             threads=job.threads,
         )
         return lambda problem, start: fit_affines(problem, start, options)
+    if settings.solver == "published":
+        rate = PublishedOptions.rate if settings.rate is None else settings.rate
+        published = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
+        return lambda problem, start: fit_published(problem, start, published)
     own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
     return lambda problem, start: fit_affines_sgd(problem, start, own)
 
@@ -210,7 +215,8 @@ def _problem(
     counts = np.zeros(max(scene.n_objects, 1), np.int64)
     for view in views:
         counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
-    drawn = FitPixels.evenly(counts, job.settings.affines.pixels, mixed, job.seed)
+    asked = job.settings.affines.pixels
+    drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
     levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
     cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]

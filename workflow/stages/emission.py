@@ -38,10 +38,12 @@ from workflow.scene.emission_solve import (
     traced,
     trial,
 )
+from workflow.scene.light_files import emitter_columns, write_light
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names
 from workflow.scene.see_through import seen_through, translucent_objects
 from workflow.scene.sun_search import find_sun
+from workflow.settings.light import PUBLISHED
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,10 @@ class FoundLight:
 def run(job: Job) -> None:
     """Write emitters.parquet, emitter_faces.parquet, object_gains.parquet, radiance_cache.parquet, environment_texels.parquet
     and emission.json."""
+    if job.settings.emission.solver in PUBLISHED:
+        from workflow.published import emission
+
+        return emission.run(job)
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     notes: list[str] = []
     known = view_exposures(capture, notes)
@@ -232,19 +238,17 @@ def _table(light: FoundLight) -> dict[str, Any]:
     outside, out = sky.size if sky else 0, left_out.size
     sides = [[_side_of(g, i) for i in range(g.size)] for g in (groups, left_out)]
     pixels = sky.pixels if sky else np.zeros(0)
-    radiance, error = (np.r_[values, np.zeros((out, 3))] for values in (solution.radiance, solution.error))
-    return {
-        "emitter_id": np.arange(groups.size + outside + out, dtype=np.int32),
-        "kind": np.array(["area"] * groups.size + ["environment"] * outside + ["area"] * out, dtype=str),
-        "faces": np.r_[groups.faces, np.zeros(outside), left_out.faces].astype(np.int32),
-        "area_m2": np.r_[groups.area, np.zeros(outside), left_out.area].astype(np.float64),
-        "side": np.array([*sides[0], *[0] * outside, *sides[1]], np.int32),
-        **{f"radiance_{c}": radiance[:, i].astype(np.float32) for i, c in enumerate("rgb")},
-        **{f"error_{c}": error[:, i].astype(np.float32) for i, c in enumerate("rgb")},
-        "observations": np.r_[groups.count, pixels, left_out.count].astype(np.int64),
-        "kept": np.arange(groups.size + outside + out) < groups.size + outside,
-        "reason": np.array([""] * (groups.size + outside) + light.reasons, dtype=str),
-    }
+    return emitter_columns(
+        faces=np.r_[groups.faces, np.zeros(outside), left_out.faces],
+        area=np.r_[groups.area, np.zeros(outside), left_out.area],
+        radiance=np.r_[solution.radiance, np.zeros((out, 3))],
+        error=np.r_[solution.error, np.zeros((out, 3))],
+        observations=np.r_[groups.count, pixels, left_out.count],
+        kept=np.arange(groups.size + outside + out) < groups.size + outside,
+        reason=[""] * (groups.size + outside) + light.reasons,
+        kind=["area"] * groups.size + ["environment"] * outside + ["area"] * out,
+        side=np.array([*sides[0], *[0] * outside, *sides[1]]),
+    )
 
 
 def _side_of(groups: EmitterGroups, group: int) -> int:
@@ -253,23 +257,10 @@ def _side_of(groups: EmitterGroups, group: int) -> int:
 
 
 def _write(job: Job, light: FoundLight, table: dict[str, Any]) -> None:
-    groups, cache, sky = light.found.groups, light.found.cache, light.outside
-    units = {"area_m2": "m^2", "radiance_r": "relative", "error_r": "relative"}
-    job.writer.table("emitters.parquet", table, units)
+    groups, sky = light.found.groups, light.outside
     face = np.flatnonzero(groups.of_face >= 0)
-    columns = {
-        "face_id": face.astype(np.int32),
-        "emitter_id": groups.of_face[face].astype(np.int32),
-        "side": groups.side[face].astype(np.int32),
-    }
-    job.writer.table("emitter_faces.parquet", columns)
-    gains = {f"gain_{c}": light.gain[:, i].astype(np.float32) for i, c in enumerate("rgb")}
-    gains["transmittance"] = light.transmittance
-    job.writer.table("object_gains.parquet", {"object_id": np.arange(len(light.gain), dtype=np.int32), **gains})
-    voxels = {name: cache.ijk[:, axis] for axis, name in enumerate("ijk")}
-    voxels |= {f"radiance_{c}": cache.radiance[:, i] for i, c in enumerate("rgb")}
-    voxels |= {"samples": cache.samples, "censored": cache.censored}
-    job.writer.table("radiance_cache.parquet", voxels, {"radiance_r": "relative"})
+    lit = table, face, groups.of_face[face], groups.side[face]
+    write_light(job, *lit, light.gain, light.transmittance, light.found.cache)
     if sky:
         row, column = np.indices(sky.columns.shape).astype(np.int32)
         ids = (sky.columns + groups.size).astype(np.int32)

@@ -22,7 +22,7 @@ from workflow.scene.base_scene import (
     read_radiance_cache,
     view_pixels,
 )
-from workflow.scene.cached_light import SpecularLight, table_of
+from workflow.scene.cached_light import UNITS, SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, View
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from iif_core.light.transport.scene import Scene
 
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
-UNITS = {f"half{half}_{lobe}": "relative" for half in range(2) for lobe in ("s0", "s1")}
 COVERAGE_RAYS = 8192  # by which the share of surface that the radiance cache knows is measured
 
 
@@ -47,6 +46,10 @@ def roughness_levels(count: int) -> np.ndarray:
 def run(job: Job) -> None:
     """Write maps/<view>.exr with the diffuse integral of every pixel (0 where nothing was hit), pixels/<view>.parquet with the
     specular integrals of the pixels that are read, both in two independent halves, levels.parquet and shading.json."""
+    if job.settings.shading.method == "published":
+        from workflow.published import shading
+
+        return shading.run(job)
     from iif_core.light.transport.scene import Scene
 
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)

@@ -1,0 +1,120 @@
+"""Stages emission, shading and affines of `preset: published` on the tiny room: artefacts, resumption, refusal."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+
+import numpy as np
+import pytest
+
+from iif_core.errors import InputError
+from workflow.artifacts import StageReader
+from workflow.runtime import fingerprint
+from workflow.runtime.job import run_stage
+from workflow.scene.normal_form import CaptureReader
+
+SCENE = """\
+preset: published
+source: {kind: builtin, scene: tiny}
+capture: {views: 4, width: 32, height: 32, samples: 16}
+prior: {kind: simulated, samples: 2}
+base: {solver: direct}
+emission: {iterations: 110, samples: 4}
+affines: {batch: 1024}
+"""
+FIRST = ("capture", "prior", "segmentation", "base")
+
+
+def run(folder, stages, monkeypatch):
+    (folder / "config/scenes").mkdir(parents=True, exist_ok=True)
+    (folder / "config/scenes/tiny.yaml").write_text(SCENE)
+    monkeypatch.chdir(folder)
+    for cached in (fingerprint.resolved, fingerprint.fingerprint):
+        cached.cache_clear()
+    for stage in stages:
+        run_stage(stage, "tiny")
+    return {stage: StageReader(folder / "results/tiny" / stage, stage, "tiny") for stage in stages}
+
+
+@pytest.fixture(scope="module")
+def finished(llvm, tmp_path_factory):
+    """Folder and readers of a run to the end of stage affines."""
+    folder = tmp_path_factory.mktemp("published")
+    with pytest.MonkeyPatch.context() as patch:
+        yield folder, run(folder, (*FIRST, "emission", "shading", "affines"), patch)
+
+
+def digests(reader):
+    return {
+        name: hashlib.sha256((reader.directory / name).read_bytes()).hexdigest() for name in (*reader.names(), "manifest.json")
+    }
+
+
+def test_emission_is_a_radiance_for_every_bright_triangle(finished):
+    _, readers = finished
+    facts, table, faces = (
+        readers["emission"].json("emission.json"),
+        readers["emission"].table("emitters.parquet"),
+        readers["emission"].table("emitter_faces.parquet"),
+    )
+    assert facts["solver"] == "published" and facts["steps"] == 110 and facts["level_error"] == 0
+    assert (table["faces"] == 1).all() and len(faces["face_id"]) == len(table["emitter_id"]) and table["kept"].any()
+    assert (table["observations"] > 0).all()
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
+    assert (radiance >= 0).all() and radiance[table["kept"]].sum(1).min() > 0.031
+    truth = readers["capture"].table("faces.parquet")["emission_r"]
+    assert truth[faces["face_id"][table["kept"][faces["emitter_id"]]]].max() > 0
+    assert facts["loss"][-1] < 0.7 * facts["loss"][0]
+    cache = readers["emission"].table("radiance_cache.parquet")
+    assert not cache["censored"].any() and max(int(cache[c].max()) for c in "ijk") < 256
+
+
+def test_shading_has_six_even_levels_and_no_halves(finished):
+    _, readers = finished
+    np.testing.assert_allclose(readers["shading"].table("levels.parquet")["roughness"], 0.02 + 0.98 * np.arange(6) / 5)
+    light = readers["shading"].exr("maps/000.exr")
+    np.testing.assert_array_equal(light["half0.diffuse.R"], light["half1.diffuse.R"])
+    specular = readers["shading"].table("pixels/000.parquet")
+    assert specular["half0_s0"].shape == (32 * 32, 18) and (specular["half0_s0"] == specular["half1_s0"]).all()
+    assert light["half0.diffuse.R"].mean() > 0.01
+
+
+def test_materials_are_fitted_to_all_pixels(finished):
+    _, readers = finished
+    facts = readers["affines"].json("affines.json")
+    pixels = facts["pixels"]
+    assert facts["solver"] == "published" and facts["light_scale"] == 1
+    assert facts["iterations"] == 3 * -(-pixels // 1024) and facts["converged"] and facts["history"][-1] < facts["history"][0]
+    assert facts["response"]["family"] == "ggcm"
+
+
+def test_a_killed_descent_goes_on_where_it_was(finished, tmp_path, monkeypatch):
+    from iif_core.light.transport import single_bounce
+
+    folder, readers = finished
+    shutil.copytree(folder / "results", tmp_path / "results")
+    whole, steps = single_bounce.trace_bounce, []
+
+    def killed(*arguments, **options):
+        steps.append(len(steps))
+        if len(steps) == 75:
+            raise KeyboardInterrupt
+        return whole(*arguments, **options)
+
+    monkeypatch.setattr(single_bounce, "trace_bounce", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, ("emission",), monkeypatch)
+    assert not (tmp_path / "results/tiny/emission/manifest.json").exists()
+    resumed = run(tmp_path, ("emission",), monkeypatch)
+    assert len(steps) == 75 + 60  # from step 50
+    assert digests(resumed["emission"]) == digests(readers["emission"])
+
+
+def test_linear_photographs_of_a_folder_are_refused(finished, tmp_path, monkeypatch):
+    """Settings refuse `dynamic_range: hdr`; what a folder holds is known to the stage alone."""
+    folder, _ = finished
+    shutil.copytree(folder / "results", tmp_path / "results")
+    monkeypatch.setattr(CaptureReader, "is_hdr", True)
+    with pytest.raises(InputError, match=r"emission.solver: published: .* set `capture: \{dynamic_range: ldr\}`"):
+        run(tmp_path, ("emission",), monkeypatch)
