@@ -44,6 +44,13 @@ class Variant(Section):
     """`scores: metrics`: row of variants.parquet that is scored; by default `result`."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
+    preset: Literal["published", "published_repaired"] | None = None
+    """Another method than ours, as `preset` of a scene."""
+
+    @property
+    def layer(self) -> dict[str, Any]:
+        """All that the variant sets over the scene."""
+        return {**self.overrides, "preset": self.preset} if self.preset else dict(self.overrides)
 
 
 class Paper(Section):
@@ -246,7 +253,7 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
             )
         if study.common:
             out.append((f"{FOLDER / parts.study}.yaml, `common`", study.common))
-        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].overrides))
+        out.append((f"{FOLDER / parts.study}.yaml, variant {parts.variant}", study.variants[parts.variant].layer))
     return [*out, ("seed of the study", {"prior": {"seed": parts.seed}})]
 
 

@@ -138,7 +138,7 @@ def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list
         "scene": cell.scene,
         "variant": cell.variant,
         "label": variant.label or cell.variant,
-        "settings": json.dumps(variant.overrides, sort_keys=True),
+        "settings": json.dumps(variant.layer, sort_keys=True),
         "seed": cell.seed,
         **(_costs(cell, quality, study.costs) if not variant.row else {}),
         "status": "ok",
