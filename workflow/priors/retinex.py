@@ -14,6 +14,7 @@ import numpy as np
 from iif_core.light.irradiance import LightField, SurfaceCellsBuilder, Trace, estimate_log_light
 from iif_core.priors.retinex import albedo_level, retinex_predictions
 from iif_core.surface.triangles import face_geometry
+from workflow.runtime import device
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.photograph import GAMMA
 from workflow.segmentations.geometry import pieces
@@ -151,9 +152,7 @@ def _groups(capture: CaptureReader) -> np.ndarray:
 
 
 def _tracer(vertices: np.ndarray, faces: np.ndarray) -> Trace:
-    import mitsuba
-
-    mitsuba.set_variant("llvm_ad_rgb")
+    device.mitsuba()
     from iif_core.light.transport.geometry import build_geometry, trace
 
     geometry = build_geometry(vertices, faces, np.full(len(faces), -1, np.int32))

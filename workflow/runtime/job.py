@@ -22,8 +22,8 @@ from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
+from workflow.runtime import device, input_digests
 from workflow.runtime import fingerprint as fp
-from workflow.runtime import input_digests
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
 
@@ -47,6 +47,7 @@ class Job:
             any other raises AttributeError.
         seed: seed of the scene, if the registry lists it.
         threads: number of cores that this job may use.
+        device: on which rays are traced, as the scene asks and this machine has it.
         log: logger of the job; `progress(done, total, what)` writes at most one line every five seconds.
     """
 
@@ -54,6 +55,7 @@ class Job:
         self.stage, self.scene, self.quality, self.threads = STAGES[stage], scene, quality, threads
         self.log = logging.getLogger(f"{stage}")
         self.document = json.loads(fp.resolved(scene, quality))
+        self.device = device.use(self.document["device"])
         self._last_progress = self._started = time.monotonic()
         self._progress_of, self._first_item = "", (0, self._started)
         self._cpu_started = time.process_time()
@@ -125,6 +127,7 @@ class Job:
             "code": fp.code_digest(self.stage.name, self.document),
             "seed": self.document["seed"],
             "inputs": inputs,
+            "device": self.device.facts(),
             "versions": library_versions(),
         }
 
@@ -201,6 +204,8 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
             f"scene {scene}, stage {stage}: settings, code or input files changed while the workflow was running"
             f" (planned {expected}, now {job.fingerprint}). Run the same command again."
         )
+    if job.device.kind != "cpu":
+        job.log.info("rays are traced on %s", job.device)
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()

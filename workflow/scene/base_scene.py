@@ -12,6 +12,7 @@ from iif_core.reflectance.material import BLACK, CHANNELS, NEUTRAL
 from iif_core.surface.cells import grid_origin
 from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -86,9 +87,7 @@ class BaseScene:
 
     def materials(self) -> CellMaterials:
         """Build the materials on the device; an object of id `n_objects` is black."""
-        import mitsuba
-
-        mitsuba.set_variant("llvm_ad_rgb")
+        device.mitsuba()
         from iif_core.light.transport.materials import CellMaterials
 
         object_values = np.concatenate([self.object_values, np.float32([BLACK])])

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from iif_core.light.emission.translucent import TRANSMITTANCE, is_brighter_where_open
+from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import BaseScene
 from workflow.scene.emission_pixels import Photographs, ViewRecord, ViewRecords
@@ -80,9 +81,7 @@ class _Behind:
     """What camera rays meet behind the faces `sheer`, (m,) bool, of a scene."""
 
     def __init__(self, scene: BaseScene, sheer: np.ndarray):
-        import mitsuba
-
-        mitsuba.set_variant("llvm_ad_rgb")
+        device.mitsuba()
         from iif_core.light.transport.geometry import build_geometry
 
         self.sheer = sheer

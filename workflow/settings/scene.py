@@ -42,6 +42,10 @@ class SceneSettings(Section):
     """Pictures under other light and from other positions, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of all random numbers."""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """Where rays are traced. `auto`: on a CUDA device where the machine has one, else on the CPU; `cuda` is an error where there
+    is none. Recorded in the manifests, and no reason to run a job again: numbers differ by rounding and noise alone. Not tried
+    on a GPU yet, hence the default."""
 
     @field_validator("segmentation", mode="before")
     @classmethod

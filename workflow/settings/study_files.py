@@ -13,7 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError
+from pydantic import Field, PositiveFloat, ValidationError
 
 from iif_core.errors import InputError
 from iif_core.evaluation import catalogue
@@ -90,6 +90,8 @@ class Study(Section):
     """Stage whose scores are collected: of the base texture, or of the result and its re-rendering."""
     costs: list[str] = ["base"]
     """Stages whose times are added."""
+    growth: dict[str, dict[str, PositiveFloat]] = {}
+    """What is varied -> variant -> how much of it there is: the page then has the exponents with which `costs` grow."""
     protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
     """Protocols in the printed table and the picture; the Parquet file has all."""
     rows: Literal["variants", "scenes"] = "variants"
@@ -183,6 +185,10 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     for stage in study.costs:
         if stage not in STAGES:
             raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")
+    for what, sizes in study.growth.items():
+        for name in sizes:
+            if name not in variants:
+                raise InputError(f"{path}: `growth.{what}`: no variant {name}. Allowed here: {', '.join(variants)}.")
     for scene in study.scenes:
         if scene not in shared:
             hint = did_you_mean(scene, shared)

@@ -34,13 +34,10 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Build the room, photograph it, and write the normal form with ground truth."""
-    from workflow.runtime import native
+    from workflow.runtime import device, native
 
     native.prepare()
-    import mitsuba as mi
-
-    if not (mi.variant() or "").startswith(("llvm_ad_rgb", "cuda_ad_rgb")):
-        mi.set_variant("llvm_ad_rgb")
+    device.mitsuba()
     native.limit_threads(job.threads)
     if job.settings.capture.denoise:
         require_denoiser()

@@ -16,7 +16,7 @@ from iif_core.camera.registration import Photo
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
 from iif_core.surface.triangles import face_geometry
-from workflow.runtime import native
+from workflow.runtime import device, native
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureWriter, Truth, View
 from workflow.sources.folder_scene import alignment, exposure, images, mesh, registration, transforms
@@ -138,10 +138,7 @@ class _Capture:
 
     def _build(self) -> None:
         native.prepare()
-        import mitsuba as mi
-
-        if mi.variant() is None:
-            mi.set_variant("llvm_ad_rgb")
+        device.mitsuba()
         native.limit_threads(self.job.threads)
         from iif_core.light.transport.geometry import build_geometry
 

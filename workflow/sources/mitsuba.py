@@ -45,12 +45,10 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def capture(job: Job) -> None:
     """Write the whole capture of the scene that `source.path` names."""
-    from workflow.runtime import native
+    from workflow.runtime import device, native
 
     native.prepare()
-    from workflow.sources.mitsuba_scene import scene
-
-    scene.choose_variant()
+    device.mitsuba()
     native.limit_threads(job.threads)
     if job.settings.capture.denoise:
         require_denoiser()

@@ -18,6 +18,7 @@ from workflow.artifacts.files import write_atomically
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings import study_files
+from workflow.studies.growth import growth_lines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -192,6 +193,7 @@ COLUMNS = [
     ("paper", "float64"),
     *((name, "float64") for name in COSTS),
     ("threads", "int64"),
+    ("stage_costs", "string"),
     ("pareto", "bool"),
     ("status", "string"),
     ("reason", "string"),
@@ -234,19 +236,21 @@ def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, s
 def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
     """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`).
 
-    A value that one of the jobs did not record is None.
+    A value that one of the jobs did not record is None. `stage_costs`: the same of each job alone, JSON.
     """
-    jobs, solver = [], {}
+    jobs, solver, alone = [], {}, {}
     for stage in stages:
         scene = fp.home(stage, cell.name, quality)
         parts = read_parts(scene, stage)
         whole: dict[str, Any] = parts.get("job", {})
         jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
+        alone[stage] = {name: jobs[-1].get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
         solver = parts.get("solve", {})
     out: dict[str, Any] = {}
     for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("threads", max)):
         known = [job[name] for job in jobs if job.get(name) is not None]
         out[name] = together(known) if known and len(known) == len(jobs) else None
+    out["stage_costs"] = json.dumps(alone)
     return out | {f"solver_{name}": solver.get(name) for name in ("seconds", "cpu_seconds")}
 
 
@@ -337,6 +341,8 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
         lines += [f"## {quantity} {METRICS[metric].label}{_direction(metric)}", "", *_markdown(["variant", *head], body), ""]
     what = "the base texture" if study.costs == ["base"] else ", ".join(study.costs)
     lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
+    if study.growth:
+        lines += growth_lines(study, shown, scenes)
     return "\n".join(lines)
 
 

@@ -15,15 +15,6 @@ import numpy as np
 
 from iif_core.errors import InputError
 
-VARIANT = "llvm_ad_rgb"
-
-
-def choose_variant() -> None:
-    """Select Mitsuba's backend, unless the process already has one that works on RGB arrays."""
-    current = mi.variant()
-    if not current or "rgb" not in current or not current.startswith(("llvm", "cuda")):
-        mi.set_variant(VARIANT)
-
 
 def children(thing: Any) -> dict[str, Any]:
     """Return the Mitsuba objects directly below an object (BSDFs, textures, emitters) by parameter name."""
