@@ -147,4 +147,4 @@ def test_emitter_that_is_never_seen_is_left_to_its_light():
     evidence = white_surface(pixels, seen, white)
     out = prune_groups(trial.rows, EmissionPrior.independent(seen), np.arange(2), evidence, ~trial.anchor, np.zeros(2, bool))
     assert out.kept.all() and np.isinf(out.excess[1])
-    np.testing.assert_allclose(out.solution.radiance, truth, rtol=0.05)
+    np.testing.assert_allclose(out.radiance, truth, rtol=0.05)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from iif_core.light.emission.cache import RadianceSums
+from iif_core.light.emission.cache import RadianceSums, VoxelPixels
 from iif_core.light.emission.candidates import (
     FaceStatistics,
     emitter_candidates,
@@ -269,6 +269,12 @@ def test_radiance_threshold_ignores_emitters_and_finds_them():
     np.testing.assert_allclose(radiance_threshold(_statistics([5, 5], [7, 7])) / 7, 5)
 
 
+def _same_cache(found, expected):
+    """To the last bit."""
+    for name in ("edge", "origin", "ijk", "radiance", "samples", "censored"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
 def test_radiance_voxels_against_a_dictionary():
     rng = np.random.default_rng(1)
     points, value = rng.uniform(-1, 1, (3000, 3)).astype(np.float32), rng.random((3000, 3))
@@ -278,6 +284,12 @@ def test_radiance_voxels_against_a_dictionary():
     for part in np.array_split(np.arange(3000), 7):
         sums.add(points[part], value[part], censored[part])
     out = sums.finish()
+    at_once = VoxelPixels.of(0.25, origin, points, value, censored)
+    _same_cache(at_once.cache(np.ones(3000, bool)), out)
+    half = rng.random(3000) < 0.5
+    some = RadianceSums(0.25, origin)
+    some.add(points[half], value[half], censored[half])
+    _same_cache(at_once.cache(half), some.finish())
     expected: dict = {}
     for p, v, c in zip(points, value, censored, strict=True):
         expected.setdefault(tuple(np.floor((p - origin) / np.float32(0.25)).astype(int)), []).append((v, c))
@@ -292,6 +304,9 @@ def test_radiance_voxels_against_a_dictionary():
 
 def test_radiance_voxels_extremes():
     empty = RadianceSums(0.1, np.zeros(3)).finish()
+    _same_cache(
+        VoxelPixels.of(0.1, np.zeros(3), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, bool)).cache(np.zeros(0, bool)), empty
+    )
     assert empty.ijk.shape == (0, 3) and empty.radiance.shape == (0, 3)
     sums = RadianceSums(0.1, np.zeros(3))
     sums.add(np.full((2, 3), 0.05), np.array([[np.nan, 0, 0], [0.0, 0.0, 0.0]]), np.zeros(2, bool))

@@ -235,7 +235,7 @@ def test_pruning_keeps_what_shines():
     matrix[1, 0] = 0.4  # a white surface there would show 0.4 of the lamp
     out = _pruning([8.0, 2.0, 2.0, 0.0, 1.0], [8.0, 2.0, 2.0, 0.0, 0.0], matrix, reach=[1.0, 1.0, 1e-3, 1.0, 1.0])
     assert out.kept.tolist() == [True, False, False, False, True]
-    assert (out.solution.radiance[~out.kept] == 0).all()
+    assert (out.radiance[~out.kept] == 0).all()
     assert "white surface" in out.reason[1] and out.excess[1] == pytest.approx(2 / 3.2, rel=0.1)
     assert "of the light" in out.reason[2] and out.reason[0] == out.reason[4] == ""
 
@@ -264,7 +264,7 @@ def test_wall_that_is_dropped_keeps_reflecting():
     matrix[1, 0] = 0.6
     out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix)
     assert out.kept.tolist() == [True, False, True]
-    np.testing.assert_allclose(out.solution.radiance[0], 8.0, rtol=0.02)
+    np.testing.assert_allclose(out.radiance[0], 8.0, rtol=0.02)
 
 
 def test_false_emitter_goes_before_the_lamp_it_hides():

@@ -22,7 +22,7 @@ from iif_core.camera.calibration.choice import (
 from iif_core.camera.gains import CameraGains, choose_gains, radius_squared, with_held_out_views
 from iif_core.camera.overlap import PatchRows, join_rows, no_rows, patch_edge, patch_numbers, patch_rows
 from iif_core.camera.pinhole import direction_derivatives
-from iif_core.light.emission.cache import RadianceSums, RadianceVoxels
+from iif_core.light.emission.cache import RadianceVoxels, VoxelPixels
 from iif_core.light.emission.candidates import (
     FaceStatistics,
     face_statistics,
@@ -146,6 +146,20 @@ class Photographs:
         """Geometry and materials on the device, made once."""
         return self.scene.traceable()
 
+    @cached_property
+    def cache_pixels(self) -> tuple[VoxelPixels, np.ndarray]:
+        """The valid interior pixels of all views with their voxels of the radiance cache, and their faces (n,)."""
+        edge = self.job.settings.emission.cache_edge
+        parts = []
+        for done, view in enumerate(self.views):
+            pixels = self.records[view].pixels
+            radiance, bound = self.radiance(view, pixels.value, pixels.index)
+            use = pixels.valid & pixels.interior & np.isfinite(radiance).all(1)
+            parts.append((pixels.points[use], radiance[use], bound[use].any(1), pixels.face[use]))
+            self.job.progress(done + 1, len(self.views), "views cached")
+        points, radiance, bound, face = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return VoxelPixels.of(edge, cache_origin(self.scene, edge), points, radiance, bound), face
+
     def number(self, view: View) -> int:
         """Return the place of a view in the capture."""
         return next(i for i, other in enumerate(self.capture.views) if other.view_id == view.view_id)
@@ -265,26 +279,28 @@ def statistics_of_faces(photos: Photographs, adjacency: np.ndarray) -> tuple[Fac
     return statistics, float(threshold), glowing
 
 
-def radiance_cache(photos: Photographs, groups: EmitterGroups) -> tuple[RadianceVoxels, SkySums, float, float | None]:
-    """Build the cache of interior pixels that are on no emitter; also return the sums of what camera rays see that miss the
-    mesh, the share of such rays, and their mean brightness relative to the other rays."""
-    edge = photos.job.settings.emission.cache_edge
-    sums, sky = RadianceSums(edge, cache_origin(photos.scene, edge)), SkySums()
-    total, mean_hit, hits = 0, 0.0, 0
+def radiance_cache(photos: Photographs, groups: EmitterGroups) -> RadianceVoxels:
+    """Build the cache of interior pixels that are on no emitter."""
+    pixels, face = photos.cache_pixels
+    return pixels.cache(groups.of_face[face] < 0)
+
+
+def escaping_light(photos: Photographs) -> tuple[SkySums, float, float | None]:
+    """Return the sums of what camera rays see that miss the mesh, the share of such rays, and their mean brightness relative to
+    the other rays."""
+    sky, total, mean_hit, hits = SkySums(), 0, 0.0, 0
     for done, view in enumerate(photos.views):
         record = photos.records[view]
         pixels = record.pixels
-        radiance, bound = photos.radiance(view, pixels.value, pixels.index)
-        use = pixels.valid & pixels.interior & (groups.of_face[pixels.face] < 0)
-        sums.add(pixels.points[use], radiance[use], bound[use].any(1))
+        radiance, _ = photos.radiance(view, pixels.value, pixels.index)
         mean_hit += float(radiance[pixels.valid].mean(1).sum())
         hits += int(pixels.valid.sum())
         light, bound = photos.radiance(view, record.escaping_value, record.escaping)
         sky.add(record.escaping_direction, light, bound, record.escaping_share)
         total += record.counted
-        photos.job.progress(done + 1, len(photos.views), "views cached")
+        photos.job.progress(done + 1, len(photos.views), "views searched for light from outside")
     brightness = float(sky.mean().mean() / max(mean_hit / max(hits, 1), 1e-12)) if sky.pixels else None
-    return sums.finish(), sky, sky.pixels / max(total, 1), brightness
+    return sky, sky.pixels / max(total, 1), brightness
 
 
 def rays_from_surface(photos: Photographs) -> np.ndarray:

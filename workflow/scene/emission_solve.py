@@ -139,7 +139,7 @@ def traced(
     as in `choose_rows` and `solve_object_gains`; voxels: None = of the photographs; left_out: (F,) bool, faces whose pixels are
     no rows unless they shine.
     """
-    cache = radiance_cache(photos, groups)[0] if voxels is None else voxels
+    cache = radiance_cache(photos, groups) if voxels is None else voxels
     pixels, base, rows = choose_rows(photos, groups, threshold, 1, tile_edge)
     if left_out is not None:
         use = (rows.group >= 0) | ~left_out[pixels.face]
@@ -280,7 +280,7 @@ def _first_look(
 ) -> Candidates:
     """Trace all groups as columns of one problem, on some of the rows; of the first groups some are `lit`."""
     thin = -(-photos.job.settings.emission.rows // FIRST_LOOK_ROWS)
-    cache = radiance_cache(photos, every)[0]
+    cache = radiance_cache(photos, every)
     pixels, base, rows = choose_rows(photos, every, threshold, thin, comparison_tile(photos))
     transport = trace_rows(photos, pixels, base, every, cache, sky, 2, unseen)
     white = _white_hidden_surface(photos, every, cache, sky, unseen)

@@ -49,7 +49,7 @@ def find_sun(photos: Photographs, sky: Sky, threshold: float) -> tuple[Sky, deci
     if not len(texels):
         return sky, decisions.no_place_for_a_sun()
     height, width = sky.columns.shape
-    cache = radiance_cache(photos, EmitterGroups.none(len(photos.scene.faces)))[0]
+    cache = radiance_cache(photos, EmitterGroups.none(len(photos.scene.faces)))
     coarse = _Rows.traced(photos, sky, cache, threshold, comparison_tile(photos), FIRST_ROWS)
     question = coarse.question(texels, (height, width))
     none = question.look()

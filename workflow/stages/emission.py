@@ -23,6 +23,7 @@ from workflow.scene.emission_pixels import (
     Photographs,
     ViewRecords,
     calibrated,
+    escaping_light,
     gain_plan,
     radiance_cache,
     rays_from_surface,
@@ -134,7 +135,8 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     options = GroupingOptions(min_observations=least)
     groups = group_emitters(candidate, statistics, adjacency, scene.normals, scene.areas, options, glowing)
     job.log.info("%d candidate faces in %d groups (%d left out)", candidate.sum(), groups.size, len(groups.dropped))
-    cache, sums, escape, brightness = radiance_cache(photos, groups)
+    cache = radiance_cache(photos, groups)
+    sums, escape, brightness = escaping_light(photos)
     met = rays_from_surface(photos)
     secondary = float((met < 0).mean())
     environment = decisions.environment(job.settings.emission.environment, escape, secondary, brightness)

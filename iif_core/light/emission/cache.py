@@ -48,6 +48,50 @@ class RadianceVoxels:
         return replace(self, radiance=values)
 
 
+@dataclass(frozen=True)
+class VoxelPixels:
+    """Pixels with the voxels that they lie in, from which the cache of some of them is made at once.
+
+    Attributes:
+        edge, origin: as in `RadianceVoxels`.
+        keys: (V,) uint64 voxels that some pixel lies in, in order.
+        voxel: (n,) int32 row of `keys`; radiance: (n, 3) linear; censored: (n,) bool, `radiance` is a lower bound.
+    """
+
+    edge: float
+    origin: np.ndarray
+    keys: np.ndarray
+    voxel: np.ndarray
+    radiance: np.ndarray
+    censored: np.ndarray
+
+    @classmethod
+    def of(cls, edge: float, origin: np.ndarray, points: np.ndarray, radiance: np.ndarray, censored: np.ndarray) -> VoxelPixels:
+        """Find the voxels of pixels at `points` (n, 3), m. Radiance has to be finite.
+
+        Raises:
+            InputError: as `RadianceSums.add`.
+        """
+        keys, voxel = np.unique(pack_keys(voxel_indices(points, edge, origin)), return_inverse=True)
+        return cls(float(edge), np.asarray(origin, np.float32), keys, voxel.astype(np.int32), radiance, censored)
+
+    def cache(self, use: np.ndarray) -> RadianceVoxels:
+        """Return the cache of the pixels `use`, (n,) bool: to the last bit that of `RadianceSums` with them in their order."""
+        size = len(self.keys)
+        plain, clipped = np.flatnonzero(use & ~self.censored), np.flatnonzero(use & self.censored)
+        voxel = self.voxel[plain]
+        count, bounds = np.bincount(voxel, minlength=size), np.bincount(self.voxel[clipped], minlength=size)
+        sums = np.stack([np.bincount(voxel, self.radiance[plain, c], size) for c in range(3)], 1)
+        largest = np.zeros((size, 3))
+        np.maximum.at(largest, self.voxel[clipped], self.radiance[clipped])
+        own = np.flatnonzero(count + bounds)
+        bound = count[own] == 0
+        mean = sums[own] / np.maximum(count[own], 1)[:, None]
+        radiance = np.where(bound[:, None], largest[own], mean).astype(np.float32)
+        samples = np.where(bound, bounds[own], count[own]).astype(np.int32)
+        return RadianceVoxels(self.edge, self.origin, unpack_keys(self.keys[own])[0], radiance, samples, bound)
+
+
 class RadianceSums:
     """Running sums per voxel: `add` the pixels of one view after another, then `finish`.
 

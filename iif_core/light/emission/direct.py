@@ -428,6 +428,7 @@ class _ChannelRows:
         bounded = bool(np.isfinite(self.width).any())
         answer, condition = self.initial.copy(), 1.0
         rounds, converged, weighed, noise = 0, False, not bounded, 0.0
+        difference = target - mean_a @ answer
         variance, effect = np.zeros(len(answer)), np.ones(len(answer))
         while rounds < max_rounds and not (converged and weighed):
             if converged and not weighed:
@@ -435,7 +436,7 @@ class _ChannelRows:
                 variance = variance * effect
             rounds += 1
             before = answer
-            share, shift = _censored(target - mean_a @ before, bound, self.noise, noise)
+            share, shift = _censored(difference, bound, self.noise, noise)
             system = self.system(weight * share, shift, variance)
             if system is not None:
                 answer, condition = self._completed(system.solve(self.initial), system.known), system.condition
@@ -450,7 +451,6 @@ class _ChannelRows:
             # The first round has no residual to weigh the prior and the bounds with.
             change = np.abs(answer - before).max(initial=0.0)
             converged = rounds > 1 and bool(change <= 1e-3 * max(answer.max(initial=0.0), 1e-300))
-        difference = target - mean_a @ answer
         counted = np.where(bound & (difference < 0), 0.0, weight)
         return _Channel(
             answer,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iif_core.light.emission.direct import EmissionPrior, EmissionSolution
+from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.rows import EmissionRows
 
 CERTAIN_EXCESS = 2.0
@@ -61,10 +61,10 @@ class WhiteSurface:
 
 @dataclass(frozen=True)
 class PrunedEmission:
-    """Result of `prune_groups`: the solution with dropped groups at 0, which were kept, why others were dropped, and `excess`
+    """Result of `prune_groups`: radiance (G, 3) with dropped groups at 0, which were kept, why others were dropped, and `excess`
     (G,) of the last round in which a group took part."""
 
-    solution: EmissionSolution
+    radiance: np.ndarray
     kept: np.ndarray
     reason: list[str]
     excess: np.ndarray
@@ -96,16 +96,16 @@ def prune_groups(
         certain: brightness relative to a white surface from which a group shines for certain.
 
     Returns:
-        The solution with the groups that remain.
+        The radiance of the groups that remain.
     """
     members = np.unique(family, return_inverse=True)[1]
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
-    solution = prior.solve(rows, _TRIAL_ROUNDS)
+    radiance = prior.radiance(rows, _TRIAL_ROUNDS)
     while True:
-        emission = solution.radiance.sum(1)
-        power = np.bincount(members, _light_shares(rows, solution.radiance, elsewhere))[members]
-        shown = np.where(kept[:, None], solution.radiance, white.seen)
+        emission = radiance.sum(1)
+        power = np.bincount(members, _light_shares(rows, radiance, elsewhere))[members]
+        shown = np.where(kept[:, None], radiance, white.seen)
         excess = np.where(kept, white.excess(shown), excess)
         dark = kept & ~protected & (emission <= 0)
         open_ = kept & ~protected & ~dark & ~missed
@@ -122,7 +122,7 @@ def prune_groups(
             drop &= power <= power[drop].min()
         trial = _solve_subset(rows, prior, kept & ~drop, white.seen)
         before = _misfit(rows, shown, elsewhere)
-        after = _misfit(rows, np.where((kept & ~drop)[:, None], trial.radiance, white.seen), elsewhere)
+        after = _misfit(rows, np.where((kept & ~drop)[:, None], trial, white.seen), elsewhere)
         if not dark.any() and after > before * (1 + MAX_RESIDUAL_GROWTH) + 1e-12:
             # One lamp that is needed must not keep the groups that were tried together with it.
             if drop.sum() > 1 and not singly:
@@ -132,8 +132,8 @@ def prune_groups(
             continue
         for g in np.flatnonzero(drop):
             reason[g] = _reason(dark[g], bool(reflecting[g]), excess[g], power[g])
-        kept, solution = kept & ~drop, trial
-    return PrunedEmission(solution, kept, reason, excess)
+        kept, radiance = kept & ~drop, trial
+    return PrunedEmission(radiance, kept, reason, excess)
 
 
 def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:
@@ -159,13 +159,11 @@ def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float
     return float(np.sqrt((counted * difference**2).sum()))
 
 
-def _solve_subset(rows: EmissionRows, prior: EmissionPrior, kept: np.ndarray, shown: np.ndarray) -> EmissionSolution:
-    """Solution over all groups, 0 outside `kept`; the others light the scene with what they show, as the cache will."""
-    part = prior.only(kept).solve(without_groups(rows, kept, shown), _TRIAL_ROUNDS)
-    radiance, error = np.zeros(prior.initial.shape), np.zeros(prior.initial.shape)
-    determined = np.zeros(len(prior.initial))
-    radiance[kept], error[kept], determined[kept] = part.radiance, part.error, part.determined
-    return replace(part, radiance=radiance, error=error, determined=determined)
+def _solve_subset(rows: EmissionRows, prior: EmissionPrior, kept: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """Radiance of all groups (G, 3), 0 outside `kept`; the others light the scene with what they show, as the cache will."""
+    radiance = np.zeros(prior.initial.shape)
+    radiance[kept] = prior.only(kept).radiance(without_groups(rows, kept, shown), _TRIAL_ROUNDS)
+    return radiance
 
 
 def without_groups(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
