@@ -19,6 +19,9 @@ Array = np.ndarray
 REPRESENTATIVES = 8
 """Largest number of pixels of a cell at which its paths start."""
 
+MERGE_ROWS = 1 << 20
+"""Pixels of further views that wait at least until they are joined with those of the views before."""
+
 _BINS = 125
 _MEDIAN_OF_NORMAL = 0.6745  # median |x| of a standard normal
 
@@ -71,7 +74,7 @@ class ShadingCellBuilder:
 
     def __init__(self, edge: float, origin: ArrayLike):
         self.edge, self.origin = edge, np.asarray(origin, np.float32)
-        self._kept: tuple[Array, ...] | None = None
+        self._parts: list[tuple[Array, ...]] = []
 
     def add(self, points: ArrayLike, normals: ArrayLike, object_id: ArrayLike, seed: int) -> None:
         """Add the pixels of one view.
@@ -91,31 +94,46 @@ class ShadingCellBuilder:
             np.asarray(object_id, np.int32),
             np.ones(len(points), np.int64),
         )
-        old = self._kept
-        columns = new if old is None else tuple(np.concatenate(pair) for pair in zip(old, new, strict=True))
-        order = np.lexsort((columns[2], columns[1], columns[0]))
-        voxel, bins = columns[0][order], columns[1][order]
-        first = np.r_[True, (voxel[1:] != voxel[:-1]) | (bins[1:] != bins[:-1])] if len(order) else np.zeros(0, bool)
-        start = np.flatnonzero(first)
-        cell = np.cumsum(first) - 1
-        rank = np.arange(len(order)) - start[cell]
-        # The first entry of a cell holds the cell's number of pixels.
-        pixels = np.bincount(cell, columns[6][order], len(start)).astype(np.int64)
-        keep = rank < REPRESENTATIVES
-        count = np.where(first, pixels[cell], 0)[keep]
-        self._kept = (*(column[order][keep] for column in columns[:6]), count)
+        self._parts.append(_smallest(new))
+        # Views are joined when they have become as much as what they are joined with, so that a pixel is sorted a few times only.
+        waiting = sum(len(part[0]) for part in self._parts[1:])
+        if waiting > max(len(self._parts[0][0]), MERGE_ROWS):
+            self._join()
+
+    def _join(self) -> None:
+        if len(self._parts) > 1:
+            self._parts = [_smallest(tuple(np.concatenate(columns) for columns in zip(*self._parts, strict=True)))]
 
     def finish(self) -> ShadingCells:
         """Return the cells, sorted by voxel and normal."""
-        if self._kept is None:
+        self._join()
+        if not self._parts:
             raise InputError("no surface point was added: no view sees the mesh")
-        voxel, bins, _, points, normals, object_id, count = self._kept
+        voxel, bins, _, points, normals, object_id, count = self._parts[0]
         voxels, row = np.unique(voxel, return_inverse=True)
         cells, start, members = np.unique(row * _BINS + bins, return_index=True, return_counts=True)
         choice = start[:, None] + np.arange(REPRESENTATIVES) % members[:, None]
         return ShadingCells(
             self.edge, self.origin, object_id[start], points[choice], normals[choice], count[start], voxels, cells
         )
+
+
+def _smallest(columns: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Keep the rows of each cell with the smallest random numbers, in the order of voxel, bin and random number.
+
+    columns: (n,) voxel, bin and random number, (n, 3) points and normals, (n,) object and number of pixels; the first row of a
+    cell gets the number of pixels of all its rows, the others 0.
+    """
+    order = np.lexsort((columns[2], columns[1], columns[0]))
+    voxel, bins = columns[0][order], columns[1][order]
+    first = np.r_[True, (voxel[1:] != voxel[:-1]) | (bins[1:] != bins[:-1])] if len(order) else np.zeros(0, bool)
+    start = np.flatnonzero(first)
+    cell = np.cumsum(first) - 1
+    pixels = np.bincount(cell, columns[6][order], len(start)).astype(np.int64)
+    keep = np.arange(len(order)) - start[cell] < REPRESENTATIVES
+    count = np.where(first, pixels[cell], 0)[keep]
+    order = order[keep]
+    return (*(column[order] for column in columns[:6]), count)
 
 
 @dataclass(frozen=True)

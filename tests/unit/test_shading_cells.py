@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
+from iif_core.surface import shading_cells
 from iif_core.surface.shading_cells import (
     REPRESENTATIVES,
     ShadingCellBuilder,
@@ -50,6 +51,18 @@ def test_pixels_share_a_cell_by_place_object_and_direction():
         cells.find(points + 50, normals, ids)
     with pytest.raises(InputError, match="no view sees"):
         ShadingCellBuilder(EDGE, (0, 0, 0)).finish()
+
+
+def test_when_views_are_joined_changes_nothing(monkeypatch):
+    parts = [(*patch(3000, seed), np.arange(3000) % 3) for seed in range(7)] + [(*patch(0), np.zeros(0, int))]
+    late = built(parts)
+    for rows in (0, 500, 4000):
+        monkeypatch.setattr(shading_cells, "MERGE_ROWS", rows)
+        early = built(parts)
+        for name in ("object_id", "points", "normals", "pixels"):
+            np.testing.assert_array_equal(getattr(early, name), getattr(late, name), name)
+        np.testing.assert_array_equal(early.find(*parts[3]), late.find(*parts[3]))
+    assert late.pixels.sum() == 21000
 
 
 def test_representatives_are_a_fair_sample_of_all_views():
