@@ -3,6 +3,8 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from iif_core.errors import InputError
 from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, scratch
+from workflow.artifacts.files import write_parquet
 from workflow.artifacts.store import ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import absent, damaged
 
@@ -288,3 +291,44 @@ def test_scratch_keeps_many_arrays_in_few_mappings(tmp_path, monkeypatch):
         np.testing.assert_array_equal(before, after)
     with pytest.raises(ValueError, match="read-only"):
         kept[-1][0, 0] = 1
+
+
+TABLES = """
+import sys
+from pathlib import Path
+import numpy as np
+from workflow.artifacts.files import read_parquet, write_parquet
+
+path = Path(sys.argv[1])
+columns = {
+    "whole": np.arange(21, dtype=np.int32),
+    "single": np.linspace(0, 1, 21, dtype=np.float32),
+    "half": np.full(21, 0.5, np.float16),
+    "truth": np.arange(21) % 3 == 0,
+    "words": np.array(["", "Küche", "a, b"] * 7, object),
+    "lists": np.arange(63.0).reshape(21, 3),
+    "key": np.arange(21, dtype=np.uint64) << 40,
+}
+for size in (21, 1, 0):
+    write_parquet(path, {name: values[:size] for name, values in columns.items()}, {"iif.schema": "x"})
+    found = read_parquet(path)
+    for name, values in columns.items():
+        assert found[name].dtype == values.dtype and found[name].shape == values[:size].shape, name
+        assert np.array_equal(found[name], values[:size]), name
+assert "pandas" not in sys.modules, "pandas was imported, a quarter of a second in every job"
+"""
+
+
+def test_tables_of_every_kind_come_back_and_need_no_pandas(tmp_path, repository):
+    subprocess.run([sys.executable, "-c", TABLES, str(tmp_path / "t.parquet")], cwd=repository, check=True)
+
+
+def test_tables_are_the_bytes_that_arrow_would_write(tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    columns = {"a": np.arange(5), "b": np.array([True, False, True, True, False]), "c": np.array(list("vwxyz"), object)}
+    write_parquet(tmp_path / "ours.parquet", columns, {"k": "v"})
+    table = pa.table({name: pa.array(values) for name, values in columns.items()}).replace_schema_metadata({"k": "v"})
+    pq.write_table(table, tmp_path / "theirs.parquet", compression="zstd", row_group_size=1 << 20)
+    assert (tmp_path / "ours.parquet").read_bytes() == (tmp_path / "theirs.parquet").read_bytes()

@@ -98,12 +98,9 @@ def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str])
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{path}: column {name} holds non-finite values")
         if array.ndim == 2:
-            flat = pa.array(np.ascontiguousarray(array).ravel())
-            arrays[name] = pa.FixedSizeListArray.from_arrays(flat, array.shape[1])
-        elif array.dtype.kind in "UO":
-            arrays[name] = pa.array([str(v) for v in array.tolist()], pa.string())
+            arrays[name] = pa.FixedSizeListArray.from_arrays(_arrow(array.ravel()), array.shape[1])
         else:
-            arrays[name] = pa.array(array)
+            arrays[name] = _arrow(array)
     lengths = {len(a) for a in arrays.values()}
     if len(lengths) > 1:
         raise ValueError(f"{path}: columns of different length { {k: len(a) for k, a in arrays.items()} }")
@@ -118,16 +115,48 @@ def read_parquet(path: Path) -> dict[str, np.ndarray]:
     import pyarrow.parquet as pq
 
     out: dict[str, np.ndarray] = {}
-    table = pq.read_table(path)
+    with pq.ParquetFile(path) as file:  # pq.read_table imports pyarrow.dataset, which takes longer than most tables
+        table = file.read()
     for name in table.column_names:
         column = table[name].combine_chunks()
         if isinstance(column, pa.ChunkedArray):
             column = column.chunk(0) if column.num_chunks else pa.array([], column.type)
         if pa.types.is_fixed_size_list(column.type):
-            out[name] = column.flatten().to_numpy(zero_copy_only=False).reshape(len(column), column.type.list_size)
+            out[name] = _values(column.flatten()).reshape(len(column), column.type.list_size)
         else:
-            out[name] = column.to_numpy(zero_copy_only=False)
+            out[name] = _values(column)
     return out
+
+
+def _arrow(values: np.ndarray) -> Any:
+    """Return numbers, truth values or words (n,) as an Arrow array without nulls. `pa.array` imports pandas for that, a quarter
+    of a second in every job."""
+    import pyarrow as pa
+
+    if values.dtype.kind in "UO":
+        words = [str(value).encode() for value in values.tolist()]
+        ends = np.cumsum([0, *map(len, words)]).astype(np.int32)
+        return pa.Array.from_buffers(pa.string(), len(words), [None, pa.py_buffer(ends), pa.py_buffer(b"".join(words))])
+    kind = pa.bool_() if values.dtype.kind == "b" else pa.from_numpy_dtype(values.dtype)
+    data = np.packbits(values, bitorder="little") if values.dtype.kind == "b" else np.ascontiguousarray(values)
+    return pa.Array.from_buffers(kind, len(values), [None, pa.py_buffer(data)])
+
+
+_ARROW_DTYPES = {"float": "float32", "double": "float64", "halffloat": "float16"}
+
+
+def _values(column: Any) -> np.ndarray:
+    """Return an Arrow array as a numpy array. `Array.to_numpy` imports pandas for that, a quarter of a second in every job."""
+    kind = _ARROW_DTYPES.get(str(column.type), str(column.type))
+    if column.null_count or not (kind == "bool" or np.dtype(kind if kind in np.sctypeDict else object).kind in "fiu"):
+        return np.array(column.to_pylist(), object) if kind == "string" else column.to_numpy(zero_copy_only=False)
+    data, end = column.buffers()[1], column.offset + len(column)
+    if not len(column):
+        return np.zeros(0, kind)
+    if kind == "bool":
+        bits = np.frombuffer(data, np.uint8, -(-end // 8))
+        return np.unpackbits(bits, count=end, bitorder="little")[column.offset :].view(bool)
+    return np.frombuffer(data, kind, end)[column.offset :]
 
 
 def write_json(path: Path, document: Any) -> None:
