@@ -335,6 +335,7 @@ SHADING = {
     "cell_edge": 0.05,
     "noise": 0.15,
     "max_samples": 512,
+    "method": "shared_paths",
     "max_bounces": 6,
     "indirect": "auto",
 }
