@@ -27,7 +27,7 @@ def cache_of(T, vertices, radiance, edge=0.25):
     return T.RadianceCache(edge, low.astype(np.float32), ijk, np.tile(np.float32(radiance), (len(ijk), 1)))
 
 
-# Integrals of the lobes in constant light, of roughness and cosine of the view (closed form by quadrature, METHOD's sheet).
+# Roughness, cosine of the view, S0 and S1 of Eq. T.5 in light of radiance 1, by quadrature.
 FURNACE = [(0.216, 0.7, 0.849, 0.002), (0.412, 0.4, 0.509, 0.028), (0.608, 1.0, 0.748, 0.0), (1.0, 0.2, 0.503, 0.009)]
 
 
@@ -109,9 +109,9 @@ class Planted:
         self.shown = self.curve(np.clip(self.exposure[:, None] * (self.matrix @ self.truth), 0, 1))
         self.drawn = []
 
-    def trace(self, rows, sampling, step):
+    def trace(self, rows, state, step):
         matrix = self.matrix[rows]
-        self.drawn.append(sampling)
+        self.drawn.append(state.sampling)
 
         class Paths:
             def radiance(self, light):
@@ -149,7 +149,7 @@ def test_what_never_grew_is_switched_off_at_step_100_unless_nothing_would_remain
     assert end.keep[[0, 1, 2]].tolist() == [True, False, True]
     scene.matrix[:] = 0
     end = list(emission.descend(emission.PublishedState.start(4), 600, scene.trace, scene.loss, options))[-1]
-    assert end.keep.all() and (end.stored == emission.START).all()
+    assert end.keep.all() and (end.stored == emission.START).all() and (end.sampling == 1).all()
 
 
 def test_loss_and_its_derivative():

@@ -111,6 +111,20 @@ def test_a_killed_descent_goes_on_where_it_was(finished, tmp_path, monkeypatch):
     assert digests(resumed["emission"]) == digests(readers["emission"])
 
 
+def test_estimated_exposures_are_refused(finished, tmp_path, monkeypatch):
+    folder, _ = finished
+    shutil.copytree(folder / "results", tmp_path / "results")
+    whole = CaptureReader.__init__
+
+    def estimated(self, reader):
+        whole(self, reader)
+        self.facts["exposure_estimated"] = True
+
+    monkeypatch.setattr(CaptureReader, "__init__", estimated)
+    with pytest.raises(InputError, match=r"emission.solver: published: .* known exposures"):
+        run(tmp_path, ("emission",), monkeypatch)
+
+
 def test_linear_photographs_of_a_folder_are_refused(finished, tmp_path, monkeypatch):
     """Settings refuse `dynamic_range: hdr`; what a folder holds is known to the stage alone."""
     folder, _ = finished

@@ -39,7 +39,6 @@ REPAIRED = "published_repaired"
 _SEEDS = 0x707562  # keeps the random streams of this stage apart from those of others
 _SAVED_EVERY = 50
 """Steps after which the state is written, so that a job that is killed loses little."""
-_STATE = "descent.parquet"
 
 
 @dataclass(frozen=True)
@@ -72,16 +71,21 @@ class _Pool:
 
 
 def run(job: Job) -> None:
-    """Write the files of stage emission, and descent.parquet, the state of the optimiser.
+    """Write the files of stage emission.
 
     Raises:
-        InputError: the photographs are linear, which the published loss does not know.
+        InputError: the photographs are linear, which the published loss does not know, or their exposures are not known.
     """
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     if capture.is_hdr:
         raise InputError(
             f"emission.solver: {job.settings.emission.solver}: the published loss is that of 8-bit photographs, and these are"
             " linear; set `capture: {dynamic_range: ldr}` or another solver"
+        )
+    if capture.facts.get("exposure_estimated"):
+        raise InputError(
+            f"emission.solver: {job.settings.emission.solver}: the published method needs known exposures, and those of this"
+            " capture were estimated; give them with the photographs, or set another solver"
         )
     notes: list[str] = []
     gains, curve = view_exposures(capture, notes), _mean_curve(job)
@@ -139,9 +143,8 @@ def _descended(
     options = PublishedOptions(steps=job.settings.emission.iterations, seed=job.seed)
     state, kept = PublishedState.start(count), job.writer.part_kept("descent")
     if kept is not None:
-        columns = job.writer.columns(_STATE)
-        stored = np.stack([columns[f"stored_{c}"] for c in "rgb"], 1)
-        state = PublishedState(stored, columns["keep"], columns["sampling"], kept["step"], tuple(kept["loss"]))
+        stored, keep, sampling = (np.array(kept[name]) for name in ("stored", "keep", "sampling"))
+        state = PublishedState(stored.reshape(count, 3), keep.astype(bool), sampling, kept["step"], tuple(kept["loss"]))
     steps = options.total(len(pool.index))
     if count:
         trace = _tracer(job, scene, pool, cache, emitter_of_face)
@@ -154,20 +157,18 @@ def _descended(
             job.progress(state.step, steps, "steps of the descent")
             if state.step % _SAVED_EVERY == 0 and state.step < steps:
                 _save(job, state)
-    _save(job, state)
     return state
 
 
 def _save(job: Job, state: PublishedState) -> None:
-    columns = {f"stored_{c}": state.stored[:, i] for i, c in enumerate("rgb")}
-    job.writer.table(_STATE, {**columns, "keep": state.keep, "sampling": state.sampling}, {"stored_r": "relative"})
-    job.writer.part_done("descent", [_STATE], {"step": state.step, "loss": list(state.loss)})
+    arrays = {name: getattr(state, name).tolist() for name in ("stored", "keep", "sampling")}
+    job.writer.part_done("descent", [], {**arrays, "step": state.step, "loss": list(state.loss)})
 
 
 def _tracer(
     job: Job, scene: BaseScene, pool: _Pool, cache: RadianceVoxels, emitter_of_face: np.ndarray
-) -> Callable[[np.ndarray, np.ndarray, int], BouncePaths]:
-    """Return what traces the pixels of a step."""
+) -> Callable[[np.ndarray, PublishedState, int], BouncePaths]:
+    """Return what traces the pixels of a step: emitters that are switched off are surface again."""
     geometry, material = scene.traceable()
     from iif_core.light.transport.cache import RadianceCache
     from iif_core.light.transport.emitters import Emitters
@@ -178,14 +179,13 @@ def _tracer(
     repaired, own = job.settings.emission.solver == REPAIRED, np.flatnonzero(emitter_of_face >= 0)
     worlds: dict[bytes, tuple[Scene, np.ndarray]] = {}
 
-    def trace(rows: np.ndarray, sampling: np.ndarray, step: int) -> BouncePaths:
-        # Emitters that are switched off are surface again; the table is refreshed only where that happens.
-        key = sampling.tobytes()
+    def trace(rows: np.ndarray, state: PublishedState, step: int) -> BouncePaths:
+        key = state.keep.tobytes() + state.sampling.tobytes()  # the table changes at two steps alone
         if key not in worlds:
             worlds.clear()
             weight, number = np.zeros(len(emitter_of_face)), emitter_of_face.copy()
-            weight[own] = sampling[emitter_of_face[own]]
-            number[own[weight[own] <= 0]] = -1
+            weight[own] = np.where(state.keep, state.sampling, 0.0)[emitter_of_face[own]]
+            number[own] = np.where(state.keep[emitter_of_face[own]], emitter_of_face[own], -1)
             dark = np.zeros((len(weight), 3))
             worlds[key] = Scene(geometry, material, Emitters(geometry, dark, sampling_weight=weight), voxels), number
         world, number = worlds[key]

@@ -47,8 +47,7 @@ class Emission(Section):
     enough rays leave the mesh and what they meet is not black."""
     solver: Literal["direct", "sgd", "published", "published_repaired"] = "direct"
     """`direct`: non-negative least squares; `sgd`: the paper's gradient descent on the same pixels, for comparison. `published`:
-    the paper's method from the photographs on, a radiance for every bright triangle found on fresh paths;
-    `published_repaired`: the same without its errors (docs/method/published.md#emission)."""
+    the paper's method; `published_repaired`: without its errors (docs/method/published.md#emission)."""
     preset: Literal["safe", "paper"] = _SGD.preset
     """`sgd`: `paper`: the published step size and pruning; `safe`: steps scaled by the diagonal of the normal matrix, and the
     average of the last iterates."""

@@ -63,6 +63,11 @@ class SceneSettings(Section):
 
     @model_validator(mode="after")
     def _published_photographs(self) -> SceneSettings:
+        if self.emission.solver in PUBLISHED and not isinstance(self.affines.response, str):
+            raise ValueError(
+                f"`emission: solver: {self.emission.solver}` takes a family as `affines: response`, and no measured curve; name"
+                " one, or set another solver"
+            )
         if self.emission.solver in PUBLISHED and self.capture.dynamic_range == "hdr":
             raise ValueError(
                 f"`emission: solver: {self.emission.solver}` knows the loss of 8-bit photographs alone; set"

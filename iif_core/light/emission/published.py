@@ -116,7 +116,7 @@ def clamped_loss(radiance: np.ndarray, exposure: np.ndarray, shown: np.ndarray, 
 def descend(
     state: PublishedState,
     pixels: int,
-    trace: Callable[[np.ndarray, np.ndarray, int], Paths],
+    trace: Callable[[np.ndarray, PublishedState, int], Paths],
     loss: Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]],
     options: PublishedOptions,
 ) -> Iterator[PublishedState]:
@@ -125,7 +125,7 @@ def descend(
     Args:
         state: where to begin; a descent that was interrupted goes on from any state that was yielded, to the same end.
         pixels: number of pixels that can be drawn.
-        trace: (pixels (n,), sampling (G,), step) -> fresh paths of these pixels.
+        trace: (pixels (n,), state, step) -> fresh paths of these pixels, to the emitters that the state keeps.
         loss: (pixels (n,), radiance (n, 3)) -> loss and its derivative by the radiance.
         options: the schedule.
     """
@@ -137,7 +137,7 @@ def descend(
             order = np.random.default_rng([0x707562, options.seed, epoch]).permutation(pixels)
         first = step % per_epoch * options.batch
         some = order[first : first + options.batch]
-        paths = trace(some, state.sampling, step)
+        paths = trace(some, state, step)
         value, by_ray = loss(some, paths.radiance(state.radiance))
         gradient = paths.gradient(by_ray, emitters) * (state.keep[:, None] & (state.stored > 0))
         state = replace(state, stored=state.stored - options.rate * gradient, step=step + 1, loss=(*state.loss, value))
@@ -154,5 +154,7 @@ def _pruned(state: PublishedState, step: int, options: PublishedOptions) -> Publ
         keep = state.keep & (total > options.bright[1] * total.max(initial=0.0))
     else:
         return state
-    state = replace(state, keep=keep) if keep.any() else state
+    if not keep.any():
+        return state
+    state = replace(state, keep=keep)
     return replace(state, sampling=state.radiance.sum(1))
