@@ -88,7 +88,9 @@ class ViewSpread:
         rows = np.concatenate([np.ones_like(count), mean, (mean**2).sum(1, keepdims=True)], 1)
         self.keys, place = np.unique(np.r_[self.keys, keys], return_inverse=True)
         sums = np.zeros((len(self.keys), 5))
-        np.add.at(sums, place.ravel(), np.concatenate([self.sums, rows]))
+        place, known = place.ravel(), len(self.sums)
+        sums[place[:known]] = self.sums
+        sums[place[known:]] += rows  # no key twice
         self.sums = sums
 
     def finish(self) -> float | None:

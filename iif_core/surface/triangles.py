@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iif_core.errors import InputError
+from iif_core.numerics.arrays import unique_rows
 from iif_core.numerics.graph import component_labels
 
 
@@ -48,8 +49,8 @@ def vertex_normals(vertices: NDArray, faces: NDArray) -> NDArray:
 
 def weld(vertices: NDArray, faces: NDArray) -> tuple[NDArray, NDArray]:
     """Merge vertices at equal positions and drop unused ones; returns the new vertices and faces."""
-    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    used, local = np.unique(inverse.ravel()[faces], return_inverse=True)
+    unique, inverse = unique_rows(vertices)
+    used, local = np.unique(inverse[faces], return_inverse=True)
     return unique[used], local.reshape(-1, 3)
 
 
@@ -98,7 +99,7 @@ def subdivide(vertices: NDArray, faces: NDArray, longest: float, max_faces: int)
     limit = np.inf
     while True:
         pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
-        edges, edge_of = np.unique(pairs, axis=0, return_inverse=True)
+        edges, edge_of = unique_rows(pairs)
         edge_of = edge_of.reshape(-1, 3)
         length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
         limit = max(longest, min(limit, length.max()) / 2)

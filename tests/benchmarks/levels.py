@@ -23,9 +23,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR, SHARED_LEVEL_ERROR
-from workflow.artifacts.store import StageReader, ids_from_disk
+from workflow.artifacts.store import StageReader, ids_from_disk, material_maps
 from workflow.scene.normal_form import CaptureReader
-from workflow.scoring.scores import material_maps
 
 FEWEST_PIXELS = 100
 SHARED_ERRORS = (0.05, 0.1, 0.15, 0.2, 0.3)

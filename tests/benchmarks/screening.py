@@ -39,10 +39,10 @@ import pandas as pd
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from workflow.artifacts.store import StageReader
+from workflow.artifacts.store import StageReader, material_maps
 from workflow.runtime.fingerprint import import_closure
 from workflow.scene.normal_form import CaptureReader
-from workflow.scoring.scores import MaterialTruth, material_maps, material_truth
+from workflow.scoring.scores import MaterialTruth, material_truth
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 CODE = ("iif_core", "workflow", "config")

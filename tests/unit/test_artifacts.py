@@ -330,5 +330,5 @@ def test_tables_are_the_bytes_that_arrow_would_write(tmp_path):
     columns = {"a": np.arange(5), "b": np.array([True, False, True, True, False]), "c": np.array(list("vwxyz"), object)}
     write_parquet(tmp_path / "ours.parquet", columns, {"k": "v"})
     table = pa.table({name: pa.array(values) for name, values in columns.items()}).replace_schema_metadata({"k": "v"})
-    pq.write_table(table, tmp_path / "theirs.parquet", compression="zstd", row_group_size=1 << 20)
+    pq.write_table(table, tmp_path / "theirs.parquet", compression="zstd", row_group_size=1 << 20, use_dictionary=["a", "b", "c"])
     assert (tmp_path / "ours.parquet").read_bytes() == (tmp_path / "theirs.parquet").read_bytes()

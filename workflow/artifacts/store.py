@@ -232,6 +232,20 @@ def rgb(channels: dict[str, np.ndarray], layer: str = "") -> np.ndarray:
     return np.stack([channels[f"{prefix}{c}"].astype(np.float32) for c in "RGB"], -1)
 
 
+def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
+    """Return the numbers k of the predictions in the channels of one view."""
+    return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
+
+
+def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
+    """Return albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
+    return {
+        "albedo": rgb(channels, f"{prefix}albedo"),
+        "roughness": channels[f"{prefix}roughness"].astype(np.float32),
+        "metallic": channels[f"{prefix}metallic"].astype(np.float32),
+    }
+
+
 def split_rgb(array: np.ndarray, layer: str = "", dtype: type = np.float32) -> dict[str, np.ndarray]:
     """Return an (H, W, 3) array as channels `layer.R/G/B` (or `R G B`)."""
     prefix = f"{layer}." if layer else ""

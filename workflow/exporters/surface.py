@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.numerics.arrays import unique_rows
 from iif_core.numerics.graph import component_labels
 from iif_core.reflectance.material import NEUTRAL
 from iif_core.surface.triangles import face_crosses, face_geometry, smooth_groups, subdivide, vertex_normals, weld
@@ -94,14 +95,13 @@ def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> l
     vertices, oriented, parent = subdivide(vertices, oriented, longest_edge, max_faces)
     parent = kept[parent]
     objects, emitters = scene.object_id[parent], scene.emitter_id[parent]
-    keys, part_of = np.unique(np.stack([objects, emitters], 1), axis=0, return_inverse=True)
-    part_of = part_of.ravel()
+    keys, part_of = unique_rows(np.stack([objects, emitters], 1))
     groups = smooth_groups(vertices, oriented, part_of, CREASE_COSINE)
     names, parts = _Names(), []
     for p, (object_id, emitter_id) in enumerate(keys.tolist()):
         own = np.flatnonzero(part_of == p)
         corners = np.stack([oriented[own].ravel(), np.repeat(groups[own], 3)], 1)
-        split, local = np.unique(corners, axis=0, return_inverse=True)
+        split, local = unique_rows(corners)
         local = local.reshape(-1, 3)
         xyz = vertices[split[:, 0]]
         normals = vertex_normals(xyz, local)
@@ -206,10 +206,10 @@ def _orientation(scene: RecoveredScene) -> tuple[Array, Array]:
 
 def _components(scene: RecoveredScene) -> Array:
     """Label the connected pieces of each object, (m,); faces are connected if they share a vertex position."""
-    _, weld = np.unique(scene.vertices, axis=0, return_inverse=True)
-    corner = weld.ravel()[scene.faces]
+    _, weld = unique_rows(scene.vertices)
+    corner = weld[scene.faces]
     key = np.stack([corner.ravel(), np.repeat(scene.object_id, 3)], 1)
-    node = np.unique(key, axis=0, return_inverse=True)[1].ravel()
+    node = unique_rows(key)[1]
     m, n = len(scene.faces), int(node.max()) + 1
     face = np.repeat(np.arange(m), 3)
     return component_labels(m + n, face, m + node)[:m]

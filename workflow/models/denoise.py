@@ -3,6 +3,9 @@ our solvers."""
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
+
 import numpy as np
 
 from iif_core.errors import InputError
@@ -13,7 +16,7 @@ NOTE = "photographs denoised (Intel Open Image Denoise): biased, and so is the r
 def require_denoiser() -> None:
     """Raise InputError if the denoiser cannot be loaded."""
     try:
-        import pyoidn  # noqa: F401
+        _oidn()
     except (ImportError, OSError) as error:
         raise InputError(
             f"denoise: the package pyoidn (Intel Open Image Denoise) does not load ({error});"
@@ -23,14 +26,23 @@ def require_denoiser() -> None:
 
 def denoise(radiance: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Denoise a linear HDR picture (H, W, 3), guided by noise-free albedo and world normals."""
-    import pyoidn
-
     images = [np.ascontiguousarray(image, np.float32) for image in (radiance, albedo, normal)]
-    return np.maximum(pyoidn.denoise(*images, hdr=True, clean_aux=True), 0)
+    return np.maximum(_oidn().denoise(*images, hdr=True, clean_aux=True), 0)
 
 
 def denoise_alone(radiance: np.ndarray) -> np.ndarray:
     """Denoise a linear HDR picture (H, W, 3) without guides."""
-    import pyoidn
+    return np.maximum(_oidn().denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)
 
-    return np.maximum(pyoidn.denoise(np.ascontiguousarray(radiance, np.float32), hdr=True), 0)
+
+def _oidn() -> ModuleType:
+    """Import pyoidn without torch, which it would import, for two seconds, to take tensors as well as arrays."""
+    hidden = "torch" not in sys.modules
+    if hidden:
+        sys.modules["torch"] = None  # type: ignore[assignment]  # an import of it now raises ImportError
+    try:
+        import pyoidn
+    finally:
+        if hidden:
+            del sys.modules["torch"]
+    return pyoidn

@@ -9,12 +9,11 @@ import numpy as np
 from iif_core.evaluation.consistency import ShadingLeft, ViewSpread
 from iif_core.evaluation.metrics import Score
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
-from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.artifacts.store import ids_from_disk, prediction_numbers, rgb
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_lit_scene
 from workflow.scene.cached_light import read_diffuse
 from workflow.scene.normal_form import CaptureReader, View
-from workflow.scoring.scores import prediction_numbers
 
 EVERY_VIEW = "all"
 """Value of the column `view` for scores over all views together."""

@@ -15,7 +15,7 @@ from iif_core.evaluation.lpips import Weights
 from iif_core.evaluation.metrics import Score
 from iif_core.fusion.uncertainty import CALIBRATION, MIN_OBJECT_CELLS, NOMINAL_COVERAGES, coverage, gauge_free_error
 from iif_core.reflectance.material import CHANNELS
-from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.artifacts.store import StageReader, ids_from_disk
 from workflow.models.lpips import lpips_weights
 from workflow.scene.normal_form import CaptureReader, Truth, View
 
@@ -135,20 +135,6 @@ def material_truth(
         for quantity, image in maps.items()
     }
     return MaterialTruth(truth, targets, masks, object_id)
-
-
-def prediction_numbers(channels: dict[str, np.ndarray]) -> list[int]:
-    """Return the numbers k of the predictions in the channels of one view."""
-    return sorted({int(name.split(".")[1]) for name in channels if name.startswith("prior.")})
-
-
-def material_maps(channels: dict[str, np.ndarray], prefix: str = "") -> dict[str, np.ndarray]:
-    """Return albedo (H, W, 3), roughness and metallic (H, W) of the channels that start with `prefix`; float32."""
-    return {
-        "albedo": rgb(channels, f"{prefix}albedo"),
-        "roughness": channels[f"{prefix}roughness"].astype(np.float32),
-        "metallic": channels[f"{prefix}metallic"].astype(np.float32),
-    }
 
 
 def perceptual_networks(with_vgg: bool = False) -> dict[str, dict[str, np.ndarray]]:

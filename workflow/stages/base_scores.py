@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from iif_core.errors import InputError
 from iif_core.evaluation import metrics
 from iif_core.reflectance.material import PROPERTIES
+from workflow.artifacts.store import material_maps
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.scoring import scores as scoring
@@ -33,7 +34,7 @@ def run(job: Job) -> None:
         if not job.read("base").has(file):
             return []
         channels = job.read("base").exr(file)
-        maps = scoring.material_maps(channels)
+        maps = material_maps(channels)
         truth = scoring.material_truth(capture, job.read("segmentation"), view, networks_of)
         return [(q, truth.scores(maps, q)) for q in PROPERTIES]
 

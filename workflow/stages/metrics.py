@@ -12,7 +12,7 @@ from iif_core.evaluation import metrics
 from iif_core.evaluation.catalogue import LPIPS_NETWORKS, METRICS_OF, PROTOCOLS_OF
 from iif_core.evaluation.lpips import Weights
 from iif_core.reflectance.material import PROPERTIES
-from workflow.artifacts.store import StageReader, ids_from_disk, rgb
+from workflow.artifacts.store import StageReader, ids_from_disk, material_maps, prediction_numbers, rgb
 from workflow.models.lpips import FETCH_VGG
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
@@ -22,10 +22,8 @@ from workflow.scoring.scores import (
     UNITS,
     MaterialTruth,
     ScoreRows,
-    material_maps,
     material_truth,
     perceptual_networks,
-    prediction_numbers,
     scored_views,
 )
 

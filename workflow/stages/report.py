@@ -8,14 +8,13 @@ import numpy as np
 import yaml
 
 from iif_core.numerics import color
-from workflow.artifacts.store import ids_from_disk, rgb
+from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
 from workflow.report import pictures as pic
 from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
-from workflow.stages.metrics import material_maps, prediction_numbers
 
 PLAN_KEYS = ("component", "included", "measure", "value", "threshold", "reason")
 ERROR_RANGE = 0.25
