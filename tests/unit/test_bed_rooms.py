@@ -69,3 +69,18 @@ def test_the_sun_stands_where_it_should():
     row, column = np.unravel_index(sky.sum(-1).argmax(), sky.shape[:2])
     assert abs(90 - (row + 0.5) * 180 / 64 - light.sun[0]) < 3 and abs((column + 0.5) * 360 / 128 - light.sun[1]) < 3
     assert sky.min() > 0 and np.isfinite(sky).all()
+
+
+@pytest.mark.parametrize("name", ["tiny", "curtains"])
+def test_finer_meshes_are_the_same_room(name):
+    coarse, fine = rooms.build(name), rooms.build(name, 2)
+    for one, other in ((coarse, fine), (coarse.scan, fine.scan)):
+        assert len(other.faces) == 16 * len(one.faces)
+        (normal, area), (finer, areas) = (face_geometry(r.vertices, r.faces) for r in (one, other))
+        np.testing.assert_allclose(areas.reshape(-1, 16).sum(1), area, rtol=1e-3, atol=1e-9)  # float32 vertices
+        near = np.repeat(area > 1e-5, 16)
+        assert ((finer * np.repeat(normal, 16, 0)).sum(1)[near] > 0.999).all()
+        np.testing.assert_array_equal(other.object_id, np.repeat(one.object_id, 16))
+        np.testing.assert_array_equal(other.emission, np.repeat(one.emission, 16, 0))
+    edges = np.sort(fine.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), 1)
+    assert len(np.unique(edges, axis=0)) < 2 * len(fine.faces)  # neighbours share the new vertices

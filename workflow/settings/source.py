@@ -19,6 +19,8 @@ class BuiltinSource(Section):
     ] = "kitchen"
     """`kitchen`: a furnished room; `tiny`: a few boxes, for tests; the others: rooms of the test bed, which differ in how light
     enters them (docs/development/rooms.md)."""
+    quarterings: int = Field(0, ge=0, le=4)
+    """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""
 
 
 class MitsubaSource(Section):

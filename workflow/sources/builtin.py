@@ -43,7 +43,7 @@ def capture(job: Job) -> None:
         require_denoiser()
     from workflow.sources import rooms
 
-    _Capture(job, rooms.build(job.settings.source.scene)).run()
+    _Capture(job, rooms.build(job.settings.source.scene, job.settings.source.quarterings)).run()
 
 
 class _Capture:

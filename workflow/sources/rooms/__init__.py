@@ -11,12 +11,15 @@ from workflow.sources.rooms.room import Room
 ROOMS: dict[str, Callable[[], Room]] = {"kitchen": kitchen.build, "tiny": tiny.build, **bed.ROOMS}
 
 
-def build(name: str) -> Room:
-    """Build the room of that name.
+def build(name: str, quarterings: int = 0) -> Room:
+    """Build the room of that name, with every face split into four `quarterings` times.
 
     Raises:
         InputError: unknown name.
     """
     if name not in ROOMS:
         raise InputError(f"source.scene: found {name!r}, allowed: {', '.join(ROOMS)}")
-    return ROOMS[name]()
+    room = ROOMS[name]()
+    for _ in range(quarterings):
+        room = room.quartered()
+    return room
