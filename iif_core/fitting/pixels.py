@@ -121,7 +121,31 @@ class Terms:
             getattr(self, name)[objects] = getattr(other, name)[objects]
 
 
-def prepare_pixels(problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None) -> tuple[Pixels, Tone]:
+def darkest_light(problem: FitProblem) -> float:
+    """Return the light below which pixels are left out (docs/method/numerics.md#pixels-without-light): a thousandth of the median
+    of exposure times diffuse light, over pixels that are finite, lit, and of an object; 0 without such pixels."""
+    use, brightness = _finite(problem), _brightness(problem)
+    return 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
+
+
+def _finite(problem: FitProblem) -> np.ndarray:
+    """Which pixels are finite, exposed, and of an object, (n,) bool."""
+    ids = np.asarray(problem.object_id)
+    use = np.isfinite(problem.base).all(1) & np.isfinite(problem.value).all(1)
+    use &= np.isfinite(problem.exposure) & (problem.exposure > 1e-6) & (ids >= 0) & (ids < problem.n_objects)
+    for d, s0, s1 in zip(problem.diffuse, problem.s0, problem.s1, strict=True):
+        use &= np.isfinite(d).all(1) & np.isfinite(s0).all((1, 2)) & np.isfinite(s1).all((1, 2))
+    return use
+
+
+def _brightness(problem: FitProblem) -> np.ndarray:
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.mean([d.sum(1, dtype=np.float64) for d in problem.diffuse], 0) * problem.exposure
+
+
+def prepare_pixels(
+    problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None, darkest: float | None = None
+) -> tuple[Pixels, Tone]:
     """Select and sort the usable pixels: finite, lit, and of an object.
 
     Pixels that receive almost no light are left out (docs/method/numerics.md#pixels-without-light).
@@ -130,19 +154,15 @@ def prepare_pixels(problem: FitProblem, response: Response, fewest: int = 0, mos
         problem: pixels with base values and cached shading; response: start of the fit.
         fewest: objects with fewer usable pixels are left out; most: largest number of pixels of an object, spread evenly over its
             clusters; None: all.
+        darkest: light below which pixels are left out; None: `darkest_light` of these pixels.
 
     Returns:
         The pixels, and the curve that residuals are measured in.
     """
-    ids = np.asarray(problem.object_id)
-    use = np.isfinite(problem.base).all(1) & np.isfinite(problem.value).all(1)
-    use &= np.isfinite(problem.exposure) & (problem.exposure > 1e-6) & (ids >= 0) & (ids < problem.n_objects)
-    for d, s0, s1 in zip(problem.diffuse, problem.s0, problem.s1, strict=True):
-        use &= np.isfinite(d).all(1) & np.isfinite(s0).all((1, 2)) & np.isfinite(s1).all((1, 2))
-    with np.errstate(invalid="ignore", over="ignore"):
-        brightness = np.mean([d.sum(1, dtype=np.float64) for d in problem.diffuse], 0) * problem.exposure
+    ids, use = np.asarray(problem.object_id), _finite(problem)
+    brightness = _brightness(problem)
     if use.any():
-        use &= brightness > 1e-3 * np.median(brightness[use])
+        use &= brightness > (1e-3 * np.median(brightness[use]) if darkest is None else darkest)
     usable = np.bincount(ids[use], minlength=problem.n_objects)
     use &= (usable >= fewest)[np.where(use, ids, 0)] if len(usable) else False
     index = np.flatnonzero(use)

@@ -167,7 +167,8 @@ def descend(
 def fit_published(problem: FitProblem, response: Response, options: PublishedOptions | None = None) -> FitResult:
     """Fit like `direct.fit_affines`, from the identity; `history` is the mean loss of the steps of each epoch."""
     opt, merged = options or PublishedOptions(), problem.merged()
-    used = merged.take(np.flatnonzero(merged.object_id >= 0))
+    seen = merged.object_id >= 0
+    used = merged if seen.all() else merged.take(np.flatnonzero(seen))  # a copy may not fit into memory
     n, per_epoch = len(used.object_id), -(-len(used.object_id) // opt.batch)
     start = PublishedState.start(problem.n_objects, response)
     state = [start, *descend(used, response, start, opt)][-1]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting.pixels import prepare_pixels, residuals
+from iif_core.fitting.pixels import darkest_light, prepare_pixels, residuals
 from iif_core.fitting.problem import FitOptions, FitProblem
 from iif_core.reflectance.material import apply_affines
 
@@ -53,13 +53,17 @@ def reference_options(**changes: object) -> FitOptions:
     return replace(own, **changes)
 
 
-def reference_loss(problem: FitProblem, affine: np.ndarray, response: Response) -> ReferenceLoss:
-    """Return the loss of a solution affine (O, 16) in the gauge of the cached light."""
-    px, tone = prepare_pixels(reference_problem(problem, response), response)
-    if not len(px.obj):
+def reference_loss(problem: FitProblem, affine: np.ndarray, response: Response, chunk: int = 1 << 20) -> ReferenceLoss:
+    """Return the loss of a solution affine (O, 16) in the gauge of the cached light; `chunk` pixels are looked at together."""
+    whole = reference_problem(problem, response)
+    darkest, sums = darkest_light(whole), np.zeros(4)  # squares, 1 - roughness, metallic, pixels
+    for first in range(0, len(whole.object_id), chunk):
+        px, tone = prepare_pixels(whole.take(slice(first, first + chunk)), response, darkest=darkest)
+        if len(px.obj):
+            squares = np.mean(residuals(px, affine, tone, FitOptions()) ** 2)
+            value = apply_affines(affine, px.obj, px.base)
+            sums += len(px.obj) * np.array([squares, np.mean(1.0 - value[:, 3]), np.mean(value[:, 4]), 1.0])
+    if not sums[3]:
         return ReferenceLoss(0.0, 0.0, 0.0, 0.0)
-    data = float(np.mean(residuals(px, affine, tone, FitOptions()) ** 2))
-    value = apply_affines(affine, px.obj, px.base)
-    roughness = ROUGHNESS_WEIGHT * float(np.mean(1.0 - value[:, 3]))
-    metallic = METALLIC_WEIGHT * float(np.mean(value[:, 4]))
+    data, roughness, metallic = (float(part) for part in sums[:3] / sums[3] * [1.0, ROUGHNESS_WEIGHT, METALLIC_WEIGHT])
     return ReferenceLoss(data + roughness + metallic, data, roughness, metallic)

@@ -1,5 +1,7 @@
 """The solvers on one problem, judged by one loss; patches; the settings of the scale."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,20 @@ def test_reference_loss_by_hand(ldr):
     assert got.roughness == pytest.approx(1e-3 * np.mean(1 - r), rel=1e-6)
     assert got.metallic == pytest.approx(5e-3 * m.mean(), abs=1e-9)
     assert got.total == pytest.approx(got.data + got.roughness + got.metallic)
+
+
+def test_reference_loss_in_parts_is_that_of_the_whole(ldr):
+    """Pixels without light are told by the median of all of them, not of a part."""
+    rng, start = np.random.default_rng(3), response("gamma")
+    order = np.argsort(ldr.diffuse[0].sum(1))  # the darkest come first
+    problem = ldr.take(order)
+    dim = np.where(np.arange(len(order))[:, None] < 40, 1e-6, 1.0)
+    problem = replace(problem, diffuse=tuple(d * dim for d in problem.diffuse))
+    affine = IDENTITY + 0.05 * rng.standard_normal((4, 16))
+    whole, parts = reference_loss(problem, affine, start), reference_loss(problem, affine, start, chunk=100)
+    assert len(order) > 300 and whole.total > 0
+    for name in ("total", "data", "roughness", "metallic"):
+        assert getattr(parts, name) == pytest.approx(getattr(whole, name), rel=1e-12)
 
 
 @pytest.mark.parametrize("family", ["gamma", "ggcm"])
@@ -107,7 +123,6 @@ def test_covariance_sees_errors_that_neighbours_share():
     problem, _ = problem_of(rng, 1, 2000, truth=IDENTITY[None])
     opt = FitOptions(select=False, population=False, ridge=1e-9, robust_width=1e3, metallic_prior=2)
     gains, claimed = [], []
-    from dataclasses import replace
 
     for _ in range(30):
         shared = np.repeat(rng.normal(0, 0.05, (100, 3)), 20, 0)

@@ -293,6 +293,26 @@ def test_scratch_keeps_many_arrays_in_few_mappings(tmp_path, monkeypatch):
         kept[-1][0, 0] = 1
 
 
+def test_arrays_are_joined_on_disk(tmp_path):
+    rng = np.random.default_rng(0)
+    parts = [rng.random((n, 2, 3)).astype(np.float32) for n in (5, 0, 400, 1)]
+    joined = scratch.Joined(tmp_path)
+    for part in parts:
+        joined.add(part)
+    whole = joined.array()
+    np.testing.assert_array_equal(whole, np.concatenate(parts))
+    np.testing.assert_array_equal(whole[np.array([404, 3])], np.concatenate(parts)[[404, 3]])
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(ValueError, match="read-only"):
+        whole[0] = 1
+    for other in (parts[0].astype(np.float64), parts[0][:, :1]):
+        with pytest.raises(ValueError, match="cannot join"):
+            joined.add(other)
+    none = scratch.Joined(tmp_path)
+    none.add(parts[1])
+    assert none.array().shape == (0, 2, 3) and none.array().dtype == np.float32
+
+
 TABLES = """
 import sys
 from pathlib import Path

@@ -170,6 +170,7 @@ def test_loss_and_its_derivative():
 def test_bright_triangles_and_the_cube_of_the_cache():
     mean = np.array([[0.2, 0.995, 0.1], [0.99, 0.99, 0.99], [2.0, 2.0, 2.0]])
     assert emission.bright_triangles(mean, np.array([5, 5, 0])).tolist() == [True, False, False]
+    assert emission.bright_triangles(mean, np.array([5, 5, 0]), 0.5).tolist() == [True, True, False]
     low, edge = emission.bounding_cube(-1.0, 3.0)
     assert (low, low + 256 * edge) == pytest.approx((-1.04, 3.04))
     assert emission.bounding_cube(2.0, 2.0)[1] > 0

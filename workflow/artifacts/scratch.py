@@ -46,3 +46,30 @@ class Scratch:
         self._start, self._used = -(-end // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY, 0
         self._file.truncate(self._start + size)
         return mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ, offset=self._start)
+
+
+class Joined:
+    """Joins arrays along their first axis, on disk: in a file that has no name, so that memory does not grow with them."""
+
+    def __init__(self, folder: Path):
+        self._folder = folder
+        self._file: IO[bytes] | None = None
+        self._rows, self._empty = 0, np.zeros(0)
+
+    def add(self, part: np.ndarray) -> None:
+        """Append rows, of the dtype and shape of those before. A full disk raises OSError."""
+        if self._file is None:
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (its rows are read until the job ends)
+            self._empty = np.zeros((0, *part.shape[1:]), part.dtype)
+        if part.dtype != self._empty.dtype or part.shape[1:] != self._empty.shape[1:]:
+            kept = f"{self._empty.dtype} {self._empty.shape[1:]}"
+            raise ValueError(f"rows of {part.dtype} {part.shape[1:]} cannot join rows of {kept}")
+        self._file.write(np.ascontiguousarray(part).data)
+        self._rows += len(part)
+
+    def array(self) -> np.ndarray:
+        """Return all rows, mapped from the file, to be read only."""
+        if self._file is None or not self._rows:
+            return self._empty
+        self._file.flush()
+        return np.memmap(self._file, self._empty.dtype, "r", shape=(self._rows, *self._empty.shape[1:])).view(np.ndarray)

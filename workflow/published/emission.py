@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from iif_core.light.transport.single_bounce import BouncePaths
 
 REPAIRED = "published_repaired"
+SATURATED_SHARE = 0.5
+"""Repaired: a triangle is an emitter if more than this share of the pixels that show it are saturated."""
 _SEEDS = 0x707562  # keeps the random streams of this stage apart from those of others
 _SAVED_EVERY = 50
 """Steps after which the state is written, so that a job that is killed loses little."""
@@ -125,14 +127,15 @@ def _read(
         shown = np.clip(pixels.value, 0, 1)
         radiance = curve.inverse(shown) / exposure[number]
         sums.add(pixels.points, radiance, np.zeros(len(radiance), bool))
-        tested = shown if job.settings.emission.solver == REPAIRED else radiance
+        tested = shown > THRESHOLD if job.settings.emission.solver == REPAIRED else radiance
         total += np.stack([np.bincount(pixels.face, tested[:, c], faces) for c in range(3)], 1)
         count += np.bincount(pixels.face, minlength=faces)
         parts.append((np.full(len(shown), number, np.int16), pixels.index.astype(np.int32), pixels.value.astype(np.float32)))
         job.progress(number + 1, len(views), "views read")
     joined = [np.concatenate(part) for part in zip(*parts, strict=True)]
     pool = _Pool(joined[0], joined[1], joined[2], views, exposure)
-    return pool, sums.finish(), bright_triangles(total / np.maximum(count, 1)[:, None], count), count
+    limit = SATURATED_SHARE if job.settings.emission.solver == REPAIRED else THRESHOLD
+    return pool, sums.finish(), bright_triangles(total / np.maximum(count, 1)[:, None], count, limit), count
 
 
 def _descended(

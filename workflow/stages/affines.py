@@ -20,6 +20,7 @@ from iif_core.fitting.published import PublishedOptions, fit_published
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
+from workflow.artifacts.scratch import Joined
 from workflow.artifacts.store import ids_from_disk, split_rgb
 from workflow.decisions import camera, materials
 from workflow.decisions.record import Decision
@@ -216,16 +217,23 @@ def _problem(
     for view in views:
         counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
     asked = job.settings.affines.pixels
-    drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+    published = job.settings.affines.solver == "published"
+    drawn = (
+        FitPixels.every(scene.n_objects, mixed)
+        if published and asked == "all"
+        else FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
+    )
     levels = roughness_levels(job)
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "base", "value", "exposure", "view", "index", "cell")}
-    cached: list[list[list[np.ndarray]]] = [[[], [], []], [[], [], []]]
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "value", "exposure", "view", "index", "cell")}
+    # What grows with pixels x levels is joined on disk; the published fit takes the mean of the halves.
+    folder = job.writer.directory
+    base, cached = Joined(folder), [[Joined(folder) for _ in range(3)] for _ in range(1 if published else 2)]
     for done, view in enumerate(views):
         pixels, specular = view_pixels(job, capture, scene, view), read_specular(job, view)
         pixels = pixels.take(drawn.of(pixels, view))
         index = pixels.index
         rows["object"].append(pixels.object_id)
-        rows["base"].append(base_maps(job, view)[index])
+        base.add(base_maps(job, view)[index])
         rows["value"].append(pixels.value)
         exposure, balance = exposure_and_balance(capture, gains, view, index)
         rows["exposure"].append(exposure)
@@ -233,23 +241,18 @@ def _problem(
         rows["index"].append(index.astype(np.int32))
         rows["cell"].append(cells_of(job, view)[index])
         specular, diffuse = specular.at(index), read_diffuse(job, view).reshape(2, -1, 3)[:, index]
-        for half in range(2):
-            for layer, part in enumerate((diffuse[half], specular.s0[half], specular.s1[half])):
-                cached[half][layer].append(balanced(part, balance))
+        for layers, half in zip(cached, (slice(None),) if published else (slice(1), slice(1, 2)), strict=True):
+            for layer, part in zip(layers, (diffuse, specular.s0, specular.s1), strict=True):
+                layer.add(balanced(part[half].mean(0), balance))
         job.progress(done + 1, len(views), "views read")
-    joined = {name: np.concatenate(parts) for name, parts in rows.items()}
+    joined = {name: np.concatenate(rows.pop(name)) for name in list(rows)}
     value, saturated = sensor_bounds(np.asarray(joined["value"], np.float32), capture.is_hdr, job.settings.emission.saturation)
-    halves = [[np.concatenate(part) for part in half] for half in cached]
-    d, s0, s1 = ((halves[0][i], halves[1][i]) for i in range(3))
-    object_id, cell = joined["object"].astype(np.int32), joined["cell"].astype(np.int64)
-    # Pixels without a cell share one position.
-    position = np.zeros((len(cell), 3))
-    if len(scene.cell_ijk):
-        position = np.where((cell >= 0)[:, None], scene.cell_ijk[np.maximum(cell, 0)], -1)
+    d, s0, s1 = (tuple(layer.array() for layer in layers) for layers in zip(*cached, strict=True))
+    object_id = joined["object"].astype(np.int32)
     problem = FitProblem(
         object_id,
         scene.n_objects,
-        joined["base"],
+        base.array(),
         d,
         s0,
         s1,
@@ -257,10 +260,18 @@ def _problem(
         value,
         joined["exposure"],
         saturated,
-        patches(object_id, position),
+        None if published else _patches(scene, object_id, joined["cell"].astype(np.int64)),
         _scatter(job, scene.n_objects),
     )
     return problem, _Places(joined["view"], joined["index"])
+
+
+def _patches(scene: BaseScene, object_id: np.ndarray, cell: np.ndarray) -> np.ndarray:
+    """Number the patches of surface whose pixels err together, (n,); pixels without a cell share one place."""
+    position = np.zeros((len(cell), 3))
+    if len(scene.cell_ijk):
+        position = np.where((cell >= 0)[:, None], scene.cell_ijk[np.maximum(cell, 0)], -1)
+    return patches(object_id, position)
 
 
 def _scatter(job: Job, n_objects: int) -> np.ndarray:

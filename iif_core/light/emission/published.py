@@ -15,7 +15,8 @@ from iif_core.camera.response import Response
 START = 0.01
 """Radiance of every channel of every triangle at first."""
 THRESHOLD = 0.99
-"""Mean radiance of a triangle, in its brightest channel, above which it is an emitter."""
+"""Mean radiance of a triangle, in its brightest channel, above which it is an emitter; repaired: sensor value of a saturated
+pixel."""
 CLAMP = 0.9
 """Sensor value at which prediction and photograph are clamped."""
 CACHE_CELLS = 256
@@ -82,9 +83,10 @@ class PublishedState:
         return np.maximum(self.stored, 0.0) * self.keep[:, None]
 
 
-def bright_triangles(mean: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return which triangles are emitters, (F,) bool: seen at all, and the mean (F, 3) of what they show above 0.99."""
-    return (count > 0) & (mean.max(1) > THRESHOLD)
+def bright_triangles(mean: np.ndarray, count: np.ndarray, limit: float = THRESHOLD) -> np.ndarray:
+    """Return which triangles are emitters, (F,) bool: seen at all, and the mean (F, 3) of what they show above the limit in one
+    channel."""
+    return (count > 0) & (mean.max(1) > limit)
 
 
 def bounding_cube(low: float, high: float) -> tuple[float, float]:

@@ -61,7 +61,10 @@ class RadianceCollector:
 
 @dataclass
 class Vertex:
-    """A shaded point of a path: `point` already lies off the surface (`offset_from`), `normal` is on the side of `wo`."""
+    """A shaded point of a path: `point` already lies off the surface (`offset_from`), `normal` is on the side of `wo`.
+
+    `chance`: probability with which a path continues in the GGX lobe; None = by what the lobes reflect (Eq. R.12).
+    """
 
     point: Any
     normal: Any
@@ -69,6 +72,7 @@ class Vertex:
     kd: Any
     ks: Any
     roughness: Any
+    chance: Any = None
 
 
 def power_weight(p: Any, q: Any) -> Any:
@@ -90,7 +94,9 @@ def to_world(local: tuple[Any, Any, Any], normal: Any) -> Any:
 
 
 def _specular_chance(vertex: Vertex) -> Any:
-    """Probability with which a path continues in the GGX lobe (Eq. R.12)."""
+    """Probability with which a path continues in the GGX lobe."""
+    if vertex.chance is not None:
+        return vertex.chance
     return brdf.specular_chance(DRJIT, dr.max(vertex.kd), dr.max(vertex.ks), dr.dot(vertex.normal, vertex.wo))
 
 

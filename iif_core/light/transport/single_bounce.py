@@ -31,6 +31,9 @@ from iif_core.reflectance import brdf
 
 Array = np.ndarray
 
+LOBE_CHANCE = 0.5
+"""Probability with which a path continues in the GGX lobe, whatever the material, as published."""
+
 
 class BouncePaths(NamedTuple):
     """What the paths of n rays collect: R contributions of emitters, and the light of the cache.
@@ -127,7 +130,7 @@ def _one_bounce(
     lit = hit.valid & (cos_front != 0)
     normal = dr.select(cos_front < 0, -hit.normal, hit.normal)
     base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, lit)
-    vertex = Vertex(offset_from(hit.point, normal), normal, -toward, *brdf.kd_ks(base_color, metallic), roughness)
+    vertex = Vertex(offset_from(hit.point, normal), normal, -toward, *brdf.kd_ks(base_color, metallic), roughness, LOBE_CHANCE)
     emitters, weights = [emitter(hit.face, hit.valid)], [mi.Color3f(dr.select(hit.valid, 1.0, 0.0))]
     if world.emitters.can_be_sampled:
         light, diffuse, specular = light_by_lobe(world, rng, vertex, lit)
