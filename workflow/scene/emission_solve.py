@@ -34,7 +34,7 @@ from iif_core.light.emission.problem import (
     white_surface,
 )
 from iif_core.light.emission.pruning import PrunedEmission, WhiteSurface, insignificant, prune_groups
-from iif_core.light.emission.rows import TracedTransport
+from iif_core.light.emission.rows import TracedTransport, light_of
 from iif_core.light.emission.search import HIDDEN_EXCESS, QUICK, Candidates, Families, search
 from iif_core.light.emission.sgd import SgdOptions, solve_emission_sgd
 from iif_core.surface.cells import pack_keys, voxel_indices
@@ -263,7 +263,7 @@ def _raised(
         return cache
     transport = trace_rows(photos, pixels, base, found.groups, found.cache, sky, 2, unseen)
     matrix, cached = transport.matrix[:, 0].mean(0), transport.cached[:, 0].mean(0)
-    light = np.einsum("ngc,gc->nc", matrix, radiance) + cached
+    light = light_of(matrix, radiance) + cached
     of_object = np.concatenate([found.gains.gain, np.ones((1, 3))])  # the last for surface of no object, -1
     possible = 1.0 / np.maximum(base[:, :3], 1e-3)  # no surface reflects more than it receives
     return cache.raised(pixels.points, np.minimum(of_object[pixels.object_id], possible) * light)

@@ -99,8 +99,15 @@ class EmissionPrior:
 
     def radiance(self, rows: EmissionRows, max_rounds: int = 20) -> np.ndarray:
         """Return (G, 3) the radiance of `solve` alone, for about half of its cost."""
+        return self.radiance_and_light(rows, max_rounds)[0]
+
+    def radiance_and_light(self, rows: EmissionRows, max_rounds: int = 20) -> tuple[np.ndarray, np.ndarray]:
+        """Return `radiance`, and A E with the mean of the two traces, (n, 3)."""
         channels = _channels(rows, np.asarray(self.initial, np.float64), True, RIDGE, self.width, self.correlation)
-        return np.stack([channel.solve(max_rounds).radiance for channel in channels], 1) if channels else self.initial.copy()
+        if not channels:
+            return self.initial.copy(), np.zeros(rows.observed.shape)
+        found = [channel.solve(max_rounds) for channel in channels]
+        return np.stack([channel.radiance for channel in found], 1), np.stack([channel.light for channel in found], 1)
 
 
 def solve_emission(
@@ -148,7 +155,7 @@ def solve_emission(
         np.stack([f.radiance for f in found], 1),
         np.stack(error, 1),
         np.stack(shares, 1).min(1),
-        max(1.0, *(f.condition for f in found)),
+        max([1.0, *(f.system.condition for f in found if f.system is not None)]),
         residual,
         sum(f.violated for f in found),
         max(f.rounds for f in found),
@@ -178,7 +185,7 @@ def _channels(
     found = []
     for c in range(3):
         prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
-        data = *(a[:, :, c] for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
+        data = *(np.ascontiguousarray(a[:, :, c]) for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
         found.append(_ChannelRows(*data, cluster, rows.noise, *prior))
     return found
 
@@ -218,8 +225,8 @@ def solve_families(
     return solve_emission(rows, start, prior_width=np.where(together, width, prior.width), family=family, correlation=correlation)
 
 
-def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """(H lifted, the lift, condition number), all of unit diagonal (Eq. L.24)."""
+def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray]:
+    """(H lifted, the lift), both of unit diagonal (Eq. L.24)."""
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
@@ -228,8 +235,7 @@ def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray, fl
     lift = np.where(share < max(TRUSTED_RELIABILITY * noise, 1e-6), 1.0 - share, 0.0)
     whole = root @ directions
     lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
-    spectrum = np.linalg.eigvalsh(normal.h + lifted)
-    return normal.h + lifted, lifted, float(spectrum[-1] / max(spectrum[0] - ridge, 1e-10))
+    return normal.h + lifted, lifted
 
 
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
@@ -267,8 +273,9 @@ def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class _Channel:
     radiance: np.ndarray
+    light: np.ndarray
     variance: np.ndarray
-    condition: float
+    system: _System | None
     violated: int
     rounds: int
     converged: bool
@@ -292,7 +299,7 @@ class _System:
 
     Attributes:
         known: (G,) bool; scale: of the unknowns; matrix: lifted H plus prior; lifted: the part of it that belongs to the
-            prior; right: b.
+            prior; right: b; data: lifted H alone; ridge: its smallest eigenvalue for directions that the data do not tell.
     """
 
     known: np.ndarray
@@ -300,7 +307,14 @@ class _System:
     matrix: np.ndarray
     lifted: np.ndarray
     right: np.ndarray
-    condition: float
+    data: np.ndarray
+    ridge: float
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the lifted H."""
+        spectrum = np.linalg.eigvalsh(self.data)
+        return float(spectrum[-1] / max(spectrum[0] - self.ridge, 1e-10))
 
     def solve(self, initial: np.ndarray) -> np.ndarray:
         """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
@@ -387,6 +401,8 @@ class _ChannelRows:
 
     def scores(self, answer: np.ndarray) -> np.ndarray:
         """S of Eq. L.27, over clusters of rows that are no bounds: (G, G)."""
+        from scipy.sparse import csr_matrix
+
         parts, weight = [], self.sure
         for part in self.chunks():
             w = weight[part, None]
@@ -399,8 +415,8 @@ class _ChannelRows:
         single = np.concatenate(parts)
         alone = self.cluster < 0
         number = np.unique(self.cluster[~alone], return_inverse=True)[1]
-        together = np.zeros((int(number.max(initial=-1)) + 1, single.shape[1]))
-        np.add.at(together, number, single[~alone])
+        shape = int(number.max(initial=-1)) + 1, len(number)
+        together = csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))), shape) @ single[~alone]
         return single[alone].T @ single[alone] + together.T @ together
 
     def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> _System | None:
@@ -414,21 +430,22 @@ class _ChannelRows:
         scale = np.sqrt(diagonal[known])
         unit, pick = np.outer(scale, scale), np.ix_(known, known)
         scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
-        matrix, lifted, condition = _definite(scaled, self.ridge)
+        matrix, lifted = _definite(scaled, self.ridge)
         each = np.sqrt(variance[known]) / (self.width[known] * scale)
         prior = np.diag(each**2)
         if self.correlation is not None:
             prior = each[:, None] * np.linalg.inv(self.correlation[pick]) * each
-        return _System(known, scale, matrix + prior, lifted + prior, scaled.b, condition)
+        return _System(known, scale, matrix + prior, lifted + prior, scaled.b, matrix, self.ridge)
 
     def solve(self, max_rounds: int) -> _Channel:
         """Solve and re-weight until the answer rests, then once more with the prior weighed by the design effect."""
         bound, weight, target = self.bound, self.weight, self.mean_target
-        mean_a = 0.5 * (self.first + self.second)
+        mean_a = (0.5 * (self.first + self.second)).astype(np.float64)
         bounded = bool(np.isfinite(self.width).any())
-        answer, condition = self.initial.copy(), 1.0
+        answer, last = self.initial.copy(), None
         rounds, converged, weighed, noise = 0, False, not bounded, 0.0
-        difference = target - mean_a @ answer
+        light = mean_a @ answer
+        difference = target - light
         variance, effect = np.zeros(len(answer)), np.ones(len(answer))
         while rounds < max_rounds and not (converged and weighed):
             if converged and not weighed:
@@ -439,10 +456,11 @@ class _ChannelRows:
             share, shift = _censored(difference, bound, self.noise, noise)
             system = self.system(weight * share, shift, variance)
             if system is not None:
-                answer, condition = self._completed(system.solve(self.initial), system.known), system.condition
+                answer, last = self._completed(system.solve(self.initial), system.known), system
             if rounds > _DAMPED_AFTER:  # two answers may alternate: take the one between them
                 answer = 0.5 * (before + answer)
-            difference = target - mean_a @ answer
+            light = mean_a @ answer
+            difference = target - light
             used = np.where(bound & (difference <= 0), 0.0, weight)
             residual = float((used * difference**2).sum() / max(np.count_nonzero(used), 1))
             variance = effect * residual if bounded else variance
@@ -454,8 +472,9 @@ class _ChannelRows:
         counted = np.where(bound & (difference < 0), 0.0, weight)
         return _Channel(
             answer,
+            light,
             variance,
-            condition,
+            last,
             int((bound & (difference > 1e-6 * np.abs(target))).sum()),
             rounds,
             converged,

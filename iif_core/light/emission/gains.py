@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
-from iif_core.light.emission.rows import EmissionRows
+from iif_core.light.emission.rows import EmissionRows, light_of
 
 PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
@@ -111,8 +111,28 @@ def estimate_object_gains(
     Returns:
         Gains, the level's error and the weights of the rows.
     """
-    options = options or GainOptions()
     count = max(int(owner.max(initial=-1)) + 1, n_objects)
+    # Objects without rows all get the same gains, so one of them is enough; a scan has many.
+    has_rows = np.bincount(owner[owner >= 0], minlength=count) > 0
+    asked = np.r_[np.flatnonzero(has_rows), np.flatnonzero(~has_rows)[:1]]
+    number = np.full(count + 1, len(asked) - 1)
+    number[asked], number[-1] = np.arange(len(asked)), -1
+    if albedo is not None:
+        albedo = albedo._replace(mean=np.asarray(albedo.mean)[asked])
+    found = _gains_of_asked(rows, number[owner], prior, scale_is_identifiable, albedo, len(asked), options or GainOptions())
+    return replace(found, gain=found.gain[number[:-1]], gloss_gain=found.gloss_gain[number[:-1]])
+
+
+def _gains_of_asked(
+    rows: EmissionRows,
+    owner: np.ndarray,
+    prior: EmissionPrior,
+    scale_is_identifiable: bool,
+    albedo: BaseAlbedo | None,
+    count: int,
+    options: GainOptions,
+) -> ObjectGains:
+    """`estimate_object_gains` for `count` objects, of which at most one has no rows."""
     gain, gloss_gain = np.ones((count, 3)), np.ones(count)
     known = owner >= 0
     if not known.any():
@@ -125,8 +145,8 @@ def estimate_object_gains(
     for _ in range(options.rounds):
         of_row, gloss_of_row = np.concatenate([gain, np.ones((1, 3))])[column], np.append(gloss_gain, 1.0)[column]
         scaled = replace(rows, weight=weight).scaled(of_row, gloss_of_row)
-        radiance = prior.radiance(scaled, max_rounds=5)
-        predicted = np.einsum("ngc,gc->nc", scaled.matrices.mean(0), radiance) + scaled.cached.sum(1).mean(0)
+        radiance, light = prior.radiance_and_light(scaled, max_rounds=5)
+        predicted = light + scaled.cached.sum(1).mean(0)
         weight = _relative_to(rows, predicted, known)
         used = np.where(rows.lower_bound, 0.0, weight)
         if rows.has_lobes:  # mean weighted square of what an object's rows leave unexplained
@@ -165,7 +185,7 @@ def _level_errors(
     if not seen.any():
         return free_error, np.full(seen.shape, free_error)
     mean = rows.matrices.mean(0)
-    size = [float((used * rows.observed * np.einsum("ngc,gc->nc", mean, e)).sum()) for e in (free, shown)]
+    size = [float((used * rows.observed * light_of(mean, e)).sum()) for e in (free, shown)]
     phi = float(np.clip(size[1] / max(sum(size), 1e-300), 0.0, 1.0)) if size[1] > 0 else 0.0
     everything = of_objects.moments(used, gloss_weight, radiance)
     error = everything.level_error()
@@ -260,10 +280,10 @@ class _ObjectRows:
 
         def lobe(number: int) -> tuple[_Traces, _Traces]:
             """Light at level 1, and light that does not follow the level."""
-            emitted = np.einsum("kngc,gc->knc", self.rows.matrix[:, number], radiance)
+            emitted = light_of(self.rows.matrix[:, number], radiance)
             constant = self.rows.cached[:, number]
             if known is not None:
-                constant = constant + np.einsum("kngc,gc->knc", self.rows.matrix[:, number], known)
+                constant = constant + light_of(self.rows.matrix[:, number], known)
             return emitted, constant
 
         def sums(values: np.ndarray) -> np.ndarray:

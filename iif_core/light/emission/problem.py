@@ -12,7 +12,7 @@ from iif_core.light.emission.environment import Sky
 from iif_core.light.emission.gains import BaseAlbedo, GainOptions, ObjectGains, estimate_object_gains
 from iif_core.light.emission.pixels import COVERAGE_ERROR, EmissionPixels
 from iif_core.light.emission.pruning import WhiteSurface, without_groups
-from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows
+from iif_core.light.emission.rows import EmissionRows, TracedTransport, block_rows, light_of
 
 ANCHOR_WEIGHT = 100.0
 """Weight of what is directly seen of a group relative to everything that its light does elsewhere (Eq. L.17)."""
@@ -48,7 +48,7 @@ class EmissionProblem:
         used = ~self.anchor
         observed, bound = self.rows.observed[used], self.rows.lower_bound[used]
         predicted = [
-            np.einsum("ngc,gc->nc", matrix[used], radiance) + cached[used]
+            light_of(matrix[used], radiance) + cached[used]
             for matrix, cached in zip(self.rows.matrices, self.rows.cached.sum(1), strict=True)
         ]
         mean = 0.5 * (predicted[0] + predicted[1])

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.light.emission.direct import EmissionPrior
-from iif_core.light.emission.rows import EmissionRows
+from iif_core.light.emission.rows import EmissionRows, light_of
 
 CERTAIN_EXCESS = 2.0
 """Brightness relative to a white surface from which a group shines for certain; more than 1, since the light that the white
@@ -154,7 +154,7 @@ def _light_shares(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) ->
 def _misfit(rows: EmissionRows, radiance: np.ndarray, mask: np.ndarray) -> float:
     """Weighted root sum of squares of some rows; bounds that are met do not count."""
     mean = rows.matrices[:, mask].mean(0)
-    difference = rows.mean_target[mask] - np.einsum("ngc,gc->nc", mean, radiance)
+    difference = rows.mean_target[mask] - light_of(mean, radiance)
     counted = np.where(rows.lower_bound[mask] & (difference < 0), 0.0, rows.weight[mask])
     return float(np.sqrt((counted * difference**2).sum()))
 
@@ -168,7 +168,7 @@ def _solve_subset(rows: EmissionRows, prior: EmissionPrior, kept: np.ndarray, sh
 
 def without_groups(rows: EmissionRows, kept: np.ndarray, shown: np.ndarray) -> EmissionRows:
     """Return the system of the `kept` groups (G,) bool; the light of the others, `shown` (G, 3), is added to what is cached."""
-    light = np.einsum("klngc,gc->klnc", rows.matrix[:, :, :, ~kept], shown[~kept])
+    light = light_of(rows.matrix[:, :, :, ~kept], shown[~kept])
     return replace(rows.columns(kept), cached=rows.cached + light)
 
 

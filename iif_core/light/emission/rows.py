@@ -121,6 +121,24 @@ _OF_TRACE = ("matrix", "cached")
 _OF_ROW = ("observed", "weight", "lower_bound", "cluster", "noise")
 
 
+def light_of(matrix: np.ndarray, radiance: np.ndarray) -> np.ndarray:
+    """Return A E for each channel, (..., 3) float64: matrix (..., G, 3), radiance (G, 3).
+
+    One matrix product over groups and channels; `einsum` with the channels innermost takes two to four times as long.
+    """
+    groups = matrix.shape[-2]
+    spread = np.zeros((groups, 3, 3))
+    spread[:, range(3), range(3)] = radiance
+    spread, flat = spread.reshape(3 * groups, 3), matrix.reshape(int(np.prod(matrix.shape[:-2])), 3 * groups)
+    out = np.empty((len(flat), 3))
+    for start in range(0, len(flat), _ROWS_AT_ONCE):  # which are converted to float64
+        out[start : start + _ROWS_AT_ONCE] = flat[start : start + _ROWS_AT_ONCE] @ spread
+    return out.reshape(*matrix.shape[:-2], 3)
+
+
+_ROWS_AT_ONCE = 2048
+
+
 def block_rows(rows: EmissionRows, block: np.ndarray) -> tuple[EmissionRows, np.ndarray]:
     """Average the rows of each block (n,) int: the answer stays the same, and the noise of A falls with the size of the block.
 

@@ -13,6 +13,7 @@ from iif_core.light.emission.direct import EmissionPrior
 from iif_core.light.emission.gains import BaseAlbedo, GainOptions
 from iif_core.light.emission.problem import ROW_FLOOR, EmissionProblem
 from iif_core.light.emission.pruning import WhiteSurface
+from iif_core.light.emission.rows import light_of
 
 Families = frozenset[int]
 
@@ -121,7 +122,7 @@ class Candidates:
     def _white(self, light: np.ndarray) -> np.ndarray:
         """(n, 3) what white surface would show in the place of the pixels of all groups that radiate `light` (G, 3)."""
         rows, owner = self.reflecting.rows, self.reflecting.owner
-        shown = np.einsum("ngc,gc->nc", rows.matrices.mean(0), light) + rows.cached.sum(1).mean(0)
+        shown = light_of(rows.matrices.mean(0), light) + rows.cached.sum(1).mean(0)
         albedo = np.where(owner[:, None] >= 0, self.albedo.mean[owner], 1.0)
         return shown / np.maximum(albedo, _DARKEST)
 
@@ -146,7 +147,7 @@ class Candidates:
 
 def lit_problem(problem: EmissionProblem, light: np.ndarray) -> EmissionProblem:
     """The problem with `light` (G, 3) in what is cached; one lobe."""
-    lit = np.einsum("kngc,gc->knc", problem.rows.matrices, light)[:, None]
+    lit = light_of(problem.rows.matrices, light)[:, None]
     return replace(problem, rows=replace(problem.rows, cached=problem.rows.cached + lit))
 
 
