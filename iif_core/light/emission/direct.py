@@ -185,7 +185,8 @@ def _channels(
     found = []
     for c in range(3):
         prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
-        data = *(np.ascontiguousarray(a[:, :, c]) for a in matrices), *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
+        both = (np.ascontiguousarray(a[:, :, c]) for a in matrices)
+        data = *both, *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
         found.append(_ChannelRows(*data, cluster, rows.noise, *prior))
     return found
 
