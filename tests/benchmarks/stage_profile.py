@@ -1,10 +1,14 @@
-"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compilation and execution of kernels, the rest.
+"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compilation and execution of kernels, and the rest;
+and how near its rays come to the rate at which the mesh can be traced at all.
 
-    python tests/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission]
+    python tests/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays]
 
 Run it in a working folder where the scene is finished; each stage is made again, in a process of its own, and writes the same
 files. Prints a table for docs/results/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
 some ten percent; CPU seconds are those of the process. Start: the interpreter and the imports before the stage begins.
+
+With `--rays` each stage that traces is made once more to count its rays, nearest hits and tests of visibility alike, and the rate
+of its kernels is compared with that of rays of random directions from visible surface, traced without anything else.
 """
 
 from __future__ import annotations
@@ -32,17 +36,14 @@ PARTS = {
 }
 """Part -> functions (end of the file's name, function) whose time with everything below is that of the part."""
 COLUMNS = ("seconds", "cpu", "start", *PARTS, "compiling", "kernels", "rest")
+TRACING = ("capture", "emission", "shading", "render")
+BARE_RAYS = 1 << 20
 
 
 def profiled(stage: str, scene: str, quality: str, threads: int) -> dict[str, float]:
     """Run a stage in this process; return the seconds of its parts."""
+    run_stage = _prepared(stage, scene, threads)
     started = time.time() - float(os.environ["STAGE_PROFILE_STARTED"])
-    native.process_environment()
-    native.prepare()
-    native.limit_threads(threads)
-    from workflow.runtime.job import configure_logging, run_stage
-
-    configure_logging(Path("results") / scene / "logs" / f"{stage}.profile.log")
     profile, wall = cProfile.Profile(), time.perf_counter()
     history = _record_kernels()
     profile.runcall(run_stage, stage, scene, quality, threads)
@@ -63,6 +64,79 @@ def profiled(stage: str, scene: str, quality: str, threads: int) -> dict[str, fl
     return found
 
 
+def _prepared(stage: str, scene: str, threads: int):
+    native.process_environment()
+    native.prepare()
+    native.limit_threads(threads)
+    from workflow.runtime.job import configure_logging, run_stage
+
+    configure_logging(Path("results") / scene / "logs" / f"{stage}.profile.log")
+    return run_stage
+
+
+def counted(stage: str, scene: str, quality: str, threads: int) -> dict[str, float]:
+    """Run a stage once more and count its rays; also measure the rate of rays on the mesh of the scene, in rays a second."""
+    run_stage = _prepared(stage, scene, threads)
+    from workflow.runtime import device
+
+    device.mitsuba()
+    import drjit as dr
+    import mitsuba as mi
+
+    from iif_core.light.transport.geometry import Geometry
+
+    count = dr.zeros(mi.UInt64, 1)
+
+    def counting(method):
+        def traced(self, origin, direction, *rest, **named):
+            active = mi.Bool(named.get("active", rest[1 if method.__name__ == "occluded" else 0]))
+            dr.scatter_add(count, mi.UInt64(1), mi.UInt32(0), active)
+            return method(self, origin, direction, *rest, **named)
+
+        return traced
+
+    originals = Geometry.nearest, Geometry.occluded
+    Geometry.nearest, Geometry.occluded = (counting(method) for method in originals)
+    run_stage(stage, scene, quality, threads)
+    dr.eval(count)
+    rays = int(count[0])
+    Geometry.nearest, Geometry.occluded = originals
+    return {"rays": rays, "bare": _bare_rate(scene)}
+
+
+def _bare_rate(scene: str) -> float:
+    """Rays a second of random directions from visible surface of the scene, the best of five."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    from iif_core.light.transport.arrays import vectors
+    from iif_core.light.transport.geometry import build_geometry
+    from workflow.artifacts.store import StageReader
+    from workflow.runtime import fingerprint
+    from workflow.scene.normal_form import CaptureReader
+
+    home = fingerprint.home("capture", scene, "draft")
+    capture = CaptureReader(StageReader(Path("results") / home / "capture", "capture", home))
+    vertices, faces = capture.mesh()
+    geometry = build_geometry(vertices, faces, np.zeros(len(faces), np.int32))
+    view = capture.views[0]
+    depth, face = capture.gbuffer(view)[:2]
+    points = capture.points(view, depth)[face >= 0]
+    rng = np.random.default_rng(0)
+    origin = points[rng.integers(0, len(points), BARE_RAYS)]
+    direction = rng.normal(size=(BARE_RAYS, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    rays = vectors(mi.Point3f, (origin + 1e-3 * direction).astype(np.float32)), vectors(mi.Vector3f, direction.astype(np.float32))
+    best = np.inf
+    for _ in range(6):  # the first compiles
+        begin = time.perf_counter()
+        dr.eval(geometry.nearest(*rays, mi.Bool(True)))
+        dr.sync_thread()
+        best = min(best, time.perf_counter() - begin)
+    return BARE_RAYS / best
+
+
 def _record_kernels():
     """Have Dr.Jit record its kernels (times in ms); return what gives them."""
     import drjit as dr
@@ -77,24 +151,42 @@ def main() -> None:
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--stages", nargs="+", default=[name for name, stage in STAGES.items() if not stage.on_demand])
+    parser.add_argument("--rays", action="store_true", help="count the rays of each stage, too")
     parser.add_argument("--here", help="run this stage in this process and print JSON")
+    parser.add_argument("--count", help="the same, and count its rays")
     arguments = parser.parse_args()
-    if arguments.here:
-        print(json.dumps(profiled(arguments.here, arguments.scene, arguments.quality, arguments.threads)))
+    if arguments.here or arguments.count:
+        work = profiled if arguments.here else counted
+        print(json.dumps(work(arguments.here or arguments.count, arguments.scene, arguments.quality, arguments.threads)))
         return
     common = [arguments.scene, "--quality", arguments.quality, "--threads", str(arguments.threads)]
     total = dict.fromkeys(COLUMNS, 0.0)
     print(f"| stage | {' | '.join(COLUMNS)} |\n|---{'|---:' * len(COLUMNS)}|")
+    seconds_of_kernels = {}
     for stage in arguments.stages:
-        environment = {**os.environ, "STAGE_PROFILE_STARTED": str(time.time())}
-        command = [sys.executable, __file__, *common, "--here", stage]
-        done = subprocess.run(command, capture_output=True, text=True, env=environment)
-        if done.returncode:
-            sys.exit(f"{stage}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}")
-        found = json.loads(done.stdout.strip().splitlines()[-1])
+        found = _in_own_process(stage, "--here", common)
+        seconds_of_kernels[stage] = found["kernels"]
         total = {name: total[name] + found[name] for name in COLUMNS}
         print(f"| {stage} | {' | '.join(f'{found[name]:.1f}' for name in COLUMNS)} |", flush=True)
     print(f"| all | {' | '.join(f'{total[name]:.1f}' for name in COLUMNS)} |")
+    share = sum(total[name] for name in ("start", "imports", "hashing")) / max(total["cpu"], 1e-9)
+    print(f"\nStart, imports and hashing: {share:.1%} of the CPU seconds.\n")
+    if arguments.rays:
+        print("| stage | million rays | million rays a second of its kernels | share of the bare rate |\n|---|---:|---:|---:|")
+        for stage in [stage for stage in arguments.stages if stage in TRACING]:
+            found = _in_own_process(stage, "--count", common)
+            rate = found["rays"] / max(seconds_of_kernels[stage], 1e-9)
+            print(f"| {stage} | {found['rays'] / 1e6:.1f} | {rate / 1e6:.2f} | {rate / found['bare']:.0%} |", flush=True)
+        print(f"\nBare rate: {found['bare'] / 1e6:.2f} million rays a second.")
+
+
+def _in_own_process(stage: str, flag: str, common: list[str]) -> dict[str, float]:
+    environment = {**os.environ, "STAGE_PROFILE_STARTED": str(time.time())}
+    command = [sys.executable, __file__, *common, flag, stage]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        sys.exit(f"{stage}: {done.stderr.strip().splitlines()[-1] if done.stderr.strip() else 'failed'}")
+    return json.loads(done.stdout.strip().splitlines()[-1])
 
 
 if __name__ == "__main__":
