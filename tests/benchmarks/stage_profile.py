@@ -1,5 +1,5 @@
-"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compilation and execution of kernels, and the rest;
-and how near its rays come to the rate at which the mesh can be traced at all.
+"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compiling and running kernels, and the rest; and
+how near its rays come to the rate at which the mesh can be traced at all.
 
     python tests/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays]
 
