@@ -121,11 +121,15 @@ class Terms:
             getattr(self, name)[objects] = getattr(other, name)[objects]
 
 
-def darkest_light(problem: FitProblem) -> float:
-    """Return the light below which pixels are left out (docs/method/numerics.md#pixels-without-light): a thousandth of the median
-    of exposure times diffuse light, over pixels that are finite, lit, and of an object; 0 without such pixels."""
-    use, brightness = _finite(problem), _brightness(problem)
-    return 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
+def darkest_and_tone(problem: FitProblem, response: Response, chunk: int) -> tuple[float, Tone]:
+    """Return what `prepare_pixels` finds from all pixels, looking at `chunk` of them together: the light below which pixels are
+    left out (docs/method/numerics.md#pixels-without-light), a thousandth of the median of exposure times diffuse light over pixels
+    that are finite, exposed, and of an object; and the curve that residuals are measured in."""
+    parts = [problem.take(slice(first, first + chunk)) for first in range(0, len(problem.object_id), chunk)]
+    use = np.concatenate([_finite(part) for part in parts] or [np.zeros(0, bool)])
+    brightness = np.concatenate([_brightness(part) for part in parts] or [np.zeros(0)])
+    darkest = 1e-3 * float(np.median(brightness[use])) if use.any() else 0.0
+    return darkest, make_tone(response, problem.value[use & (brightness > darkest)])
 
 
 def _finite(problem: FitProblem) -> np.ndarray:
@@ -144,7 +148,11 @@ def _brightness(problem: FitProblem) -> np.ndarray:
 
 
 def prepare_pixels(
-    problem: FitProblem, response: Response, fewest: int = 0, most: int | None = None, darkest: float | None = None
+    problem: FitProblem,
+    response: Response,
+    fewest: int = 0,
+    most: int | None = None,
+    of_all: tuple[float, Tone] | None = None,
 ) -> tuple[Pixels, Tone]:
     """Select and sort the usable pixels: finite, lit, and of an object.
 
@@ -154,7 +162,8 @@ def prepare_pixels(
         problem: pixels with base values and cached shading; response: start of the fit.
         fewest: objects with fewer usable pixels are left out; most: largest number of pixels of an object, spread evenly over its
             clusters; None: all.
-        darkest: light below which pixels are left out; None: `darkest_light` of these pixels.
+        of_all: light below which pixels are left out, and curve, where these pixels are a part (`darkest_and_tone`); None: those
+            of these pixels.
 
     Returns:
         The pixels, and the curve that residuals are measured in.
@@ -162,7 +171,7 @@ def prepare_pixels(
     ids, use = np.asarray(problem.object_id), _finite(problem)
     brightness = _brightness(problem)
     if use.any():
-        use &= brightness > (1e-3 * np.median(brightness[use]) if darkest is None else darkest)
+        use &= brightness > (1e-3 * np.median(brightness[use]) if of_all is None else of_all[0])
     usable = np.bincount(ids[use], minlength=problem.n_objects)
     use &= (usable >= fewest)[np.where(use, ids, 0)] if len(usable) else False
     index = np.flatnonzero(use)
@@ -177,7 +186,7 @@ def prepare_pixels(
     fresh = np.flatnonzero(np.r_[True, (np.diff(obj) != 0) | (np.diff(cluster) != 0)]) if len(index) else np.zeros(0, np.int64)
     starts = np.r_[fresh, len(index)].astype(np.int64)
     first = np.searchsorted(obj[fresh], np.arange(problem.n_objects + 1)).astype(np.int64)
-    tone = make_tone(response, problem.value[index])
+    tone = make_tone(response, problem.value[index]) if of_all is None else of_all[1]
     kind = np.result_type(*(np.asarray(a).dtype for a in (problem.value, problem.diffuse[0], problem.s0[0], problem.s1[0])))
     kind = np.float32 if kind == np.float32 else np.float64
     levels = np.ascontiguousarray(problem.levels, np.float64)

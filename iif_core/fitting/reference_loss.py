@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.camera.response import Response
-from iif_core.fitting.pixels import darkest_light, prepare_pixels, residuals
+from iif_core.fitting.pixels import darkest_and_tone, prepare_pixels, residuals
 from iif_core.fitting.problem import FitOptions, FitProblem
 from iif_core.reflectance.material import apply_affines
 
@@ -56,9 +56,9 @@ def reference_options(**changes: object) -> FitOptions:
 def reference_loss(problem: FitProblem, affine: np.ndarray, response: Response, chunk: int = 1 << 20) -> ReferenceLoss:
     """Return the loss of a solution affine (O, 16) in the gauge of the cached light; `chunk` pixels are looked at together."""
     whole = reference_problem(problem, response)
-    darkest, sums = darkest_light(whole), np.zeros(4)  # squares, 1 - roughness, metallic, pixels
+    of_all, sums = darkest_and_tone(whole, response, chunk), np.zeros(4)  # squares, 1 - roughness, metallic, pixels
     for first in range(0, len(whole.object_id), chunk):
-        px, tone = prepare_pixels(whole.take(slice(first, first + chunk)), response, darkest=darkest)
+        px, tone = prepare_pixels(whole.take(slice(first, first + chunk)), response, of_all=of_all)
         if len(px.obj):
             squares = np.mean(residuals(px, affine, tone, FitOptions()) ** 2)
             value = apply_affines(affine, px.obj, px.base)

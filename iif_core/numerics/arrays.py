@@ -22,7 +22,8 @@ def numbered_by_first(labels: ArrayLike) -> NDArray:
 def unique_rows(rows: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the distinct rows of (n, k) numbers in increasing order, (m, k), and where each row stands among them, (n,).
 
-    The same as `np.unique(rows, axis=0, return_inverse=True)`, which compares rows as records and takes four times as long.
+    The same as `np.unique(rows, axis=0, return_inverse=True)` for k > 0, which compares rows as records and takes two to five
+    times as long.
 
     Example:
         >>> unique, inverse = unique_rows([[1, 2], [0, 5], [1, 2]])

@@ -101,11 +101,11 @@ def counted(stage: str, scene: str, quality: str, threads: int) -> dict[str, flo
     dr.eval(count)
     rays = int(count[0])
     Geometry.nearest, Geometry.occluded = originals
-    return {"rays": rays, "bare": _bare_rate(scene)}
+    return {"rays": rays, "bare": _bare_rate(scene, quality)}
 
 
-def _bare_rate(scene: str) -> float:
-    """Rays a second of random directions from visible surface of the scene, the best of five."""
+def _bare_rate(scene: str, quality: str) -> float:
+    """Rays a second from visible surface of the scene into the half of all directions on the camera's side, the best of five."""
     import drjit as dr
     import mitsuba as mi
     import numpy as np
@@ -116,7 +116,7 @@ def _bare_rate(scene: str) -> float:
     from workflow.runtime import fingerprint
     from workflow.scene.normal_form import CaptureReader
 
-    home = fingerprint.home("capture", scene, "draft")
+    home = fingerprint.home("capture", scene, quality)
     capture = CaptureReader(StageReader(Path("results") / home / "capture", "capture", home))
     vertices, faces = capture.mesh()
     geometry = build_geometry(vertices, faces, np.zeros(len(faces), np.int32))
@@ -124,9 +124,9 @@ def _bare_rate(scene: str) -> float:
     depth, face = capture.gbuffer(view)[:2]
     points = capture.points(view, depth)[face >= 0]
     rng = np.random.default_rng(0)
-    origin = points[rng.integers(0, len(points), BARE_RAYS)]
+    origin, eye = points[rng.integers(0, len(points), BARE_RAYS)], view.world_from_camera[:3, 3]
     direction = rng.normal(size=(BARE_RAYS, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction *= np.sign(((eye - origin) * direction).sum(1, keepdims=True)) / np.linalg.norm(direction, axis=1, keepdims=True)
     rays = vectors(mi.Point3f, (origin + 1e-3 * direction).astype(np.float32)), vectors(mi.Vector3f, direction.astype(np.float32))
     best = np.inf
     for _ in range(6):  # the first compiles
@@ -170,10 +170,11 @@ def main() -> None:
         print(f"| {stage} | {' | '.join(f'{found[name]:.1f}' for name in COLUMNS)} |", flush=True)
     print(f"| all | {' | '.join(f'{total[name]:.1f}' for name in COLUMNS)} |")
     share = sum(total[name] for name in ("start", "imports", "hashing")) / max(total["cpu"], 1e-9)
-    print(f"\nStart, imports and hashing: {share:.1%} of the CPU seconds.\n")
-    if arguments.rays:
+    print(f"\nStart, imports and hashing, which use one core: {share:.1%} of the CPU seconds.\n")
+    tracing = [stage for stage in arguments.stages if stage in TRACING]
+    if arguments.rays and tracing:
         print("| stage | million rays | million rays a second of its kernels | share of the bare rate |\n|---|---:|---:|---:|")
-        for stage in [stage for stage in arguments.stages if stage in TRACING]:
+        for stage in tracing:
             found = _in_own_process(stage, "--count", common)
             rate = found["rays"] / max(seconds_of_kernels[stage], 1e-9)
             print(f"| {stage} | {found['rays'] / 1e6:.1f} | {rate / 1e6:.2f} | {rate / found['bare']:.0%} |", flush=True)

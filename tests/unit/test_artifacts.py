@@ -299,15 +299,17 @@ def test_arrays_are_joined_on_disk(tmp_path):
     joined = scratch.Joined(tmp_path)
     for part in parts:
         joined.add(part)
+    for other in (parts[0].astype(np.float64), parts[0][:, :1]):
+        with pytest.raises(ValueError, match="cannot join"):
+            joined.add(other)
     whole = joined.array()
     np.testing.assert_array_equal(whole, np.concatenate(parts))
     np.testing.assert_array_equal(whole[np.array([404, 3])], np.concatenate(parts)[[404, 3]])
     assert not list(tmp_path.iterdir())
     with pytest.raises(ValueError, match="read-only"):
         whole[0] = 1
-    for other in (parts[0].astype(np.float64), parts[0][:, :1]):
-        with pytest.raises(ValueError, match="cannot join"):
-            joined.add(other)
+    with pytest.raises(ValueError, match="before they are read"):
+        joined.add(parts[0])
     none = scratch.Joined(tmp_path)
     none.add(parts[1])
     assert none.array().shape == (0, 2, 3) and none.array().dtype == np.float32
@@ -341,6 +343,24 @@ assert "pandas" not in sys.modules, "pandas was imported, a quarter of a second 
 
 def test_tables_of_every_kind_come_back_and_need_no_pandas(tmp_path, repository):
     subprocess.run([sys.executable, "-c", TABLES, str(tmp_path / "t.parquet")], cwd=repository, check=True)
+
+
+def test_floats_are_packed_byte_by_byte_and_all_else_with_a_dictionary(tmp_path):
+    import pyarrow.parquet as pq
+
+    columns = {
+        "number": np.arange(5, dtype=np.int32),
+        "single": np.linspace(0, 1, 5, dtype=np.float32),
+        "double": np.linspace(0, 1, 5),
+        "list": np.zeros((5, 3), np.float32),
+        "ids": np.zeros((5, 2), np.int32),
+    }
+    write_parquet(tmp_path / "t.parquet", columns, {})
+    row = pq.ParquetFile(tmp_path / "t.parquet").metadata.row_group(0)
+    found = {row.column(i).path_in_schema.split(".")[0]: set(row.column(i).encodings) for i in range(row.num_columns)}
+    for name, encodings in found.items():
+        floats = columns[name].dtype.kind == "f"
+        assert ("BYTE_STREAM_SPLIT" in encodings, "RLE_DICTIONARY" in encodings) == (floats, not floats), name
 
 
 def test_tables_are_the_bytes_that_arrow_would_write(tmp_path):

@@ -110,8 +110,8 @@ def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str])
 
 
 def _encoding(table: Any) -> dict[str, Any]:
-    """Return how columns are packed: floats byte by byte and without a dictionary of their values, which hardly ever repeat. That
-    is written in a fifth of the time and two thirds of the size of Parquet's default."""
+    """Return how columns are packed: floats byte by byte and without a dictionary of their values, which hardly ever repeat in
+    tables of pixels and cells (docs/results/performance.md)."""
     import pyarrow as pa
 
     leaves = {

@@ -54,22 +54,29 @@ class Joined:
     def __init__(self, folder: Path):
         self._folder = folder
         self._file: IO[bytes] | None = None
-        self._rows, self._empty = 0, np.zeros(0)
+        self._rows, self._joined = 0, np.zeros(0)
 
     def add(self, part: np.ndarray) -> None:
-        """Append rows, of the dtype and shape of those before. A full disk raises OSError."""
+        """Append rows, of the dtype and shape of those before."""
+        if self._rows and self._file is None:
+            raise ValueError("rows are added before they are read")
         if self._file is None:
-            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (its rows are read until the job ends)
-            self._empty = np.zeros((0, *part.shape[1:]), part.dtype)
-        if part.dtype != self._empty.dtype or part.shape[1:] != self._empty.shape[1:]:
-            kept = f"{self._empty.dtype} {self._empty.shape[1:]}"
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 (closed by `array`)
+            self._joined = np.zeros((0, *part.shape[1:]), part.dtype)
+        if part.dtype != self._joined.dtype or part.shape[1:] != self._joined.shape[1:]:
+            kept = f"{self._joined.dtype} {self._joined.shape[1:]}"
             raise ValueError(f"rows of {part.dtype} {part.shape[1:]} cannot join rows of {kept}")
         self._file.write(np.ascontiguousarray(part).data)
         self._rows += len(part)
 
     def array(self) -> np.ndarray:
-        """Return all rows, mapped from the file, to be read only."""
-        if self._file is None or not self._rows:
-            return self._empty
-        self._file.flush()
-        return np.memmap(self._file, self._empty.dtype, "r", shape=(self._rows, *self._empty.shape[1:])).view(np.ndarray)
+        """Return all rows, mapped from the file, to be read only; nothing is added afterwards. A full disk raises OSError, here
+        or while rows are added."""
+        if self._file is not None:
+            with self._file as file:
+                file.flush()
+                if self._rows:
+                    shape = (self._rows, *self._joined.shape[1:])
+                    self._joined = np.memmap(file, self._joined.dtype, "r", shape=shape).view(np.ndarray)
+            self._file = None
+        return self._joined

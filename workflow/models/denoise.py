@@ -36,7 +36,7 @@ def denoise_alone(radiance: np.ndarray) -> np.ndarray:
 
 
 def _oidn() -> ModuleType:
-    """Import pyoidn without torch, which it would import, for two seconds, to take tensors as well as arrays."""
+    """Import pyoidn without torch. It would import torch, which takes two seconds, only to accept tensors as well."""
     hidden = "torch" not in sys.modules
     if hidden:
         sys.modules["torch"] = None  # type: ignore[assignment]  # an import of it now raises ImportError

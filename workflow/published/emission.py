@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 REPAIRED = "published_repaired"
 SATURATED_SHARE = 0.5
-"""Repaired: a triangle is an emitter if more than this share of the pixels that show it are saturated."""
+"""With `published_repaired` a triangle is an emitter if more than this share of the pixels that show it are saturated."""
 _SEEDS = 0x707562  # keeps the random streams of this stage apart from those of others
 _SAVED_EVERY = 50
 """Steps after which the state is written, so that a job that is killed loses little."""

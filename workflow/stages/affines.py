@@ -212,17 +212,14 @@ def _problem(
     job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray, gains: CameraGains
 ) -> tuple[FitProblem, _Places]:
     """Draw the pixels of the fit evenly over objects and read their cached shading (docs/method/fitting.md#which-pixels)."""
-    views = capture.used
-    counts = np.zeros(max(scene.n_objects, 1), np.int64)
-    for view in views:
-        counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
-    asked = job.settings.affines.pixels
-    published = job.settings.affines.solver == "published"
-    drawn = (
-        FitPixels.every(scene.n_objects, mixed)
-        if published and asked == "all"
-        else FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
-    )
+    views, asked, published = capture.used, job.settings.affines.pixels, job.settings.affines.solver == "published"
+    if published and asked == "all":
+        drawn = FitPixels.every(scene.n_objects, mixed)
+    else:
+        counts = np.zeros(max(scene.n_objects, 1), np.int64)
+        for view in views:
+            counts += count_eligible(view_pixels(job, capture, scene, view), mixed, scene.n_objects)
+        drawn = FitPixels.evenly(counts, int(counts.sum()) if asked == "all" else asked, mixed, job.seed)
     levels = roughness_levels(job)
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("object", "value", "exposure", "view", "index", "cell")}
     # What grows with pixels x levels is joined on disk; the published fit takes the mean of the halves.

@@ -6,6 +6,7 @@ noise go to the prior (Eq. L.24).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -104,9 +105,9 @@ class EmissionPrior:
     def radiance_and_light(self, rows: EmissionRows, max_rounds: int = 20) -> tuple[np.ndarray, np.ndarray]:
         """Return `radiance`, and A E with the mean of the two traces, (n, 3)."""
         channels = _channels(rows, np.asarray(self.initial, np.float64), True, RIDGE, self.width, self.correlation)
-        if not channels:
-            return self.initial.copy(), np.zeros(rows.observed.shape)
         found = [channel.solve(max_rounds) for channel in channels]
+        if not found:
+            return self.initial.copy(), np.zeros(rows.observed.shape)
         return np.stack([channel.radiance for channel in found], 1), np.stack([channel.light for channel in found], 1)
 
 
@@ -143,11 +144,12 @@ def solve_emission(
         InputError: `initial` of the wrong shape, negative or non-finite; non-finite rows.
     """
     groups, initial = rows.groups, np.asarray(initial, np.float64)
-    channels = _channels(rows, initial, cross, ridge, prior_width, correlation)
-    if not channels:
+    found, errors = [], []
+    for channel in _channels(rows, initial, cross, ridge, prior_width, correlation):
+        found.append(channel.solve(max_rounds))
+        errors.append(channel.uncertainty(found[-1].radiance, found[-1].variance, family))
+    if not found:
         return EmissionSolution(initial.copy(), initial.copy(), np.zeros(groups), 1.0, 0.0, 0, 0, True)
-    found = [channel.solve(max_rounds) for channel in channels]
-    errors = [channel.uncertainty(f.radiance, f.variance, family) for channel, f in zip(channels, found, strict=True)]
     error, shares = zip(*errors, strict=True)
     square, square_target = sum(f.square for f in found), sum(f.square_target for f in found)
     residual = float(np.sqrt(square / square_target)) if square_target > 0 else 0.0
@@ -170,8 +172,8 @@ def _channels(
     ridge: float,
     prior_width: float | np.ndarray,
     correlation: np.ndarray | None,
-) -> list[_ChannelRows]:
-    """The checked system of each channel; none without groups or rows."""
+) -> Iterator[_ChannelRows]:
+    """The checked system of each channel, one after the other so that only one is held; none without groups or rows."""
     groups = rows.groups
     if initial.shape != (groups, 3) or not np.isfinite(initial).all() or (initial < 0).any():
         raise InputError(f"emission: initial radiance of shape {initial.shape}, needed ({groups}, 3), finite and >= 0")
@@ -179,16 +181,14 @@ def _channels(
         if not np.isfinite(getattr(rows, name)).all():
             raise InputError(f"emission rows: {name} holds non-finite values; drop those pixels first")
     if groups == 0 or len(rows.observed) == 0:
-        return []
+        return
     matrices, targets = rows.matrices, rows.targets
     cluster = np.full(len(rows.observed), -1) if rows.cluster is None else rows.cluster
-    found = []
     for c in range(3):
         prior = initial[:, c], _width(initial[:, c], prior_width), cross, ridge, correlation
         both = (np.ascontiguousarray(a[:, :, c]) for a in matrices)
         data = *both, *(t[:, c] for t in targets), rows.weight[:, c], rows.lower_bound[:, c]
-        found.append(_ChannelRows(*data, cluster, rows.noise, *prior))
-    return found
+        yield _ChannelRows(*data, cluster, rows.noise, *prior)
 
 
 def solve_families(
@@ -227,7 +227,7 @@ def solve_families(
 
 
 def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray]:
-    """(H lifted, the lift), both of unit diagonal (Eq. L.24)."""
+    """(H lifted, the lift), in units in which the diagonal of M is 1 (Eq. L.24)."""
     values, vectors = np.linalg.eigh(normal.m)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
@@ -273,6 +273,9 @@ def _width(initial: np.ndarray, relative: float | np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Channel:
+    """Answer of one channel: radiance and variance of a row of weight 1 (G,), light A E (n,), and the last system; rounds,
+    violated bounds, and sums of squares of residual and target."""
+
     radiance: np.ndarray
     light: np.ndarray
     variance: np.ndarray
@@ -300,7 +303,7 @@ class _System:
 
     Attributes:
         known: (G,) bool; scale: of the unknowns; matrix: lifted H plus prior; lifted: the part of it that belongs to the
-            prior; right: b; data: lifted H alone; ridge: its smallest eigenvalue for directions that the data do not tell.
+            prior; right: b; data: lifted H alone; ridge: what was added to its diagonal.
     """
 
     known: np.ndarray
@@ -334,7 +337,7 @@ class _ChannelRows:
     """The rows of one colour channel and the prior of its answer.
 
     Attributes:
-        first, second: (n, G) float32 views; target, target_second, weight: (n,); bound: (n,) bool.
+        first, second: (n, G) float32, contiguous; target, target_second, weight: (n,); bound: (n,) bool.
         cluster: (n,) int; noise: (n,) or None.
         initial, width: (G,) mean and standard deviation of the prior; cross, ridge, correlation: as in `solve_emission`.
     """

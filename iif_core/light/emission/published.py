@@ -15,8 +15,8 @@ from iif_core.camera.response import Response
 START = 0.01
 """Radiance of every channel of every triangle at first."""
 THRESHOLD = 0.99
-"""Mean radiance of a triangle, in its brightest channel, above which it is an emitter; repaired: sensor value of a saturated
-pixel."""
+"""Mean radiance of a triangle, in its brightest channel, above which it is an emitter. `published_repaired`: sensor value
+above which a pixel counts as saturated."""
 CLAMP = 0.9
 """Sensor value at which prediction and photograph are clamped."""
 CACHE_CELLS = 256

@@ -124,7 +124,7 @@ _OF_ROW = ("observed", "weight", "lower_bound", "cluster", "noise")
 def light_of(matrix: np.ndarray, radiance: np.ndarray) -> np.ndarray:
     """Return A E for each channel, (..., 3) float64: matrix (..., G, 3), radiance (G, 3).
 
-    One matrix product over groups and channels; `einsum` with the channels innermost takes two to four times as long.
+    One matrix product over groups and channels; `einsum` with the channels innermost takes up to four times as long.
     """
     groups = matrix.shape[-2]
     spread = np.zeros((groups, 3, 3))
