@@ -122,9 +122,12 @@ class Terms:
 
 
 def darkest_and_tone(problem: FitProblem, response: Response, chunk: int) -> tuple[float, Tone]:
-    """Return what `prepare_pixels` finds from all pixels, looking at `chunk` of them together: the light below which pixels are
-    left out (docs/method/numerics.md#pixels-without-light), a thousandth of the median of exposure times diffuse light over pixels
-    that are finite, exposed, and of an object; and the curve that residuals are measured in."""
+    """Return what `prepare_pixels` finds from all pixels, looking at `chunk` of them together.
+
+    These are the light below which pixels are left out (docs/method/numerics.md#pixels-without-light), a thousandth of the median
+    of exposure times diffuse light over pixels that are finite, exposed, and of an object; and the curve that residuals are
+    measured in.
+    """
     parts = [problem.take(slice(first, first + chunk)) for first in range(0, len(problem.object_id), chunk)]
     use = np.concatenate([_finite(part) for part in parts] or [np.zeros(0, bool)])
     brightness = np.concatenate([_brightness(part) for part in parts] or [np.zeros(0)])
