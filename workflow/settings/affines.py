@@ -113,8 +113,8 @@ class Affines(Section):
     iterations: int = Field(_DIRECT.iterations, ge=1, le=500)
     """`direct`: largest number of Gauss-Newton steps; the fit ends earlier when a step changes nothing."""
     pixels: Annotated[Literal["all"] | Annotated[int, Field(ge=100)], word_or_count("all", least=100)] = 200000
-    """`objects`: pixels in the fit, drawn evenly over the objects, or `all`; with `solver: published` also those along the border of
-    another object."""
+    """`objects`: pixels in the fit, drawn evenly over the objects, or `all`; with `solver: published` also those along the border
+    of another object."""
     population: bool = _DIRECT.population
     """`direct`: the prior of every object is the distribution of the well-determined objects of the scene (empirical Bayes);
     `false`: a fixed, weak prior."""
