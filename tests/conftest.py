@@ -13,6 +13,8 @@ from workflow.runtime import native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 THREADS = 2
+# As in every job, before anything imports NumPy: threads that wait for one another make small matrices several times as slow.
+os.environ[native.SMALL_MATRICES] = "1"
 
 try:
     native.prepare()

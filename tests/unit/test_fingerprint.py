@@ -31,7 +31,7 @@ def fingerprints(root, folder, quality="draft"):
 def checkout(repository, tmp_path):
     """A copy of the code and a folder with one scene."""
     for name in ("iif_core", "workflow", "config"):
-        shutil.copytree(repository / name, tmp_path / "code" / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(repository / name, tmp_path / "code" / name)  # byte code too, so that it need not be compiled
     scenes = tmp_path / "run/config/scenes"
     scenes.mkdir(parents=True)
     (scenes / "t.yaml").write_text(SCENE)
