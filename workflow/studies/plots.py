@@ -62,7 +62,8 @@ def draw(study: Study, frame: pd.DataFrame, histories: Mapping[Any, list[dict[st
                 else:
                     _lines(axes, study, of_scene, key)
                 below = f"\n{PROTOCOLS[protocol].words}" if protocol else ""
-                axes.set_title(f"{scene}: {key.split('/')[0]}{below}", fontsize=9)
+                if axes.axison:
+                    axes.set_title(f"{scene}: {key.split('/')[0]}{below}", fontsize=9)
             if kind == "history":
                 _curves(row[-1], study, {cell: h for cell, h in histories.items() if cell.scene == scene})
                 row[-1].set_title(f"{scene}: {study.plot.history} while solving", fontsize=9)
@@ -176,7 +177,12 @@ def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
 def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: str) -> None:
     """Draw the score over CPU time; filled markers are on the Pareto front, which is drawn as a line."""
     chosen, front = _of(frame, key, protocol), []
-    for colour, (words, names) in zip(_cycle(), _groups(study).items(), strict=False):
+    if chosen.empty:  # scored as it is alone
+        axes.axis("off")
+        return
+    alone = not study.plot.group and len(study.variants) <= len(_COLOURS)
+    groups = {variant.label or name: [name] for name, variant in study.variants.items()} if alone else _groups(study)
+    for colour, (words, names) in zip(_cycle(), groups.items(), strict=False):
         axes.plot([], [], "o", mfc="none", color=colour, label=words or "variants")
         for name in names:
             runs = chosen[chosen["variant"] == name].dropna(subset=["cpu_seconds"])
@@ -188,7 +194,7 @@ def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: s
                 front.append((x, y))
             face = colour if best else "none"
             axes.errorbar(x, y, xerr=dx, yerr=dy, fmt="o", ms=5, mfc=face, color=colour, elinewidth=0.8)
-            if best:
+            if best and len(names) > 1:
                 axes.annotate(
                     _others(study, name), (x, y), xytext=(4, -6 + 8 * (len(front) % 2)), textcoords="offset points", fontsize=5.5
                 )
