@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from iif_core.errors import InputError
 from iif_core.reflectance import brdf
 from iif_core.surface import cells
 from tests.unit.transport_rooms import constant_cache, merge, quad, repeated
@@ -151,3 +152,24 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     assert np.isfinite(room.render(T, 2, seed=0)).all()
     rendered = T.render(T.Scene(room.geometry, material, room.emitters), room.origin, room.directions, T.PathOptions(2, 3, 0))
     assert np.isfinite(rendered).all() and rendered.mean() > 0
+
+
+def test_repainted_materials_are_those_built_anew(T, room):
+    import mitsuba as mi
+
+    edge, origin = 0.11, cells.grid_origin(room.vertices, 0.11)
+    seen = cells.unpack_keys(np.unique(cells.pack_keys(cells.voxel_indices(room.points, edge, origin), room.object))[::2])
+    rng = np.random.default_rng(4)
+    before, after = ((rng.uniform(0.1, 1, (len(seen[0]), 5)), rng.uniform(0.1, 1, (n, 5))) for n in (3, 4))
+    first = T.CellMaterials(edge, origin, *seen, *before)
+    at = mi.Point3f(room.points.T), mi.UInt32(0), mi.Int32(room.object.astype(np.int32)), mi.Bool(True)
+
+    def read(material):
+        colour, roughness, metallic = material(*at)
+        return np.column_stack([colour.numpy().T, roughness.numpy(), metallic.numpy()])
+
+    old = read(first)
+    np.testing.assert_array_equal(read(first.repainted(*after)), read(T.CellMaterials(edge, origin, *seen, *after)))
+    np.testing.assert_array_equal(read(first), old)
+    with pytest.raises(InputError, match="at least one row"):
+        first.repainted(before[0], np.zeros((0, 5)))

@@ -90,8 +90,16 @@ class BaseScene:
         device.mitsuba()
         from iif_core.light.transport.materials import CellMaterials
 
-        object_values = np.concatenate([self.object_values, np.float32([BLACK])])
-        return CellMaterials(self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object, self.cell_values, object_values)
+        grid = self.cell_edge, self.cell_origin, self.cell_ijk, self.cell_object
+        return CellMaterials(*grid, self.cell_values, self._values_of_objects)
+
+    def repainted(self, materials: CellMaterials) -> CellMaterials:
+        """Give the `materials` of a scene with the same cells the values of this one."""
+        return materials.repainted(self.cell_values, self._values_of_objects)
+
+    @property
+    def _values_of_objects(self) -> np.ndarray:
+        return np.concatenate([self.object_values, np.float32([BLACK])])
 
 
 def read_base_scene(job: Job) -> BaseScene:

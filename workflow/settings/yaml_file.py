@@ -11,7 +11,7 @@ from iif_core.errors import InputError
 
 
 class _StrictLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-    """YAML in which a key that occurs twice in one mapping is an error; read by libyaml where PyYAML has it, ten times as fast."""
+    """YAML in which a key that occurs twice in one mapping is an error; by libyaml where PyYAML has it, ten times as fast."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [self.construct_object(key, deep=deep) for key, _ in node.value]

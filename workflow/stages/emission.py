@@ -152,7 +152,7 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
         )
     certain = CERTAIN_EXCESS_OPEN if outside is not None and outside.is_unseen else CERTAIN_EXCESS
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
-    unseen = scene.with_gains(gain).materials()
+    unseen = scene.with_gains(gain).repainted(photos.world[1])
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
     # What was dropped for giving little light, and not for being no brighter than a white surface, may be needed after all.
     offered = pruned.kept[: groups.size] | (pruned.excess[: groups.size] >= certain)

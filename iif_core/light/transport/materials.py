@@ -5,6 +5,7 @@ Rows of tables are (base colour R, G, B, roughness, metallic), linear; roughness
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import drjit as dr
@@ -63,20 +64,32 @@ class CellMaterials:
         values: ArrayLike,
         object_values: ArrayLike,
     ):
-        ijk = np.asarray(ijk).reshape(-1, 3)
-        values = rows_of(np.asarray(values, np.float32).reshape(-1, 5), len(ijk), 5, "cell values")
+        self._ijk, self._object_id = np.asarray(ijk).reshape(-1, 3), object_id
+        self._cells = VoxelRows(edge, origin, self._ijk, object_id)
+        self._grid, self._coarse = (edge, origin), None
+        self._paint(values, object_values)
+
+    def _paint(self, values: ArrayLike, object_values: ArrayLike) -> None:
+        values = rows_of(np.asarray(values, np.float32).reshape(-1, 5), len(self._ijk), 5, "cell values")
         object_values = np.asarray(object_values, np.float32)
         object_values = rows_of(object_values, len(object_values), 5, "object values")
         if not len(object_values):
             raise InputError("CellMaterials needs at least one row of object_values: the material of surface nobody saw")
-        self._cells = VoxelRows(edge, origin, ijk, object_id)
+        coarse_ijk, coarse_object, coarse = coarse_cells(self._ijk, self._object_id, values)
+        if self._coarse is None:
+            edge, origin = self._grid
+            self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
         self._objects = dr.opaque(mi.Int32, len(object_values))
-        coarse_ijk, coarse_object, coarse = coarse_cells(ijk, object_id, values)
-        self._coarse = VoxelRows(COARSE * edge, origin, coarse_ijk, coarse_object)
-        self._first_coarse, self._first_object = (dr.opaque(mi.UInt32, row) for row in (len(ijk), len(ijk) + len(coarse)))
+        self._first_coarse, self._first_object = (dr.opaque(mi.UInt32, row) for row in (len(values), len(values) + len(coarse)))
         # One table of cells, coarse cells, objects and the overall mean: a miss only changes which row is read.
         parts = [values, coarse, object_values, object_values.mean(axis=0, keepdims=True)]
         self._rows = _Rows(np.concatenate(parts), "values")
+
+    def repainted(self, values: ArrayLike, object_values: ArrayLike) -> CellMaterials:
+        """Return other materials of the same cells, `values` (n, 5) and `object_values`; the cells are not looked up anew."""
+        other = copy.copy(self)
+        other._paint(values, object_values)
+        return other
 
     def __call__(self, point: Any, face: Any, object_id: Any, active: Any) -> tuple[Any, Any, Any]:
         found, row = self._cells.find(point, object_id, active)
