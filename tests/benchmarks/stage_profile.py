@@ -1,7 +1,7 @@
-"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compiling and running kernels, and the rest; and
-how near its rays come to the rate at which the mesh can be traced at all.
+"""Where the time of every stage goes: imports, hashing, EXR and Parquet files, compiling and running kernels, and the rest; how
+near its rays come to the rate at which the mesh can be traced at all, and its loops over pixels to the bandwidth of memory.
 
-    python tests/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays]
+    python tests/benchmarks/stage_profile.py kitchen [--quality draft] [--threads 2] [--stages base emission] [--rays] [--loops]
 
 Run it in a working folder where the scene is finished; each stage is made again, in a process of its own, and writes the same
 files. Prints a table for docs/results/performance.md. Seconds of wall time under Python's profiler, which slows Python code by
@@ -9,6 +9,10 @@ some ten percent; CPU seconds are those of the process. Start: the interpreter a
 
 With `--rays` each stage that traces is made once more to count its rays, nearest hits and tests of visibility alike, and the rate
 of its kernels is compared with that of rays of random directions from visible surface, traced without anything else.
+
+With `--loops` the compiled loops of `base` and `affines` are timed on one thread: the arrays that a call is given are read or
+written at least once, so their size over the time, relative to the rate at which a large array is copied, says how near a loop
+comes to the bound of memory. What is far below it is bound by arithmetic or by waiting for single values.
 """
 
 from __future__ import annotations
@@ -38,6 +42,9 @@ PARTS = {
 COLUMNS = ("seconds", "cpu", "start", *PARTS, "compiling", "kernels", "rest")
 TRACING = ("capture", "emission", "shading", "render")
 BARE_RAYS = 1 << 20
+LOOPS = {"base": ("iif_core.fusion.kernels",), "affines": ("iif_core.fitting.kernels", "iif_core.fitting.profile_kernels")}
+SHOWN_SHARE = 0.02
+"""Loops that take less than this share of all loops of a stage are left out of the table."""
 
 
 def profiled(stage: str, scene: str, quality: str, threads: int) -> dict[str, float]:
@@ -137,6 +144,61 @@ def _bare_rate(scene: str, quality: str) -> float:
     return BARE_RAYS / best
 
 
+def timed_loops(stage: str, scene: str, quality: str) -> dict[str, list[float]]:
+    """Run a stage once more on one thread; return calls, seconds and bytes of the arrays of each compiled loop, by its name."""
+    run_stage = _prepared(stage, scene, 1)
+    import importlib
+
+    from numba.core.dispatcher import Dispatcher
+
+    modules = [importlib.import_module(name) for name in LOOPS[stage]]
+    compiled = [(module, name, loop) for module in modules for name, loop in vars(module).items() if isinstance(loop, Dispatcher)]
+    inner = {name for _, _, loop in compiled for name in loop.py_func.__code__.co_names}
+    found: dict[str, list[float]] = {}
+
+    def timing(name, loop):
+        def timed(*arguments, **named):
+            started = time.perf_counter()
+            result = loop(*arguments, **named)
+            seconds = time.perf_counter() - started
+            sizes = {key: size for value in (*arguments, *named.values(), result) for key, size in _arrays(value)}
+            total = found.setdefault(name, [0, 0.0, 0.0])
+            total[:] = total[0] + 1, total[1] + seconds, total[2] + sum(sizes.values())
+            return result
+
+        return timed
+
+    for module, name, loop in compiled:
+        if name not in inner:  # loops that others call are part of their time
+            setattr(module, name, timing(f"{module.__name__.split('.')[1]}.{name}", loop))
+    run_stage(stage, scene, quality, 1)
+    return found
+
+
+def _arrays(value):
+    """(address, bytes) of every array in a value."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray):
+        yield value.ctypes.data, value.nbytes
+    elif isinstance(value, tuple | list):
+        for part in value:
+            yield from _arrays(part)
+
+
+def _bandwidth() -> float:
+    """Bytes read and written a second while an array of 256 MB is copied by one thread, the best of five."""
+    import numpy as np
+
+    source = np.ones(1 << 25)
+    target, best = np.zeros_like(source), np.inf
+    for _ in range(5):
+        begin = time.perf_counter()
+        np.copyto(target, source)
+        best = min(best, time.perf_counter() - begin)
+    return 2 * source.nbytes / best
+
+
 def _record_kernels():
     """Have Dr.Jit record its kernels (times in ms); return what gives them."""
     import drjit as dr
@@ -152,12 +214,17 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--stages", nargs="+", default=[name for name, stage in STAGES.items() if not stage.on_demand])
     parser.add_argument("--rays", action="store_true", help="count the rays of each stage, too")
+    parser.add_argument("--loops", action="store_true", help="time the compiled loops of base and affines, too")
+    parser.add_argument("--time-loops", help="the same of one stage, in this process, as JSON")
     parser.add_argument("--here", help="run this stage in this process and print JSON")
     parser.add_argument("--count", help="the same, and count its rays")
     arguments = parser.parse_args()
     if arguments.here or arguments.count:
         work = profiled if arguments.here else counted
         print(json.dumps(work(arguments.here or arguments.count, arguments.scene, arguments.quality, arguments.threads)))
+        return
+    if arguments.time_loops:
+        print(json.dumps(timed_loops(arguments.time_loops, arguments.scene, arguments.quality)))
         return
     common = [arguments.scene, "--quality", arguments.quality, "--threads", str(arguments.threads)]
     total = dict.fromkeys(COLUMNS, 0.0)
@@ -179,6 +246,18 @@ def main() -> None:
             rate = found["rays"] / max(seconds_of_kernels[stage], 1e-9)
             print(f"| {stage} | {found['rays'] / 1e6:.1f} | {rate / 1e6:.2f} | {rate / found['bare']:.0%} |", flush=True)
         print(f"\nBare rate: {found['bare'] / 1e6:.2f} million rays a second.")
+    looping = [stage for stage in arguments.stages if stage in LOOPS]
+    if arguments.loops and looping:
+        copied = _bandwidth()
+        print("| stage | loop | calls | seconds | GB a second | share of the bandwidth |\n|---|---|---:|---:|---:|---:|")
+        for stage in looping:
+            loops = _in_own_process(stage, "--time-loops", common)
+            whole = sum(seconds for _, seconds, _ in loops.values())
+            for name, (calls, seconds, size) in sorted(loops.items(), key=lambda item: -item[1][1]):
+                if seconds >= SHOWN_SHARE * whole:
+                    rate = size / seconds
+                    print(f"| {stage} | `{name}` | {calls} | {seconds:.2f} | {rate / 1e9:.2f} | {rate / copied:.0%} |", flush=True)
+        print(f"\nBandwidth of one thread: {copied / 1e9:.1f} GB a second.")
 
 
 def _in_own_process(stage: str, flag: str, common: list[str]) -> dict[str, float]:
