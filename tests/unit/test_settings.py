@@ -40,7 +40,16 @@ def scene(tmp_path):
     ],
 )
 def test_what_is_read_decides_where_specular_light_is_traced(scene, text, pixels):
-    assert settings.load("x", "draft", scene(f"{GOOD}{text}\n")).shading.pixels == pixels
+    shading = settings.load("x", "draft", scene(f"{GOOD}{text}\n")).shading
+    assert (shading.pixels, shading.noise) == (pixels, 0.1 if pixels == "all" else 0.2)
+
+
+def test_noise_of_the_light_can_be_set(scene):
+    assert settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: 0.05}}\n")).shading.noise == 0.05
+    for wrong in ("0", "-0.1", "some", "true"):
+        with pytest.raises(InputError, match=r"`shading.noise`: found .*'auto' or a number above 0") as error:
+            settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {wrong}}}\n"))
+        assert len(str(error.value).splitlines()) == 1
 
 
 @pytest.mark.parametrize(

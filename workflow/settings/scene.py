@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
-from workflow.settings.light import PUBLISHED, Emission, Shading
+from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.outputs import Export, Metrics, Render, Report
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting
@@ -77,7 +77,8 @@ class SceneSettings(Section):
 
     @model_validator(mode="after")
     def _lit_pixels(self) -> SceneSettings:
-        """Put the number, or `all`, in the place of `shading: {pixels: auto}`: what is traced follows from what is read."""
+        """Put the number, or `all`, in the place of `shading: {pixels: auto}`, and the number in that of `noise: auto`: what is
+        traced follows from what is read."""
         textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
         every = textured or self.affines.model in FREE_CELLS or self.affines.pixels == "all"
         asked, needed = self.shading.pixels, "all" if every else self.affines.pixels
@@ -88,6 +89,9 @@ class SceneSettings(Section):
             reader = "texture from the photographs" if textured else f"`affines: {whole}`"
             why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
             raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
+        if self.shading.noise == "auto":
+            noise = NOISE_OF_TEXTURES if self.shading.pixels == "all" else NOISE_OF_OBJECTS
+            object.__setattr__(self, "shading", self.shading.model_copy(update={"noise": noise}))
         return self
 
 

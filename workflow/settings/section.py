@@ -18,6 +18,17 @@ def word_or_count(*words: str, least: int) -> BeforeValidator:
     return BeforeValidator(checked)
 
 
+def word_or_positive(*words: str) -> BeforeValidator:
+    """Return a check with one message for a setting that is one of some words or a number above 0."""
+
+    def checked(value: object) -> object:
+        if value in words or (isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")):
+            return value
+        raise ValueError(f"Needed: {', '.join(map(repr, words))} or a number above 0")
+
+    return BeforeValidator(checked)
+
+
 class Section(BaseModel):
     """A part of the settings. Unknown keys are errors, and so are keys without effect beside the chosen solver or model."""
 
