@@ -6,7 +6,7 @@ It shares no code with the solvers of this project but the response of the camer
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -164,14 +164,26 @@ def descend(
         yield state
 
 
-def fit_published(problem: FitProblem, response: Response, options: PublishedOptions | None = None) -> FitResult:
-    """Fit like `direct.fit_affines`, from the identity; `history` is the mean loss of the steps of each epoch."""
+def fit_published(
+    problem: FitProblem,
+    response: Response,
+    options: PublishedOptions | None = None,
+    state: PublishedState | None = None,
+    keep: Callable[[PublishedState], None] | None = None,
+) -> FitResult:
+    """Fit like `direct.fit_affines`, from the identity or from a `state`; `history` is the mean loss of the steps of each epoch.
+
+    `keep` is called with the state after each epoch, from which a fit that was interrupted goes on to the same end.
+    """
     opt, merged = options or PublishedOptions(), problem.merged()
     seen = merged.object_id >= 0
     used = merged if seen.all() else merged.take(np.flatnonzero(seen))  # a copy may not fit into memory
     n, per_epoch = len(used.object_id), -(-len(used.object_id) // opt.batch)
-    start = PublishedState.start(problem.n_objects, response)
-    state = [start, *descend(used, response, start, opt)][-1]
+    state = PublishedState.start(problem.n_objects, response) if state is None else state
+    for after in descend(used, response, state, opt):
+        state = after
+        if keep is not None:
+            keep(state)
     done, whole = state.step, opt.epochs * per_epoch
     pixels = np.bincount(used.object_id, minlength=problem.n_objects)
     found = replace(response, params=state.params)

@@ -256,7 +256,7 @@ def main() -> None:
             for name, (calls, seconds, size) in sorted(loops.items(), key=lambda item: -item[1][1]):
                 if seconds >= SHOWN_SHARE * whole:
                     rate = size / seconds
-                    print(f"| {stage} | `{name}` | {calls} | {seconds:.2f} | {rate / 1e9:.2f} | {rate / copied:.0%} |", flush=True)
+                    print(f"| {stage} | `{name}` | {calls} | {seconds:.2f} | {rate / 1e9:.2f} | {rate / copied:.0%} |")
         print(f"\nBandwidth of one thread: {copied / 1e9:.1f} GB a second.")
 
 

@@ -1,5 +1,6 @@
 """The paper's optimiser: gradients against automatic differentiation, fits of planted scenes, edge cases."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from iif_core.fusion.reference_loss import loss_of_result
 from iif_core.fusion.sgd import engine, kernels, solve
 from iif_core.fusion.sgd import pool as sgd_pool
 from iif_core.fusion.sgd.options import SgdOptions, sgd_options
-from iif_core.fusion.sgd.solve import converged, solve_sgd
+from iif_core.fusion.sgd.solve import SgdState, converged, solve_sgd
 from iif_core.reflectance.material import unclamped_material
 from tests.oracles import torch_sgd
 from tests.oracles.label_loss import label_loss
@@ -247,6 +248,31 @@ def test_batches_are_permutations():
 
 
 # -------------------------------------------------------------------------------------------------------------- solver
+
+
+@pytest.mark.parametrize("texture", ["cells", "hashgrid"])
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_descent_goes_on_from_the_end_of_any_epoch(texture, threads):
+    """The selection is fixed between the second and the third state, and the history is written between two of them."""
+    problem, _ = simulated()
+    problem = on_a_wall(problem) if texture == "hashgrid" else problem
+    pixels = sum(int((np.ravel(c) >= 0).sum()) for c in problem.cell_of_pixel)
+    own = {"texture": texture, "grid": SMALL_GRID, "choice": "argmin", "choose_at": 0.5}
+    options = sgd_options("paper", batch=pixels // 4, iterations=17, records=5, **own)
+    states = []
+
+    def keep(state):
+        copied = {name: array.copy() for name, array in state.arrays.items()}
+        states.append(SgdState(copied, json.loads(json.dumps(state.facts))))
+
+    whole = solve_sgd(problem, options, threads=threads)
+    kept = solve_sgd(problem, options, threads=threads, keep=keep)
+    assert [state.facts["step"] for state in states] == [4, 8, 12, 16]
+    assert "fixed" not in states[1].arrays and "fixed" in states[2].arrays
+    for fit in (kept, *(solve_sgd(problem, options, threads=threads, state=state) for state in states)):
+        for name in ("value", "scale", "corrections", "alpha"):
+            np.testing.assert_array_equal(getattr(fit, name), getattr(whole, name), err_msg=name)
+        assert fit.history == whole.history
 
 
 def test_loss_falls_in_the_history():

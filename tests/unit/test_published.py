@@ -239,6 +239,10 @@ def test_descent_lowers_the_loss_and_goes_on_after_a_kill():
     np.testing.assert_array_equal(fit.affine, states[-1].affine)
     assert fit.converged and fit.iterations == 114 and len(fit.history) == 3 and fit.history[-1] < 0.7 * fit.history[0]
     assert (fit.pixels == 400).all() and (fit.residual > 0).all()
+    seen = []
+    resumed = fitting.fit_published(problem, curve, options, states[1], seen.append)
+    np.testing.assert_array_equal(resumed.affine, fit.affine)
+    assert resumed.history == fit.history and [state.step for state in seen] == [114]
 
 
 def test_a_descent_that_leaves_the_finite_numbers_says_so():

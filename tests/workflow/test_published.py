@@ -26,9 +26,9 @@ affines: {batch: 1024}
 FIRST = ("capture", "prior", "segmentation", "base")
 
 
-def run(folder, stages, monkeypatch):
+def run(folder, stages, monkeypatch, scene=SCENE):
     (folder / "config/scenes").mkdir(parents=True, exist_ok=True)
-    (folder / "config/scenes/tiny.yaml").write_text(SCENE)
+    (folder / "config/scenes/tiny.yaml").write_text(scene)
     monkeypatch.chdir(folder)
     for cached in (fingerprint.resolved, fingerprint.fingerprint):
         cached.cache_clear()
@@ -109,6 +109,55 @@ def test_a_killed_descent_goes_on_where_it_was(finished, tmp_path, monkeypatch):
     resumed = run(tmp_path, ("emission",), monkeypatch)
     assert len(steps) == 75 + 60  # from step 50
     assert digests(resumed["emission"]) == digests(readers["emission"])
+
+
+def test_a_killed_material_fit_goes_on_after_its_last_epoch(finished, tmp_path, monkeypatch):
+    from iif_core.fitting import published
+
+    folder, readers = finished
+    shutil.copytree(folder / "results", tmp_path / "results")
+    whole, steps = published.loss_and_gradient, []
+    per_epoch = readers["affines"].json("affines.json")["iterations"] // 3
+
+    def killed(*arguments):
+        steps.append(len(steps))
+        if len(steps) == 2 * per_epoch + 1:
+            raise KeyboardInterrupt
+        return whole(*arguments)
+
+    monkeypatch.setattr(published, "loss_and_gradient", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, ("affines",), monkeypatch)
+    assert not (tmp_path / "results/tiny/affines/manifest.json").exists()
+    resumed = run(tmp_path, ("affines",), monkeypatch)
+    assert len(steps) == 3 * per_epoch + 1
+    assert digests(resumed["affines"]) == digests(readers["affines"])
+
+
+def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypatch):
+    from iif_core.fusion.sgd import engine
+    from workflow.stages import base
+
+    folder, _ = finished
+    shutil.copytree(folder / "results", tmp_path / "results")
+    descent = SCENE.replace("{solver: direct}", "{solver: sgd, preset: paper, texture: cells, iterations: 12}")
+    monkeypatch.setattr(base, "KEPT_EVERY", 0.0)
+    whole, steps = engine.Engine.step, []
+
+    def killed(self, step):
+        steps.append(len(steps))
+        if len(steps) == 8:
+            raise KeyboardInterrupt
+        return whole(self, step)
+
+    monkeypatch.setattr(engine.Engine, "step", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, ("base",), monkeypatch, descent)
+    resumed = digests(run(tmp_path, ("base",), monkeypatch, descent)["base"])
+    assert 8 < len(steps) < 8 + 12
+    monkeypatch.setattr(engine.Engine, "step", whole)
+    shutil.rmtree(tmp_path / "results/tiny/base")
+    assert digests(run(tmp_path, ("base",), monkeypatch, descent)["base"]) == resumed
 
 
 def test_estimated_exposures_are_refused(finished, tmp_path, monkeypatch):

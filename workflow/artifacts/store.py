@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +120,28 @@ class StageWriter:
                 return None
         self.files |= done["files"]
         return done["facts"]
+
+    def keep_state(self, name: str, arrays: Mapping[str, np.ndarray], facts: Any) -> None:
+        """Write down where a long computation is, so that a job that is killed goes on from there; `finish` removes it."""
+        document = json.dumps({"by": self.provenance["fingerprint"], "facts": facts})
+
+        def write(path: Path) -> None:
+            with path.open("wb") as file:  # or NumPy would append .npz to the name
+                np.savez(file, **{f"array.{key}": array for key, array in arrays.items()}, document=np.array(document))
+
+        io.write_atomically(io.inside(self.directory, f"{UNFINISHED}/{name}.npz"), write)
+
+    def kept_state(self, name: str) -> tuple[dict[str, np.ndarray], Any] | None:
+        """Return arrays and facts of `keep_state`; None if there is nothing, or nothing that this job can go on from: it was
+        written under another fingerprint, or is damaged."""
+        try:
+            with np.load(io.inside(self.directory, f"{UNFINISHED}/{name}.npz"), allow_pickle=False) as kept:
+                document = json.loads(str(kept["document"]))
+                if document["by"] != self.provenance["fingerprint"]:
+                    return None
+                return {key.removeprefix("array."): kept[key] for key in kept.files if key != "document"}, document["facts"]
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+            return None
 
     def channels(self, name: str) -> dict[str, np.ndarray]:
         """Return the channels of a raster that this stage has written or taken over."""

@@ -144,10 +144,9 @@ def _descended(
     """Run the descent, from where an earlier run of the same job was killed."""
     count = int(emitter_of_face.max(initial=-1)) + 1
     options = PublishedOptions(steps=job.settings.emission.iterations, seed=job.seed)
-    state, kept = PublishedState.start(count), job.writer.part_kept("descent")
+    state, kept = PublishedState.start(count), job.writer.kept_state("descent")
     if kept is not None:
-        stored, keep, sampling = (np.array(kept[name]) for name in ("stored", "keep", "sampling"))
-        state = PublishedState(stored.reshape(count, 3), keep.astype(bool), sampling, kept["step"], tuple(kept["loss"]))
+        state = PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
     steps = options.total(len(pool.index))
     if count:
         trace = _tracer(job, scene, pool, cache, emitter_of_face)
@@ -164,8 +163,8 @@ def _descended(
 
 
 def _save(job: Job, state: PublishedState) -> None:
-    arrays = {name: getattr(state, name).tolist() for name in ("stored", "keep", "sampling")}
-    job.writer.part_done("descent", [], {**arrays, "step": state.step, "loss": list(state.loss)})
+    arrays = {name: getattr(state, name) for name in ("stored", "keep", "sampling")}
+    job.writer.keep_state("descent", arrays, {"step": state.step, "loss": list(state.loss)})
 
 
 def _tracer(

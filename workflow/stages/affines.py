@@ -16,7 +16,7 @@ from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import level_deviation, prediction_scatter
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
-from iif_core.fitting.published import PublishedOptions, fit_published
+from iif_core.fitting.published import PublishedOptions, PublishedState, fit_published
 from iif_core.fitting.reference_loss import reference_loss
 from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
@@ -100,7 +100,14 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
     if settings.solver == "published":
         rate = PublishedOptions.rate if settings.rate is None else settings.rate
         published = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
-        return lambda problem, start: fit_published(problem, start, published)
+        kept = job.writer.kept_state("descent")
+        at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
+
+        def keep(state: PublishedState) -> None:
+            facts = {"step": state.step, "loss": list(state.loss)}
+            job.writer.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
+
+        return lambda problem, start: fit_published(problem, start, published, at, keep)
     own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
     return lambda problem, start: fit_affines_sgd(problem, start, own)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from iif_core.fusion.pixels import pixel_weights, relative_footprints, surface_t
 from iif_core.fusion.problem import FusionProblem, FusionResult, one_segment_per_view, with_every_object
 from iif_core.fusion.reference_loss import loss_of_result
 from iif_core.fusion.sgd.options import preset_grid, sgd_options
-from iif_core.fusion.sgd.solve import SgdFit, converged, solve_sgd
+from iif_core.fusion.sgd.solve import SgdFit, SgdState, converged, solve_sgd
 from iif_core.reflectance.material import CHANNELS, PROPERTIES
 from iif_core.surface.cell_grid import CellGrid, CellValues, build_cell_grid, median_footprint, smallest_edge
 from iif_core.surface.cells import neighbour_pairs, unpack_keys
@@ -28,6 +29,9 @@ from workflow.scene.normal_form import CaptureReader, View
 
 MEMORY_BYTES = 1 << 30
 """Predictions that stay in memory between sweeps; those of further views are mapped from a file without a name."""
+
+KEPT_EVERY = 30.0
+"""Seconds between two states of a descent on disk; that of the paper's hash grid has 400 MB."""
 
 
 def run(job: Job) -> None:
@@ -132,7 +136,19 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
         grid = preset_grid(settings.preset, settings.hash_levels, settings.hash_entries)
         given = {name: value for name, value in own.items() if value is not None}
         chosen = sgd_options(settings.preset, grid=grid, seed=job.seed, **given)
-        fit = solve_sgd(problem, chosen, progress, job.threads)
+        kept = job.writer.kept_state("descent")
+        if kept is not None:
+            job.log.info("the descent goes on from step %d", kept[1]["step"])
+
+        last = time.monotonic()
+
+        def keep(state: SgdState) -> None:
+            nonlocal last
+            if time.monotonic() - last >= KEPT_EVERY:
+                job.writer.keep_state("descent", state.arrays, state.facts)
+                last = time.monotonic()
+
+        fit = solve_sgd(problem, chosen, progress, job.threads, kept and SgdState(*kept), keep)
         texture = fit.value, fit.scale, fit.corrections, fit.alpha
         return describe_fit(problem, *texture, fit.history, job.threads, MEMORY_BYTES), fit
     variant = {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -218,3 +218,35 @@ class HashGridTexture:
         network = (self.network, self.network_first, self.network_second, self.network_gradient)
         live = np.ones(-(-self.network.flat.size // self.kernels.SPAN), bool)
         self.kernels.adam(*(net.flat for net in network), live, factors)
+
+    def flush(self) -> None:
+        """Apply the update of the table that is queued, which the next forward pass would have applied to the same end."""
+        update, self.queued = self.queued, None
+        if update is not None:
+            self.run(lambda number: update.apply(self, number), reversed(range(len(self.levels))))
+            self.buffers.give(update.slopes)
+
+    def state(self) -> dict[str, NDArray]:
+        """Return everything that the next steps depend on, as it is in memory, by name."""
+        self.flush()
+        networks = zip(("network", "network_first", "network_second"), self._networks, strict=True)
+        return {
+            **{name: getattr(self, name) for name in ("table", "first", "second")},
+            **{name: network.flat for name, network in networks},
+            "live": np.concatenate(self.live),
+            "steps": np.array(self.steps),
+        }
+
+    def restore(self, state: Mapping[str, NDArray]) -> None:
+        """Go on from `state` of a texture of the same options."""
+        for name in ("table", "first", "second"):
+            getattr(self, name)[...] = state[name]
+        for name, network in zip(("network", "network_first", "network_second"), self._networks, strict=True):
+            network.flat[...] = state[name]
+        for live, part in zip(self.live, np.split(state["live"], np.cumsum([len(x) for x in self.live])[:-1]), strict=True):
+            live[...] = part
+        self.steps, self.queued, self.pending = int(state["steps"]), None, None
+
+    @property
+    def _networks(self) -> tuple[_Network, _Network, _Network]:
+        return self.network, self.network_first, self.network_second

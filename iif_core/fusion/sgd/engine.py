@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +46,20 @@ class Adam:
             adam(self.parameter[rows], self.first[rows], self.second[rows], self.gradient[rows], self.live[spans], factors)
 
         run(update, range(0, len(self.live), piece))
+
+    def state(self, name: str) -> dict[str, NDArray]:
+        """Return everything that the next steps depend on, as it is in memory; keys begin with `name`."""
+        arrays = {part: getattr(self, part) for part in _OF_ADAM}
+        return {f"{name}.{part}": array for part, array in (*arrays.items(), ("steps", np.array(self.steps)))}
+
+    def restore(self, name: str, state: Mapping[str, NDArray]) -> None:
+        """Go on from a `state`."""
+        for part in _OF_ADAM:
+            getattr(self, part)[...] = state[f"{name}.{part}"]
+        self.steps = int(state[f"{name}.steps"])
+
+
+_OF_ADAM = ("parameter", "first", "second", "live")
 
 
 class Engine:
@@ -157,6 +171,22 @@ class Engine:
         if self.grid is None:
             return self.table[self.pool.cell[pixels]]
         return self.grid.evaluate(self.pool.coordinates[pixels])
+
+    def state(self) -> dict[str, NDArray]:
+        """Return everything that the next steps depend on, as it is in memory, by name."""
+        texture = self.adam_table.state("table") if self.grid is None else self.grid.state()
+        fixed = {} if self.fixed is None else {"fixed": self.fixed}
+        return self.adam_affine.state("affine") | self.adam_z.state("z") | fixed | texture
+
+    def restore(self, state: Mapping[str, NDArray]) -> None:
+        """Go on from a `state` of the same problem and options."""
+        self.adam_affine.restore("affine", state)
+        self.adam_z.restore("z", state)
+        self.fixed = np.array(state["fixed"]) if "fixed" in state else None
+        if self.grid is None:
+            self.adam_table.restore("table", state)
+        else:
+            self.grid.restore(state)
 
     def fix(self, alpha: NDArray) -> None:
         self.fixed = np.ascontiguousarray(alpha, np.float32)

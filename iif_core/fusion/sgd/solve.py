@@ -7,8 +7,9 @@ in memory (in half precision if they come so), since a batch draws from every vi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,19 @@ class SgdFit:
         return self.alpha
 
 
+@dataclass(frozen=True)
+class SgdState:
+    """Where a descent is at the end of an epoch.
+
+    Attributes:
+        arrays: parameters and moments by name, as they are in memory: they change with the next step.
+        facts: plain numbers and lists: `step`, `rng` (state of the random numbers), `history`, and `sums` of `since` steps.
+    """
+
+    arrays: Mapping[str, NDArray]
+    facts: Mapping[str, Any]
+
+
 def converged(history: list[dict[str, float]], tolerance: float = 0.01) -> bool:
     """Return whether the loss changes by less than the share `tolerance` over the last fifth of the history.
 
@@ -91,14 +105,20 @@ def solve_sgd(
     options: SgdOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
+    state: SgdState | None = None,
+    keep: Callable[[SgdState], None] | None = None,
 ) -> SgdFit:
     """Solve a problem by the paper's optimiser.
+
+    A descent that was interrupted goes on from any state that `keep` was given, to the same bytes.
 
     Args:
         problem: predictions on cells, with surface points for a hash grid.
         options: how to solve; None = the safe preset.
         progress: called as progress(done, total) with numbers of steps.
         threads: at least 1.
+        state: where to go on; None = from the start.
+        keep: called with the state at the end of each epoch but the last, to write it down.
 
     Returns:
         Texture, affine maps, selection and history.
@@ -111,7 +131,7 @@ def solve_sgd(
     pool = gather(problem, options)
     engine = Engine(pool, options, problem.n_cells, threads)
     try:
-        return _solve(problem, options, pool, engine, progress)
+        return _solve(problem, options, pool, engine, progress, state, keep)
     finally:
         engine.close()
 
@@ -122,6 +142,8 @@ def _solve(
     pool: Pool,
     engine: Engine,
     progress: Callable[[int, int], None] | None,
+    state: SgdState | None,
+    keep: Callable[[SgdState], None] | None,
 ) -> SgdFit:
     batch = min(options.batch, len(pool))
     per_epoch = max(1, len(pool) // batch)
@@ -135,8 +157,16 @@ def _solve(
     choose_at = round(options.choose_at * steps)
     history: list[dict[str, float]] = []
     every = max(1, steps // options.records)
-    sums, since = np.zeros(len(TERMS)), 0
-    for step in range(steps):
+    sums, since, first = np.zeros(len(TERMS)), 0, 0
+    if state is not None:
+        engine.restore(state.arrays)
+        rng.bit_generator.state = state.facts["rng"]
+        first, history = state.facts["step"], list(state.facts["history"])
+        sums, since = np.array(state.facts["sums"], np.float64), state.facts["since"]
+    for step in range(first, steps):
+        if keep is not None and step > first and step % per_epoch == 0:
+            facts = {"step": step, "rng": rng.bit_generator.state, "history": history, "sums": sums.tolist(), "since": since}
+            keep(SgdState(engine.state(), facts))
         temperature = temperature_at(options, step, steps)
         if choose and step == choose_at:
             engine.fix(_chosen(engine.errors(temperature), pool))
