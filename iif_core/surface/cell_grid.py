@@ -75,12 +75,13 @@ def build_cell_grid(views: Iterable[tuple[NDArray, NDArray]], corners: NDArray, 
         keys = pack_keys(voxel_indices(points, edge, origin), objects)
         unique, inverse, count = np.unique(keys, return_inverse=True, return_counts=True)
         sums = np.stack([np.bincount(inverse, points[:, a], len(unique)) for a in range(3)], 1)
-        found.append((unique, inverse, count, sums))
+        found.append((unique, inverse.astype(np.int32), count, sums))
     keys = np.unique(np.concatenate([unique for unique, *_ in found])) if found else np.zeros(0, np.uint64)
     total, summed = np.zeros(len(keys)), np.zeros((len(keys), 3))
     cell_of_pixel = []
-    for unique, inverse, count, sums in found:
-        rows = np.searchsorted(keys, unique)
+    while found:
+        unique, inverse, count, sums = found.pop(0)
+        rows = np.searchsorted(keys, unique).astype(np.int32)
         total[rows] += count
         summed[rows] += sums
         cell_of_pixel.append(rows[inverse])

@@ -10,9 +10,11 @@ some ten percent; CPU seconds are those of the process. Start: the interpreter a
 With `--rays` each stage that traces is made once more to count its rays, nearest hits and tests of visibility alike, and the rate
 of its kernels is compared with that of rays of random directions from visible surface, traced without anything else.
 
-With `--loops` the compiled loops of `base` and `affines` are timed on one thread: the arrays that a call is given are read or
-written at least once, so their size over the time, relative to the rate at which a large array is copied, says how near a loop
-comes to the bound of memory. What is far below it is bound by arithmetic or by waiting for single values.
+With `--loops` the compiled loops of the direct solvers of `base` and `affines` are timed on one thread, the first call of each
+left out, because it loads compiled code. The size of the arrays that a call is given over its time, relative to the rate at
+which a large array is copied, is the largest share of the bound of memory that the loop can have: `sums` and `fit_albedo` are
+given all pixels, and late in a fit read those of some objects alone. What is far below 100 % is bound by arithmetic or by waiting
+for single values.
 """
 
 from __future__ import annotations
@@ -155,6 +157,7 @@ def timed_loops(stage: str, scene: str, quality: str) -> dict[str, list[float]]:
     compiled = [(module, name, loop) for module in modules for name, loop in vars(module).items() if isinstance(loop, Dispatcher)]
     inner = {name for _, _, loop in compiled for name in loop.py_func.__code__.co_names}
     found: dict[str, list[float]] = {}
+    warm: set[str] = set()
 
     def timing(name, loop):
         def timed(*arguments, **named):
@@ -162,8 +165,10 @@ def timed_loops(stage: str, scene: str, quality: str) -> dict[str, list[float]]:
             result = loop(*arguments, **named)
             seconds = time.perf_counter() - started
             sizes = {key: size for value in (*arguments, *named.values(), result) for key, size in _arrays(value)}
-            total = found.setdefault(name, [0, 0.0, 0.0])
-            total[:] = total[0] + 1, total[1] + seconds, total[2] + sum(sizes.values())
+            if name in warm:
+                total = found.setdefault(name, [0, 0.0, 0.0])
+                total[:] = total[0] + 1, total[1] + seconds, total[2] + sum(sizes.values())
+            warm.add(name)
             return result
 
         return timed

@@ -31,7 +31,9 @@ def fingerprints(root, folder, quality="draft"):
 def checkout(repository, tmp_path):
     """A copy of the code and a folder with one scene."""
     for name in ("iif_core", "workflow", "config"):
-        shutil.copytree(repository / name, tmp_path / "code" / name)  # byte code too, so that it need not be compiled
+        # Byte code too, so that it need not be compiled; but not what other processes write just now.
+        passing = shutil.ignore_patterns("*.pyc.*", "*.nb?", "*.tmp*")
+        shutil.copytree(repository / name, tmp_path / "code" / name, ignore=passing)
     scenes = tmp_path / "run/config/scenes"
     scenes.mkdir(parents=True)
     (scenes / "t.yaml").write_text(SCENE)

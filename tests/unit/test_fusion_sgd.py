@@ -261,7 +261,8 @@ def test_a_descent_goes_on_from_the_end_of_any_epoch(texture, threads):
     options = sgd_options("paper", batch=pixels // 4, iterations=17, records=5, **own)
     states = []
 
-    def keep(state):
+    def keep(state_of):
+        state = state_of()
         copied = {name: array.copy() for name, array in state.arrays.items()}
         states.append(SgdState(copied, json.loads(json.dumps(state.facts))))
 
@@ -269,7 +270,7 @@ def test_a_descent_goes_on_from_the_end_of_any_epoch(texture, threads):
     kept = solve_sgd(problem, options, threads=threads, keep=keep)
     assert [state.facts["step"] for state in states] == [4, 8, 12, 16]
     assert "fixed" not in states[1].arrays and "fixed" in states[2].arrays
-    for fit in (kept, *(solve_sgd(problem, options, threads=threads, state=state) for state in states)):
+    for fit in (kept, *(solve_sgd(problem, options, threads=threads, load=lambda at=state: at) for state in states)):
         for name in ("value", "scale", "corrections", "alpha"):
             np.testing.assert_array_equal(getattr(fit, name), getattr(whole, name), err_msg=name)
         assert fit.history == whole.history

@@ -9,7 +9,7 @@ from iif_core.errors import InputError
 from iif_core.fusion.options import FusionOptions
 from workflow import settings
 from workflow.registry import STAGES
-from workflow.settings import batch_table, study_files
+from workflow.settings import batch_table, study_files, yaml_file
 from workflow.settings.names import did_you_mean_path
 
 GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
@@ -29,23 +29,24 @@ def scene(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "pixels"),
+    ("text", "pixels", "noise"),
     [
-        ("affines: {pixels: 5000}", 5000),
-        ("affines: {model: object_mean}", 200_000),
-        ("affines: {texture: photographs}", "all"),
-        ("affines: {model: fipt}", "all"),
-        ("shading: {pixels: all}", "all"),
-        ("shading: {pixels: 300000}", 300_000),
+        ("affines: {pixels: 5000}", 5000, 0.2),
+        ("affines: {model: object_mean}", 200_000, 0.2),
+        ("affines: {texture: photographs}", "all", 0.1),
+        ("affines: {model: fipt}", "all", 0.1),
+        ("shading: {pixels: all}", "all", 0.2),
+        ("shading: {pixels: 300000}", 300_000, 0.2),
     ],
 )
-def test_what_is_read_decides_where_specular_light_is_traced(scene, text, pixels):
+def test_what_is_read_decides_where_specular_light_is_traced_and_how_noisy_diffuse_light_may_be(scene, text, pixels, noise):
     shading = settings.load("x", "draft", scene(f"{GOOD}{text}\n")).shading
-    assert (shading.pixels, shading.noise) == (pixels, 0.1 if pixels == "all" else 0.2)
+    assert (shading.pixels, shading.noise) == (pixels, noise)
 
 
 def test_noise_of_the_light_can_be_set(scene):
-    assert settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: 0.05}}\n")).shading.noise == 0.05
+    for text in ("0.05", "5e-2", "'0.05'"):  # YAML reads a number without a dot and with an exponent as a word
+        assert settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {text}}}\n")).shading.noise == 0.05
     for wrong in ("0", "-0.1", "some", "true"):
         with pytest.raises(InputError, match=r"`shading.noise`: found .*'auto' or a number above 0") as error:
             settings.load("x", "draft", scene(f"{GOOD}shading: {{noise: {wrong}}}\n"))
@@ -260,3 +261,20 @@ def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
         settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
     with pytest.raises(InputError, match="preset"):
         settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))
+
+
+def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
+    """A merged mapping is no duplicate, a key that stands twice is one, and what is wrong is named."""
+    path, found = tmp_path / "x.yaml", []
+    for loader in (yaml_file._FastLoader, yaml_file._StrictLoader):
+        monkeypatch.setattr(yaml_file, "_FastLoader", loader)
+        path.write_text("a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\n")
+        found.append([yaml_file.read_yaml(path)])
+        for wrong in ("a: 1\nb: {x: 1,\n  x: 2}\n", "a: *nobody\n", "a: [1\nb: 2\n", "a: %x\n"):
+            path.write_text(wrong)
+            with pytest.raises(InputError) as error:
+                yaml_file.read_yaml(path)
+            found[-1].append(str(error.value))
+    assert found[0] == found[1]
+    assert found[0][0]["b"] == {"x": 1, "y": 3}
+    assert "key `x` stands twice" in found[0][1] and "nobody" in found[0][2]

@@ -487,6 +487,25 @@ def test_every_kind_of_picture_is_drawn(tmp_path):
         draw(study, frame[:0], {}, tmp_path / "empty.png")
 
 
+def test_a_few_named_variants_have_a_colour_each_and_what_is_not_scored_no_panel(tmp_path, monkeypatch):
+    from matplotlib import pyplot as plt
+
+    from workflow.studies.plots import draw
+
+    variants = {name: study_files.Variant(label="same") for name in "abc"}
+    frame = frame_of([(name, 0, "psnr", 20.0 + i, 1.0 + i) for i, name in enumerate(variants)])
+    frame["pareto"] = study_table._pareto(frame)
+    kinds = {"scenes": ["t"], "protocols": ["raw", "scaled"], "show": ["albedo/psnr"]}
+    study = study_files.Study(title="T", variants=variants, plot=study_files.Plot(kind="pareto"), **kinds)
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+    draw(study, frame, {}, tmp_path / "t.png")
+    scored, empty = figures[0].axes
+    points = [c for c in scored.containers]
+    assert len({c.lines[0].get_color() for c in points}) == 3 and len(points) == 3
+    assert scored.axison and not empty.axison and not empty.get_title()
+
+
 def test_share_of_errors_within_the_claimed_interval():
     rng = np.random.default_rng(0)
     n = 20_000

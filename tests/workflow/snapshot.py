@@ -1,6 +1,6 @@
 """Snapshot of rule outputs: files, counts and scores. Rewrite it from finished runs, and read the difference before committing:
 
-python tests/workflow/snapshot.py <folder of the run of tiny> <folder of the run of kitchen as in test_snapshot.py>
+python tests/workflow/snapshot.py <folder of the run of tiny> <folder of the run of kitchen>
 """
 
 import json

@@ -11,7 +11,7 @@ import pytest
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.runtime import fingerprint
-from workflow.runtime.job import run_stage
+from workflow.runtime.job import Job, run_stage
 from workflow.scene.normal_form import CaptureReader
 
 SCENE = """\
@@ -134,13 +134,14 @@ def test_a_killed_material_fit_goes_on_after_its_last_epoch(finished, tmp_path, 
     assert digests(resumed["affines"]) == digests(readers["affines"])
 
 
-def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypatch):
+@pytest.mark.parametrize("texture", ["cells", "hashgrid, hash_levels: 4, hash_entries: 10"])
+def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypatch, texture):
     from iif_core.fusion.sgd import engine
     from workflow.stages import base
 
     folder, _ = finished
     shutil.copytree(folder / "results", tmp_path / "results")
-    descent = SCENE.replace("{solver: direct}", "{solver: sgd, preset: paper, texture: cells, iterations: 12}")
+    descent = SCENE.replace("{solver: direct}", f"{{solver: sgd, preset: paper, texture: {texture}, iterations: 12}}")
     monkeypatch.setattr(base, "KEPT_EVERY", 0.0)
     whole, steps = engine.Engine.step, []
 
@@ -150,11 +151,21 @@ def test_a_killed_base_goes_on_after_its_last_epoch(finished, tmp_path, monkeypa
             raise KeyboardInterrupt
         return whole(self, step)
 
+    written = Job.keep_state
+
+    def noted(job, name, arrays, facts):
+        kept.append(facts["step"])
+        written(job, name, arrays, facts)
+
+    kept = []
+    monkeypatch.setattr(Job, "keep_state", noted)
     monkeypatch.setattr(engine.Engine, "step", killed)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, ("base",), monkeypatch, descent)
+    assert kept and kept == [kept[0] * (i + 1) for i in range(len(kept))] and 7 - kept[0] < kept[-1] <= 7
+    monkeypatch.setattr(Job, "keep_state", written)
     resumed = digests(run(tmp_path, ("base",), monkeypatch, descent)["base"])
-    assert 8 < len(steps) < 8 + 12
+    assert len(steps) == 8 + 12 - kept[-1]
     monkeypatch.setattr(engine.Engine, "step", whole)
     shutil.rmtree(tmp_path / "results/tiny/base")
     assert digests(run(tmp_path, ("base",), monkeypatch, descent)["base"]) == resumed

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -129,7 +128,10 @@ class StageWriter:
             with path.open("wb") as file:  # or NumPy would append .npz to the name
                 np.savez(file, **{f"array.{key}": array for key, array in arrays.items()}, document=np.array(document))
 
-        io.write_atomically(io.inside(self.directory, f"{UNFINISHED}/{name}.npz"), write)
+        path = io.inside(self.directory, f"{UNFINISHED}/{name}.npz")
+        for left in path.parent.glob(f".{path.stem}.*"):  # by a job that was killed while it wrote
+            left.unlink(missing_ok=True)
+        io.write_atomically(path, write)
 
     def kept_state(self, name: str) -> tuple[dict[str, np.ndarray], Any] | None:
         """Return arrays and facts of `keep_state`; None if there is nothing, or nothing that this job can go on from: it was
@@ -140,7 +142,7 @@ class StageWriter:
                 if document["by"] != self.provenance["fingerprint"]:
                     return None
                 return {key.removeprefix("array."): kept[key] for key in kept.files if key != "document"}, document["facts"]
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile):
+        except Exception:  # whatever zipfile and NumPy make of a damaged archive: the work begins again
             return None
 
     def channels(self, name: str) -> dict[str, np.ndarray]:

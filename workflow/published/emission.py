@@ -144,7 +144,7 @@ def _descended(
     """Run the descent, from where an earlier run of the same job was killed."""
     count = int(emitter_of_face.max(initial=-1)) + 1
     options = PublishedOptions(steps=job.settings.emission.iterations, seed=job.seed)
-    state, kept = PublishedState.start(count), job.writer.kept_state("descent")
+    state, kept = PublishedState.start(count), job.kept_state("descent")
     if kept is not None:
         state = PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
     steps = options.total(len(pool.index))
@@ -164,7 +164,7 @@ def _descended(
 
 def _save(job: Job, state: PublishedState) -> None:
     arrays = {name: getattr(state, name) for name in ("stored", "keep", "sampling")}
-    job.writer.keep_state("descent", arrays, {"step": state.step, "loss": list(state.loss)})
+    job.keep_state("descent", arrays, {"step": state.step, "loss": list(state.loss)})
 
 
 def _tracer(

@@ -94,7 +94,7 @@ class BaseScene:
         return CellMaterials(*grid, self.cell_values, self._values_of_objects)
 
     def repainted(self, materials: CellMaterials) -> CellMaterials:
-        """Give the `materials` of a scene with the same cells the values of this one."""
+        """Return a copy of `materials`, which must be of the same cells, with the values of this scene."""
         return materials.repainted(self.cell_values, self._values_of_objects)
 
     @property

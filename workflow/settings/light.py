@@ -13,7 +13,7 @@ _SGD = SgdOptions()
 PUBLISHED = ("published", "published_repaired")
 """Solvers that are the published method from the photographs on."""
 NOISE_OF_OBJECTS, NOISE_OF_TEXTURES = 0.2, 0.1
-"""Noise of the diffuse light where numbers of objects are fitted to it, and where every pixel gets a material of its own."""
+"""Noise of the diffuse light where numbers of objects are fitted to it, and where surface cells get materials of their own."""
 _OURS_ALONE = ("min_observations", "cache_edge", "max_bounces", "prune", "environment")  # sizes come with a quality
 
 
@@ -81,7 +81,8 @@ class Shading(Section):
     """Edge in metres of the surface cells for which diffuse light is cached, once for all views."""
     noise: Annotated[Literal["auto"] | Annotated[float, Field(gt=0)], word_or_positive("auto")] = "auto"
     """Relative standard error of diffuse light (median over an object) below which no more paths are added. `auto`: 0.2, or 0.1
-    where every pixel is read, because the noise of a cell would be seen there."""
+    for texture from the photographs and for `model: fipt` and `iris`, in whose textures the noise of a cell would be seen.
+    Studies that compare models on the same light set a number."""
     max_samples: int = Field(512, ge=2)
     """Largest number of paths per cell."""
     max_bounces: int = Field(6, ge=1, le=64)

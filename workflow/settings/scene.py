@@ -90,7 +90,7 @@ class SceneSettings(Section):
             why = f"{reader} reads every pixel" if every else f"the fit reads {needed} (`affines: pixels`)"
             raise ValueError(f"`shading: pixels` is {asked}, but {why}; write `auto`, or at least `{needed}`")
         if self.shading.noise == "auto":
-            noise = NOISE_OF_TEXTURES if self.shading.pixels == "all" else NOISE_OF_OBJECTS
+            noise = NOISE_OF_TEXTURES if textured or self.affines.model in FREE_CELLS else NOISE_OF_OBJECTS
             object.__setattr__(self, "shading", self.shading.model_copy(update={"noise": noise}))
         return self
 

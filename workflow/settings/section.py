@@ -22,9 +22,15 @@ def word_or_positive(*words: str) -> BeforeValidator:
     """Return a check with one message for a setting that is one of some words or a number above 0."""
 
     def checked(value: object) -> object:
-        if value in words or (isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < float("inf")):
+        if value in words:
             return value
-        raise ValueError(f"Needed: {', '.join(map(repr, words))} or a number above 0")
+        try:
+            number = float(value) if isinstance(value, int | float | str) and not isinstance(value, bool) else 0.0
+        except ValueError:
+            number = 0.0
+        if not 0 < number < float("inf"):
+            raise ValueError(f"Needed: {', '.join(map(repr, words))} or a number above 0")
+        return number
 
     return BeforeValidator(checked)
 

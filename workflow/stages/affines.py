@@ -100,12 +100,12 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
     if settings.solver == "published":
         rate = PublishedOptions.rate if settings.rate is None else settings.rate
         published = PublishedOptions(rate, epochs=settings.epochs, batch=settings.batch, seed=job.seed)
-        kept = job.writer.kept_state("descent")
+        kept = job.kept_state("descent")
         at = kept and PublishedState(**kept[0], step=kept[1]["step"], loss=tuple(kept[1]["loss"]))
 
         def keep(state: PublishedState) -> None:
             facts = {"step": state.step, "loss": list(state.loss)}
-            job.writer.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
+            job.keep_state("descent", {"affine": state.affine, "params": state.params}, facts)
 
         return lambda problem, start: fit_published(problem, start, published, at, keep)
     own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)

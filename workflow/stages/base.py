@@ -31,7 +31,7 @@ MEMORY_BYTES = 1 << 30
 """Predictions that stay in memory between sweeps; those of further views are mapped from a file without a name."""
 
 KEPT_EVERY = 30.0
-"""Seconds between two states of a descent on disk; that of the paper's hash grid has 400 MB."""
+"""Seconds between two states of a descent that are written; each has 335 MB with the paper's hash grid."""
 
 
 def run(job: Job) -> None:
@@ -136,19 +136,23 @@ def _solve(job: Job, problem: FusionProblem) -> tuple[FusionResult, SgdFit | Non
         grid = preset_grid(settings.preset, settings.hash_levels, settings.hash_entries)
         given = {name: value for name, value in own.items() if value is not None}
         chosen = sgd_options(settings.preset, grid=grid, seed=job.seed, **given)
-        kept = job.writer.kept_state("descent")
-        if kept is not None:
-            job.log.info("the descent goes on from step %d", kept[1]["step"])
-
         last = time.monotonic()
 
-        def keep(state: SgdState) -> None:
+        def load() -> SgdState | None:
+            kept = job.kept_state("descent")
+            if kept is None:
+                return None
+            job.log.info("the descent goes on from step %d", kept[1]["step"])
+            return SgdState(*kept)
+
+        def keep(state_of: Callable[[], SgdState]) -> None:
             nonlocal last
             if time.monotonic() - last >= KEPT_EVERY:
-                job.writer.keep_state("descent", state.arrays, state.facts)
+                state = state_of()
+                job.keep_state("descent", state.arrays, state.facts)
                 last = time.monotonic()
 
-        fit = solve_sgd(problem, chosen, progress, job.threads, kept and SgdState(*kept), keep)
+        fit = solve_sgd(problem, chosen, progress, job.threads, load, keep)
         texture = fit.value, fit.scale, fit.corrections, fit.alpha
         return describe_fit(problem, *texture, fit.history, job.threads, MEMORY_BYTES), fit
     variant = {"raw": "texel_mean", "image_affine": "full"}.get(settings.variant, settings.variant)
@@ -173,7 +177,7 @@ class _Surface:
         """(index of pixels on the mesh (m,), points (m, 3), object ids (m,)); index is into the flattened image."""
         depth, face_id = self.capture.gbuffer(view)
         object_id = ids_from_disk(self.segmentation.exr(f"maps/{view.name}.exr")["object.id"])
-        index = np.flatnonzero((face_id >= 0) & (depth > 0) & (object_id >= 0))
+        index = np.flatnonzero((face_id >= 0) & (depth > 0) & (object_id >= 0)).astype(np.int32)
         points = self.capture.points(view, depth).reshape(-1, 3)[index]
         return index, points, object_id.ravel()[index]
 

@@ -177,12 +177,12 @@ def _lines(axes: Any, study: Study, frame: pd.DataFrame, key: str) -> None:
 def _scatter(axes: Any, study: Study, frame: pd.DataFrame, key: str, protocol: str) -> None:
     """Draw the score over CPU time; filled markers are on the Pareto front, which is drawn as a line."""
     chosen, front = _of(frame, key, protocol), []
-    if chosen.empty:  # scored as it is alone
+    if chosen.empty:  # this quantity has no such protocol
         axes.axis("off")
         return
     alone = not study.plot.group and len(study.variants) <= len(_COLOURS)
-    groups = {variant.label or name: [name] for name, variant in study.variants.items()} if alone else _groups(study)
-    for colour, (words, names) in zip(_cycle(), groups.items(), strict=False):
+    groups = [(v.label or name, [name]) for name, v in study.variants.items()] if alone else _groups(study).items()
+    for colour, (words, names) in zip(_cycle(), groups, strict=False):
         axes.plot([], [], "o", mfc="none", color=colour, label=words or "variants")
         for name in names:
             runs = chosen[chosen["variant"] == name].dropna(subset=["cpu_seconds"])

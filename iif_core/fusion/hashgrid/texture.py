@@ -227,7 +227,7 @@ class HashGridTexture:
             self.buffers.give(update.slopes)
 
     def state(self) -> dict[str, NDArray]:
-        """Return everything that the next steps depend on, as it is in memory, by name."""
+        """Apply what is queued (`flush`), and return everything that the next steps depend on, as it is in memory, by name."""
         self.flush()
         networks = zip(("network", "network_first", "network_second"), self._networks, strict=True)
         return {

@@ -105,20 +105,20 @@ def solve_sgd(
     options: SgdOptions | None = None,
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
-    state: SgdState | None = None,
-    keep: Callable[[SgdState], None] | None = None,
+    load: Callable[[], SgdState | None] | None = None,
+    keep: Callable[[Callable[[], SgdState]], None] | None = None,
 ) -> SgdFit:
     """Solve a problem by the paper's optimiser.
 
-    A descent that was interrupted goes on from any state that `keep` was given, to the same bytes.
+    A descent that was interrupted goes on from the end of any epoch, to the same bytes.
 
     Args:
         problem: predictions on cells, with surface points for a hash grid.
         options: how to solve; None = the safe preset.
         progress: called as progress(done, total) with numbers of steps.
         threads: at least 1.
-        state: where to go on; None = from the start.
-        keep: called with the state at the end of each epoch but the last, to write it down.
+        load: returns where to go on, None = from the start; called once, so that the state is held no longer than it is needed.
+        keep: called at the end of each epoch but the last with a function that returns the state, to write it down or not.
 
     Returns:
         Texture, affine maps, selection and history.
@@ -131,7 +131,7 @@ def solve_sgd(
     pool = gather(problem, options)
     engine = Engine(pool, options, problem.n_cells, threads)
     try:
-        return _solve(problem, options, pool, engine, progress, state, keep)
+        return _solve(problem, options, pool, engine, progress, load, keep)
     finally:
         engine.close()
 
@@ -142,8 +142,8 @@ def _solve(
     pool: Pool,
     engine: Engine,
     progress: Callable[[int, int], None] | None,
-    state: SgdState | None,
-    keep: Callable[[SgdState], None] | None,
+    load: Callable[[], SgdState | None] | None,
+    keep: Callable[[Callable[[], SgdState]], None] | None,
 ) -> SgdFit:
     batch = min(options.batch, len(pool))
     per_epoch = max(1, len(pool) // batch)
@@ -158,15 +158,20 @@ def _solve(
     history: list[dict[str, float]] = []
     every = max(1, steps // options.records)
     sums, since, first = np.zeros(len(TERMS)), 0, 0
-    if state is not None:
+    if load is not None and (state := load()) is not None:
         engine.restore(state.arrays)
         rng.bit_generator.state = state.facts["rng"]
         first, history = state.facts["step"], list(state.facts["history"])
         sums, since = np.array(state.facts["sums"], np.float64), state.facts["since"]
+        del state
+
+    def state_now() -> SgdState:
+        facts = {"rng": rng.bit_generator.state, "history": list(history), "sums": sums.tolist(), "since": since}
+        return SgdState(engine.state(), {"step": step, **facts})
+
     for step in range(first, steps):
         if keep is not None and step > first and step % per_epoch == 0:
-            facts = {"step": step, "rng": rng.bit_generator.state, "history": history, "sums": sums.tolist(), "since": since}
-            keep(SgdState(engine.state(), facts))
+            keep(state_now)
         temperature = temperature_at(options, step, steps)
         if choose and step == choose_at:
             engine.fix(_chosen(engine.errors(temperature), pool))

@@ -86,7 +86,11 @@ class CellMaterials:
         self._rows = _Rows(np.concatenate(parts), "values")
 
     def repainted(self, values: ArrayLike, object_values: ArrayLike) -> CellMaterials:
-        """Return other materials of the same cells, `values` (n, 5) and `object_values`; the cells are not looked up anew."""
+        """Return a copy with other materials of the same cells, `values` (n, 5) and `object_values`; cells are not hashed anew.
+
+        Raises:
+            InputError: as the constructor.
+        """
         other = copy.copy(self)
         other._paint(values, object_values)
         return other
