@@ -311,7 +311,8 @@ def _sky_with_sun(towards, radiance, cosine):
     return np.where(sun[..., None], radiance, 1.0).astype(np.float32), (solid_angles(64, 128) * sun).sum()
 
 
-@pytest.mark.parametrize("shines", [True, pytest.param(False, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("shines", [True, False])
 def test_sun_that_nobody_sees(tmp_path, llvm, shines):
     towards = np.array([0.62, 0.1, 0.78])
     towards /= np.linalg.norm(towards)
