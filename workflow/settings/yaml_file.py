@@ -27,7 +27,7 @@ class _StrictLoader(_Strict, yaml.SafeLoader):
 
 
 class _FastLoader(_Strict, getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-    """The same by libyaml where PyYAML has it, ten times as fast. Its messages say less."""
+    """The same by libyaml where PyYAML has it, which is much faster; its messages say less."""
 
 
 def _parsed(text: str) -> Any:
