@@ -14,6 +14,7 @@ PUBLISHED = ("published", "published_repaired")
 """Solvers that are the published method from the photographs on."""
 NOISE_OF_OBJECTS, NOISE_OF_TEXTURES = 0.2, 0.1
 """Noise of the diffuse light where numbers of objects are fitted to it, and where surface cells get materials of their own."""
+_SHARED_PATHS_ALONE = ("samples", "levels", "cell_edge", "noise", "max_samples", "max_bounces", "indirect")
 _OURS_ALONE = ("min_observations", "cache_edge", "max_bounces", "prune", "environment")  # sizes come with a quality
 
 
@@ -61,7 +62,7 @@ class Shading(Section):
     """Incident light that is cached for the fits: diffuse, and specular at several roughness levels."""
 
     IDLE: ClassVar = {
-        "method": {"published": ("method: shared_paths", ("cell_edge", "max_samples", "max_bounces", "indirect"))},
+        "method": {"published": ("method: shared_paths", _SHARED_PATHS_ALONE)},
     }
 
     method: Literal["shared_paths", "published"] = "shared_paths"

@@ -91,12 +91,11 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         layers.append((str(shown), read_yaml(path)))
     if parts := study_files.derived(scene, root):
         layers += study_files.layers(parts, root)
-    given = len(layers)
     layers = _with_preset(layers, root)
     try:
         return SceneSettings.model_validate(_merged(layers))
     except ValidationError:
-        below = 1 + len(layers) - given  # what comes before the file of the scene
+        below = 2 if layers[1][0].startswith(_PRESETS) else 1  # what comes before the file of the scene
         for count in range(below + 1, len(layers) + 1):  # blame the first layer that spoils it
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
@@ -105,13 +104,17 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
         raise
 
 
+_PRESETS = "config/presets/"
+
+
 def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[tuple[str, dict[str, Any]]]:
-    """Return the layers with the file of the `preset` that the uppermost of them names, right above the quality."""
-    named = [layer["preset"] for _, layer in layers if "preset" in layer]
-    if not named or named[-1] not in PRESETS:
+    """Return the layers with the file of the `preset` that the uppermost of them names, right below that layer."""
+    naming = [i for i, (_, layer) in enumerate(layers) if "preset" in layer]
+    name = layers[naming[-1]][1]["preset"] if naming else None
+    if name not in PRESETS:
         return layers
-    file = configuration(f"presets/{named[-1]}.yaml", root)
-    return [layers[0], (f"config/presets/{named[-1]}.yaml", read_yaml(file)), *layers[1:]]
+    file = configuration(f"presets/{name}.yaml", root)
+    return [*layers[: naming[-1]], (f"{_PRESETS}{name}.yaml", read_yaml(file)), *layers[naming[-1] :]]
 
 
 def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:

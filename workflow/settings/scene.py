@@ -22,7 +22,7 @@ class SceneSettings(Section):
 
     preset: Literal["ours", "published", "published_repaired"] = "ours"
     """`published`: every stage as the paper has it, to compare with; `published_repaired`: the same without its errors
-    (docs/method/published.md). Presets are files of settings, config/presets/, between the quality and the scene."""
+    (docs/method/published.md). Presets are files of settings, config/presets/, right below the file that names them."""
     source: Source
     """Where photographs, cameras and mesh come from."""
     capture: Capture = Capture()
@@ -76,7 +76,7 @@ class SceneSettings(Section):
         return self
 
     @model_validator(mode="after")
-    def _lit_pixels(self) -> SceneSettings:
+    def _automatic_shading(self) -> SceneSettings:
         """Put the number, or `all`, in the place of `shading: {pixels: auto}`, and the number in that of `noise: auto`: what is
         traced follows from what is read."""
         textured = self.affines.model == "objects" and textures_cells(self.affines.texture, self.prior.kind)
