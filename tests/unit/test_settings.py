@@ -255,6 +255,8 @@ def test_a_preset_lies_between_the_quality_and_the_scene(scene):
 def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
     with pytest.raises(InputError, match=r"`prune`: read by `solver: direct` or `sgd` alone"):
         settings.load("x", "draft", scene(GOOD + "preset: published\nemission: {prune: 0.2}\n"))
+    with pytest.raises(InputError, match=r"`levels`: read by `method: shared_paths` alone"):
+        settings.load("x", "draft", scene(GOOD + "preset: published\nshading: {levels: 4}\n"))
     with pytest.raises(InputError, match="no measured curve"):
         settings.load("x", "draft", scene(GOOD + "preset: published\naffines: {response: {file: c.csv}}\n"))
     with pytest.raises(InputError, match="8-bit photographs"):

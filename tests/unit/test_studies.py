@@ -151,6 +151,20 @@ def test_variants_share_what_an_earlier_one_made(folder):
     assert len(study_table.inputs("late", "draft")) == 6  # `same` needs nothing of its own
 
 
+def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
+    text = "title: x\nscenes: [t]\ncommon: {shading: {pixels: 500000}}\nvariants:\n  ours: {}\n"
+    folder("studies/a", text + "  theirs: {preset: published, overrides: {emission: {iterations: 7}}}\n")
+    ours, theirs = (settings.load(f"t--a-{name}-s0") for name in ("ours", "theirs"))
+    assert (ours.preset, ours.shading.pixels, ours.emission.solver) == ("ours", 500000, "direct")
+    assert (theirs.preset, theirs.shading.pixels, theirs.emission.solver) == ("published", "all", "published")
+    assert theirs.emission.iterations == 7 and theirs.prior == ours.prior
+    for stage in ("capture", "prior", "segmentation"):
+        assert fp.home(stage, "t--a-theirs-s0", "draft") == fp.home(stage, "t--a-ours-s0", "draft")
+    folder("studies/a", text + "  theirs: {preset: published, overrides: {emission: {prune: 0.1}}}\n")
+    with pytest.raises(InputError, match=r"a.yaml, variant theirs: `emission`: `prune`: read by"):
+        settings.load("t--a-theirs-s0")
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
