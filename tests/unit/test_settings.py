@@ -242,7 +242,7 @@ def test_registry_is_ordered_and_its_settings_exist(repository):
         settings.select(document, stage.settings)
 
 
-def test_a_preset_lies_between_the_quality_and_the_scene(scene):
+def test_a_preset_lies_below_the_file_that_names_it(scene):
     root = scene(GOOD + "preset: published\nemission: {iterations: 7}\n", "affines: {pixels: 500}\nemission: {samples: 4}\n")
     got = settings.load("x", "draft", root)
     solvers = got.base.solver, got.emission.solver, got.affines.solver
@@ -263,6 +263,15 @@ def test_a_setting_of_ours_beside_a_preset_is_idle(scene):
         settings.load("x", "draft", scene(GOOD + "preset: published\ncapture: {dynamic_range: hdr}\n"))
     with pytest.raises(InputError, match="preset"):
         settings.load("x", "draft", scene(GOOD + "preset: theirs\n"))
+
+
+def test_mistakes_beside_a_preset_are_those_of_the_file_that_names_it(scene):
+    for text, words in (("capture: {dynamic_range: hdr}\n", "8-bit photographs"), ("emission: {prune: 0.2}\n", "`prune`")):
+        with pytest.raises(InputError, match=rf"^config/scenes/x.yaml: .*{words}"):
+            settings.load("x", "draft", scene(GOOD + "preset: published\n" + text))
+    root = scene(GOOD + "affines: {model: no_such}\n", "preset: published\n")  # the quality names it
+    with pytest.raises(InputError, match=r"^config/scenes/x.yaml: `affines.model`"):
+        settings.load("x", "draft", root)
 
 
 def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):

@@ -20,7 +20,8 @@ from workflow.settings.names import RESERVED, SCENE_NAME, configuration, did_you
 from workflow.settings.yaml_file import read_yaml
 
 TABLE = Path("config/batch.tsv")
-PRESETS = "config/quality/"
+CHOSEN = ("config/quality/", "config/presets/")
+"""Files of settings that a user names and does not write."""
 COLUMNS = ("name", "source", "path", "base", "overrides")
 _NAME = re.compile(SCENE_NAME)
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(\.[A-Za-z_][A-Za-z0-9_]*)*")
@@ -187,7 +188,7 @@ def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]
 
 def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str], str]:
     """Return a function that tells where the value of a dotted key comes from: the layer that names most of it, the upper one
-    of two. A preset is named only for keys that it sets itself: what is missing is missing in the table."""
+    of two. A quality or a preset is named only for keys that it sets itself: what is missing is missing in the table."""
 
     def where(dotted: str) -> str:
         best, found = line.at(), 0
@@ -198,7 +199,7 @@ def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str]
                     break
                 depth, node = depth + 1, node[part]
             whole = depth == dotted.count(".") + 1
-            if depth and depth >= found and (whole or not name.startswith(PRESETS)):
+            if depth and depth >= found and (whole or not name.startswith(CHOSEN)):
                 best, found = name, depth
         missing = dotted == "source.path" and found < 2
         return line.at("path") if missing else best

@@ -15,7 +15,7 @@ PUBLISHED = ("published", "published_repaired")
 NOISE_OF_OBJECTS, NOISE_OF_TEXTURES = 0.2, 0.1
 """Noise of the diffuse light where numbers of objects are fitted to it, and where surface cells get materials of their own."""
 _SHARED_PATHS_ALONE = ("samples", "levels", "cell_edge", "noise", "max_samples", "max_bounces", "indirect")
-_OURS_ALONE = ("min_observations", "cache_edge", "max_bounces", "prune", "environment")  # sizes come with a quality
+_OURS_ALONE = ("min_observations", "cache_edge", "max_bounces", "pixels", "rows", "prune", "environment")
 
 
 class Emission(Section):

@@ -95,16 +95,14 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
     try:
         return SceneSettings.model_validate(_merged(layers))
     except ValidationError:
-        below = 2 if layers[1][0].startswith(_PRESETS) else 1  # what comes before the file of the scene
-        for count in range(below + 1, len(layers) + 1):  # blame the first layer that spoils it
+        for count, (place, _) in enumerate(layers, 1):  # blame the first file that spoils it, but who names a preset for that
+            if not place or place.startswith(batch_table.CHOSEN):
+                continue
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
             except ValidationError as error:
-                raise InputError(explain(error, lambda _, blamed=layers[count - 1][0]: blamed)) from None
+                raise InputError(explain(error, lambda _, blamed=place: blamed)) from None
         raise
-
-
-_PRESETS = "config/presets/"
 
 
 def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -114,7 +112,7 @@ def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[t
     if name not in PRESETS:
         return layers
     file = configuration(f"presets/{name}.yaml", root)
-    return [*layers[: naming[-1]], (f"{_PRESETS}{name}.yaml", read_yaml(file)), *layers[naming[-1] :]]
+    return [*layers[: naming[-1]], (f"config/presets/{name}.yaml", read_yaml(file)), *layers[naming[-1] :]]
 
 
 def _merged(layers: list[tuple[str, dict[str, Any]]]) -> dict[str, Any]:

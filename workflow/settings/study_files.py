@@ -1,8 +1,8 @@
 """Studies: tables of variants (settings) x scenes x seeds, run by the ordinary rules (docs/development/studies.md).
 
 A *derived scene* `<scene>--<study>-<variant>-s<seed>` has the settings of the scene's own file, over them its entry in
-`config/studies/scenes.yaml`, over these the settings of the variant, and `prior.seed: <seed>`. `<scene>--s<seed>` is the same
-without a variant and holds what all studies share: photographs, predictions, segments.
+`config/studies/scenes.yaml`, over these `common` of the study and the settings of the variant, and `prior.seed: <seed>`.
+`<scene>--s<seed>` is the same without study and variant and holds what all studies share: photographs, predictions, segments.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Variant(Section):
     """`scores: metrics`: row of variants.parquet that is scored; by default `result`."""
     overrides: dict[str, dict[str, Any]] = {}
     """Settings, section by section, over those of the scene."""
-    preset: Literal["published", "published_repaired"] | None = None
-    """Another method than ours, as `preset` of a scene."""
+    preset: Literal["ours", "published", "published_repaired"] | None = None
+    """Another method, as `preset` of a scene; by default what the scene has."""
 
     @property
     def layer(self) -> dict[str, Any]:
