@@ -50,5 +50,9 @@ rule verify:
 include: "workflow/rules/unknown.smk"
 
 
+onstart:
+    tell_costs()
+
+
 onerror:
     tell_reasons()

@@ -14,7 +14,7 @@ from iif_core.errors import InputError
 from workflow.artifacts.verify import absent
 from workflow.batch import plan as batch_table
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import native
+from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
 from workflow.settings import QUALITIES, SCENE_NAME, require_relighting, scene_file
 from workflow.settings import refuse_target, study_files
@@ -115,16 +115,22 @@ def job(stage):
     return arguments
 
 
-def per_attempt(amount, diffusion=None):
-    """A resource that grows with every retry; `diffusion`: for a prior that is a network of gigabytes, not a formula."""
+def needs(stage):
+    """Memory, time and disk that a job of a stage asks for, by the cost model; memory and time grow with every retry."""
 
-    def value(wildcards, attempt):
-        if diffusion is None:
-            return amount * attempt
-        kind = resolved(wildcards.scene)["prior"]["kind"]
-        return (diffusion if kind in ("rgbx", "marigold") else amount) * attempt
+    def value(of, grows):
+        def resource(wildcards, threads, attempt):
+            scene = wildcards.scene
+            cost = or_stop(forecast.job_cost, stage, scene, QUALITY, threads)
+            return of(cost) * (attempt if grows else 1)
 
-    return value
+        return resource
+
+    return {
+        "mem_mb": value(forecast.memory_mb, True),
+        "runtime": value(forecast.minutes, True),
+        "disk_mb": value(forecast.disk_mb, False),
+    }
 
 
 def resolved(scene):
@@ -255,6 +261,28 @@ def batch_targets(wildcards):
     )
     refused = ["results/batch/refused"] if plan.refused else []
     return [*scenes, "results/batch/complete", *refused]
+
+
+# ------------------------------------------------------------------------------------------------------------- costs
+
+
+def tell_costs():
+    """Say what the jobs that are needed will take."""
+    jobs = [
+        forecast.Planned(job.rule.name, job.wildcards.scene, job.threads)
+        for job in workflow.dag.needrun_jobs(exclude_finished=False)
+        if job.rule.name in fingerprints.STAGES
+    ]
+    print("\n".join(forecast.forecast(jobs, QUALITY, workflow.cores)), file=sys.stderr)
+
+
+def tell_costs_of_dry_run():
+    """The same at the end of a dry run, which has no hook of its own."""
+    if workflow.is_main_process and workflow.dryrun and workflow.dag is not None:
+        tell_costs()
+
+
+atexit.register(tell_costs_of_dry_run)
 
 
 # ------------------------------------------------------------------------------------------------------------ errors

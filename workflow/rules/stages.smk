@@ -17,9 +17,6 @@ rule stage:
     benchmark:
         "results/{scene}/benchmarks/<stage>.jsonl"
     threads: 2
-    resources:
-        mem_mb=per_attempt(5000),
-        runtime=per_attempt(60),
     shell:
         "python3 -m workflow {params.job} --threads {threads} --log {log:q}"
 
@@ -30,8 +27,7 @@ use rule stage as capture with:
     pathvars:
         stage="capture",
     resources:
-        mem_mb=per_attempt(5000),
-        runtime=per_attempt(120),
+        **needs("capture"),
     params:
         job=job("capture"),
     message:
@@ -44,8 +40,7 @@ use rule stage as prior with:
     pathvars:
         stage="prior",
     resources:
-        mem_mb=per_attempt(3000, diffusion=12000),
-        runtime=per_attempt(120, diffusion=720),
+        **needs("prior"),
     params:
         job=job("prior"),
     message:
@@ -58,8 +53,7 @@ use rule stage as segmentation with:
     pathvars:
         stage="segmentation",
     resources:
-        mem_mb=per_attempt(4000),
-        runtime=per_attempt(60),
+        **needs("segmentation"),
     params:
         job=job("segmentation"),
     message:
@@ -71,6 +65,8 @@ use rule stage as base with:
         unpack(reads("base", "capture", "prior", "segmentation")),
     pathvars:
         stage="base",
+    resources:
+        **needs("base"),
     params:
         job=job("base"),
     message:
@@ -82,6 +78,8 @@ use rule stage as emission with:
         unpack(reads("emission", "capture", "segmentation", "base")),
     pathvars:
         stage="emission",
+    resources:
+        **needs("emission"),
     params:
         job=job("emission"),
     message:
@@ -94,8 +92,7 @@ use rule stage as shading with:
     pathvars:
         stage="shading",
     resources:
-        mem_mb=per_attempt(5000),
-        runtime=per_attempt(120),
+        **needs("shading"),
     params:
         job=job("shading"),
     message:
@@ -117,6 +114,8 @@ use rule stage as affines with:
         ),
     pathvars:
         stage="affines",
+    resources:
+        **needs("affines"),
     params:
         job=job("affines"),
     message:
@@ -131,8 +130,7 @@ use rule stage as render with:
     pathvars:
         stage="render",
     resources:
-        mem_mb=per_attempt(5000),
-        runtime=per_attempt(120),
+        **needs("render"),
     params:
         job=job("render"),
     message:
@@ -157,8 +155,7 @@ use rule stage as metrics with:
     pathvars:
         stage="metrics",
     resources:
-        mem_mb=per_attempt(3000),
-        runtime=per_attempt(60),
+        **needs("metrics"),
     params:
         job=job("metrics"),
     message:
@@ -173,6 +170,8 @@ use rule stage as export with:
     pathvars:
         stage="export",
     threads: 1
+    resources:
+        **needs("export"),
     params:
         job=job("export"),
     message:
@@ -200,8 +199,7 @@ use rule stage as report with:
         stage="report",
     threads: 1
     resources:
-        mem_mb=per_attempt(4000),
-        runtime=per_attempt(30),
+        **needs("report"),
     params:
         job=job("report"),
     message:
@@ -215,8 +213,7 @@ use rule stage as relight with:
     pathvars:
         stage="relight",
     resources:
-        mem_mb=per_attempt(5000),
-        runtime=per_attempt(240),
+        **needs("relight"),
     params:
         job=job("relight"),
     message:
@@ -230,8 +227,7 @@ use rule stage as base_scores with:
     pathvars:
         stage="base_scores",
     resources:
-        mem_mb=per_attempt(3000),
-        runtime=per_attempt(60),
+        **needs("base_scores"),
     params:
         job=job("base_scores"),
     message:

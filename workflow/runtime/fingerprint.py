@@ -31,6 +31,7 @@ PACKAGES = ("iif_core", "workflow")  # their __init__ hold nothing but a docstri
 INFRASTRUCTURE = (
     "workflow.runtime",
     "workflow.registry",
+    "workflow.costs",
     "workflow.settings",
     "workflow.studies",
     "workflow.batch",

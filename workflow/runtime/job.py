@@ -22,7 +22,7 @@ from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
-from workflow.runtime import device, input_digests
+from workflow.runtime import device, forecast, input_digests
 from workflow.runtime import fingerprint as fp
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
@@ -170,8 +170,10 @@ class Job:
             "max_rss_mb": memory,
             "threads": self.threads,
         }
+        cost = forecast.job_cost(self.stage.name, self.scene, self.quality, self.threads, machine=1.0)
+        expected = forecast.expected(cost)
         parts = {name: {key: round(value, 3) for key, value in part.items()} for name, part in self._parts.items()}
-        document = {**parts, "job": {key: round(value, 3) for key, value in whole.items()}}
+        document = {**parts, "job": {key: round(value, 3) for key, value in whole.items()}, "expected": expected}
         write_json(Path("results") / self.scene / "benchmarks" / f"{self.stage.name}.parts.json", document)
 
     def progress(self, done: int, total: int, what: str) -> None:

@@ -1,0 +1,186 @@
+"""A model of what jobs cost, fitted to jobs that are done.
+
+cost = factor of the machine x sum over counts of (coefficient x count), for CPU seconds, wall seconds of two threads, memory
+and disk, for every stage and kind. Coefficients are non-negative and minimise the squared relative error. The range is that of
+the errors at rooms that the fit has not seen.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from workflow.costs.work import SceneSize, Work, work_of
+
+SHIPPED = Path(__file__).with_name("coefficients.json")
+MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
+FEWEST_ROOMS = 3
+"""Rooms from which on errors at unseen rooms are measured; with fewer, the range is that of `UNMEASURED`."""
+LEAST_SHARE = 1e-4
+"""Share of the cost below which a count is left out."""
+UNMEASURED = (0.5, 2.0)
+"""Range of a cost of which nothing better is known, as factors on it."""
+
+
+class Range(NamedTuple):
+    """A predicted cost: the middle, and the bounds of 10 and 90 per cent."""
+
+    middle: float
+    low: float
+    high: float
+
+    def __mul__(self, factor: float) -> Range:  # type: ignore[override]
+        return Range(self.middle * factor, self.low * factor, self.high * factor)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Coefficients of one measure of one kind of job, and factors for the bounds of 10 and 90 per cent."""
+
+    coefficients: dict[str, float]
+    low: float
+    high: float
+    jobs: int
+    rooms: int
+
+    def predict(self, counts: dict[str, float]) -> Range:
+        middle = sum(value * counts.get(name, 0.0) for name, value in self.coefficients.items())
+        return Range(middle, middle * self.low, middle * self.high)
+
+
+Fits = dict[tuple[str, str, str], Fit]
+"""(stage, kind, measure) -> fit."""
+
+
+class Cost(NamedTuple):
+    """What a job will cost; a measure that was never fitted for this kind of job is None."""
+
+    cpu_seconds: Range | None
+    seconds: Range | None
+    memory_mb: Range | None
+    disk_mb: Range | None
+
+
+@lru_cache(None)
+def shipped() -> Fits:
+    """Return the fits that come with the project."""
+    return read_fits(SHIPPED)
+
+
+def predict(stage: str, work: Work, threads: int = 2, machine: float = 1.0, fits: Fits | None = None) -> Cost:
+    """Return what a job will cost.
+
+    Wall seconds of other numbers of threads follow from those of two and from the CPU seconds, after Amdahl: with p seconds that
+    all threads share and s that one thread has to itself, two threads take s + p/2 of wall time and s + p of CPU time.
+
+    Args:
+        stage, work: the job (`workflow.costs.work.work_of`).
+        threads: that it may use.
+        machine: times as slow as the machine of the fits.
+        fits: default: those that come with the project.
+    """
+    fits = shipped() if fits is None else fits
+    of_kind = {name: fits.get((stage, work.kind, name)) for name in MEASURES}
+    found = {name: fit.predict(work.counts) if fit else None for name, fit in of_kind.items()}
+    cpu, wall = found["cpu_seconds"], found["seconds"]
+    if cpu is not None:
+        two = wall.middle if wall else cpu.middle
+        shared = min(max(2 * (cpu.middle - two), 0.0), cpu.middle)
+        middle = max(two, cpu.middle / 2) + shared * (1 / max(threads, 1) - 0.5)
+        bounds = wall or cpu
+        found["seconds"] = Range(middle, middle * bounds.low / bounds.middle, middle * bounds.high / bounds.middle) * machine
+        found["cpu_seconds"] = cpu * machine
+    return Cost(**found)
+
+
+def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
+    """Fit the cost of every kind of job.
+
+    Args:
+        rows: of `workflow.costs.records`: scene, stage, kind, threads, the measures and the counts. Wall seconds are fitted to
+            jobs of two threads alone.
+    """
+    of_kind: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for row in rows:
+        of_kind[row["stage"], row["kind"]].append(row)
+    fits = {}
+    for (stage, kind), jobs in sorted(of_kind.items()):
+        for measure in MEASURES:
+            used = [row for row in jobs if row[measure] > 0 and (measure != "seconds" or row["threads"] == 2)]
+            if used:
+                fits[stage, kind, measure] = _fit(used, measure)
+    return fits
+
+
+def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
+    fixed = {"scene", "stage", "kind", "threads", "fingerprint", *MEASURES}
+    names = [name for name in rows[0] if name not in fixed]
+    coefficients = _coefficients(rows, names, measure)
+    rooms = sorted({row["scene"] for row in rows})
+    low, high = UNMEASURED
+    if len(rooms) >= FEWEST_ROOMS:
+        errors = []
+        for room in rooms:
+            others = _coefficients([row for row in rows if row["scene"] != room], names, measure)
+            errors += [_error(row, others, measure) for row in rows if row["scene"] == room]
+        low, high = _quantiles(errors)
+    return Fit(coefficients, low, high, len(rows), len(rooms))
+
+
+def _coefficients(rows: list[dict[str, Any]], names: list[str], measure: str) -> dict[str, float]:
+    import numpy as np
+    from scipy.optimize import nnls
+
+    counts = np.array([[row.get(name, 0.0) for name in names] for row in rows])
+    costs = np.array([row[measure] for row in rows])
+    relative = counts / costs[:, None]
+    scale = np.maximum(np.sqrt((relative**2).mean(axis=0)), 1e-300)
+    solution, _ = nnls(relative / scale, np.ones(len(rows)))
+    share = solution * relative.mean(axis=0) / scale  # of the cost of the jobs, in the mean
+    found = zip(names, solution / scale, share, strict=True)
+    return {name: float(f"{value:.5g}") for name, value, part in found if part > LEAST_SHARE}
+
+
+def _error(row: dict[str, Any], coefficients: dict[str, float], measure: str) -> float:
+    """Return the logarithm of actual over predicted cost."""
+    predicted = sum(value * row.get(name, 0.0) for name, value in coefficients.items())
+    return math.log(row[measure] / predicted) if predicted > 0 else 0.0
+
+
+def _quantiles(errors: list[float]) -> tuple[float, float]:
+    import numpy as np
+
+    low, high = np.quantile(errors, [0.1, 0.9])
+    return float(f"{min(math.exp(low), 1.0):.3g}"), float(f"{max(math.exp(high), 1.0):.3g}")
+
+
+def write_fits(path: Path, fits: Fits) -> None:
+    """Write fits as JSON: stage -> kind -> measure."""
+    tree: dict[str, Any] = {}
+    for (stage, kind, measure), fit in fits.items():
+        entry = {"coefficients": fit.coefficients, "range": [fit.low, fit.high], "jobs": fit.jobs, "rooms": fit.rooms}
+        tree.setdefault(stage, {}).setdefault(kind, {})[measure] = entry
+    lines = json.dumps(tree, indent=1)
+    path.write_text(lines + "\n")
+
+
+def read_fits(path: Path) -> Fits:
+    """Read what `write_fits` wrote."""
+    tree = json.loads(path.read_text())
+    return {
+        (stage, kind, measure): Fit(entry["coefficients"], *entry["range"], entry["jobs"], entry["rooms"])
+        for stage, kinds in tree.items()
+        for kind, measures in kinds.items()
+        for measure, entry in measures.items()
+    }
+
+
+def cost_of(stage: str, settings: dict[str, Any], size: SceneSize, threads: int = 2, machine: float = 1.0) -> Cost:
+    """Return what a stage will cost at a scene of some size."""
+    return predict(stage, work_of(stage, settings, size), threads, machine)

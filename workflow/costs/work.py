@@ -1,0 +1,186 @@
+"""The work of each stage, counted in what its loops run over: pixels, predictions, paths, faces.
+
+The cost of a job is a sum over these counts, with factors that are fitted to finished jobs (workflow/costs/model.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+MILLION = 1e6
+PASSES_OF_BASE = 10
+"""Passes over the pixels that the published descent of the base makes where no number of steps is set."""
+STEP_OF_BASE, STEP_OF_EMISSION = 65536, 8192
+"""Pixels of one step of the descents."""
+PUBLISHED_PATHS = 256 + 64 + 5 * 128
+"""Paths a pixel of `shading.method: published`: diffuse light, the mirror, and five lobes."""
+
+
+@dataclass(frozen=True)
+class SceneSize:
+    """What decides the cost of a scene beside its settings.
+
+    Attributes:
+        views: photographs.
+        pixels: of all of them together, at the size that they are worked on.
+        faces: of the mesh.
+        source_mb: size of the files that `capture` reads, in MB; 0 for rooms that are made.
+        exact: whether these are counts of a finished capture, or estimates from settings and headers of files.
+    """
+
+    views: int
+    pixels: float
+    faces: float
+    source_mb: float = 0.0
+    exact: bool = False
+
+
+class Work(NamedTuple):
+    """The counts of one job, in millions (views: in hundreds), and what kind of job it is: other kinds have other factors."""
+
+    kind: str
+    counts: dict[str, float]
+
+
+def work_of(stage: str, settings: dict[str, Any], size: SceneSize) -> Work:
+    """Return the work of a stage.
+
+    Args:
+        stage: name of a stage of workflow/registry.py.
+        settings: all settings of the scene, as plain values (`workflow.settings.dump`).
+        size: of the scene.
+
+    Returns:
+        The kind, such as `direct`, and the counts. Every job has the count `job` of 1, for what it costs to start.
+    """
+    kind, counts = _STAGES[stage](settings, size)
+    return Work(kind, {"job": 1.0, **{name: float(value) for name, value in counts.items()}})
+
+
+def _capture(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    made = settings["source"]["kind"] in ("builtin", "mitsuba")
+    pixels, faces = size.pixels / MILLION, size.faces / MILLION
+    if made:
+        return settings["source"]["kind"], {"paths": pixels * settings["capture"]["samples"], "pixels": pixels, "faces": faces}
+    return "photographs", {"pixels": pixels, "faces": faces, "source_mb": size.source_mb, "views": size.views / 100}
+
+
+def _prior(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    pixels = size.pixels / MILLION
+    return settings["prior"]["kind"], {"predictions": pixels * settings["prior"]["samples"], "pixels": pixels}
+
+
+def _segmentation(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return settings["segmentation"]["kind"], {"pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
+
+
+def _base(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    base, pixels, faces = settings["base"], size.pixels / MILLION, size.faces / MILLION
+    predictions = pixels * min(base["predictions"] or 1 << 30, settings["prior"]["samples"])
+    counts = {"predictions": predictions, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
+    if base["solver"] == "direct":
+        return "direct", counts
+    hashed = (base["texture"] or ("hashgrid" if base["preset"] == "paper" else "cells")) == "hashgrid"
+    steps = base["iterations"] or (-(-PASSES_OF_BASE * size.pixels // STEP_OF_BASE) if base["preset"] == "paper" else 3000)
+    return ("hashgrid" if hashed else "descent"), {**counts, "steps": steps * STEP_OF_BASE / MILLION}
+
+
+def _base_cells(settings: dict[str, Any], size: SceneSize) -> float:
+    """Cells of the base in millions, up to a factor: a view shows as many as it has pixels over the area of a cell, and other
+    views show some of them again."""
+    return (size.pixels * size.views**-0.5) / settings["base"]["cell_footprints"] ** 2 / MILLION
+
+
+def _base_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", {"pixels": size.pixels / MILLION}
+
+
+def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    emission, faces = settings["emission"], size.faces / MILLION
+    if emission["solver"].startswith("published"):
+        steps = emission["iterations"] or -(-size.pixels // STEP_OF_EMISSION)
+        paths = steps * STEP_OF_EMISSION * emission["samples"] / MILLION
+        return "published", {"paths": paths, "pixels": size.pixels / MILLION, "faces": faces}
+    rows = min(emission["rows"], size.pixels) / MILLION
+    seen = min(emission["pixels"], size.pixels) / MILLION
+    kind = "direct" if emission["solver"] == "direct" else "descent"
+    return kind, {"rows": rows, "paths": rows * emission["samples"], "pixels": seen, "views": size.views / 100, "faces": faces}
+
+
+def _shading(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    shading, pixels, faces = settings["shading"], size.pixels / MILLION, size.faces / MILLION
+    if shading["method"] == "published":
+        return "published", {"paths": pixels * PUBLISHED_PATHS, "pixels": pixels, "faces": faces}
+    traced = pixels if shading["pixels"] == "all" else min(shading["pixels"] / MILLION, pixels)
+    cells = 1 / shading["cell_edge"] ** 2 / MILLION  # a square metre
+    noise = shading["noise"] if isinstance(shading["noise"], int | float) else 0.2
+    return "shared_paths", {
+        "specular": traced * shading["samples"],
+        "written": traced * shading["levels"],
+        "diffuse": cells * shading["samples"],
+        "adaptive": cells * min(noise**-2, shading["max_samples"]),
+        "pixels": pixels,
+        "faces": faces,
+    }
+
+
+def _affines(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    affines, pixels, faces = settings["affines"], size.pixels / MILLION, size.faces / MILLION
+    read = pixels if affines["pixels"] == "all" else min(affines["pixels"] / MILLION, pixels)
+    if affines["model"] != "objects":
+        return affines["model"], {"pixels": pixels, "faces": faces}
+    counts = {"read": read, "pixels": pixels, "faces": faces, "cells": _base_cells(settings, size)}
+    if affines["solver"] == "direct":
+        return ("textured" if settings["prior"]["kind"] == "retinex" else "direct"), counts
+    return affines["solver"], {**counts, "passes": read * affines["epochs"]}
+
+
+def _render(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    pixels = size.pixels / MILLION
+    return "all", {"paths": pixels * settings["render"]["samples"], "pixels": pixels, "faces": size.faces / MILLION}
+
+
+def _relight(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    a_view = size.pixels / max(size.views, 1) / MILLION
+    pictures = sum(max(one["camera"].get("frames") or 1, len(one["camera"].get("views") or [0])) for one in settings["relight"])
+    return "all", {"pixels": pictures * a_view, "faces": size.faces / MILLION}
+
+
+def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    metrics = settings["metrics"]
+    share = 1.0 if metrics["views"] == "all" else min(1.0, metrics["views"] / max(size.views, 1))
+    scored = share * size.pixels / MILLION
+    counts = {"scored": scored, "pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
+    return ("vgg" if metrics["lpips_vgg"] else "all"), counts
+
+
+def _export(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
+
+
+def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    shown = min(settings["report"]["views"], size.views) * size.pixels / max(size.views, 1) / MILLION
+    return "all", {"shown": shown, "pixels": size.pixels / MILLION}
+
+
+def _publish(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", {"pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
+
+
+_STAGES = {
+    "capture": _capture,
+    "prior": _prior,
+    "segmentation": _segmentation,
+    "base": _base,
+    "base_scores": _base_scores,
+    "emission": _emission,
+    "shading": _shading,
+    "affines": _affines,
+    "render": _render,
+    "relight": _relight,
+    "metrics": _metrics,
+    "export": _export,
+    "report": _report,
+    "publish": _publish,
+}

@@ -1,0 +1,152 @@
+"""What Snakemake is told about each job, and what a person reads before the jobs start."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from workflow.costs.machine import machine_factor
+from workflow.costs.model import Cost, Range, predict
+from workflow.costs.size import estimate, size_of_capture
+from workflow.costs.work import SceneSize, Work, work_of
+from workflow.registry import STAGES
+from workflow.runtime import fingerprint as fingerprints
+
+MEMORY_MARGIN = 1.25
+TIME_MARGIN, TIME_LEAST = 4.0, 10
+"""A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
+UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
+"""Of kinds of jobs that nobody has measured yet: priors that are networks, and segmentation by masks of a network."""
+START, START_OF_JOB = 5.0, 0.9
+"""Wall seconds that Snakemake takes to start, and for the start of each job beside what the job measures itself."""
+
+
+@lru_cache(None)
+def scene_size(scene: str, quality: str) -> SceneSize:
+    """Return the size of a scene.
+
+    Raises:
+        InputError: the settings or the files of the scene cannot be used.
+    """
+    home = fingerprints.home("capture", scene, quality)
+    try:
+        manifest = json.loads(Path(f"results/{home}/capture/manifest.json").read_text())
+        if manifest["fingerprint"] == fingerprints.fingerprint("capture", scene, quality):
+            return size_of_capture(manifest)
+    except (OSError, ValueError, KeyError, TypeError, IndexError):
+        pass  # not there, or damaged: it will be made
+    document = json.loads(fingerprints.resolved(scene, quality))
+    return estimate(document, fingerprints.raw_inputs("capture", document))
+
+
+def job_work(stage: str, scene: str, quality: str) -> Work:
+    """Return the work of a job.
+
+    Raises:
+        InputError: the settings or files of the scene cannot be used.
+    """
+    return work_of(stage, json.loads(fingerprints.resolved(scene, quality)), scene_size(scene, quality))
+
+
+def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: float | None = None) -> Cost:
+    """Return what a job will cost on this machine, or on one of factor `machine`."""
+    factor = machine_factor() if machine is None else machine
+    return predict(stage, job_work(stage, scene, quality), threads, factor)
+
+
+def memory_mb(cost: Cost) -> int:
+    """Return the memory to ask for: a quarter above what nine of ten such jobs took."""
+    return _rounded(cost.memory_mb.high * MEMORY_MARGIN) if cost.memory_mb else UNKNOWN_MEMORY
+
+
+def minutes(cost: Cost) -> int:
+    """Return the time to ask for."""
+    return TIME_LEAST + math.ceil(cost.seconds.high * TIME_MARGIN / 60) if cost.seconds else UNKNOWN_MINUTES
+
+
+def disk_mb(cost: Cost) -> int:
+    """Return the disk that the files of the job will take."""
+    return math.ceil(cost.disk_mb.high) if cost.disk_mb else UNKNOWN_DISK
+
+
+def _rounded(mb: float) -> int:
+    return math.ceil(mb / 100) * 100
+
+
+class Planned(NamedTuple):
+    """A job that Snakemake is going to run."""
+
+    stage: str
+    scene: str
+    threads: int
+
+
+def forecast(jobs: Iterable[Planned], quality: str, cores: int) -> list[str]:
+    """Return lines for a person: a range of time, memory and disk for each stage, and for all jobs together."""
+    of_stage: dict[str, list[Cost]] = {}
+    busy = [0.0, 0.0, 0.0]  # middle, low, high of the seconds, times the share of the cores
+    for job in jobs:
+        cost = job_cost(job.stage, job.scene, quality, job.threads)
+        of_stage.setdefault(job.stage, []).append(cost)
+        if cost.seconds:
+            share = min(job.threads, cores) / max(cores, 1)
+            busy = [total + share * (part + START_OF_JOB) for total, part in zip(busy, cost.seconds, strict=True)]
+    if not of_stage:
+        return []
+    rows = [("stage", "jobs", "time", "memory", "disk")]
+    for stage in (name for name in STAGES if name in of_stage):
+        costs = of_stage[stage]
+        rows.append((stage, str(len(costs)), *_cells(costs)))
+    widths = [max(len(row[i]) for row in rows) for i in range(5)]
+    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
+    unknown = sorted(stage for stage, costs in of_stage.items() if any(cost.seconds is None for cost in costs))
+    beside = f", without {', '.join(unknown)}, of which nothing was measured yet" if unknown else ""
+    whole = f"expected: {_span(START + busy[1], START + busy[2], duration)} of wall time on {cores} cores{beside}"
+    return [*lines, whole]
+
+
+def _cells(costs: list[Cost]) -> tuple[str, str, str]:
+    times, memory, disk = ([cost[i] for cost in costs] for i in (1, 2, 3))
+    return (
+        "not measured" if None in times else _span(sum(t.low for t in times), sum(t.high for t in times), duration),
+        "not measured" if None in memory else _span(max(m.low for m in memory), max(m.high for m in memory), size),
+        "not measured" if None in disk else _span(sum(d.low for d in disk), sum(d.high for d in disk), size),
+    )
+
+
+def _span(low: float, high: float, show: Any) -> str:
+    first, last = show(low), show(high)
+    return first if first == last else f"{first} to {last}"
+
+
+def duration(seconds: float) -> str:
+    """Return seconds in words.
+
+    >>> [duration(x) for x in (0.4, 42.4, 100, 4000)]
+    ['1 s', '42 s', '1 min 40 s', '1 h 7 min']
+    """
+    whole = max(1, round(seconds))
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s" if whole % 60 else f"{whole // 60} min"
+    return f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def size(mb: float) -> str:
+    """Return megabytes in words.
+
+    >>> [size(x) for x in (0.3, 812, 1234)]
+    ['1 MB', '812 MB', '1.2 GB']
+    """
+    return f"{max(1, round(mb))} MB" if mb < 1000 else f"{mb / 1000:.1f} GB"
+
+
+def expected(cost: Cost) -> dict[str, float]:
+    """Return the middles of a cost, as they are kept beside what the job took."""
+    names: Mapping[str, Range | None] = cost._asdict()
+    return {name: round(found.middle, 3) for name, found in names.items() if found}
