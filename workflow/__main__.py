@@ -1,7 +1,8 @@
 """`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
 `python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
-workflow batch` collect what jobs have left so far, and `python -m workflow lpips_vgg` fetches weights.
+workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, and `python -m
+workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -47,6 +48,8 @@ def _arguments() -> argparse.Namespace:
     batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
     batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
     batch.add_argument("--log", type=Path)
+    costs = commands.add_parser("costs")
+    costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
     return parser.parse_args()
@@ -152,6 +155,10 @@ def main() -> int:
         return _guarded("fetching VGG16", fetch_vgg, JobState("weights", "lpips_vgg"))
     if arguments.command == "batch":
         return _batch(arguments)
+    if arguments.command == "costs":
+        from workflow.costs.refit import refit
+
+        return _guarded("costs", lambda: print("\n".join(refit(arguments.results))))
     return _run_stage(arguments)
 
 

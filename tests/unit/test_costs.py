@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from workflow import settings
-from workflow.costs import machine, model, records, size
+from workflow.costs import machine, model, records, refit, size
 from workflow.costs.work import SceneSize, Work, work_of
 from workflow.registry import STAGES
 from workflow.runtime import forecast
@@ -195,3 +195,16 @@ def test_the_forecast_names_every_stage_and_the_whole(repository, monkeypatch):
     assert lines[-1].endswith("of wall time on 2 cores")
     assert forecast.forecast([], "draft", 2) == []
     assert os.getcwd() == str(repository)
+
+
+def test_jobs_are_added_once_and_the_fit_is_that_of_the_table(tmp_path, monkeypatch):
+    table, fits = tmp_path / "costs.csv", tmp_path / "coefficients.json"
+    records.write_rows(table, planted(rooms=3))
+    new = planted(rooms=4)[-3:]
+    monkeypatch.setattr(refit, "gather", lambda folders: [*new, *planted(rooms=3)[:2]])
+    lines = refit.refit([], table, fits)
+    assert lines[0] == f"{table}: 27 jobs, 3 of them new"
+    assert refit.refit([], table, fits)[0] == f"{table}: 27 jobs, 0 of them new"
+    assert any(line.startswith("| render, all | 27 | 4 | ") for line in lines)
+    found = model.read_fits(fits)
+    assert found == model.fit_rows(records.read_rows(table)) and len(found) == 4

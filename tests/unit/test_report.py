@@ -236,6 +236,7 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     old = {"s": 99.0, "cpu_time": 1, "max_rss": 1}
     new = {"s": 12.5, "cpu_time": 20.25, "max_rss": 300.5, "threads": 2}
     (benchmarks / "base.jsonl").write_text(f"{json.dumps(old)}\n{json.dumps(new)}\n")
+    (benchmarks / "base.parts.json").write_text(json.dumps({"expected": {"cpu_seconds": 10.0, "memory_mb": 77.0}}))
     (benchmarks / "affines.jsonl").write_text(json.dumps({"s": 0.2, "cpu_time": "NA", "max_rss": "NA"}) + "\n")
 
 
@@ -445,6 +446,9 @@ def test_timings(toy):
     assert [row["rule"] for row in rows] == ["base", "affines"]
     assert rows[0]["seconds"] == 12.5 and rows[0]["cpu_seconds"] == 20.25 and rows[0]["threads"] == 2
     assert rows[1]["cpu_seconds"] == 0.0 and rows[1]["threads"] == 0
+    assert rows[0]["expected"] == {"cpu_seconds": 10.0, "memory_mb": 77.0} and rows[1]["expected"] == {}
+    page = (toy / "scenes/toy/report.html").read_text()
+    assert '<td class="off" title="off by more than a factor of 2">10.0</td>' in page
     table = read_parquet(toy / "scenes/toy/timings.parquet")
     assert list(table) == ["rule", "wildcards", "seconds", "cpu_seconds", "max_rss_mb", "threads"]
     assert read_timings("nothing", toy) == []

@@ -10,7 +10,10 @@ from workflow.registry import STAGES
 
 
 def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
-    """Return one row per job, in the order of the workflow: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads.
+    """Return one row per job, in the order of the workflow: rule, wildcards, seconds, cpu_seconds, max_rss_mb, threads, expected.
+
+    `expected` is what the model of costs says of the job on the machine that it was fitted on (`cpu_seconds`, `memory_mb`, ...),
+    and empty where the job left nothing about it.
 
     Of a job that ran several times, the last line of `results/<scene>/benchmarks/<rule>.jsonl` is used. A rule without a
     readable file (run without Snakemake, or not yet finished) has no row. Numbers that were not recorded are 0: threads of
@@ -33,6 +36,7 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
                 "cpu_seconds": _number(facts.get("cpu_time")),
                 "max_rss_mb": _number(facts.get("max_rss")),
                 "threads": int(_number(facts.get("threads", _threads(path)))),
+                "expected": read_parts(scene, stage, root).get("expected", {}),
             }
         )
     return rows

@@ -1,0 +1,50 @@
+"""`python -m workflow costs`: add finished jobs to the table of costs, and fit the model to it again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from workflow.costs.model import MEASURES, SHIPPED, Fits, fit_rows, write_fits
+from workflow.costs.records import gather, read_rows, write_rows
+
+TABLE = Path("docs/results/data/costs.csv")
+"""The rows that the shipped coefficients were fitted to."""
+
+
+def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED) -> list[str]:
+    """Add the finished jobs under `folders` to the table, fit all costs again, and return lines that say how well they fit.
+
+    Args:
+        folders: like `results/`; with none, the table stays as it is. A job that the table has already is not added twice.
+        table: CSV file of rows (`workflow.costs.records.write_rows`).
+        fits: JSON file that is written.
+    """
+    rows = list(read_rows(table)) if table.is_file() else []
+    known = {_identity(row) for row in rows}
+    new = [row for row in gather(folders) if _identity(row) not in known]
+    if new:
+        write_rows(table, rows + new)
+        rows = list(read_rows(table))
+    found = fit_rows(rows)
+    write_fits(fits, found)
+    return [f"{table}: {len(rows)} jobs, {len(new)} of them new", *_lines(found)]
+
+
+def _identity(row: dict[str, Any]) -> tuple[str, str, float]:
+    return row["stage"], row["fingerprint"], float(row["seconds"])
+
+
+def _lines(fits: Fits) -> list[str]:
+    lines = [
+        "Range of actual over predicted cost, from the 10 to the 90 % quantile, in rooms that a fit did not see:",
+        "| stage, kind | jobs | rooms | CPU seconds | seconds | memory | disk |",
+        "|---|---:|---:|---|---|---|---|",
+    ]
+    for stage, kind in sorted({key[:2] for key in fits}):
+        cells = [fits.get((stage, kind, measure)) for measure in MEASURES]
+        counted = max((fit for fit in cells if fit), key=lambda fit: fit.jobs)
+        ranges = [f"{fit.low:.2f} to {fit.high:.2f}" if fit else "" for fit in cells]
+        lines.append(f"| {stage}, {kind} | {counted.jobs} | {counted.rooms} | {' | '.join(ranges)} |")
+    return lines
