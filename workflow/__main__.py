@@ -49,6 +49,7 @@ def _arguments() -> argparse.Namespace:
     batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
     batch.add_argument("--log", type=Path)
     costs = commands.add_parser("costs")
+    costs.add_argument("--log", type=Path)
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
