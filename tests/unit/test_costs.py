@@ -1,6 +1,7 @@
 import json
 import math
 import os
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -53,6 +54,18 @@ def test_the_range_is_that_of_rooms_that_were_not_seen():
 def test_few_rooms_say_little():
     fit = model.fit_rows(planted(rooms=2))["render", "all", "cpu_seconds"]
     assert (fit.low, fit.high) == model.UNMEASURED
+
+
+def test_jobs_of_one_size_do_not_promise_that_a_larger_one_costs_the_same():
+    rows = planted()
+    for row in rows:
+        row.update(pixels=1.5 + 0.01 * row["faces"], paths=2.0, cpu_seconds=90.0)
+    fit = model.fit_rows(rows)["render", "all", "cpu_seconds"]
+    assert "job" not in fit.coefficients
+    one = {"job": 1.0, "pixels": 1.5, "paths": 2.0, "faces": 1.0}
+    larger = {name: value * (1 if name == "job" else 30) for name, value in one.items()}
+    assert fit.predict(one).middle == pytest.approx(90.0, rel=0.1)
+    assert fit.predict(larger).middle > 20 * fit.predict(one).middle
 
 
 def test_wall_time_follows_threads():
@@ -143,7 +156,7 @@ def test_machine_factor_is_that_of_finished_jobs(tmp_path):
 def test_rows_come_back_as_they_were_written(tmp_path):
     rows = planted(rooms=1, of_room=3)
     records.write_rows(tmp_path / "a.csv", rows)
-    key = lambda row: row["seconds"]  # noqa: E731
+    key = itemgetter("seconds")
     back = sorted(records.read_rows(tmp_path / "a.csv"), key=key)
     assert back == [{**row, "threads": float(row["threads"])} for row in sorted(rows, key=key)]
 

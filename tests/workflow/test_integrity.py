@@ -27,8 +27,10 @@ def test_touched_code_inputs_and_scene_file_rerun_nothing(workflow):
 def test_a_setting_reruns_its_stage_and_those_below(workflow):
     path = workflow.folder / "config/scenes/tiny.yaml"
     path.write_text(path.read_text().replace("render: {samples: 8}", "render: {samples: 9}"))
-    rules = planned(workflow.run("scenes/tiny", "-n"))
-    assert rules == {"render", "metrics", "report", "publish"}
+    dry = workflow.run("scenes/tiny", "-n")
+    assert planned(dry) == {"render", "metrics", "report", "publish"}
+    forecast = dry.stderr[dry.stderr.rindex("\nstage ") :].split("\n")
+    assert [line.split(" ")[0] for line in forecast if line] == ["stage", "render", "metrics", "report", "publish", "expected:"]
 
 
 def test_failed_run_does_not_leave_the_old_deliverable_as_up_to_date(workflow):

@@ -22,6 +22,8 @@ SHIPPED = Path(__file__).with_name("coefficients.json")
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
 FEWEST_ROOMS = 3
 """Rooms from which on errors at unseen rooms are measured; with fewer, the range is that of `UNMEASURED`."""
+LEAST_RATIO = 2.0
+"""Ratio of the largest to the smallest count, beside faces, below which all jobs are of one size."""
 LEAST_SHARE = 1e-4
 """Share of the cost below which a count is left out."""
 UNMEASURED = (0.5, 2.0)
@@ -112,7 +114,7 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
     fits = {}
     for (stage, kind), jobs in sorted(of_kind.items()):
         for measure in MEASURES:
-            used = [row for row in jobs if row[measure] > 0 and (measure != "seconds" or row["threads"] == 2)]
+            used = [row for row in jobs if row.get(measure, 0.0) > 0 and (measure != "seconds" or row["threads"] == 2)]
             if used:
                 fits[stage, kind, measure] = _fit(used, measure)
     return fits
@@ -121,6 +123,8 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
 def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
     fixed = {"scene", "stage", "kind", "threads", "fingerprint", *MEASURES}
     names = [name for name in rows[0] if name not in fixed]
+    if measure in ("cpu_seconds", "seconds") and not _sizes_differ(rows, names):
+        names.remove("job")
     coefficients = _coefficients(rows, names, measure)
     rooms = sorted({row["scene"] for row in rows})
     low, high = UNMEASURED
@@ -131,6 +135,13 @@ def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
             errors += [_error(row, others, measure) for row in rows if row["scene"] == room]
         low, high = _quantiles(errors)
     return Fit(coefficients, low, high, len(rows), len(rooms))
+
+
+def _sizes_differ(rows: list[dict[str, Any]], names: list[str]) -> bool:
+    """Return whether the jobs tell what starting one costs from what its work costs. Where they do not, all of its time is taken
+    to grow with the work: a larger scene that is promised the time of a small one would be ended by a scheduler."""
+    sizes = ([row.get(name, 0.0) for row in rows] for name in names if name not in ("job", "faces"))
+    return names == ["job"] or any(max(values) > LEAST_RATIO * min(values) > 0 for values in sizes)
 
 
 def _coefficients(rows: list[dict[str, Any]], names: list[str], measure: str) -> dict[str, float]:

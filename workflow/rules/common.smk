@@ -21,6 +21,7 @@ from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table
 
 STARTED = time.time()
+FOLDER = os.getcwd()
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
 
 native.process_environment()
@@ -273,12 +274,14 @@ def tell_costs():
         for job in workflow.dag.needrun_jobs(exclude_finished=False)
         if job.rule.name in fingerprints.STAGES
     ]
-    print("\n".join(forecast.forecast(jobs, QUALITY, workflow.cores)), file=sys.stderr)
+    for line in forecast.forecast(jobs, QUALITY, workflow.cores):
+        print(line, file=sys.stderr)
 
 
 def tell_costs_of_dry_run():
-    """The same at the end of a dry run, which has no hook of its own."""
+    """The same at the end of a dry run, which has no hook of its own; Snakemake has gone back to the folder of the caller by then."""
     if workflow.is_main_process and workflow.dryrun and workflow.dag is not None:
+        os.chdir(FOLDER)
         tell_costs()
 
 
