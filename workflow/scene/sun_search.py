@@ -98,9 +98,7 @@ class _Rows:
     transport: TracedTransport
 
     @classmethod
-    def traced(
-        cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int
-    ) -> _Rows:
+    def traced(cls, photos: Photographs, sky: Sky, cache: RadianceVoxels, threshold: float, tile_edge: int, rows: int) -> _Rows:
         """Trace `rows` pixels, to be averaged in tiles; the cache is that of all surface."""
         none = EmitterGroups.none(len(photos.scene.faces))
         thin = -(-photos.job.settings.emission.rows // rows)

@@ -15,10 +15,10 @@ class BuiltinSource(Section):
 
     kind: Literal["builtin"]
     scene: Literal[
-        "kitchen", "tiny", "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening"
+        "kitchen", "matte", "tiny", "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening"
     ] = "kitchen"
-    """`kitchen`: a furnished room; `tiny`: a few boxes, for tests; the others: rooms of the test bed, which differ in how light
-    enters them (docs/development/rooms.md)."""
+    """`kitchen`: a furnished room; `matte`: the same in matte paint, without gloss and metal; `tiny`: a few boxes, for tests; the
+    others: rooms of the test bed, which differ in how light enters them (docs/development/rooms.md)."""
     quarterings: int = Field(0, ge=0, le=4)
     """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""
 

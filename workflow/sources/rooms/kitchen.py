@@ -7,6 +7,8 @@ touch keep a gap of 1 to 2 mm or pass through each other, so that no two surface
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from workflow.sources.rooms import kitchen_decor, kitchen_things
@@ -34,6 +36,7 @@ from workflow.sources.rooms.palette import (
     tiles,
     wood,
 )
+from workflow.sources.rooms.patterns import MaterialTable
 from workflow.sources.rooms.room import Room, RoomBuilder
 from workflow.sources.rooms.shapes import Shape, box, cylinder, lathe, mm, move, ring, sheet, sphere, tub, tube, wedge
 
@@ -73,6 +76,13 @@ def build() -> Room:
     for step in (*steps, _lamps, *kitchen_things.STEPS, *kitchen_decor.STEPS):
         step(room)
     return room.finish(_SHOTS)
+
+
+def build_matte() -> Room:
+    """Build the same kitchen in matte paint: every roughness is 0.9, and nothing is metal."""
+    room = build()
+    paints = (replace(finish, roughness=(0.9, 0.0, 0.0), metallic=0.0) for finish in room.materials.materials)
+    return replace(room, name="matte", materials=MaterialTable(tuple(paints)))
 
 
 def _front(wall: str, start: float, stop: float, low: float, high: float) -> Shape:
