@@ -45,7 +45,7 @@ from iif_core.fitting.selection import (
 )
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.brdf import R_MIN
-from iif_core.reflectance.material import GAINS, IDENTITY, NUMBERS
+from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, NUMBERS
 
 SELECTION_PIXELS = 3000
 """Pixels of an object in the selection. With few pixels in each cluster, the errors that its pixels share would go unseen."""
@@ -115,7 +115,7 @@ def _descend_all(
     scatter: np.ndarray,
 ) -> FitProgress:
     """Select the kinds, learn the population, and descend on all pixels."""
-    if opt.select:
+    if opt.select and opt.lobes:
         fit = _select_kinds(px, fit, tone, texture, opt, start_params)
     if opt.population:
         some = px.take(choose_evenly(px.obj, px.offsets, POPULATION_PIXELS))
@@ -200,6 +200,9 @@ def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) ->
         metal = texture.enough & (texture.mean[:, 4] > opt.metallic_prior)
         free[:, 12], free[:, 13] = texture.enough & texture.varied[:, 0], texture.enough
         free[:, 14], free[:, 15] = metal & texture.varied[:, 1], metal
+    if not opt.lobes:
+        affine[:, 12:], free[:, 12:] = 0.0, False
+        affine[:, 13] = np.maximum(texture.mean[:, 3], MATTE_ROUGHNESS)
     return FitProgress(DescentState(affine, free, params.copy(), np.full(n, 1e-2)), prior, population, metallic)
 
 
@@ -306,6 +309,7 @@ def result_of(
     if fit.population is not None and len(members):
         affine[:] = population_mean(fit.population, np.zeros(1), KINDS[:1])
         affine[:, 12] = 0.0
+        affine[:, 13] = affine[:, 13] if opt.lobes else np.maximum(affine[:, 13], MATTE_ROUGHNESS)
         spread = fit.population.spread[0]
         if fit.levels is not None:
             affine[:, GAINS], spread = gain_of_the_rest(fit.levels, state.affine)

@@ -103,6 +103,9 @@ class FitOptions:
         ridge: without population and selection, weight for each pixel of a prior at the identity.
         select: choose between dielectric and metal, and the local minimum of the roughness, by their evidence; otherwise start at
             the identity, with metallic free where its predicted mean exceeds `metallic_prior`.
+        metals: with `select`, whether an object may be a metal.
+        lobes: whether the photographs can tell roughness and metal: without specular lobes, roughness is that of the base, or
+            `MATTE_ROUGHNESS` where that is smoother, and nothing is metal.
         metallic_prior: see `select`.
         base_tells_levels: the base knows the brightness of objects by itself, beside the photographs.
         texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
@@ -123,6 +126,8 @@ class FitOptions:
     population: bool = True
     ridge: float = 2e-3
     select: bool = True
+    metals: bool = True
+    lobes: bool = True
     metallic_prior: float = 0.25
     base_tells_levels: bool = True
     texture_sigma: float = 2.0 / 255.0

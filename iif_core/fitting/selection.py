@@ -160,7 +160,7 @@ def profile_roughness(
     cost = np.full((n_objects, 3, len(ROUGHNESS_GRID)), np.inf)
     affine = np.zeros((n_objects, 3, len(ROUGHNESS_GRID), NUMBERS))
     everything = np.arange(n_objects)
-    for kind in range(3):
+    for kind in range(3 if opt.metals else 1):
         tried = np.flatnonzero(mixed) if kind == 2 else everything
         current = state.affine[:, :12].copy()
         for at in range(len(ROUGHNESS_GRID) - 1, -1, -1):

@@ -17,6 +17,8 @@ LOWEST = np.array([0.0, 0.0, 0.0, R_MIN, 0.0])
 """Smallest value of each channel; the largest is 1."""
 NEUTRAL = np.array([0.5, 0.5, 0.5, 0.9, 0.0])
 """Material of surface that nobody saw (docs/method/numerics.md#surface-that-nobody-saw)."""
+MATTE_ROUGHNESS = 0.85
+"""Roughness from which surface counts as matte: its lobe is so wide that photographs of a room do not show it."""
 BLACK = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
 """Material of emitters that were kept: what is seen of them is their emission."""
 

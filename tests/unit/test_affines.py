@@ -13,7 +13,7 @@ from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
-from iif_core.reflectance.material import GAINS, IDENTITY, apply_affines
+from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(
@@ -433,3 +433,20 @@ def test_refused():
     ):
         with pytest.raises(InputError):
             FitProblem(**{**problem.__dict__, **change})
+
+
+def test_without_lobes_only_albedo_is_fitted():
+    problem, truth = problem_of(np.random.default_rng(0))
+    out = fit_affines(problem, response("identity"), FitOptions(lobes=False))
+    rough = np.array([problem.base[problem.object_id == o, 3].mean() for o in range(problem.n_objects)])
+    assert not out.free[:, 12:].any() and out.free[:, :12].any()
+    np.testing.assert_allclose(out.affine[:, 13], np.maximum(rough, MATTE_ROUGHNESS), atol=1e-5)
+    assert (out.affine[:, [12, 14, 15]] == 0).all() and np.isfinite(out.covariance).all()
+
+
+def test_without_metals_every_object_is_a_dielectric():
+    problem, _ = problem_of(np.random.default_rng(0))
+    metals = fit_affines(problem, response("identity"), FitOptions())
+    none = fit_affines(problem, response("identity"), FitOptions(metals=False))
+    assert (none.affine[:, 14:] == 0).all() and np.isfinite(none.affine).all()
+    assert none.free[:, :14].sum() == metals.free[:, :14].sum()

@@ -233,9 +233,7 @@ def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None)
     return _Level(best, colour)
 
 
-def _colour_shift(
-    moments: _Moments, level: np.ndarray, base: np.ndarray, rows: np.ndarray, error: np.ndarray
-) -> np.ndarray:
+def _colour_shift(moments: _Moments, level: np.ndarray, base: np.ndarray, rows: np.ndarray, error: np.ndarray) -> np.ndarray:
     """(3,) by which log s of each channel changes if the colour of the light, of standard error `error` (3,), is weighed against
     the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,)."""
 
