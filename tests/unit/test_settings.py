@@ -289,3 +289,36 @@ def test_yaml_is_read_alike_with_and_without_libyaml(tmp_path, monkeypatch):
     assert found[0] == found[1]
     assert found[0][0]["b"] == {"x": 1, "y": 3}
     assert "key `x` stands twice" in found[0][1] and "nobody" in found[0][2]
+
+
+@pytest.mark.parametrize(
+    ("words", "section", "key", "value"),
+    [
+        ("environment: off", "emission", "environment", "off"),
+        ("environment: on", "emission", "environment", "on"),
+        ("radiance_cache: off", "shading", "indirect", "path"),
+        ("radiance_cache: on", "shading", "indirect", "cache"),
+        ("denoiser: off", "render", "denoise", False),
+        ("specular: off", "emission", "environment", "auto"),
+    ],
+)
+def test_a_forced_component_is_the_setting_of_its_own(scene, words, section, key, value):
+    found = settings.load("x", "draft", scene(f"{GOOD}override: {{components: {{{words}}}}}\n"))
+    assert getattr(getattr(found, section), key) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("override: {components: {environment: off}}\nemission: {environment: on}", "contradicts `emission: environment: on`"),
+        ("override: {components: {denoiser: on}}\nrender: {denoise: false}", "contradicts `render: denoise: False`"),
+        ("override: {components: {metallic: on}}", "override.components.metallic"),
+        ("override: {components: {gloss: off}}", "gloss"),
+        ("override: {components: {specular: maybe}}", "'auto', 'on' or 'off'"),
+        ("capture: {dynamic_range: ldr}\npreset: published\noverride: {components: {specular: off}}", "has no plan"),
+    ],
+)
+def test_an_override_that_cannot_be(scene, text, words):
+    with pytest.raises(InputError) as caught:
+        settings.load("x", "draft", scene(f"{GOOD}{text}\n"))
+    assert words in str(caught.value), caught.value

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from iif_core.light.emission.sgd import SgdOptions
-from workflow.settings.section import Section, word_or_count, word_or_positive
+from workflow.settings.section import ON_OFF, Section, word_or_count, word_or_positive
 
 _SGD = SgdOptions()
 PUBLISHED = ("published", "published_repaired")
@@ -45,7 +45,7 @@ class Emission(Section):
     """Paths per pixel, over two independent halves."""
     prune: float = Field(0.01, ge=0, lt=1)
     """Emitters of objects that give less than this share of the photographed light are dropped, unless it is missed."""
-    environment: Literal["auto", "on", "off"] = "auto"
+    environment: Annotated[Literal["auto", "on", "off"], ON_OFF] = "auto"
     """Light from outside the mesh: 42 directions, what is seen apart, or twelve where the mesh is open. `auto`: included when
     enough rays leave the mesh and what they meet is not black."""
     solver: Literal["direct", "sgd", "published", "published_repaired"] = "direct"

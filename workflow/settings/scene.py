@@ -10,6 +10,7 @@ from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.outputs import Export, Metrics, Render, Report
+from workflow.settings.override import Override
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting
 from workflow.settings.section import Section
@@ -38,6 +39,8 @@ class SceneSettings(Section):
     metrics: Metrics = Metrics()
     export: Export = Export()
     report: Report = Report()
+    override: Override = Override()
+    """Parts of the model that are forced in or out, in the words of plan.yaml."""
     relight: list[Relighting] = Field(default_factory=list)
     """Pictures under other light and from other positions, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
@@ -73,6 +76,29 @@ class SceneSettings(Section):
                 f"`emission: solver: {self.emission.solver}` knows the loss of 8-bit photographs alone; set"
                 " `capture: {dynamic_range: ldr}`, or another solver"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _overridden(self) -> SceneSettings:
+        """Put components that are forced, and have a setting of their own, in the place of that setting."""
+        choice = self.override.components
+        forced = {name: value for name, value in choice.model_dump().items() if value != "auto"}
+        if forced and (self.preset != "ours" or self.emission.solver in PUBLISHED):
+            raise ValueError(f"`override: components: {', '.join(forced)}`: the published method has no plan; remove it")
+        own = {
+            "environment": ("emission", "environment", {"on": "on", "off": "off"}),
+            "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),
+            "denoiser": ("render", "denoise", {"on": True, "off": False}),
+        }
+        for component, (section, key, values) in own.items():
+            if component in forced:
+                part, value = getattr(self, section), values[forced[component]]
+                if key in part.model_fields_set and getattr(part, key) not in (value, "auto"):
+                    raise ValueError(
+                        f"`override: components: {component}: {forced[component]}` contradicts"
+                        f" `{section}: {key}: {getattr(part, key)}`; remove one of the two"
+                    )
+                object.__setattr__(self, section, part.model_copy(update={key: value}))
         return self
 
     @model_validator(mode="after")

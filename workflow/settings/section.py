@@ -35,6 +35,10 @@ def word_or_positive(*words: str) -> BeforeValidator:
     return BeforeValidator(checked)
 
 
+ON_OFF = BeforeValidator(lambda value: ("off", "on")[value] if isinstance(value, bool) else value)
+"""For settings that are the words `on` or `off`, which YAML reads as true and false."""
+
+
 class Section(BaseModel):
     """A part of the settings. Unknown keys are errors, and so are keys without effect beside the chosen solver or model."""
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from workflow.settings.section import Section
+from workflow.settings.section import ON_OFF, Section
 
 
 class BuiltinSource(Section):
@@ -37,12 +37,12 @@ class MitsubaSource(Section):
 
 
 class PhotographedSource(Section):
-    alignment: Literal["check", "warn", "off"] = "check"
+    alignment: Annotated[Literal["check", "warn", "off"], ON_OFF] = "check"
     """Compare the projected mesh with depth images, sparse points or image edges; `check` refuses a mismatch and reports the
     measured disagreement."""
     alignment_tolerance: float = Field(0.05, gt=0)
     """Largest accepted median relative difference of depth, where depth images or sparse points exist."""
-    registration: Literal["auto", "off"] = "auto"
+    registration: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
 
