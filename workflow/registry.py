@@ -34,23 +34,35 @@ STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
         Stage("capture", (), ("source", "capture", "seed"), reads_raw=True),
+        Stage(
+            "plan",
+            ("capture",),
+            (
+                "override.components.specular",
+                "emission.environment",
+                "emission.saturation",
+                "emission.solver",
+                "shading.method",
+                "seed",
+            ),
+        ),
         Stage("prior", ("capture",), ("prior", "source", "seed"), reads_raw=True),
         Stage("segmentation", ("capture",), ("segmentation", "source", "capture"), reads_raw=True),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
         Stage("base_scores", ("capture", "prior", "segmentation", "base"), (), reads_raw=True, on_demand=True),
         Stage(
             "emission",
-            ("capture", "segmentation", "base"),
+            ("capture", "plan", "segmentation", "base"),
             ("emission", "capture.dynamic_range", "affines.response", "seed"),
             reads_raw=True,
         ),
-        Stage("shading", ("capture", "segmentation", "base", "emission"), ("shading", "seed")),
+        Stage("shading", ("capture", "plan", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
             "affines",
             ("capture", "prior", "segmentation", "base", "emission", "shading"),
-            ("affines", "capture.dynamic_range", "emission.saturation", "prior.kind", "seed"),
+            ("affines", "capture.dynamic_range", "emission.saturation", "override.components.metallic", "prior.kind", "seed"),
         ),
-        Stage("render", ("capture", "segmentation", "base", "emission", "affines"), ("render", "seed")),
+        Stage("render", ("capture", "segmentation", "base", "emission", "shading", "affines"), ("render", "seed")),
         Stage(
             "relight",
             ("capture", "segmentation", "base", "emission", "affines"),
@@ -67,13 +79,14 @@ STAGES: dict[str, Stage] = {
         Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(
             "report",
-            ("capture", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
+            ("capture", "plan", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
             ("report",),
         ),
         Stage(
             "publish",
             (
                 "capture",
+                "plan",
                 "prior",
                 "segmentation",
                 "base",

@@ -501,7 +501,7 @@ def test_hdr_photographs_are_radiance(llvm, tmp_path, monkeypatch):
 
 
 def test_unknown_room_is_refused():
-    with pytest.raises(InputError, match="'cellar'.*kitchen, tiny"):
+    with pytest.raises(InputError, match="'cellar'.*kitchen, matte, tiny"):
         rooms.build("cellar")
 
 

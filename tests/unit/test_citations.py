@@ -20,6 +20,7 @@ PAGE_OF_LETTER = {
     "C": "camera",
     "P": "priors",
     "T": "published",
+    "N": "plan",
     "O": "objects",
     "F": "fusion",
     "L": "light",

@@ -3,13 +3,15 @@ import json
 import numpy as np
 import pytest
 
-from workflow.decisions import camera, light, materials, objects
+from iif_core.requirements.evidence import NOTHING, Evidence
+from workflow.decisions import camera, light, materials, objects, plan
+from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED
 
 CHOSEN = {
     "candidates": [{"family": "srgb", "behind": 60.0, "error": 20.0}, {"family": "gamma", "behind": 0.0, "error": 0.0}],
     "reason": "gamma it is",
 }
-KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
+KEYS = {"component", "included", "status", "measure", "value", "threshold", "reason"}
 
 
 @pytest.mark.parametrize(
@@ -37,9 +39,6 @@ KEYS = {"component", "included", "measure", "value", "threshold", "reason"}
         (camera.exposure("estimate", np.zeros(0), 0), False),
         (materials.metallic(np.array([True, False]), np.array([0.1, 0.9])), True),
         (materials.metallic(np.zeros(0, bool), np.zeros(0)), False),
-        (materials.specular(np.array([0.9, 0.95]), np.zeros(2, bool)), False),
-        (materials.specular(np.array([0.9, 0.4]), np.zeros(2, bool)), True),
-        (materials.specular(np.zeros(0), np.zeros(0, bool)), False),
         (materials.affine_size(["full, roughness", "gain", "identity (3 pixels)"]), True),
         (materials.affine_size([]), False),
     ],
@@ -78,3 +77,59 @@ def test_light_passes_unless_it_explains_the_room_worse():
         assert found["included"] == expected
         assert ("no light passes" in found["reason"]) != expected and "curtain" in found["reason"]
         assert np.isfinite(found["value"])
+
+
+IN, OUT, UNCLEAR = Evidence(30.0, 10.0, 500), Evidence(-30.0, 10.0, 500), Evidence(3.0, 10.0, 500)
+
+
+@pytest.mark.parametrize(
+    ("decision", "included", "status"),
+    [
+        (plan.environment("auto", 0.0, 0.0, IN), False, SETTLED),
+        (plan.environment("auto", 0.1, 0.1, IN), True, SETTLED),
+        (plan.environment("auto", 0.1, 0.1, OUT), False, SETTLED),
+        (plan.environment("auto", 0.1, 0.1, UNCLEAR), True, PROVISIONAL),
+        (plan.environment("auto", 0.1, 0.1, NOTHING), True, PROVISIONAL),
+        (plan.environment("on", 0.0, 0.0, NOTHING), True, FORCED),
+        (plan.environment("off", 0.1, 0.1, IN), False, FORCED),
+        (plan.specular("auto", IN, None), True, SETTLED),
+        (plan.specular("auto", OUT, None), False, SETTLED),
+        (plan.specular("auto", UNCLEAR, None), True, PROVISIONAL),
+        (plan.specular("auto", OUT, "needed"), True, SETTLED),
+        (plan.specular("off", IN, None), False, FORCED),
+        (plan.emitters(True, NOTHING), True, PROVISIONAL),
+        (plan.emitters(False, IN), True, PROVISIONAL),
+        (plan.radiance_cache(0.9), True, PROVISIONAL),
+        (plan.radiance_cache(0.1), False, PROVISIONAL),
+        (light.denoiser(True), True, SETTLED),
+        (light.denoiser(False), False, FORCED),
+        (light.radiance_cache("path", 0.9, 0.0), False, FORCED),
+        (materials.metallic(np.ones(2, bool), np.ones(2), "off"), False, FORCED),
+    ],
+)
+def test_what_is_settled_and_what_is_not(decision, included, status):
+    assert (decision["included"], decision["status"]) == (included, status)
+    assert json.loads(json.dumps(decision, allow_nan=False)) == decision
+
+
+def test_linear_photographs_need_no_response_and_given_exposures_no_gains():
+    of = {item["component"]: item for item in plan.later(is_hdr=True, exposure_estimated=False)}
+    out = {name for name, item in of.items() if not item["included"]}
+    assert out == {"camera_response", "exposure", "white_balance", "vignetting"}
+    assert all(item["included"] for item in plan.later(is_hdr=False, exposure_estimated=True))
+
+
+@pytest.mark.parametrize(("lowest", "metal", "included"), [(0.9, 0.0, False), (0.5, 0.0, True), (0.9, 1.0, True)])
+def test_predictions_settle_what_the_photographs_left_open(lowest, metal, included):
+    settled = plan.matte_by_predictions(plan.specular("auto", UNCLEAR, None), lowest, metal, 0.85)
+    assert (settled["included"], settled["status"]) == (included, SETTLED)
+    for decided in (plan.specular("auto", IN, None), plan.specular("off", IN, None)):
+        assert plan.matte_by_predictions(decided, lowest, metal, 0.85) == decided
+
+
+def test_the_plan_says_how_to_turn_it_over():
+    assert plan.with_override(plan.specular("auto", OUT, None))["override"] == "override: {components: {specular: on}}"
+    assert "override" not in plan.with_override(plan.emitters(False, IN))
+    assert plan.included([plan.radiance_cache(0.9)], "radiance_cache")["value"] == 0.9
+    with pytest.raises(KeyError):
+        plan.included([], "specular")

@@ -20,6 +20,7 @@ from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import read_exr, read_parquet
 from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
+from workflow.decisions.record import PROVISIONAL, SETTLED, not_probed
 from workflow.registry import STAGES
 from workflow.report import pictures as pic
 from workflow.report.page import number, score_table
@@ -128,6 +129,12 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     curve = np.linspace(0, 1, 101) ** (1 / 2.2)
     samples = np.stack([curve] * 3) if truth and dynamic_range == "ldr" else None
     writer.finish("made up", dynamic_range, truth, ["a note with <angle> brackets"], samples)
+    job.writer.finish()
+
+    job = FakeJob("plan", root)
+    closed = not_probed("environment", False, "the mesh is closed", SETTLED)
+    open_yet = [not_probed(name, True, "decided later", PROVISIONAL) for name in ("metallic", "vignetting")]
+    job.writer.json("plan.json", {"plan": [closed, *open_yet]})
     job.writer.finish()
 
     job = FakeJob("prior", root)
@@ -457,7 +464,13 @@ def test_timings(toy):
 def test_plan_is_collected(toy):
     plan = yaml.safe_load((toy / "scenes/toy/plan.yaml").read_text())
     assert plan["scene"] == "toy"
-    assert [(item["component"], item["included"], item["rule"]) for item in plan["components"]] == [("metallic", False, "base")]
+    found = [(item["component"], item["included"], item["status"], item["rule"]) for item in plan["components"]]
+    assert found == [
+        ("environment", False, "settled", "plan"),
+        ("metallic", False, "settled", "base"),  # as a later stage settled it
+        ("vignetting", False, "settled", "plan"),  # nobody had a reason to try it
+        ("denoiser", False, "forced", "render"),
+    ]
 
 
 # ---------------------------------------------------------------------------------------------------------------- page

@@ -14,9 +14,11 @@ import numpy as np
 
 from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.camera.simulation import response_curve
+from iif_core.requirements.evidence import NOTHING
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.store import ids_to_disk, split_rgb
+from workflow.decisions import plan as decisions
 from workflow.registry import STAGES
 from workflow.scene.normal_form import CaptureWriter, Truth, View
 
@@ -136,7 +138,7 @@ class StubJob:
     def __init__(self, stage: str, folder: Path, settings: dict[str, Any], seed: int = 0):
         self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
         self.document = {"seed": seed}
-        known = {"prior": {"kind": "simulated"}, **settings}
+        known = {"prior": {"kind": "simulated"}, "override": {"components": SimpleNamespace(metallic="auto")}, **settings}
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
         self.log = logging.getLogger(stage)
         provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}
@@ -243,7 +245,19 @@ def build(
     segmentation.finish()
     capture.finish()
     _write_base(folder, room, pixels, size)
+    write_plan(folder)
     return room
+
+
+def write_plan(folder: Path, specular: str = "on", environment: str = "auto") -> None:
+    """Write a plan that leaves the light to stage emission; `specular: auto` leaves the lobes to the predictions."""
+    plan = StubJob("plan", folder, {}).writer
+    components = [
+        decisions.environment(environment, 0.1, 0.1, NOTHING),
+        decisions.specular(specular, NOTHING, None),
+    ]
+    plan.json("plan.json", {"plan": components})
+    plan.finish()
 
 
 def _spoil(room: Room, strength: float, rng: np.random.Generator) -> np.ndarray:

@@ -3,16 +3,18 @@
 import logging
 import shutil
 from collections import Counter
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build, write_plan
 
 from iif_core.camera.simulation import response_curve
 from workflow.artifacts import files
 from workflow.scene import emission_pixels
 from workflow.scene.base_scene import read_base_scene
+from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader
 from workflow.stages import affines, emission, shading
 
@@ -77,7 +79,7 @@ def test_hdr_emission_is_recovered(hdr):
 def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
     """Where photographs have more pixels than the stage looks at, a part of each stands for it."""
     folder, _ = hdr
-    for stage in ("capture", "segmentation", "base"):
+    for stage in ("capture", "plan", "segmentation", "base"):
         shutil.copytree(folder / stage, tmp_path / stage)
     _run(tmp_path, "hdr", upto="emission", emission={"pixels": 6 * 48 * 48 // 3})
     table, radiance = _emitters(tmp_path)
@@ -101,6 +103,46 @@ def test_faces_between_the_chosen_pixels_are_seen(hdr):
         seen |= set(record.seen)
         assert set(np.unique(capture.gbuffer(view)[1])) - {-1} == set(record.seen)
     assert of_pixels < seen
+
+
+def test_without_lobes_no_path_is_traced_for_a_pixel(hdr, tmp_path):
+    """The light of a pixel is that of its cell, as if it came from everywhere; albedo is fitted alone, nearly as well."""
+    folder, room = hdr
+    for stage in ("capture", "prior", "segmentation", "base", "emission"):
+        shutil.copytree(folder / stage, tmp_path / stage)
+    write_plan(tmp_path, specular="off")
+    common = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "affines": AFFINES}
+    for name, module, own in (("shading", shading, SHADING), ("affines", affines, AFFINES)):
+        job = StubJob(name, tmp_path, {**common, name: own})
+        module.run(job)
+        job.writer.finish()
+    facts = _reader(tmp_path, "shading").json("shading.json")
+    assert facts["specular"] == {"pixels": 0}
+    assert {item["component"]: item["status"] for item in facts["plan"]}["specular"] == "forced"
+    fitted = _reader(tmp_path, "affines").table("objects.parquet")
+    rough, metal = np.stack(fitted["T_roughness"]), np.stack(fitted["T_metallic"])
+    assert (rough[:, 0] == 0).all() and (rough[:, 1] >= 0.85).all() and (metal == 0).all()
+    assert _psnr(tmp_path, room, "affines") > _psnr(folder, room, "base") + 1
+    diffuse = read_diffuse(StubJob("reader", tmp_path, {}), CaptureReader(_reader(tmp_path, "capture")).views[0])
+    own = read_specular(StubJob("reader", tmp_path, {}), CaptureReader(_reader(tmp_path, "capture")).views[0])
+    light = diffuse.reshape(2, -1, 3)[:, own.index]
+    roughest = own.s0[:, :, -1] + own.s1[:, :, -1]
+    lit = light.min(-1) > 0
+    assert (roughest[lit] < light[lit]).all() and (roughest[lit] > 0.1 * light[lit]).all()
+
+
+@pytest.mark.parametrize(("roughness", "included"), [(0.95, False), (0.4, True)])
+def test_predictions_settle_the_lobes_where_the_photographs_left_them_open(hdr, tmp_path, roughness, included):
+    folder, _ = hdr
+    for stage in ("capture", "prior", "segmentation", "base", "emission"):
+        shutil.copytree(folder / stage, tmp_path / stage)
+    write_plan(tmp_path, specular="auto")
+    job = StubJob("shading", tmp_path, {"shading": SHADING})
+    scene = read_base_scene(job)
+    values = scene.cell_values.copy()
+    values[:, 3], values[:, 4] = roughness, 0
+    settled = shading._specular(job, replace(scene, cell_values=values))
+    assert (settled["included"], settled["status"]) == (included, "settled")
 
 
 def test_hdr_albedo_comes_closer_to_the_truth(hdr):

@@ -16,6 +16,9 @@ STEP_OF_BASE, STEP_OF_EMISSION = 65536, 8192
 PUBLISHED_PATHS = 256 + 64 + 5 * 128
 """Paths a pixel of `shading.method: published`: diffuse light, the mirror, and five lobes."""
 
+PROBED_VIEWS = 32
+"""Photographs that stage plan reads."""
+
 
 @dataclass(frozen=True)
 class SceneSize:
@@ -64,6 +67,11 @@ def _capture(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
     if made:
         return settings["source"]["kind"], {"paths": pixels * settings["capture"]["samples"], "pixels": pixels, "faces": faces}
     return "photographs", {"pixels": pixels, "faces": faces, "source_mb": size.source_mb, "views": size.views / 100}
+
+
+def _plan(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    read = min(size.views, PROBED_VIEWS) * size.pixels / max(size.views, 1) / MILLION
+    return "probes", {"pixels": read, "faces": size.faces / MILLION}
 
 
 def _prior(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -170,6 +178,7 @@ def _publish(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
 
 _STAGES = {
     "capture": _capture,
+    "plan": _plan,
     "prior": _prior,
     "segmentation": _segmentation,
     "base": _base,

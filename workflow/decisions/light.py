@@ -7,7 +7,8 @@ import numpy as np
 from iif_core.light.emission.search import STEP
 from iif_core.light.emission.sun import SHARP, Disc, is_needed
 from iif_core.light.emission.translucent import TRANSMITTANCE
-from workflow.decisions.record import Decision, decision
+from workflow.decisions.plan import CACHE_COVERAGE
+from workflow.decisions.record import FORCED, SETTLED, Decision, decision
 
 ESCAPE_PRIMARY = 1e-3
 """Share of camera rays that leave the mesh, above which an environment is considered."""
@@ -19,8 +20,6 @@ ESCAPE_OPEN = 0.3
 """Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
 and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see
 (docs/method/light.md#open-meshes)."""
-CACHE_COVERAGE = 0.3
-"""Share of secondary hits that must have been photographed for the radiance cache."""
 
 
 def environment(setting: str, primary_escape: float, secondary_escape: float, relative_brightness: float | None) -> Decision:
@@ -111,6 +110,12 @@ def transmission(names: str, shines: float, passes: float, possible: bool) -> De
     return decision("transmission", included, measure, value, -STEP, reason)
 
 
+def denoiser(setting: bool) -> Decision:
+    """Describe the denoiser of the re-renderings: paths are few, and nothing is fitted to them."""
+    status, reason = (SETTLED, "views are re-rendered by few paths, which are noisy") if setting else (FORCED, "set to off")
+    return decision("denoiser", setting, "whether re-renderings have the noise of paths", 1.0, 1.0, reason, status)
+
+
 def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
     """Decide between photographed radiance and further bounces for indirect light (Eq. S.14); `setting` is `cache`, `path` or
     `auto`.
@@ -120,6 +125,6 @@ def radiance_cache(setting: str, coverage: float, censored: float) -> Decision:
     """
     measure = "share of secondary hits whose radiance was photographed"
     if setting != "auto":
-        return decision("radiance_cache", setting == "cache", measure, coverage, CACHE_COVERAGE, f"set to {setting}")
+        return decision("radiance_cache", setting == "cache", measure, coverage, CACHE_COVERAGE, f"set to {setting}", FORCED)
     reason = f"{coverage:.0%} of secondary hits were photographed ({censored:.1%} of the voxels only saturated)"
     return decision("radiance_cache", coverage > CACHE_COVERAGE, measure, coverage, CACHE_COVERAGE, reason)

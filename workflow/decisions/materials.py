@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from workflow.decisions.record import Decision, decision
+from workflow.decisions.record import FORCED, Decision, decision
 
 METALLIC_PRIOR = 0.25
 """Median predicted metallic above which an object counts as predicted metal."""
-SPECULAR_ROUGHNESS = 0.85
-"""Roughness below which an object counts as glossy."""
 
 
-def metallic(free: np.ndarray, prior_median: np.ndarray) -> Decision:
-    """Decide about metallic: objects (`free`, not dielectrics) that the photographs show to be metals, at least in parts."""
+def metallic(free: np.ndarray, prior_median: np.ndarray, setting: str = "auto") -> Decision:
+    """Decide about metallic: objects (`free`, not dielectrics) that the photographs show to be metals, at least in parts;
+    `setting` is `auto` or `off`."""
     count = int(np.count_nonzero(free))
     predicted = int(np.count_nonzero(np.asarray(free) & (np.asarray(prior_median) > METALLIC_PRIOR)))
     value = float(np.max(prior_median)) if len(prior_median) else 0.0
     paying = count - predicted
     reason = f"fitted for {count} of {len(free)} objects ({predicted} because predicted, {paying} because it pays)"
+    if setting != "auto":
+        return decision(
+            "metallic", False, "largest median predicted metalness", value, METALLIC_PRIOR, f"set to {setting}", FORCED
+        )
     return decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
-
-
-def specular(low_roughness: np.ndarray, free_metallic: np.ndarray) -> Decision:
-    """Decide about the specular lobe: some object is smoother than 0.85 in 5 % of its pixels (`low_roughness`), or metallic."""
-    value = float(np.min(low_roughness)) if len(low_roughness) else 1.0
-    needed = value < SPECULAR_ROUGHNESS or bool(np.any(free_metallic))
-    reason = f"{int(np.count_nonzero(np.asarray(low_roughness) < SPECULAR_ROUGHNESS))} objects are glossy"
-    return decision("specular", needed, "lowest 5 % quantile of roughness of an object", value, SPECULAR_ROUGHNESS, reason)
 
 
 def affine_size(models: list[str]) -> Decision:

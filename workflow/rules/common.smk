@@ -183,6 +183,15 @@ def again_without(folder, manifest):
         workflow.dag.forcefiles.add(folder)
 
 
+def plan_inputs(wildcards):
+    """The plan of a scene; a plan whose copy is gone is copied again."""
+    folder_or_stop(f"plan/{wildcards.scene}")
+    again_without(
+        f"plan/{wildcards.scene}", f"results/{wildcards.scene}/plan/manifest.json"
+    )
+    return {"manifest": manifest("plan", wildcards.scene)}
+
+
 def relight_inputs(*names):
     """What is relit; a scene without relightings stops here, before any job."""
     inputs_of = reads("relight", *names)

@@ -7,6 +7,7 @@ rule publish:
         unpack(
             publish_inputs(
                 "capture",
+                "plan",
                 "prior",
                 "segmentation",
                 "base",
@@ -36,6 +37,22 @@ rule publish:
         "{wildcards.scene}: publishing scenes/{wildcards.scene}"
     shell:
         "python3 -m workflow {params.job} --log {log:q}"
+
+
+rule planned:
+    """Copy what a scene requires to plan/<scene>/, and show it; no stage after `plan` runs."""
+    input:
+        unpack(plan_inputs),
+    output:
+        plan=directory("plan/{scene}"),
+    log:
+        "results/{scene}/logs/planned.log",
+    localrule: True
+    message:
+        "{wildcards.scene}: what it requires, in plan/{wildcards.scene}/plan.yaml"
+    shell:
+        "mkdir -p {output.plan:q} && cp results/{wildcards.scene}/plan/plan.yaml {output.plan:q} 2> {log:q}"
+        " && cat {output.plan:q}/plan.yaml"
 
 
 rule relit:

@@ -34,6 +34,19 @@ use rule stage as capture with:
         "{wildcards.scene}: photographs, cameras and mesh into the normal form"
 
 
+use rule stage as plan with:
+    input:
+        unpack(reads("plan", "capture")),
+    pathvars:
+        stage="plan",
+    resources:
+        **needs("plan"),
+    params:
+        job=job("plan"),
+    message:
+        "{wildcards.scene}: what the scene requires"
+
+
 use rule stage as prior with:
     input:
         unpack(reads("prior", "capture")),
@@ -75,7 +88,7 @@ use rule stage as base with:
 
 use rule stage as emission with:
     input:
-        unpack(reads("emission", "capture", "segmentation", "base")),
+        unpack(reads("emission", "capture", "plan", "segmentation", "base")),
     pathvars:
         stage="emission",
     resources:
@@ -88,7 +101,7 @@ use rule stage as emission with:
 
 use rule stage as shading with:
     input:
-        unpack(reads("shading", "capture", "segmentation", "base", "emission")),
+        unpack(reads("shading", "capture", "plan", "segmentation", "base", "emission")),
     pathvars:
         stage="shading",
     resources:
@@ -125,7 +138,15 @@ use rule stage as affines with:
 use rule stage as render with:
     input:
         unpack(
-            reads("render", "capture", "segmentation", "base", "emission", "affines")
+            reads(
+                "render",
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "shading",
+                "affines",
+            )
         ),
     pathvars:
         stage="render",
@@ -184,6 +205,7 @@ use rule stage as report with:
             reads(
                 "report",
                 "capture",
+                "plan",
                 "prior",
                 "segmentation",
                 "base",
@@ -237,6 +259,7 @@ use rule stage as base_scores with:
 # Shown by `snakemake --list`: snakefmt knows no docstrings in `use rule`.
 descriptions = {
     "capture": "Bring photographs, cameras and mesh into the normal form, or render them.",
+    "plan": "Find out, from photographs and mesh alone, which parts of the model the scene requires.",
     "prior": "Predict materials K times for every photograph.",
     "segmentation": "Assign faces of the mesh to objects, and pixels to segments.",
     "base": "Fuse the predictions of all views into one base texture.",
@@ -246,7 +269,7 @@ descriptions = {
     "render": "Render every view again with the recovered materials and lights.",
     "metrics": "Score the result against ground truth, where there is any, and against the photographs.",
     "export": "Write the result for other programs: glTF, Mitsuba, tables.",
-    "report": "Write report.html and plan.yaml.",
+    "report": "Write report.html, and plan.yaml with all decisions settled.",
     "relight": "Render the recovered scene under other light; made on demand.",
     "base_scores": "Score the base texture; made on demand by studies.",
 }

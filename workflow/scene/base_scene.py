@@ -347,12 +347,12 @@ def pixel_gains(gains: CameraGains, number: int, view: View, index: np.ndarray) 
     return gains.factor(number, radius_squared(index, view.width, view.height))
 
 
-def read_radiance_cache(job: Job) -> RadianceCache:
-    """Read the radiance cache onto the device, voxels that only saturated pixels show included."""
+def read_radiance_cache(job: Job, scale: float = 1.0) -> RadianceCache:
+    """Read the radiance cache, its radiance times `scale`, onto the device; voxels that only saturated pixels show are in it."""
     from iif_core.light.transport.cache import RadianceCache
 
     reader = job.read("emission")
     table, facts = reader.table("radiance_cache.parquet"), reader.json("emission.json")
     ijk = np.stack([table[c] for c in "ijk"], 1).astype(np.int32)
-    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float32)
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1).astype(np.float32) * np.float32(scale)
     return RadianceCache(facts["cache_edge_m"], np.asarray(facts["cache_origin"], np.float32), ijk, radiance)

@@ -66,6 +66,12 @@ def read_specular(job: Job, view: View) -> SpecularLight:
     return SpecularLight(index.astype(np.int64), lobes("s0"), lobes("s1"))
 
 
+def has_lobes(job: Job) -> bool:
+    """Return whether specular lobes were traced; without them, the light of a pixel is as if it came from everywhere alike."""
+    plan = job.read("shading").json("shading.json")["plan"]
+    return all(item["included"] for item in plan if item["component"] == "specular")
+
+
 def read_diffuse(job: Job, view: View) -> np.ndarray:
     """Read the diffuse light of every pixel of a view, (2, H, W, 3) float32 in two independent halves; 0 where nothing is hit."""
     channels = job.read("shading").exr(f"maps/{view.name}.exr")

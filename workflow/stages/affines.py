@@ -37,7 +37,7 @@ from workflow.scene.base_scene import (
     sensor_bounds,
     view_pixels,
 )
-from workflow.scene.cached_light import read_diffuse, read_specular
+from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names, write_response
 from workflow.settings.affines import KnownLamp
@@ -64,7 +64,8 @@ def run(job: Job) -> None:
     albedo = textures.albedo(fit) if textures is not None else None
     _write_cells(job, fit, albedo)
     _write_maps(job, capture, fit, albedo)
-    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"])
+    metals = job.settings.override.components.metallic
+    plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], metals)
     loss = reference_loss(problem, free.affine, free.response)
     _write_facts(job, fit, loss.__dict__, plan)
 
@@ -94,6 +95,8 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             response_prior=prior,
             # This prior read the brightness of objects from the same photographs (docs/results/real-scenes.md).
             base_tells_levels=job.settings.prior.kind != "retinex",
+            lobes=has_lobes(job),
+            metals=job.settings.override.components.metallic != "off",
             threads=job.threads,
         )
         return lambda problem, start: fit_affines(problem, start, options)
@@ -367,23 +370,21 @@ def _plan(
     fit: FitResult,
     calibration: dict[str, Any],
     dynamic_range: str,
+    metals: str,
 ) -> list[Decision]:
     """Return the decisions of this stage with their measured reasons."""
     object_id = problem.object_id
-    fitted = apply_affines(fit.affine, object_id, problem.base)
-    medians, glossy = np.zeros(problem.n_objects), np.ones(problem.n_objects)
+    medians = np.zeros(problem.n_objects)
     order = np.argsort(object_id, kind="stable")
     bounds = np.searchsorted(object_id[order], np.arange(problem.n_objects + 1))
     for o in range(problem.n_objects):
         own = order[bounds[o] : bounds[o + 1]]
         if len(own):
             medians[o] = np.median(problem.base[own, 4])
-            glossy[o] = np.quantile(fitted[own, 3], 0.05)
     metal = np.any(fit.affine[:, 14:] != 0, 1)  # also objects whose metallic is as predicted, which is not fitted
     return [
         camera.camera_response(dynamic_range, calibration),
-        materials.metallic(metal & fit.free.any(1), medians),
-        materials.specular(glossy, metal),
+        materials.metallic(metal & fit.free.any(1), medians, metals),
         materials.affine_size(fit.model),
         materials.scale(**fit.facts["scale"]),
     ]

@@ -17,6 +17,8 @@ from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN,
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
+from workflow.decisions.plan import included
+from workflow.decisions.record import SETTLED
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.emission_pixels import (
@@ -140,6 +142,10 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     met = rays_from_surface(photos)
     secondary = float((met < 0).mean())
     environment = decisions.environment(job.settings.emission.environment, escape, secondary, brightness)
+    planned = included(job.read("plan").json("plan.json")["plan"], "environment")
+    # Where light passes through surface, the mesh is another one than the plan was made for.
+    if planned["status"] == SETTLED and scene.transmittance is None:
+        environment = planned
     is_open = secondary > decisions.ESCAPE_OPEN
     outside = (sums.directions() if is_open else sums.groups()) if environment["included"] else None
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""render: re-renders every view from the recovered materials and emitters by path tracing
+"""render: re-renders every view from the recovered materials and emitters, by path tracing
 (docs/method/shading.md#re-rendering)."""
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from workflow.artifacts.store import rgb, split_rgb
 from workflow.decisions import light as decisions
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import pixel_gains, read_gains
+from workflow.scene.base_scene import pixel_gains, read_gains, read_radiance_cache
+from workflow.scene.cached_light import has_lobes
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 
@@ -40,7 +41,11 @@ def run(job: Job) -> None:
     emitters = scene.light.emitters(geometry)
     if not (emitters.can_be_sampled or scene.light.environment.any()):
         job.log.warning("no emitter and no environment: the re-renderings are black (see emission.json)")
-    world = Scene(geometry, material, emitters)
+    # What matte surface shows of other surface is a mean over many directions, for which photographed radiance is good enough.
+    cache = None if has_lobes(job) or not _ends_in_cache(job) else read_radiance_cache(job, scene.light_scale)
+    how = "whole paths" if cache is None else "paths that end where radiance was photographed"
+    job.log.info("views are re-rendered by %s", how)
+    world = Scene(geometry, material, emitters, cache)
     found: dict[int, np.ndarray] = {}
     through_holes = job.read("emission").json("emission.json")["escape_share"]["secondary"] > decisions.ESCAPE_OPEN
     white_balance = bool((gains.gain != gains.gain[:, :1]).any())
@@ -49,12 +54,12 @@ def run(job: Job) -> None:
         eye = view.world_from_camera[:3, 3]
         _, face_id = capture.gbuffer(view)
         seed = ((job.seed << 32) | _SEEDS) << 32 | view.view_id
+        fitted = _fitted(job, view)
         paths = PathOptions(job.settings.render.samples, job.settings.render.max_bounces, seed)
         jitter = _pixel_steps(view, face_id, through_holes)
         radiance = render(world, eye, _directions(view).reshape(-1, 3), paths, jitter).reshape(view.height, view.width, 3)
         if not np.isfinite(radiance).all():
             raise InputError(f"view {view.name}: re-rendered radiance is not finite; please report it with the scene")
-        fitted = _fitted(job, view)
         if job.settings.render.denoise:
             radiance = denoise(radiance, *_guides(scene, fitted, face_id, eye))
         factor = pixel_gains(gains, done, view, np.arange(view.height * view.width)).reshape(radiance.shape)
@@ -72,6 +77,13 @@ def run(job: Job) -> None:
         columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
         job.writer.table("held_out.parquet", columns)
     job.progress(len(capture.views), len(capture.views), "views re-rendered")
+    job.writer.json("render.json", {"paths": how, "plan": [decisions.denoiser(job.settings.render.denoise)]})
+
+
+def _ends_in_cache(job: Job) -> bool:
+    """Return whether the cached light of the fit ended in photographed radiance, too."""
+    plan = job.read("shading").json("shading.json")["plan"]
+    return all(item["included"] for item in plan if item["component"] == "radiance_cache")
 
 
 def _fitted(job: Job, view: View) -> dict[str, np.ndarray]:

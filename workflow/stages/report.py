@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import yaml
 
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
+from workflow.decisions.record import PROVISIONAL, SETTLED, plan_text
 from workflow.report import pictures as pic
 from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
 from workflow.runtime.job import Job
@@ -16,7 +16,7 @@ from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
 
-PLAN_KEYS = ("component", "included", "measure", "value", "threshold", "reason")
+PLAN_KEYS = ("component", "included", "status", "measure", "value", "threshold", "gain_nats", "error_nats", "reason")
 ERROR_RANGE = 0.25
 COVERAGE_RANGE = 4.0
 UNCERTAINTY_RANGE = 0.2
@@ -29,7 +29,7 @@ def run(job: Job) -> None:
     recovered = read_recovered(job)
     summary = job.read("metrics").json("summary.json")
     plan = collect_plan(job)
-    job.writer.bytes("plan.yaml", plan_text(job, plan).encode())
+    job.writer.bytes("plan.yaml", plan_text(job.scene, job.quality, plan).encode())
     response_svg, response_note = _response(job, capture)
     emission = _document(job, "emission", "emission.json")
     page = Page(
@@ -55,8 +55,10 @@ def run(job: Job) -> None:
 
 
 def collect_plan(job: Job) -> list[dict[str, Any]]:
-    """Return the plan items in the JSON documents of the stages (key `plan`), in workflow order, with the name of the rule."""
-    items = []
+    """Return the plan items in the JSON documents of the stages (key `plan`), with the name of the rule, in the order in which
+    their components are first named. What stage plan left provisional is replaced by what a later stage settled; what no stage
+    had a reason to try is out."""
+    items: dict[str, dict[str, Any]] = {}
     for stage in job.stage.upstream:
         reader = job.read(stage)
         for name in reader.names():
@@ -65,14 +67,11 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
             document = reader.json(name)
             found = document.get("plan", []) if isinstance(document, dict) else []
             for item in found if isinstance(found, list) else []:
-                items.append({**{key: item.get(key) for key in PLAN_KEYS}, "included": bool(item.get("included")), "rule": stage})
-    return items
-
-
-def plan_text(job: Job, plan: list[dict[str, Any]]) -> str:
-    """Return plan.yaml: what the scene requires, what was left out, and the measured reason for each."""
-    document = {"scene": job.scene, "quality": job.quality, "components": plan}
-    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=100)
+                kept = {key: item[key] for key in PLAN_KEYS if key in item}
+                if items.get(item["component"], {"status": PROVISIONAL})["status"] == PROVISIONAL:
+                    items[item["component"]] = {"status": SETTLED, **kept, "included": bool(item.get("included")), "rule": stage}
+    untried = {"included": False, "status": SETTLED, "reason": "no stage had a reason to try it"}
+    return [{**item, **untried} if item["status"] == PROVISIONAL else item for item in items.values()]
 
 
 # ---------------------------------------------------------------------------------------------------------------- text

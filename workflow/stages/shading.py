@@ -8,10 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.reflectance.directional_albedo import uniform_lobes
+from iif_core.reflectance.material import MATTE_ROUGHNESS
 from iif_core.surface.cells import grid_origin
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
 from workflow.artifacts.store import split_rgb
 from workflow.decisions import light as decisions
+from workflow.decisions.materials import METALLIC_PRIOR
+from workflow.decisions.plan import included, matte_by_predictions
+from workflow.decisions.record import PROVISIONAL, Decision
 from workflow.fitting.fit_pixels import FitPixels, count_eligible
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
@@ -31,6 +36,7 @@ if TYPE_CHECKING:
     from iif_core.light.transport.scene import Scene
 
 _SEEDS = 0x736861  # keeps the random streams of this stage apart from those of others
+LEAST_CELLS = 20  # of an object whose predictions speak for or against specular lobes
 COVERAGE_RAYS = 8192  # by which the share of surface that the radiance cache knows is measured
 
 
@@ -45,7 +51,9 @@ def roughness_levels(count: int) -> np.ndarray:
 
 def run(job: Job) -> None:
     """Write maps/<view>.exr with the diffuse integral of every pixel (0 where nothing was hit), pixels/<view>.parquet with the
-    specular integrals of the pixels that are read, both in two independent halves, levels.parquet and shading.json."""
+    specular integrals of the pixels that are read, both in two independent halves, levels.parquet and shading.json.
+
+    In a scene without specular lobes nothing is traced for the pixels: their lobes are those of uniform light (Eq. S.22)."""
     if job.settings.shading.method == "published":
         from workflow.published import shading
 
@@ -61,14 +69,18 @@ def run(job: Job) -> None:
     # Surface outside all photographs is given the object gains that stage emission found.
     geometry, material = scene.with_gains(read_object_gains(job, scene.n_objects)).traceable(light.emits)
     cache = read_radiance_cache(job)
-    decision = _indirect(job, geometry, cache, mixed, cells)
+    decision, specular = _indirect(job, geometry, cache, mixed, cells), _specular(job, scene)
+    job.log.info("specular lobes: %s (%s)", "traced" if specular["included"] else "none", specular["reason"])
     world = Scene(geometry, material, light.emitters(geometry), cache if decision["included"] else None)
     with job.timed("diffuse"):
         diffuse = _diffuse(job, world, cells)
     with job.timed("specular"):
-        traced = _views(job, capture, scene, world, levels, cells, diffuse, drawn)
+        lit = world if specular["included"] else None
+        traced = _views(job, capture, scene, lit, levels, cells, diffuse, drawn)
     job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
-    job.writer.json("shading.json", {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [decision]})
+    job.writer.json(
+        "shading.json", {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [specular, decision]}
+    )
 
 
 def _cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> tuple[ShadingCells, np.ndarray]:
@@ -107,6 +119,19 @@ def _indirect(
     )
 
 
+def _specular(job: Job, scene: BaseScene) -> Decision:
+    """Settle whether the scene needs specular lobes; where the photographs alone did not tell, by the fused predictions."""
+    planned = included(job.read("plan").json("plan.json")["plan"], "specular")
+    lowest, metal = 1.0, 0.0
+    if planned["status"] == PROVISIONAL:
+        order = np.argsort(scene.cell_object, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(scene.cell_object[order])) + 1)
+        groups = [group for group in groups if len(group) >= LEAST_CELLS]
+        lowest = min((float(np.quantile(scene.cell_values[group, 3], 0.05)) for group in groups), default=0.0)
+        metal = float(max((np.median(scene.cell_values[group, 4]) for group in groups), default=1.0) > METALLIC_PRIOR)
+    return matte_by_predictions(planned, lowest, metal, MATTE_ROUGHNESS)
+
+
 def _diffuse(job: Job, world: Scene, cells: ShadingCells) -> DiffuseShading:
     """Diffuse integrals of all cells, twice."""
     from iif_core.light.transport.scene import PathOptions
@@ -138,14 +163,15 @@ def _views(
     job: Job,
     capture: CaptureReader,
     scene: BaseScene,
-    world: Scene,
+    world: Scene | None,
     levels: np.ndarray,
     cells: ShadingCells,
     diffuse: DiffuseShading,
     drawn: FitPixels | None,
 ) -> int:
     """Write the specular light of the pixels that are `drawn`, None = of all, and the diffuse light of the cells, averaged with
-    that of the own paths of these pixels (Eq. S.19). Nothing is traced for held-out views. Returns the number of pixels."""
+    that of the own paths of these pixels (Eq. S.19). Nothing is traced for held-out views, and without a `world` for none.
+    Returns the number of pixels that were traced."""
     count = 0
     for done, view in enumerate(capture.views):
         job.progress(done, len(capture.views), "views cached")
@@ -153,8 +179,13 @@ def _views(
         light = diffuse.diffuse[:, cells.find(pixels.points, pixels.normals, pixels.object_id)].astype(np.float32)
         own = np.arange(len(pixels.index)) if drawn is None else drawn.of(pixels, view)
         own = own[:0] if view.split == "test" else own
-        traced, s0, s1 = _traced(job, world, levels, view, pixels.take(own))
-        light[:, own] = combine_estimates(light[:, own], diffuse.noise_last, traced)
+        if world is None:
+            chosen = pixels.take(own)
+            s0, s1 = uniform_lobes(light[:, own], (chosen.normals * chosen.wo).sum(1), levels)
+        else:
+            traced, s0, s1 = _traced(job, world, levels, view, pixels.take(own))
+            light[:, own] = combine_estimates(light[:, own], diffuse.noise_last, traced)
+            count += len(own)
         if not all(np.isfinite(part).all() for part in (light, s0, s1)):
             raise InputError(f"view {view.name}: cached shading is not finite; please report it with the scene")
         channels: dict[str, np.ndarray] = {}
@@ -162,7 +193,6 @@ def _views(
             channels |= _channels(f"half{half}.diffuse", light[half], pixels.index, view.height, view.width)
         job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
         job.writer.table(table_of(view), SpecularLight(pixels.index[own], s0, s1).columns(), UNITS)
-        count += len(own)
     job.progress(len(capture.views), len(capture.views), "views cached")
     return count
 

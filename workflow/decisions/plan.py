@@ -1,0 +1,135 @@
+"""What a scene requires, as far as photographs, cameras and mesh tell it before any other stage (docs/method/plan.md)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from iif_core.requirements.evidence import Evidence
+from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by_evidence, decision, not_probed
+
+CACHE_COVERAGE = 0.3
+"""Share of secondary hits that must have been photographed for the radiance cache."""
+LATER = {
+    "camera_response": ("emission", "the photographs are 8-bit; the family follows from surface that several exposures show"),
+    "exposure": ("emission", "decided by surface that several photographs show"),
+    "white_balance": ("emission", "decided by surface that several photographs show"),
+    "vignetting": ("emission", "decided by surface that several photographs show"),
+    "metallic": ("affines", "decided for each object by the evidence of the fit"),
+    "denoiser": ("render", "views are re-rendered by few paths, which are noisy"),
+    "affine_size": ("affines", "follows the texture of each object"),
+}
+"""Component -> stage that settles it, and how."""
+_GAINS = ("exposure", "white_balance", "vignetting")
+
+
+def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str, str, str], later: str) -> Decision:
+    """Return in, out or provisional by the evidence; `words` are the reasons for in, out and neither."""
+    if setting != "auto":
+        return by_evidence(component, setting == "on", evidence, f"forced {setting}", FORCED)
+    if evidence.pays:
+        return by_evidence(component, True, evidence, words[0], SETTLED)
+    if evidence.rows and evidence.gain < -evidence.error:
+        return by_evidence(component, False, evidence, words[1], SETTLED)
+    return by_evidence(component, True, evidence, f"{words[2]}; stage {later} decides", PROVISIONAL)
+
+
+def environment(setting: str, escape_primary: float, escape_secondary: float, evidence: Evidence) -> Decision:
+    """Decide about light from outside the mesh.
+
+    Args:
+        setting: `on`, `off` or `auto`.
+        escape_primary, escape_secondary: share of camera rays and of rays from surface that leave the mesh.
+        evidence: for the radiance of rays that leave it.
+    """
+    leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
+    if setting == "auto" and not (escape_primary or escape_secondary):
+        return not_probed("environment", False, f"the mesh is closed: {leaves}", SETTLED)
+    words = (f"{leaves}, and bring light", f"{leaves}, and bring no light", f"{leaves}; the photographs do not tell yet")
+    return _weighed("environment", setting, evidence, words, "emission")
+
+
+def emitters(is_hdr: bool, evidence: Evidence) -> Decision:
+    """Describe whether saturated surface brings light; which groups of faces do is found by stage emission."""
+    if is_hdr:
+        return not_probed("emitters", True, "lamps are not saturated; stage emission finds them", PROVISIONAL)
+    reason = "saturated surface explains how bright the rest is" if evidence.pays else "saturated surface explains little"
+    return by_evidence("emitters", True, evidence, f"{reason}; stage emission finds the lamps", PROVISIONAL)
+
+
+def specular(setting: str, evidence: Evidence, needed: str | None) -> Decision:
+    """Decide about specular lobes.
+
+    Args:
+        setting: `on`, `off` or `auto`.
+        evidence: for lobes in how surface changes its radiance from photograph to photograph.
+        needed: why the settings need the lobes in any case; None = they do not.
+    """
+    if setting == "auto" and needed is not None:
+        return by_evidence("specular", True, evidence, needed, SETTLED)
+    words = (
+        "surface changes with the viewer as what it mirrors does",
+        "surface looks the same from everywhere, and lobes make it worse",
+        "the photographs alone do not tell",
+    )
+    return _weighed("specular", setting, evidence, words, "shading")
+
+
+def radiance_cache(photographed: float) -> Decision:
+    """Foresee whether indirect light is read from photographs, by how much of the surface that it comes from they show."""
+    reason = f"{photographed:.0%} of the surface that rays from surface meet was photographed (stage shading)"
+    measure = "share of secondary hits whose radiance was photographed"
+    included = photographed > CACHE_COVERAGE
+    return decision("radiance_cache", included, measure, photographed, CACHE_COVERAGE, reason, PROVISIONAL)
+
+
+def later(is_hdr: bool, exposure_estimated: bool) -> list[Decision]:
+    """Return the components that need predictions or light, and who settles them. Linear photographs have no response, and
+    nothing is estimated of exposures that are given."""
+    out = []
+    for component, (stage, reason) in LATER.items():
+        if component == "camera_response" and is_hdr:
+            out.append(not_probed(component, False, "the photographs are linear radiance", SETTLED))
+        elif component in _GAINS and not exposure_estimated:
+            out.append(not_probed(component, False, "exposures are taken as given", SETTLED))
+        else:
+            out.append(not_probed(component, True, f"{reason} (stage {stage})", PROVISIONAL))
+    return out
+
+
+def matte_by_predictions(provisional: Decision, lowest_roughness: float, metal: float, threshold: float) -> Decision:
+    """Settle a provisional decision about specular lobes by the fused predictions.
+
+    Args:
+        provisional: of stage plan.
+        lowest_roughness: of all objects the lowest 5 % quantile of roughness; metal: the largest mean metalness.
+        threshold: roughness below which surface is glossy.
+    """
+    if provisional["status"] != PROVISIONAL:
+        return provisional
+    glossy = lowest_roughness < threshold or metal > 0.0
+    found = f"the predictions go down to a roughness of {lowest_roughness:.2f} (5 % quantile of an object)"
+    reason = f"{found}{' and have metal' if metal > 0 else ''}; the photographs alone do not tell"
+    return {**provisional, "included": glossy, "status": SETTLED, "reason": reason}
+
+
+OVERRIDDEN = ("environment", "specular", "metallic", "radiance_cache", "denoiser")
+"""Components that the settings can force (`override: {components: ...}`)."""
+
+
+def with_override(item: Decision) -> Decision:
+    """Return a decision with the words that turn it over in the scene file, where there are any."""
+    if item["component"] not in OVERRIDDEN:
+        return item
+    return {**item, "override": f"override: {{components: {{{item['component']}: {'off' if item['included'] else 'on'}}}}}"}
+
+
+def included(plan: list[dict[str, Any]], component: str) -> Decision:
+    """Return the decision about a component.
+
+    Raises:
+        KeyError: the plan has none.
+    """
+    for item in plan:
+        if item["component"] == component:
+            return item
+    raise KeyError(component)

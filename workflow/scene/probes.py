@@ -1,0 +1,312 @@
+"""Rows of the probes of stage plan, from the photographs of a capture alone (docs/method/plan.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from iif_core.camera.pinhole import project
+from iif_core.errors import InputError
+from iif_core.numerics.color import linear_from_srgb
+from iif_core.numerics.xp import NUMPY
+from iif_core.reflectance import brdf
+from iif_core.requirements.probes import MAX_POINTS, GlossRows, LightRows
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader, View
+
+if TYPE_CHECKING:
+    from iif_core.light.transport.geometry import Geometry
+
+_SEEDS = 0x706C6E  # keeps the random streams of this stage apart from those of others
+MAX_VIEWS = 32
+"""Photographs that are read, spread evenly."""
+CACHE_PIXELS = 12_500
+"""Pixels of a photograph that enter the table of photographed radiance."""
+RAYS = 32
+"""Cosine-distributed rays from a point."""
+LOBES = (0.1, 0.3, 0.6)
+"""Roughnesses of the lobes that gloss is looked for with."""
+LOBE_RAYS = 16
+PAIRS = 6
+"""Further photographs of a point that are compared with its own."""
+VOXELS_IN_DEPTH = 25
+"""Voxels of the table in the median depth of the photographs."""
+BLOCK_VOXELS = 5
+"""Edge, in voxels, of the blocks of surface that err together."""
+DEPTH_TOLERANCE = 0.01
+DEPTH_RANGE, BRIGHTNESS_RANGE = 1.1, 2.0
+"""Largest over smallest depth and radiance within BORDER pixels of a point."""
+BORDER = 2
+"""Pixels around a point that must show nothing else."""
+
+
+@dataclass(frozen=True)
+class ViewRadiance:
+    """One photograph as radiance: `radiance` (H, W, 3), `usable` and `saturated` (H, W), z-depth and face (H, W)."""
+
+    view: View
+    radiance: np.ndarray
+    usable: np.ndarray
+    saturated: np.ndarray
+    depth: np.ndarray
+    face: np.ndarray
+
+
+def read_radiance(capture: CaptureReader, view: View, saturation: float) -> ViewRadiance:
+    """Read a photograph; 8-bit values become radiance by the sRGB curve and the exposure, which no probe improves on."""
+    value, valid = capture.photo(view)
+    depth, face = capture.gbuffer(view)
+    if capture.is_hdr:
+        return ViewRadiance(view, value / view.exposure, valid, np.zeros(valid.shape, bool), depth, face)
+    radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / view.exposure
+    return ViewRadiance(view, radiance, valid, valid & (value.max(-1) >= saturation), depth, face)
+
+
+@dataclass(frozen=True)
+class RadianceTable:
+    """Mean photographed radiance of voxels: sorted keys (c,), radiance (c, 3), and whether all pixels were saturated (c,)."""
+
+    edge: float
+    low: np.ndarray
+    keys: np.ndarray
+    radiance: np.ndarray
+    saturated: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, radiance: np.ndarray, saturated: np.ndarray, edge: float) -> RadianceTable:
+        """Average pixels: points and radiance (n, 3), saturated (n,); saturated ones count where there are no others."""
+        low = points.min(0)
+        keys, row = np.unique(_keys(points, low, edge), return_inverse=True)
+        clean = np.bincount(row, ~saturated, len(keys)) > 0
+        weight = np.where(clean[row], ~saturated, True).astype(float)
+        total = np.maximum(np.bincount(row, weight, len(keys)), 1e-9)
+        mean = np.stack([np.bincount(row, weight * radiance[:, c], len(keys)) for c in range(3)], 1) / total[:, None]
+        return cls(edge, low, keys, mean, ~clean)
+
+    def find(self, points: np.ndarray) -> np.ndarray:
+        """Return the row of the voxel around each point (n, 3), -1 = nothing was photographed there."""
+        keys = _keys(points, self.low, self.edge)
+        row = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[row] == keys, row, -1)
+
+
+def _keys(points: np.ndarray, low: np.ndarray, edge: float) -> np.ndarray:
+    i, j, k = np.clip(np.floor((points - low) / edge), -1, 2**20 - 2).astype(np.int64).T + 1
+    return (i << 42) | (j << 21) | k
+
+
+@dataclass(frozen=True)
+class Points:
+    """Surface points of a probe: position and unit normal towards the viewer (n, 3), radiance (n, 3), number of the view in the
+    probe (n,), `group` of surface and `block` (n,)."""
+
+    position: np.ndarray
+    normal: np.ndarray
+    radiance: np.ndarray
+    view: np.ndarray
+    group: np.ndarray
+    block: np.ndarray
+
+
+@dataclass(frozen=True)
+class ProbeRows:
+    """What the probes read: rows for the light and for gloss; shares of camera rays and of rays from surface that leave the mesh,
+    of the others that meet photographed surface; brightness of escaping camera rays relative to the photographs, None = none."""
+
+    light: LightRows
+    gloss: GlossRows
+    escape_primary: float
+    escape_secondary: float
+    photographed: float
+    outside: float | None
+
+
+def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation: float) -> ProbeRows:
+    """Draw the points and trace their rays.
+
+    Raises:
+        InputError: no photograph shows the mesh.
+    """
+    rng = np.random.default_rng([job.seed, _SEEDS])
+    views = capture.used[:: max(1, -(-len(capture.used) // MAX_VIEWS))]
+    photos = [read_radiance(capture, view, saturation) for view in views]
+    depth = np.concatenate([photo.depth[photo.face >= 0] for photo in photos])
+    if not len(depth):
+        raise InputError("plan: no photograph shows the mesh; check poses and mesh (capture/report of the alignment)")
+    edge = float(np.median(depth)) / VOXELS_IN_DEPTH
+    table = _table(photos, edge, rng)
+    points = _draw(photos, geometry, capture.faces()["instance_id"], table, rng)
+    light, secondary, photographed = _light_rows(points, geometry, table, rng)
+    missed = np.array([np.count_nonzero(p.usable & (p.face < 0)) for p in photos])
+    counted = sum(np.count_nonzero(p.usable) for p in photos)
+    sky = np.mean([p.radiance[p.usable & (p.face < 0)].mean() for p in photos if (p.usable & (p.face < 0)).any()] or [0.0])
+    inside = np.mean([p.radiance[p.usable & (p.face >= 0)].mean() for p in photos if (p.usable & (p.face >= 0)).any()])
+    gloss = _gloss_rows(points, photos, geometry, table, float(sky), rng)
+    outside = float(sky / max(inside, 1e-12)) if missed.any() else None
+    return ProbeRows(light, gloss, float(missed.sum() / max(counted, 1)), secondary, photographed, outside)
+
+
+def _table(photos: list[ViewRadiance], edge: float, rng: np.random.Generator) -> RadianceTable:
+    points, radiance, saturated = [], [], []
+    for photo in photos:
+        index = np.flatnonzero((photo.usable & (photo.face >= 0)).ravel())
+        index = rng.choice(index, min(len(index), CACHE_PIXELS), replace=False)
+        origin = photo.view.world_from_camera[:3, 3]
+        ways = photo.view.directions().reshape(-1, 3)[index]
+        points.append(origin + photo.depth.ravel()[index, None] * ways)
+        radiance.append(photo.radiance.reshape(-1, 3)[index])
+        saturated.append(photo.saturated.ravel()[index])
+    return RadianceTable.of(np.concatenate(points), np.concatenate(radiance), np.concatenate(saturated), edge)
+
+
+def _draw(
+    photos: list[ViewRadiance], geometry: Geometry, instance: np.ndarray, table: RadianceTable, rng: np.random.Generator
+) -> Points:
+    """Draw points evenly over the photographs, away from edges and from what is saturated or black."""
+    each = MAX_POINTS // len(photos)
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("position", "normal", "radiance", "view", "face")}
+    for number, photo in enumerate(photos):
+        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.min(-1) > 0) & _away_from_edges(photo)
+        index = np.flatnonzero(good.ravel())
+        index = rng.choice(index, min(len(index), each), replace=False)
+        way = photo.view.directions().reshape(-1, 3)[index]
+        face = photo.face.ravel()[index]
+        normal = geometry.normals[face]
+        parts["position"].append(photo.view.world_from_camera[:3, 3] + photo.depth.ravel()[index, None] * way)
+        parts["normal"].append(np.where((normal * way).sum(1, keepdims=True) > 0, -normal, normal))
+        parts["radiance"].append(photo.radiance.reshape(-1, 3)[index])
+        parts["view"].append(np.full(len(index), number))
+        parts["face"].append(face)
+    joined = {name: np.concatenate(part) for name, part in parts.items()}
+    block = _keys(joined["position"], table.low, BLOCK_VOXELS * table.edge)
+    axis = np.abs(joined["normal"]).argmax(1)
+    side = 2 * axis + (np.take_along_axis(joined["normal"], axis[:, None], 1)[:, 0] > 0)
+    owner = instance[joined.pop("face")].astype(np.int64)
+    # Where nothing tells objects apart, a block of surface with one orientation is one.
+    group = np.where(owner >= 0, owner, -2 - (block * 6 + side))
+    return Points(**joined, group=np.unique(group, return_inverse=True)[1], block=block)
+
+
+def _away_from_edges(photo: ViewRadiance) -> np.ndarray:
+    """(H, W) bool: the neighbourhood is at one depth and of one brightness, and not at the border: what is photographed is the
+    surface in the middle of the pixel alone."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    size = 2 * BORDER + 1
+    depth = np.where(photo.face >= 0, photo.depth, 0)
+    light = np.where(photo.usable & ~photo.saturated, photo.radiance.mean(-1), 0)
+    smooth = np.ones(depth.shape, bool)
+    for image, ratio in ((depth, DEPTH_RANGE), (light, BRIGHTNESS_RANGE)):
+        low, high = minimum_filter(image, size, mode="constant"), maximum_filter(image, size, mode="constant")
+        smooth &= (low > 0) & (high < ratio * low)
+    return smooth
+
+
+def _light_rows(
+    points: Points, geometry: Geometry, table: RadianceTable, rng: np.random.Generator
+) -> tuple[LightRows, float, float]:
+    """Return the rows, the share of rays that leave the mesh, and of the others the share that meets photographed surface."""
+    from iif_core.light.transport.geometry import cosine_directions, trace
+
+    normal = np.repeat(points.normal.astype(np.float64), RAYS, 0)
+    way = cosine_directions(normal, rng)
+    start = np.repeat(points.position, RAYS, 0) + 1e-3 * normal
+    face, t = trace(geometry, start, way)
+    hit = face >= 0
+    row = np.full(len(face), -1)
+    row[hit] = table.find(start[hit] + t[hit, None] * way[hit])
+    saturated = (row >= 0) & table.saturated[row]
+    known = np.where((row >= 0) & ~saturated, table.radiance[row].mean(1), 0.0)
+    seen = (row >= 0).reshape(-1, RAYS).sum(1)
+    # Rays that meet surface which nobody photographed are taken to bring what the others bring.
+    share = hit.reshape(-1, RAYS).sum(1) / np.maximum(seen, 1) / RAYS
+    rows = LightRows(
+        points.radiance.mean(1),
+        known.reshape(-1, RAYS).sum(1) * share,
+        saturated.reshape(-1, RAYS).sum(1) * share,
+        1.0 - hit.reshape(-1, RAYS).mean(1),
+        points.group,
+        points.block,
+    )
+    return rows, float((~hit).mean()), float((row[hit] >= 0).mean()) if hit.any() else 0.0
+
+
+def _gloss_rows(
+    points: Points,
+    photos: list[ViewRadiance],
+    geometry: Geometry,
+    table: RadianceTable,
+    sky: float,
+    rng: np.random.Generator,
+) -> GlossRows:
+    """Compare each point with at most PAIRS other photographs of it."""
+    found = [_seen_in(points, number, photo) for number, photo in enumerate(photos)]
+    point, value, view = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.lexsort((rng.random(len(point)), point))
+    point, value, view = point[order], value[order], view[order]
+    rank = np.arange(len(point)) - np.searchsorted(point, point)
+    keep = rank < PAIRS
+    point, value, view = point[keep], value[keep], view[keep]
+    eyes = np.stack([photo.view.world_from_camera[:3, 3] for photo in photos])
+    each = np.arange(len(points.view))
+    uniform = rng.random((2, LOBE_RAYS))  # the same for all points, so that differences between views keep little noise
+    own = _lobes(points, each, eyes[points.view], geometry, table, sky, uniform)
+    other = _lobes(points, point, eyes[view], geometry, table, sky, uniform)
+    pair = np.stack([points.radiance.mean(1)[point], value], 1)
+    mean = pair.mean(1)
+    numbers = np.stack([points.view[point], view], 1)
+    lobes = np.stack([own[point], other], 1) / mean[:, None, None]
+    return GlossRows(pair / mean[:, None], lobes, numbers, points.group[point], points.block[point])
+
+
+def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the points of other photographs that this one shows: their rows, what it shows (mean of the channels), and its
+    number."""
+    from scipy.ndimage import map_coordinates
+
+    v = photo.view
+    u, w, z = project(points.position, v.fx, v.fy, v.cx, v.cy, v.world_from_camera)
+    x, y = np.floor(u), np.floor(w)
+    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number)
+    row = np.flatnonzero(inside)
+    at = (y[row].astype(int), x[row].astype(int))
+    good = photo.usable[at] & ~photo.saturated[at] & _away_from_edges(photo)[at]
+    good &= np.abs(photo.depth[at] - z[row]) < DEPTH_TOLERANCE * z[row]
+    value = map_coordinates(photo.radiance.mean(-1), [w[row] - 0.5, u[row] - 0.5], order=1, mode="nearest")
+    good &= value > 0
+    return row[good], value[good], np.full(int(good.sum()), number)
+
+
+def _lobes(
+    points: Points, row: np.ndarray, eye: np.ndarray, geometry: Geometry, table: RadianceTable, sky: float, uniform: np.ndarray
+) -> np.ndarray:
+    """Return (n, J) what dielectric lobes of the roughnesses LOBES reflect from the points `row` towards `eye` (n, 3)."""
+    from iif_core.light.transport.geometry import trace
+
+    position, normal = points.position[row], points.normal[row].astype(np.float64)
+    wo = eye - position
+    wo /= np.linalg.norm(wo, axis=1, keepdims=True)
+    helper = np.where(np.abs(normal[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
+    tangent = np.cross(normal, helper)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], 1)
+    out = np.zeros((len(row), len(LOBES)))
+    for j, roughness in enumerate(LOBES):
+        local = np.stack(brdf.sample_ggx_half(NUMPY, *uniform, roughness), -1)
+        h = np.einsum("ra,nax->nrx", local, frame)
+        wi = np.stack(brdf.reflect(wo[:, None].transpose(2, 0, 1), h.transpose(2, 0, 1)), -1)
+        n, o = normal[:, None].transpose(2, 0, 1), wo[:, None].transpose(2, 0, 1)
+        NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(NUMPY, n, wi.transpose(2, 0, 1), o)
+        _, spec, fc = brdf.lobes(NUMPY, NoL, NoV, NoH, VoH, sin2_h, roughness)
+        fresnel = brdf.F0_DIELECTRIC + (1 - brdf.F0_DIELECTRIC) * fc
+        weight = spec * fresnel / np.maximum(brdf.specular_pdf(NUMPY, NoH, VoH, sin2_h, roughness), 1e-12)
+        start = np.broadcast_to((position + 1e-3 * normal)[:, None], wi.shape).reshape(-1, 3)
+        face, t = trace(geometry, start, wi.reshape(-1, 3))
+        hit = face >= 0
+        light = np.where(hit, 0.0, sky)
+        found = table.find(start[hit] + t[hit, None] * wi.reshape(-1, 3)[hit])
+        light[hit] = np.where(found >= 0, table.radiance[found].mean(1), 0.0)
+        out[:, j] = (weight * light.reshape(weight.shape)).mean(1)
+    return out
