@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, StubJob, build, write_plan
+from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, StubJob, build, write_plan
 
 from iif_core.camera.simulation import response_curve
 from workflow.artifacts import files
@@ -16,7 +16,7 @@ from workflow.scene import emission_pixels
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
 from workflow.scene.normal_form import CaptureReader
-from workflow.stages import affines, emission, shading
+from workflow.stages import affines, emission, plan, shading
 
 TRUE = np.array([[LAMP, 0.95 * LAMP, 0.85 * LAMP], [BULB, 0.8 * BULB, 0.6 * BULB]])
 
@@ -314,3 +314,51 @@ def test_known_scale_of_a_lamp_and_of_a_patch(hdr):
     with pytest.raises(InputError, match="box"):
         gauge(white_patch=SimpleNamespace(object=None, view="v000", box=(0, 0, 400, 4), albedo=0.9))
     assert len(free["name"]) == len(room.names)
+
+
+PLANNED = {
+    "override": {"components": SimpleNamespace(specular="auto", metallic="auto")},
+    "emission": {**EMISSION, "environment": "auto", "saturation": 0.99, "solver": "direct"},
+    "shading": {**SHADING, "method": "shared_paths"},
+}
+
+
+def _planned(folder):
+    job = StubJob("plan", folder, PLANNED)
+    plan.run(job)
+    job.writer.finish()
+    facts = _reader(folder, "plan").json("plan.json")
+    return {item["component"]: item for item in facts["plan"]}, facts["probes"]
+
+
+def test_the_plan_of_a_closed_room(hdr, tmp_path):
+    folder, _ = hdr
+    shutil.copytree(folder / "capture", tmp_path / "capture")
+    of, probes = _planned(tmp_path)
+    assert (of["environment"]["included"], of["environment"]["status"]) == (False, "settled")
+    assert of["camera_response"]["included"] is False and of["emitters"]["status"] == "provisional"
+    assert probes["points"] > 500 and probes["photographed_share"] > 0.5 and probes["outside_brightness"] is None
+    again, _ = _planned(tmp_path)
+    assert again == of  # the same photographs, the same plan
+
+
+def test_light_from_outside_is_seen_by_the_plan(tmp_path, llvm):
+    """A hole in the ceiling under a bright sky is found; under a black one it is not."""
+    hole = {"ceiling": None, "lamp": None}
+    for name, sky in (("bright", 5.0), ("black", 0.0)):
+        room = Room(parts=hole, lights={"bulb": BULB * np.ones(3)})
+        build(tmp_path / name, views=6, size=48, samples=64, room=room, sky=sky)
+        of, probes = _planned(tmp_path / name)
+        assert probes["escape_share"]["secondary"] > 0.05
+        if sky:
+            assert (of["environment"]["included"], of["environment"]["status"]) == (True, "settled")
+        else:
+            assert not of["environment"]["included"] or of["environment"]["status"] == "provisional"
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_photographs_without_anything_to_see_leave_all_open(tmp_path, llvm, value):
+    build(tmp_path, views=3, size=24, samples=1, curve="srgb", dynamic_range="ldr", retouch=lambda _, image: value + 0 * image)
+    of, probes = _planned(tmp_path)
+    assert probes["points"] == 0 and of["specular"]["status"] == "provisional" and of["specular"]["included"]
+    assert of["environment"]["status"] == "provisional" or "closed" in of["environment"]["reason"]

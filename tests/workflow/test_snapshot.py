@@ -7,8 +7,8 @@ from snapshot import DECIBELS, GATED, PATH, moved, take
 from support import Workflow
 
 KITCHEN = """
-capture: {views: 12, width: 128, height: 128, samples: 32}
-prior: {samples: 6}
+capture: {views: 8, width: 96, height: 96, samples: 32}
+prior: {samples: 5}
 """
 
 

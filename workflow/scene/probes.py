@@ -100,12 +100,13 @@ def _keys(points: np.ndarray, low: np.ndarray, edge: float) -> np.ndarray:
 @dataclass(frozen=True)
 class Points:
     """Surface points of a probe: position and unit normal towards the viewer (n, 3), radiance (n, 3), number of the view in the
-    probe (n,), `group` of surface and `block` (n,)."""
+    probe (n,), whether its neighbourhood is of one brightness (n,), `group` of surface and `block` (n,)."""
 
     position: np.ndarray
     normal: np.ndarray
     radiance: np.ndarray
     view: np.ndarray
+    even: np.ndarray
     group: np.ndarray
     block: np.ndarray
 
@@ -141,11 +142,17 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation:
     light, secondary, photographed = _light_rows(points, geometry, table, rng)
     missed = np.array([np.count_nonzero(p.usable & (p.face < 0)) for p in photos])
     counted = sum(np.count_nonzero(p.usable) for p in photos)
-    sky = np.mean([p.radiance[p.usable & (p.face < 0)].mean() for p in photos if (p.usable & (p.face < 0)).any()] or [0.0])
-    inside = np.mean([p.radiance[p.usable & (p.face >= 0)].mean() for p in photos if (p.usable & (p.face >= 0)).any()])
-    gloss = _gloss_rows(points, photos, geometry, table, float(sky), rng)
-    outside = float(sky / max(inside, 1e-12)) if missed.any() else None
+    sky, inside = (_mean_radiance(photos, hit) for hit in (False, True))
+    gloss = _gloss_rows(points, photos, geometry, table, sky, rng)
+    outside = sky / max(inside, 1e-12) if missed.any() else None
     return ProbeRows(light, gloss, float(missed.sum() / max(counted, 1)), secondary, photographed, outside)
+
+
+def _mean_radiance(photos: list[ViewRadiance], hit: bool) -> float:
+    """Return the mean radiance of what camera rays meet, or of where they miss; 0 without such pixels."""
+    found = [photo.radiance[photo.usable & ((photo.face >= 0) == hit)].mean(-1) for photo in photos]
+    every = np.concatenate(found)
+    return float(every.mean()) if len(every) else 0.0
 
 
 def _table(photos: list[ViewRadiance], edge: float, rng: np.random.Generator) -> RadianceTable:
@@ -164,11 +171,11 @@ def _table(photos: list[ViewRadiance], edge: float, rng: np.random.Generator) ->
 def _draw(
     photos: list[ViewRadiance], geometry: Geometry, instance: np.ndarray, table: RadianceTable, rng: np.random.Generator
 ) -> Points:
-    """Draw points evenly over the photographs, away from edges and from what is saturated or black."""
+    """Draw points evenly over the photographs, away from edges of the mesh and from what is saturated or black."""
     each = MAX_POINTS // len(photos)
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("position", "normal", "radiance", "view", "face")}
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in ("position", "normal", "radiance", "view", "even", "face")}
     for number, photo in enumerate(photos):
-        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.min(-1) > 0) & _away_from_edges(photo)
+        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.min(-1) > 0) & _even(photo, False)
         index = np.flatnonzero(good.ravel())
         index = rng.choice(index, min(len(index), each), replace=False)
         way = photo.view.directions().reshape(-1, 3)[index]
@@ -178,6 +185,7 @@ def _draw(
         parts["normal"].append(np.where((normal * way).sum(1, keepdims=True) > 0, -normal, normal))
         parts["radiance"].append(photo.radiance.reshape(-1, 3)[index])
         parts["view"].append(np.full(len(index), number))
+        parts["even"].append(_even(photo, True).ravel()[index])
         parts["face"].append(face)
     joined = {name: np.concatenate(part) for name, part in parts.items()}
     block = _keys(joined["position"], table.low, BLOCK_VOXELS * table.edge)
@@ -189,19 +197,20 @@ def _draw(
     return Points(**joined, group=np.unique(group, return_inverse=True)[1], block=block)
 
 
-def _away_from_edges(photo: ViewRadiance) -> np.ndarray:
-    """(H, W) bool: the neighbourhood is at one depth and of one brightness, and not at the border: what is photographed is the
-    surface in the middle of the pixel alone."""
+def _even(photo: ViewRadiance, light: bool) -> np.ndarray:
+    """(H, W) bool: the neighbourhood is at one depth, and not at the border; with `light` also of one brightness. What is
+    photographed is then the surface in the middle of the pixel alone."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     size = 2 * BORDER + 1
-    depth = np.where(photo.face >= 0, photo.depth, 0)
-    light = np.where(photo.usable & ~photo.saturated, photo.radiance.mean(-1), 0)
-    smooth = np.ones(depth.shape, bool)
-    for image, ratio in ((depth, DEPTH_RANGE), (light, BRIGHTNESS_RANGE)):
+    images = [(np.where(photo.face >= 0, photo.depth, 0), DEPTH_RANGE)]
+    if light:
+        images.append((np.where(photo.usable & ~photo.saturated, photo.radiance.mean(-1), 0), BRIGHTNESS_RANGE))
+    even = np.ones(photo.depth.shape, bool)
+    for image, ratio in images:
         low, high = minimum_filter(image, size, mode="constant"), maximum_filter(image, size, mode="constant")
-        smooth &= (low > 0) & (high < ratio * low)
-    return smooth
+        even &= (low > 0) & (high < ratio * low)
+    return even
 
 
 def _light_rows(
@@ -230,7 +239,7 @@ def _light_rows(
         points.group,
         points.block,
     )
-    return rows, float((~hit).mean()), float((row[hit] >= 0).mean()) if hit.any() else 0.0
+    return rows, float((~hit).mean()) if len(hit) else 0.0, float((row[hit] >= 0).mean()) if hit.any() else 0.0
 
 
 def _gloss_rows(
@@ -269,10 +278,10 @@ def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarr
     v = photo.view
     u, w, z = project(points.position, v.fx, v.fy, v.cx, v.cy, v.world_from_camera)
     x, y = np.floor(u), np.floor(w)
-    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number)
+    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number) & points.even
     row = np.flatnonzero(inside)
     at = (y[row].astype(int), x[row].astype(int))
-    good = photo.usable[at] & ~photo.saturated[at] & _away_from_edges(photo)[at]
+    good = photo.usable[at] & ~photo.saturated[at] & _even(photo, True)[at]
     good &= np.abs(photo.depth[at] - z[row]) < DEPTH_TOLERANCE * z[row]
     value = map_coordinates(photo.radiance.mean(-1), [w[row] - 0.5, u[row] - 0.5], order=1, mode="nearest")
     good &= value > 0
