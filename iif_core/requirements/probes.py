@@ -19,7 +19,9 @@ GLOSSES = np.geomspace(0.25, 16, 7)
 """Strengths of a lobe that are tried, in units of a dielectric's."""
 LEAST_PAIRS = 8
 """Pairs of photographs that a group needs to be given a lobe."""
-_DARKEST = 1e-6  # of the mean light, which keeps the logarithm of a point without light finite
+LEAST_ROWS = 8
+"""Rows below which a probe says nothing."""
+_DARKEST = 1e-3  # of the mean light: a point in the dark is no evidence without bound
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,13 @@ class LightRows:
 
 
 def _group_levels(values: np.ndarray, group: np.ndarray, fit: np.ndarray) -> np.ndarray:
-    """Return (n,) the median of `values` over the rows in `fit` of the same group; the overall one where a group has none."""
+    """Return (n,) the median of `values` over the rows in `fit` of the same group; NaN where a group has none."""
     names, row = np.unique(group, return_inverse=True)
     order = np.lexsort((values, row))
     order = order[fit[order]]
     count = np.bincount(row[order], minlength=len(names))
     start = np.cumsum(count) - count
-    level = np.full(len(names), np.median(values[fit]) if fit.any() else 0.0)
+    level = np.full(len(names), np.nan)
     some = np.flatnonzero(count)
     low, high = order[start[some] + (count[some] - 1) // 2], order[start[some] + count[some] // 2]
     level[some] = 0.5 * (values[low] + values[high])
@@ -71,7 +73,7 @@ def light_evidence(rows: LightRows, seed: int) -> dict[str, Evidence]:
         `environment`, `emitters` -> evidence.
     """
     n = len(rows.radiance)
-    if n < 8:
+    if n < LEAST_ROWS or len(np.unique(rows.block)) < FOLDS:
         return {"environment": NOTHING, "emitters": NOTHING}
     fold = folds_of_blocks(rows.block, seed)
     unit = max(float(np.median(rows.radiance)), 1e-30)
@@ -93,10 +95,11 @@ def light_evidence(rows: LightRows, seed: int) -> dict[str, Evidence]:
                         best[name] = (loss, apart)
         for name, (_, apart) in best.items():
             residual[name][~fit] = apart[~fit]
-    return {
-        name: held_out_evidence(residual[name], residual["full"], fold, rows.block, rows.group)
-        for name in ("environment", "emitters")
-    }
+    found = {}
+    for name, share in (("environment", rows.escaping), ("emitters", rows.saturated)):
+        enough = np.count_nonzero(share) >= LEAST_ROWS
+        found[name] = held_out_evidence(residual[name], residual["full"], fold, rows.block, rows.group) if enough else NOTHING
+    return found
 
 
 @dataclass(frozen=True)
@@ -106,13 +109,14 @@ class GlossRows:
     Attributes:
         radiance: (n, 2) in the two photographs, in (0, 2).
         lobes: (n, 2, J) of what specular lobes of several roughnesses would reflect with the reflectance of a dielectric.
-        view: (n, 2) numbers of the photographs.
+        view: (n, 2) numbers of the photographs; point: (n,) numbers of the points, which have several pairs.
         group: (n,) surface that has one gloss; block: (n,) what errs together.
     """
 
     radiance: np.ndarray
     lobes: np.ndarray
     view: np.ndarray
+    point: np.ndarray
     group: np.ndarray
     block: np.ndarray
 
@@ -123,8 +127,9 @@ def _without_lobe(radiance: np.ndarray, lobes: np.ndarray, strength: np.ndarray 
     return left[..., 1] - left[..., 0]
 
 
-def _lobe_of(radiance: np.ndarray, lobes: np.ndarray, offset: np.ndarray) -> tuple[float, int] | None:
-    """Return strength and number of the lobe that explains pairs (n, 2) best, None = none is worth its two numbers."""
+def _lobe_of(radiance: np.ndarray, lobes: np.ndarray, offset: np.ndarray, points: int) -> tuple[float, int] | None:
+    """Return strength and number of the lobe that explains pairs (n, 2) of some `points` best; None = none is worth its two
+    numbers."""
     if len(radiance) < LEAST_PAIRS:
         return None
     loss = np.array(
@@ -134,53 +139,50 @@ def _lobe_of(radiance: np.ndarray, lobes: np.ndarray, offset: np.ndarray) -> tup
         ]
     )
     g, j = np.unravel_index(np.argmin(loss), loss.shape)
-    # Twice the maximised log likelihood of Laplace residuals is -2 n log(sum |r|): Akaike's criterion for two numbers.
-    worth = len(radiance) * np.log(loss[0, 0] / max(loss[g, j], 1e-30))
+    # Twice the maximised log likelihood of n Laplace residuals is -2 n log(sum |r|): Akaike's criterion for two numbers. The
+    # pairs of a point share one of their two photographs, so that points count.
+    worth = points * np.log(loss[0, 0] / max(loss[g, j], 1e-30))
     return (float(GLOSSES[g - 1]), int(j)) if g and worth > 2.0 else None
 
 
-def _view_offsets(difference: np.ndarray, view: np.ndarray, rounds: int = 5) -> np.ndarray:
-    """Return (n,) how much brighter the second photograph of each pair is on the whole: robust gains of the views."""
-    gain = np.zeros(int(view.max()) + 1)
+def _view_gains(difference: np.ndarray, view: np.ndarray, count: int, rounds: int = 5) -> np.ndarray:
+    """Return (count,) how much brighter each photograph is than others on the same surface: medians, repeated."""
+    gain = np.zeros(count)
     for _ in range(rounds):
         rest = difference - (gain[view[:, 1]] - gain[view[:, 0]])
         values, owner = np.concatenate([rest, -rest]), np.concatenate([view[:, 1], view[:, 0]])
         order = np.argsort(owner, kind="stable")
         for part in np.split(order, np.flatnonzero(np.diff(owner[order])) + 1):
             gain[owner[part[0]]] += 0.5 * np.median(values[part])
-    return gain[view[:, 1]] - gain[view[:, 0]]
+    return gain
 
 
-def gloss_evidence(rows: GlossRows, seed: int) -> tuple[Evidence, dict[int, float]]:
-    """Return the evidence for specular lobes, and what is gained on each group (Eq. N.5).
+def gloss_evidence(rows: GlossRows, seed: int) -> Evidence:
+    """Return the evidence for specular lobes (Eq. N.5).
 
-    The simpler model is a matte surface: the same radiance from everywhere. The larger one adds k >= 0 times a lobe, with k and
-    the roughness of the lobe fitted to each group by least absolute residuals.
+    The simpler model is matte surface: the same radiance from everywhere, up to a gain of each photograph. The larger one adds
+    k >= 0 times a lobe, with k and the roughness of the lobe fitted to each group by least absolute residuals.
 
     Args:
         rows: of the probe.
         seed: of the folds.
-
-    Returns:
-        The evidence, and nats a group; groups that are seen too little are absent.
     """
-    n = len(rows.radiance)
-    if n < 8:
-        return NOTHING, {}
+    if len(rows.radiance) < LEAST_ROWS or len(np.unique(rows.block)) < FOLDS:
+        return NOTHING
     fold = folds_of_blocks(rows.block, seed)
-    matte = rows.radiance[:, 1] - rows.radiance[:, 0]
-    offset = _view_offsets(matte, rows.view)
-    matte = matte - offset
-    apart = matte.copy()
-    for name in np.unique(rows.group):
-        own = rows.group == name
-        for number in range(FOLDS):
-            fit, held = own & (fold != number), own & (fold == number)
-            choice = _lobe_of(rows.radiance[fit], rows.lobes[fit], offset[fit])
+    difference = rows.radiance[:, 1] - rows.radiance[:, 0]
+    matte, apart = np.empty((2, len(difference)))
+    for number in range(FOLDS):
+        fit, held = fold != number, fold == number
+        gain = _view_gains(difference[fit], rows.view[fit], int(rows.view.max()) + 1)
+        offset = gain[rows.view[:, 1]] - gain[rows.view[:, 0]]
+        matte[held] = apart[held] = difference[held] - offset[held]
+        for name in np.unique(rows.group[held]):
+            own = rows.group == name
+            used, judged = own & fit, own & held
+            points = len(np.unique(rows.point[used]))
+            choice = _lobe_of(rows.radiance[used], rows.lobes[used], offset[used], points)
             if choice is not None:
                 strength, j = choice
-                apart[held] = _without_lobe(rows.radiance[held], rows.lobes[held][:, :, j], strength) - offset[held]
-    evidence = held_out_evidence(matte, apart, fold, rows.block, rows.group)
-    scale = max(float(np.abs(matte).mean()), 1e-6)
-    gain = (np.abs(matte) - np.abs(apart)) / scale
-    return evidence, {int(name): float(gain[rows.group == name].sum()) for name in np.unique(rows.group)}
+                apart[judged] = _without_lobe(rows.radiance[judged], rows.lobes[judged][:, :, j], strength) - offset[judged]
+    return held_out_evidence(matte, apart, fold, rows.block, rows.group)

@@ -92,11 +92,10 @@ IN, OUT, UNCLEAR = Evidence(30.0, 10.0, 500), Evidence(-30.0, 10.0, 500), Eviden
         (plan.environment("auto", 0.1, 0.1, NOTHING), True, PROVISIONAL),
         (plan.environment("on", 0.0, 0.0, NOTHING), True, FORCED),
         (plan.environment("off", 0.1, 0.1, IN), False, FORCED),
-        (plan.specular("auto", IN, None), True, SETTLED),
-        (plan.specular("auto", OUT, None), False, SETTLED),
-        (plan.specular("auto", UNCLEAR, None), True, PROVISIONAL),
-        (plan.specular("auto", OUT, "needed"), True, SETTLED),
-        (plan.specular("off", IN, None), False, FORCED),
+        (plan.specular("auto", IN), True, SETTLED),
+        (plan.specular("auto", OUT), False, SETTLED),
+        (plan.specular("auto", UNCLEAR), True, PROVISIONAL),
+        (plan.specular("off", IN), False, FORCED),
         (plan.emitters(True, NOTHING), True, PROVISIONAL),
         (plan.emitters(False, IN), True, PROVISIONAL),
         (plan.radiance_cache(0.9), True, PROVISIONAL),
@@ -119,17 +118,29 @@ def test_linear_photographs_need_no_response_and_given_exposures_no_gains():
     assert all(item["included"] for item in plan.later(is_hdr=False, exposure_estimated=True))
 
 
-@pytest.mark.parametrize(("lowest", "metal", "included"), [(0.9, 0.0, False), (0.5, 0.0, True), (0.9, 1.0, True)])
+@pytest.mark.parametrize(("lowest", "metal", "included"), [(0.9, False, False), (0.5, False, True), (0.9, True, True)])
 def test_predictions_settle_what_the_photographs_left_open(lowest, metal, included):
-    settled = plan.matte_by_predictions(plan.specular("auto", UNCLEAR, None), lowest, metal, 0.85)
-    assert (settled["included"], settled["status"]) == (included, SETTLED)
-    for decided in (plan.specular("auto", IN, None), plan.specular("off", IN, None)):
+    settled = plan.matte_by_predictions(plan.specular("auto", UNCLEAR), lowest, metal, 0.85)
+    assert (settled["included"], settled["status"], settled["threshold"]) == (included, SETTLED, 0.85)
+    assert settled["gain_nats"] == 3.0  # what the photographs said is still there
+    for decided in (plan.specular("auto", IN), plan.specular("off", IN)):
         assert plan.matte_by_predictions(decided, lowest, metal, 0.85) == decided
 
 
 def test_the_plan_says_how_to_turn_it_over():
-    assert plan.with_override(plan.specular("auto", OUT, None))["override"] == "override: {components: {specular: on}}"
+    assert plan.with_override(plan.specular("auto", OUT))["override"] == "override: {components: {specular: on}}"
     assert "override" not in plan.with_override(plan.emitters(False, IN))
     assert plan.included([plan.radiance_cache(0.9)], "radiance_cache")["value"] == 0.9
     with pytest.raises(KeyError):
         plan.included([], "specular")
+
+
+def test_a_probe_that_finds_nothing_in_enough_rows_leaves_the_part_out():
+    assert plan.specular("auto", Evidence(0.0, 0.0, 900))["included"] is False
+
+
+def test_the_published_method_is_not_planned():
+    of = {item["component"]: item for item in plan.not_planned()}
+    assert of["specular"]["status"] == SETTLED and of["environment"]["status"] == PROVISIONAL
+    later = plan.later(False, True, set(of))
+    assert not {item["component"] for item in later} & set(of)

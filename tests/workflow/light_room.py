@@ -254,7 +254,7 @@ def write_plan(folder: Path, specular: str = "on", environment: str = "auto") ->
     plan = StubJob("plan", folder, {}).writer
     components = [
         decisions.environment(environment, 0.1, 0.1, NOTHING),
-        decisions.specular(specular, NOTHING, None),
+        decisions.specular(specular, NOTHING),
     ]
     plan.json("plan.json", {"plan": components})
     plan.finish()

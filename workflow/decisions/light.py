@@ -38,7 +38,7 @@ def environment(setting: str, primary_escape: float, secondary_escape: float, re
     """
     measure = "share of cosine-distributed rays from the surface that leave the mesh"
     if setting != "auto":
-        return decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}")
+        return decision("environment", setting == "on", measure, secondary_escape, ESCAPE_SECONDARY, f"set to {setting}", FORCED)
     leaves = primary_escape > ESCAPE_PRIMARY or secondary_escape > ESCAPE_SECONDARY
     dark = relative_brightness is not None and relative_brightness <= ESCAPE_BRIGHTNESS
     if not leaves:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 from iif_core.requirements.evidence import Evidence
@@ -10,7 +11,7 @@ from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by
 CACHE_COVERAGE = 0.3
 """Share of secondary hits that must have been photographed for the radiance cache."""
 LATER = {
-    "camera_response": ("emission", "the photographs are 8-bit; the family follows from surface that several exposures show"),
+    "camera_response": ("affines", "the photographs are 8-bit; the family follows from surface that several exposures show"),
     "exposure": ("emission", "decided by surface that several photographs show"),
     "white_balance": ("emission", "decided by surface that several photographs show"),
     "vignetting": ("emission", "decided by surface that several photographs show"),
@@ -19,7 +20,7 @@ LATER = {
     "affine_size": ("affines", "follows the texture of each object"),
 }
 """Component -> stage that settles it, and how."""
-_GAINS = ("exposure", "white_balance", "vignetting")
+GAINS = ("exposure", "white_balance", "vignetting")
 
 
 def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str, str, str], later: str) -> Decision:
@@ -28,7 +29,7 @@ def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str,
         return by_evidence(component, setting == "on", evidence, f"forced {setting}", FORCED)
     if evidence.pays:
         return by_evidence(component, True, evidence, words[0], SETTLED)
-    if evidence.rows and evidence.gain < -evidence.error:
+    if evidence.rows and evidence.gain <= -evidence.error:
         return by_evidence(component, False, evidence, words[1], SETTLED)
     return by_evidence(component, True, evidence, f"{words[2]}; stage {later} decides", PROVISIONAL)
 
@@ -56,16 +57,13 @@ def emitters(is_hdr: bool, evidence: Evidence) -> Decision:
     return by_evidence("emitters", True, evidence, f"{reason}; stage emission finds the lamps", PROVISIONAL)
 
 
-def specular(setting: str, evidence: Evidence, needed: str | None) -> Decision:
+def specular(setting: str, evidence: Evidence) -> Decision:
     """Decide about specular lobes.
 
     Args:
         setting: `on`, `off` or `auto`.
         evidence: for lobes in how surface changes its radiance from photograph to photograph.
-        needed: why the settings need the lobes in any case; None = they do not.
     """
-    if setting == "auto" and needed is not None:
-        return by_evidence("specular", True, evidence, needed, SETTLED)
     words = (
         "surface changes with the viewer as what it mirrors does",
         "surface looks the same from everywhere, and lobes make it worse",
@@ -82,34 +80,44 @@ def radiance_cache(photographed: float) -> Decision:
     return decision("radiance_cache", included, measure, photographed, CACHE_COVERAGE, reason, PROVISIONAL)
 
 
-def later(is_hdr: bool, exposure_estimated: bool) -> list[Decision]:
+def later(is_hdr: bool, exposure_estimated: bool, known: Collection[str] = ()) -> list[Decision]:
     """Return the components that need predictions or light, and who settles them. Linear photographs have no response, and
-    nothing is estimated of exposures that are given."""
+    nothing is estimated of exposures that are given. Components that are `known` already are left out."""
     out = []
     for component, (stage, reason) in LATER.items():
+        if component in known:
+            continue
         if component == "camera_response" and is_hdr:
             out.append(not_probed(component, False, "the photographs are linear radiance", SETTLED))
-        elif component in _GAINS and not exposure_estimated:
+        elif component in GAINS and not exposure_estimated:
             out.append(not_probed(component, False, "exposures are taken as given", SETTLED))
         else:
             out.append(not_probed(component, True, f"{reason} (stage {stage})", PROVISIONAL))
     return out
 
 
-def matte_by_predictions(provisional: Decision, lowest_roughness: float, metal: float, threshold: float) -> Decision:
+def matte_by_predictions(provisional: Decision, lowest_roughness: float, metal: bool, threshold: float) -> Decision:
     """Settle a provisional decision about specular lobes by the fused predictions.
 
     Args:
         provisional: of stage plan.
-        lowest_roughness: of all objects the lowest 5 % quantile of roughness; metal: the largest mean metalness.
+        lowest_roughness: of all objects the lowest 5 % quantile of roughness; metal: whether an object is predicted to be metal.
         threshold: roughness below which surface is glossy.
     """
     if provisional["status"] != PROVISIONAL:
         return provisional
-    glossy = lowest_roughness < threshold or metal > 0.0
-    found = f"the predictions go down to a roughness of {lowest_roughness:.2f} (5 % quantile of an object)"
-    reason = f"{found}{' and have metal' if metal > 0 else ''}; the photographs alone do not tell"
-    return {**provisional, "included": glossy, "status": SETTLED, "reason": reason}
+    found = f"the predictions go down to a roughness of {lowest_roughness:.2f}{' and have metal' if metal else ''}"
+    reason = f"{found}; the photographs alone do not tell"
+    measure = "lowest 5 % quantile of the predicted roughness of an object"
+    settled = decision("specular", lowest_roughness < threshold or metal, measure, lowest_roughness, threshold, reason)
+    return {**provisional, **settled}
+
+
+def not_planned() -> list[Decision]:
+    """Return the components of the published method, which decides about them itself."""
+    names = ("environment", "emitters", "radiance_cache", "metallic", "affine_size", "denoiser")
+    out = [not_probed(name, True, "the published method is not planned", PROVISIONAL) for name in names]
+    return [*out, not_probed("specular", True, "the published method traces all lobes", SETTLED)]
 
 
 OVERRIDDEN = ("environment", "specular", "metallic", "radiance_cache", "denoiser")
@@ -118,7 +126,7 @@ OVERRIDDEN = ("environment", "specular", "metallic", "radiance_cache", "denoiser
 
 def with_override(item: Decision) -> Decision:
     """Return a decision with the words that turn it over in the scene file, where there are any."""
-    if item["component"] not in OVERRIDDEN:
+    if item["component"] not in OVERRIDDEN or (item["component"] == "metallic" and not item["included"]):
         return item
     return {**item, "override": f"override: {{components: {{{item['component']}: {'off' if item['included'] else 'on'}}}}}"}
 

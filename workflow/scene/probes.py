@@ -33,8 +33,12 @@ PAIRS = 6
 """Further photographs of a point that are compared with its own."""
 VOXELS_IN_DEPTH = 25
 """Voxels of the table in the median depth of the photographs."""
-BLOCK_VOXELS = 5
-"""Edge, in voxels, of the blocks of surface that err together."""
+BLOCK_VOXELS, GROUP_VOXELS = 5, 25
+"""Edges, in voxels, of the blocks of surface that err together, and of what counts as one object where nothing tells objects."""
+LEAST_SEEN = 0.25
+"""Share of the rays from a point that must meet photographed surface, among those that meet any."""
+LEAST_COSINE = 0.05
+"""Cosine between normal and viewer below which a photograph does not show a point: it may show the back of a thin sheet."""
 DEPTH_TOLERANCE = 0.01
 DEPTH_RANGE, BRIGHTNESS_RANGE = 1.1, 2.0
 """Largest over smallest depth and radiance within BORDER pixels of a point."""
@@ -58,9 +62,10 @@ def read_radiance(capture: CaptureReader, view: View, saturation: float) -> View
     """Read a photograph; 8-bit values become radiance by the sRGB curve and the exposure, which no probe improves on."""
     value, valid = capture.photo(view)
     depth, face = capture.gbuffer(view)
+    exposure = view.exposure if view.exposure > 1e-6 else 1.0  # docs/method/numerics.md#exposure-at-zero
     if capture.is_hdr:
-        return ViewRadiance(view, value / view.exposure, valid, np.zeros(valid.shape, bool), depth, face)
-    radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / view.exposure
+        return ViewRadiance(view, value / exposure, valid, np.zeros(valid.shape, bool), depth, face)
+    radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / exposure
     return ViewRadiance(view, radiance, valid, valid & (value.max(-1) >= saturation), depth, face)
 
 
@@ -133,9 +138,12 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation:
     rng = np.random.default_rng([job.seed, _SEEDS])
     views = capture.used[:: max(1, -(-len(capture.used) // MAX_VIEWS))]
     photos = [read_radiance(capture, view, saturation) for view in views]
-    depth = np.concatenate([photo.depth[photo.face >= 0] for photo in photos])
+    depth = np.concatenate([photo.depth[photo.usable & (photo.face >= 0)] for photo in photos])
     if not len(depth):
-        raise InputError("plan: no photograph shows the mesh; check poses and mesh (capture/report of the alignment)")
+        raise InputError(
+            "plan: no usable pixel of any photograph shows the mesh; compare poses and mesh (`alignment` in"
+            " capture/capture.json), and look at the masks"
+        )
     edge = float(np.median(depth)) / VOXELS_IN_DEPTH
     table = _table(photos, edge, rng)
     points = _draw(photos, geometry, capture.faces()["instance_id"], table, rng)
@@ -175,7 +183,7 @@ def _draw(
     each = MAX_POINTS // len(photos)
     parts: dict[str, list[np.ndarray]] = {name: [] for name in ("position", "normal", "radiance", "view", "even", "face")}
     for number, photo in enumerate(photos):
-        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.min(-1) > 0) & _even(photo, False)
+        good = photo.usable & ~photo.saturated & (photo.face >= 0) & (photo.radiance.mean(-1) > 0) & _even(photo, False)
         index = np.flatnonzero(good.ravel())
         index = rng.choice(index, min(len(index), each), replace=False)
         way = photo.view.directions().reshape(-1, 3)[index]
@@ -192,8 +200,9 @@ def _draw(
     axis = np.abs(joined["normal"]).argmax(1)
     side = 2 * axis + (np.take_along_axis(joined["normal"], axis[:, None], 1)[:, 0] > 0)
     owner = instance[joined.pop("face")].astype(np.int64)
-    # Where nothing tells objects apart, a block of surface with one orientation is one.
-    group = np.where(owner >= 0, owner, -2 - (block * 6 + side))
+    # Where nothing tells objects apart, a large block of surface with one orientation is one.
+    piece = np.unique(_keys(joined["position"], table.low, GROUP_VOXELS * table.edge), return_inverse=True)[1]
+    group = np.where(owner >= 0, owner, -2 - (piece * 6 + side))
     return Points(**joined, group=np.unique(group, return_inverse=True)[1], block=block)
 
 
@@ -231,13 +240,15 @@ def _light_rows(
     seen = (row >= 0).reshape(-1, RAYS).sum(1)
     # Rays that meet surface which nobody photographed are taken to bring what the others bring.
     share = hit.reshape(-1, RAYS).sum(1) / np.maximum(seen, 1) / RAYS
+    hits = hit.reshape(-1, RAYS).sum(1)
+    use = seen >= LEAST_SEEN * hits
     rows = LightRows(
-        points.radiance.mean(1),
-        known.reshape(-1, RAYS).sum(1) * share,
-        saturated.reshape(-1, RAYS).sum(1) * share,
-        1.0 - hit.reshape(-1, RAYS).mean(1),
-        points.group,
-        points.block,
+        points.radiance.mean(1)[use],
+        (known.reshape(-1, RAYS).sum(1) * share)[use],
+        (saturated.reshape(-1, RAYS).sum(1) * share)[use],
+        1.0 - hits[use] / RAYS,
+        points.group[use],
+        points.block[use],
     )
     return rows, float((~hit).mean()) if len(hit) else 0.0, float((row[hit] >= 0).mean()) if hit.any() else 0.0
 
@@ -267,7 +278,7 @@ def _gloss_rows(
     mean = pair.mean(1)
     numbers = np.stack([points.view[point], view], 1)
     lobes = np.stack([own[point], other], 1) / mean[:, None, None]
-    return GlossRows(pair / mean[:, None], lobes, numbers, points.group[point], points.block[point])
+    return GlossRows(pair / mean[:, None], lobes, numbers, point, points.group[point], points.block[point])
 
 
 def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -278,7 +289,9 @@ def _seen_in(points: Points, number: int, photo: ViewRadiance) -> tuple[np.ndarr
     v = photo.view
     u, w, z = project(points.position, v.fx, v.fy, v.cx, v.cy, v.world_from_camera)
     x, y = np.floor(u), np.floor(w)
-    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number) & points.even
+    towards = v.world_from_camera[:3, 3] - points.position
+    facing = (towards * points.normal).sum(1) > LEAST_COSINE * np.linalg.norm(towards, axis=1)
+    inside = facing & (z > 0) & (x >= 0) & (y >= 0) & (x < v.width) & (y < v.height) & (points.view != number) & points.even
     row = np.flatnonzero(inside)
     at = (y[row].astype(int), x[row].astype(int))
     good = photo.usable[at] & ~photo.saturated[at] & _even(photo, True)[at]

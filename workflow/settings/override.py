@@ -15,7 +15,8 @@ class Components(Section):
     environment: Choice = "auto"
     """Light from outside the mesh, as `emission: {environment: ...}`."""
     specular: Choice = "auto"
-    """Specular lobes; without them nothing is metal, and re-rendering reads cached light."""
+    """Specular lobes; without them nothing is metal, and re-renderings end in photographed
+    radiance, if the radiance cache is in."""
     metallic: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """Metals among the objects, told apart by the fit; `off`: every object is a dielectric."""
     radiance_cache: Choice = "auto"

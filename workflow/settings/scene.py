@@ -83,8 +83,13 @@ class SceneSettings(Section):
         """Put components that are forced, and have a setting of their own, in the place of that setting."""
         choice = self.override.components
         forced = {name: value for name, value in choice.model_dump().items() if value != "auto"}
-        if forced and (self.preset != "ours" or self.emission.solver in PUBLISHED):
+        published = self.emission.solver in PUBLISHED or self.shading.method == "published"
+        if forced and (self.preset != "ours" or published):
             raise ValueError(f"`override: components: {', '.join(forced)}`: the published method has no plan; remove it")
+        fits_both = self.affines.model == "objects" and self.affines.solver == "direct"
+        for component in ("specular", "metallic"):
+            if forced.get(component) == "off" and not fits_both:
+                raise ValueError(f"`override: components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
         own = {
             "environment": ("emission", "environment", {"on": "on", "off": "off"}),
             "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),

@@ -8,7 +8,8 @@ import numpy as np
 
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
-from workflow.decisions.record import PROVISIONAL, SETTLED, plan_text
+from workflow.decisions.plan import GAINS
+from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
 from workflow.report import pictures as pic
 from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
 from workflow.runtime.job import Job
@@ -16,7 +17,19 @@ from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
 
-PLAN_KEYS = ("component", "included", "status", "measure", "value", "threshold", "gain_nats", "error_nats", "reason")
+PLAN_KEYS = (
+    "component",
+    "included",
+    "status",
+    "measure",
+    "value",
+    "threshold",
+    "gain_nats",
+    "error_nats",
+    "rows",
+    "reason",
+    "override",
+)
 ERROR_RANGE = 0.25
 COVERAGE_RANGE = 4.0
 UNCERTAINTY_RANGE = 0.2
@@ -56,8 +69,8 @@ def run(job: Job) -> None:
 
 def collect_plan(job: Job) -> list[dict[str, Any]]:
     """Return the plan items in the JSON documents of the stages (key `plan`), with the name of the rule, in the order in which
-    their components are first named. What stage plan left provisional is replaced by what a later stage settled; what no stage
-    had a reason to try is out."""
+    their components are first named. What a later stage found replaces what was planned; of gains that no stage had a reason to
+    try there are none."""
     items: dict[str, dict[str, Any]] = {}
     for stage in job.stage.upstream:
         reader = job.read(stage)
@@ -68,10 +81,14 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
             found = document.get("plan", []) if isinstance(document, dict) else []
             for item in found if isinstance(found, list) else []:
                 kept = {key: item[key] for key in PLAN_KEYS if key in item}
-                if items.get(item["component"], {"status": PROVISIONAL})["status"] == PROVISIONAL:
-                    items[item["component"]] = {"status": SETTLED, **kept, "included": bool(item.get("included")), "rule": stage}
+                earlier = items.get(item["component"], {})
+                forced = {"status": FORCED} if earlier.get("status") == FORCED else {}
+                found_here = {**kept, "included": bool(item.get("included")), **forced, "rule": stage}
+                items[item["component"]] = {"status": SETTLED, **found_here}
     untried = {"included": False, "status": SETTLED, "reason": "no stage had a reason to try it"}
-    return [{**item, **untried} if item["status"] == PROVISIONAL else item for item in items.values()]
+    return [
+        {**item, **untried} if item["status"] == PROVISIONAL and item["component"] in GAINS else item for item in items.values()
+    ]
 
 
 # ---------------------------------------------------------------------------------------------------------------- text

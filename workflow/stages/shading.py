@@ -122,13 +122,13 @@ def _indirect(
 def _specular(job: Job, scene: BaseScene) -> Decision:
     """Settle whether the scene needs specular lobes; where the photographs alone did not tell, by the fused predictions."""
     planned = included(job.read("plan").json("plan.json")["plan"], "specular")
-    lowest, metal = 1.0, 0.0
+    lowest, metal = 1.0, False
     if planned["status"] == PROVISIONAL:
         order = np.argsort(scene.cell_object, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(scene.cell_object[order])) + 1)
         groups = [group for group in groups if len(group) >= LEAST_CELLS]
         lowest = min((float(np.quantile(scene.cell_values[group, 3], 0.05)) for group in groups), default=0.0)
-        metal = float(max((np.median(scene.cell_values[group, 4]) for group in groups), default=1.0) > METALLIC_PRIOR)
+        metal = max((float(np.median(scene.cell_values[group, 4])) for group in groups), default=1.0) > METALLIC_PRIOR
     return matte_by_predictions(planned, lowest, metal, MATTE_ROUGHNESS)
 
 
