@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 FOLDS = 2
+AGAINST = 2.0
+"""Standard errors below zero from which a part of the model is left out: missing it costs accuracy, having it costs time."""
 SHRINKAGE = 5.0
 """Rows of the common scale that each group is given beside its own."""
 _SMALLEST_SCALE = 1e-6  # of the residuals, so that an exact model has a finite likelihood
@@ -30,6 +32,11 @@ class Evidence:
     def pays(self) -> bool:
         """Whether the larger model is taken: it gains more than one standard error."""
         return self.rows > 0 and self.gain > self.error
+
+    @property
+    def speaks_against(self) -> bool:
+        """Whether the larger model is clearly worse: it loses `AGAINST` standard errors, or gains nothing whatever."""
+        return self.rows > 0 and self.gain <= -AGAINST * self.error
 
 
 NOTHING = Evidence(0.0, 0.0, 0)

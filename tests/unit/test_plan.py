@@ -80,6 +80,7 @@ def test_light_passes_unless_it_explains_the_room_worse():
 
 
 IN, OUT, UNCLEAR = Evidence(30.0, 10.0, 500), Evidence(-30.0, 10.0, 500), Evidence(3.0, 10.0, 500)
+LEANS = Evidence(-15.0, 10.0, 500)
 
 
 @pytest.mark.parametrize(
@@ -95,6 +96,7 @@ IN, OUT, UNCLEAR = Evidence(30.0, 10.0, 500), Evidence(-30.0, 10.0, 500), Eviden
         (plan.specular("auto", IN), True, SETTLED),
         (plan.specular("auto", OUT), False, SETTLED),
         (plan.specular("auto", UNCLEAR), True, PROVISIONAL),
+        (plan.specular("auto", LEANS), True, PROVISIONAL),
         (plan.specular("off", IN), False, FORCED),
         (plan.emitters(True, NOTHING), True, PROVISIONAL),
         (plan.emitters(False, IN), True, PROVISIONAL),

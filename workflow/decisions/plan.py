@@ -29,7 +29,7 @@ def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str,
         return by_evidence(component, setting == "on", evidence, f"forced {setting}", FORCED)
     if evidence.pays:
         return by_evidence(component, True, evidence, words[0], SETTLED)
-    if evidence.rows and evidence.gain <= -evidence.error:
+    if evidence.speaks_against:
         return by_evidence(component, False, evidence, words[1], SETTLED)
     return by_evidence(component, True, evidence, f"{words[2]}; stage {later} decides", PROVISIONAL)
 
