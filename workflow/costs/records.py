@@ -100,4 +100,5 @@ def read_rows(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the rows of `write_rows`, with numbers for numbers."""
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
-            yield {name: text if name in FIXED and name != "threads" else float(text) for name, text in row.items() if text != ""}
+            named = {name: text if name in FIXED else float(text) for name, text in row.items() if text != ""}
+            yield {**named, "threads": int(named["threads"])}
