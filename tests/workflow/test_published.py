@@ -23,7 +23,7 @@ base: {solver: direct}
 emission: {iterations: 110, samples: 4}
 affines: {batch: 1024}
 """
-FIRST = ("capture", "prior", "segmentation", "base")
+FIRST = ("capture", "plan", "prior", "segmentation", "base")
 
 
 def run(folder, stages, monkeypatch, scene=SCENE):
