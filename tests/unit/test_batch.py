@@ -277,7 +277,7 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
     assert rows["refused"]["reason"].endswith("<script>bad data</script> | second line")
     assert (rows["failed"]["stage"], rows["failed"]["reason"]) == ("segmentation", "mesh: no faces")
     assert rows["failed"]["log"] == "results/failed/logs/segmentation.log"
-    assert (rows["killed"]["stage"], rows["idle"]["stage"]) == ("capture", "prior")
+    assert (rows["killed"]["stage"], rows["idle"]["stage"]) == ("capture", "plan")
     import pyarrow.parquet as pq
 
     table = pq.read_table("results/batch/summary.parquet")

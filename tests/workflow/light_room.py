@@ -253,7 +253,7 @@ def write_plan(folder: Path, specular: str = "on", environment: str = "auto") ->
     """Write a plan that leaves the light to stage emission; `specular: auto` leaves the lobes to the predictions."""
     plan = StubJob("plan", folder, {}).writer
     components = [
-        decisions.environment(environment, 0.1, 0.1, NOTHING),
+        decisions.environment(environment, 0.1, 0.1, 1.0, NOTHING),
         decisions.specular(specular, NOTHING),
     ]
     plan.json("plan.json", {"plan": components})

@@ -93,7 +93,9 @@ def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant
     result = fresh.run("-n", *arguments)
     last = result.stderr.strip().splitlines()[-1]
     assert result.returncode == 1 and "Exception" not in result.stderr
-    assert last.startswith(f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name> and ")
+    assert last.startswith(
+        f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name>, plan/<name> and "
+    )
 
 
 @pytest.mark.parametrize("target", ["scenes/tiny", "relight/tiny"])

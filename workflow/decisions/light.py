@@ -7,15 +7,13 @@ import numpy as np
 from iif_core.light.emission.search import STEP
 from iif_core.light.emission.sun import SHARP, Disc, is_needed
 from iif_core.light.emission.translucent import TRANSMITTANCE
-from workflow.decisions.plan import CACHE_COVERAGE
+from workflow.decisions.plan import CACHE_COVERAGE, ESCAPE_BRIGHTNESS
 from workflow.decisions.record import FORCED, SETTLED, Decision, decision
 
 ESCAPE_PRIMARY = 1e-3
 """Share of camera rays that leave the mesh, above which an environment is considered."""
 ESCAPE_SECONDARY = 2e-3
 """The same for rays from the surface."""
-ESCAPE_BRIGHTNESS = 0.02
-"""Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 ESCAPE_OPEN = 0.3
 """Share of escaping rays from which the mesh counts as a part of a room. Its holes then show the rest of the room, which is near
 and looks different from everywhere, so the environment has twelve directions instead of a map of what the cameras see

@@ -8,6 +8,8 @@ from typing import Any
 from iif_core.requirements.evidence import Evidence
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, Decision, by_evidence, decision, not_probed
 
+ESCAPE_BRIGHTNESS = 0.02
+"""Brightness of escaping camera rays, relative to the photographs, up to which the outside counts as black."""
 CACHE_COVERAGE = 0.3
 """Share of secondary hits that must have been photographed for the radiance cache."""
 LATER = {
@@ -34,17 +36,23 @@ def _weighed(component: str, setting: str, evidence: Evidence, words: tuple[str,
     return by_evidence(component, True, evidence, f"{words[2]}; stage {later} decides", PROVISIONAL)
 
 
-def environment(setting: str, escape_primary: float, escape_secondary: float, evidence: Evidence) -> Decision:
+def environment(
+    setting: str, escape_primary: float, escape_secondary: float, brightness: float | None, evidence: Evidence
+) -> Decision:
     """Decide about light from outside the mesh.
 
     Args:
         setting: `on`, `off` or `auto`.
         escape_primary, escape_secondary: share of camera rays and of rays from surface that leave the mesh.
+        brightness: of camera rays that leave it, relative to the photographs; None = none leaves.
         evidence: for the radiance of rays that leave it.
     """
     leaves = f"{escape_primary:.2%} of camera rays and {escape_secondary:.2%} of others leave the mesh"
     if setting == "auto" and not (escape_primary or escape_secondary):
         return not_probed("environment", False, f"the mesh is closed: {leaves}", SETTLED)
+    if setting == "auto" and brightness is not None and brightness <= ESCAPE_BRIGHTNESS:
+        # Seen, not inferred: a small lamp that the probe's rays miss may look like light from outside.
+        return by_evidence("environment", False, evidence, f"{leaves}, into {brightness:.1%} of the mean brightness", SETTLED)
     words = (f"{leaves}, and bring light", f"{leaves}, and bring no light", f"{leaves}; the photographs do not tell yet")
     return _weighed("environment", setting, evidence, words, "emission")
 

@@ -43,7 +43,7 @@ def _probed(job: Job, capture: CaptureReader) -> tuple[list[Decision], dict[str,
         light, gloss = light_evidence(rows.light, job.seed), gloss_evidence(rows.gloss, job.seed)
     escape = rows.escape_primary, rows.escape_secondary
     plan = [
-        decisions.environment(settings.emission.environment, *escape, light["environment"]),
+        decisions.environment(settings.emission.environment, *escape, rows.outside, light["environment"]),
         decisions.emitters(capture.is_hdr, light["emitters"]),
         decisions.specular(settings.override.components.specular, gloss),
         decisions.radiance_cache(rows.photographed),
