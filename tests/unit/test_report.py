@@ -471,6 +471,8 @@ def test_plan_is_collected(toy):
         ("vignetting", False, "settled", "plan"),  # nobody had a reason to try it
         ("denoiser", False, "forced", "render"),
     ]
+    words = {item["component"]: item.get("override") for item in plan["components"]}
+    assert words["denoiser"] == "override: {components: {denoiser: on}}" and words["vignetting"] is None
 
 
 # ---------------------------------------------------------------------------------------------------------------- page

@@ -8,7 +8,7 @@ import numpy as np
 
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
-from workflow.decisions.plan import GAINS
+from workflow.decisions.plan import GAINS, with_override
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
 from workflow.report import pictures as pic
 from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
@@ -86,9 +86,8 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
                 found_here = {**kept, "included": bool(item.get("included")), **forced, "rule": stage}
                 items[item["component"]] = {"status": SETTLED, **found_here}
     untried = {"included": False, "status": SETTLED, "reason": "no stage had a reason to try it"}
-    return [
-        {**item, **untried} if item["status"] == PROVISIONAL and item["component"] in GAINS else item for item in items.values()
-    ]
+    settled = ({**i, **untried} if i["status"] == PROVISIONAL and i["component"] in GAINS else i for i in items.values())
+    return [with_override(item) for item in settled]
 
 
 # ---------------------------------------------------------------------------------------------------------------- text
