@@ -17,6 +17,7 @@ class Stage:
         settings: dotted paths of the settings that it reads.
         reads_raw: whether files from outside results/ enter here.
         on_demand: whether no scene needs it, only a study or a target of its own.
+        shared: stages whose files it reads in the folder of the scene that all variants of a study share.
     """
 
     name: str
@@ -24,11 +25,15 @@ class Stage:
     settings: tuple[str, ...]
     reads_raw: bool = False
     on_demand: bool = False
+    shared: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
         return f"workflow.stages.{self.name}"
 
+
+SHARED = "shared_"
+"""Begins the name of an input that is a stage of the shared scene, in rules and manifests."""
 
 STAGES: dict[str, Stage] = {
     stage.name: stage
@@ -76,6 +81,13 @@ STAGES: dict[str, Stage] = {
             ("metrics",),
             reads_raw=True,
         ),
+        Stage(
+            "common_scores",
+            ("capture", "segmentation", "base", "emission", "affines"),
+            ("seed",),
+            on_demand=True,
+            shared=("capture", "segmentation"),
+        ),
         Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
         Stage(
             "report",
@@ -102,3 +114,9 @@ STAGES: dict[str, Stage] = {
         ),
     )
 }
+
+
+def upstream_of(stage: str) -> set[str]:
+    """Return all stages from which a stage is made, directly or not."""
+    found = set(STAGES[stage].upstream)
+    return found.union(*(upstream_of(one) for one in found))

@@ -257,7 +257,7 @@ def test_finished_scores_are_kept_before_the_study_ends(folder, tmp_path):
         writer.finish()
     kept = tmp_path / "kept.csv"
     pd.DataFrame(
-        [[scene, "first", 0, "albedo", "psnr", "raw", 1.5, 2, None, "z"] for scene in ("u", "t")],
+        [[scene, "first", 0, "albedo", "psnr", "raw", 1.5, 2, None, None, None, None, "z"] for scene in ("u", "t")],
         columns=study_table.KEPT,
     ).to_csv(kept, index=False)
     for _ in range(2):

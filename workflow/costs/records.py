@@ -10,7 +10,7 @@ from typing import Any
 
 from workflow.costs.size import size_of_capture
 from workflow.costs.work import work_of
-from workflow.registry import STAGES
+from workflow.registry import SHARED, STAGES
 
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
 FIXED = ("scene", "stage", "kind", "threads", "fingerprint")
@@ -78,6 +78,8 @@ def _upstream(manifest: dict[str, Any], known: dict[tuple[str, str], dict[str, A
     """Return the manifests that a stage was made from, and its own; None if one is gone."""
     found = {manifest["stage"]: manifest}
     for name, entry in manifest["inputs"].items():
+        if name.startswith(SHARED):  # what scores are compared with is no part of the work
+            continue
         if (name, entry["fingerprint"]) not in known:
             return None
         further = _upstream(known[name, entry["fingerprint"]], known)

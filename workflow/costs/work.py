@@ -104,6 +104,10 @@ def _base_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[s
     return "all", {"pixels": size.pixels / MILLION}
 
 
+def _common_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
+
+
 def _emission(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     emission, faces = settings["emission"], size.faces / MILLION
     if emission["solver"].startswith("published"):
@@ -183,6 +187,7 @@ _STAGES = {
     "segmentation": _segmentation,
     "base": _base,
     "base_scores": _base_scores,
+    "common_scores": _common_scores,
     "emission": _emission,
     "shading": _shading,
     "affines": _affines,

@@ -13,6 +13,7 @@ sys.path.insert(0, workflow.basedir)
 from iif_core.errors import InputError
 from workflow.artifacts.verify import absent
 from workflow.batch import plan as batch_table
+from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
@@ -87,13 +88,19 @@ wildcard_constraints:
 def reads(stage, *names):
     """Named inputs of a stage: the manifests of the stages `names`, which must be those of workflow/registry.py.
 
-    The scene is checked first, so that bad input stops before any job. Variants of a study share what they have in common.
+    The scene is checked first, so that bad input stops before any job. Variants of a study share what they have in common, and
+    what is read from the scene that they share has `shared_` before its name.
     """
-    assert names == fingerprints.STAGES[stage].upstream, (stage, names)
+    shared = [name.removeprefix(SHARED) for name in names if name.startswith(SHARED)]
+    own = tuple(name for name in names if not name.startswith(SHARED))
+    assert own == fingerprints.STAGES[stage].upstream, (stage, names)
+    assert tuple(shared) == fingerprints.STAGES[stage].shared, (stage, names)
 
     def inputs(wildcards):
         or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
-        return {name: manifest(name, wildcards.scene) for name in names}
+        common = study_files.shared_scene(wildcards.scene)
+        found = {name: manifest(name, wildcards.scene) for name in own}
+        return found | {f"{SHARED}{name}": manifest(name, common) for name in shared}
 
     return inputs
 

@@ -256,6 +256,31 @@ use rule stage as base_scores with:
         "{wildcards.scene}: scores of the base texture"
 
 
+# On demand: studies whose variants have other photographs.
+use rule stage as common_scores with:
+    input:
+        unpack(
+            reads(
+                "common_scores",
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "affines",
+                "shared_capture",
+                "shared_segmentation",
+            )
+        ),
+    pathvars:
+        stage="common_scores",
+    resources:
+        **needs("common_scores"),
+    params:
+        job=job("common_scores"),
+    message:
+        "{wildcards.scene}: scores at shared views"
+
+
 # Shown by `snakemake --list`: snakefmt knows no docstrings in `use rule`.
 descriptions = {
     "capture": "Bring photographs, cameras and mesh into the normal form, or render them.",
@@ -272,6 +297,7 @@ descriptions = {
     "report": "Write report.html, and plan.yaml with all decisions settled.",
     "relight": "Render the recovered scene under other light; made on demand.",
     "base_scores": "Score the base texture; made on demand by studies.",
+    "common_scores": "Score the result at views that all variants of a study share; made on demand by studies.",
 }
 for name, text in descriptions.items():
     workflow.get_rule(name).docstring = text

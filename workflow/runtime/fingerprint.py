@@ -235,6 +235,9 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
         "raw": raw,
         "upstream": {up: fingerprint(up, scene, quality) for up in STAGES[stage].upstream},
     }
+    if STAGES[stage].shared:
+        shared = study_files.shared_scene(scene)
+        facts["shared"] = {up: fingerprint(up, shared, quality) for up in STAGES[stage].shared}
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -21,9 +21,10 @@ from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import sha256_of, write_json
-from workflow.registry import STAGES
+from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, forecast, input_digests
 from workflow.runtime import fingerprint as fp
+from workflow.settings import study_files
 
 _LIBRARIES = ("numpy", "scipy", "mitsuba", "drjit", "open3d", "OpenEXR", "pyarrow", "torch", "snakemake")
 
@@ -61,7 +62,7 @@ class Job:
         self._cpu_started = time.process_time()
         self._parts: dict[str, dict[str, float]] = {}
         self._earlier = {"seconds": 0.0, "cpu_seconds": 0.0}  # of runs that were killed, and from which this one goes on
-        self._readers: dict[str, StageReader] = {}
+        self._readers: dict[tuple[str, str], StageReader] = {}
 
     @cached_property
     def settings(self) -> SimpleNamespace:
@@ -93,18 +94,31 @@ class Job:
         """
         if stage not in self.stage.upstream:
             raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as upstream")
-        if stage not in self._readers:
-            scene = fp.home(stage, self.scene, self.quality)
+        return self._reader(stage, self.scene)
+
+    def read_shared(self, stage: str) -> StageReader:
+        """Return the reader of a stage of the scene that all variants of a study share.
+
+        Raises:
+            InputError: as `read`.
+        """
+        if stage not in self.stage.shared:
+            raise AssertionError(f"stage {self.stage.name} reads {stage}, which registry.py does not list as shared")
+        return self._reader(stage, study_files.shared_scene(self.scene))
+
+    def _reader(self, stage: str, of: str) -> StageReader:
+        if (stage, of) not in self._readers:
+            scene = fp.home(stage, of, self.quality)
             reader = StageReader(stage_directory(scene, stage), stage, scene)
-            expected = fp.fingerprint(stage, self.scene, self.quality)
+            expected = fp.fingerprint(stage, of, self.quality)
             if reader.fingerprint != expected:
                 raise InputError(
                     f"{reader.directory / 'manifest.json'}: built as {reader.fingerprint}, needed {expected}"
-                    f" (settings, inputs or code changed since). Run: snakemake --cores 2 scenes/{self.scene}"
+                    f" (settings, inputs or code changed since). Run: snakemake --cores 2 scenes/{of}"
                     f" --config quality={self.quality}"
                 )
-            self._readers[stage] = reader
-        return self._readers[stage]
+            self._readers[stage, of] = reader
+        return self._readers[stage, of]
 
     @cached_property
     def writer(self) -> StageWriter:
@@ -112,13 +126,12 @@ class Job:
         return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
-        inputs = {}
-        for stage in self.stage.upstream:
-            reader = self.read(stage)
-            inputs[stage] = {
-                "fingerprint": reader.fingerprint,
-                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
-            }
+        readers = {stage: self.read(stage) for stage in self.stage.upstream}
+        readers |= {f"{SHARED}{stage}": self.read_shared(stage) for stage in self.stage.shared}
+        inputs = {
+            name: {"fingerprint": reader.fingerprint, "manifest_sha256": sha256_of(reader.directory / "manifest.json")}
+            for name, reader in readers.items()
+        }
         return {
             "scene": self.scene,
             "stage": self.stage.name,

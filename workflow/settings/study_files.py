@@ -62,6 +62,27 @@ class Paper(Section):
     """`quantity/metric` -> number."""
 
 
+class Design(Section):
+    """Variants as runs of a design: each is a string of digits, the level of every factor, which is also its name."""
+
+    factors: dict[str, list[Any]] = Field(min_length=1)
+    """Setting, or settings joined by ` + `, -> its levels, from cheap to dear."""
+    trajectories: int = Field(0, ge=0)
+    """The first runs are this number of trajectories of Morris (`workflow/studies/screening.py`): the page then has the effect of
+    each factor."""
+    runs: list[str] = Field(min_length=1)
+    """In the order of the trajectories; a run that is there twice is one variant."""
+
+    def overrides(self, run: str) -> dict[str, dict[str, Any]]:
+        """Return the settings of a run."""
+        out: dict[str, dict[str, Any]] = {}
+        for (names, levels), digit in zip(self.factors.items(), run, strict=True):
+            for dotted in names.split(" + "):
+                section, _, key = dotted.partition(".")
+                out.setdefault(section, {})[key] = levels[int(digit)]
+        return out
+
+
 class Plot(Section):
     """The picture."""
 
@@ -86,10 +107,11 @@ class Study(Section):
     """Names of entries in config/studies/scenes.yaml."""
     seeds: list[int] = Field([0, 1, 2], min_length=1)
     """Seeds of the prior; everything else keeps the seed of the scene."""
-    scores: Literal["base_scores", "metrics"] = "base_scores"
-    """Stage whose scores are collected: of the base texture, or of the result and its re-rendering."""
+    scores: Literal["base_scores", "metrics", "common_scores"] = "base_scores"
+    """Stage whose scores are collected: of the base texture, of the result and its re-rendering, or of the result at views that
+    all variants share."""
     costs: list[str] = ["base"]
-    """Stages whose times are added."""
+    """Stages whose times are added; they are made even if the scores do not need them."""
     growth: dict[str, dict[str, PositiveFloat]] = {}
     """What is varied -> variant -> how much of it there is: the page then has the exponents with which `costs` grow."""
     protocols: list[catalogue.ProtocolName] = Field(["raw", "oracle_affine"], min_length=1)
@@ -104,6 +126,8 @@ class Study(Section):
     """Name -> variant."""
     grids: list[dict[str, list[Any]]] = []
     """Each maps dotted settings to values; every combination is a variant, named after its values."""
+    design: Design | None = None
+    """Runs of a design, which are variants too."""
     paper: dict[str, Paper] = {}
     """Variant -> published numbers."""
     show: list[str] = ["albedo/psnr", "albedo/ssim", "albedo/lpips", "roughness/l2", "metallic/l2"]
@@ -156,6 +180,8 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
             if name in variants:
                 raise InputError(f"{path}: `grids.{i}`: variant {name} is there already; give each a setting of its own")
             variants[name] = variant
+    if study.design:
+        variants |= _design(study.design, path, variants)
     if not variants:
         raise InputError(f"{path}: no variants; add `variants: {{<name>: {{overrides: ...}}}}` or `grids`")
     for name in variants:
@@ -208,6 +234,33 @@ def _grid(grid: dict[str, list[Any]], where: str) -> dict[str, Variant]:
             overrides.setdefault(section, {})[key] = value
         words = [re.sub(r"[^A-Za-z0-9_]", "_", str(value)) for value in values]
         out["-".join(words)] = Variant(label=", ".join(str(value) for value in values), overrides=overrides)
+    return out
+
+
+def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str, Variant]:
+    for names, levels in design.factors.items():
+        if not 1 <= len(levels) <= 10 or any(dotted.count(".") != 1 for dotted in names.split(" + ")):
+            raise InputError(
+                f"{path}: `design.factors`: found `{names}: {levels}`, needed <section>.<key>: [level, ...] of at most 10 levels;"
+                " settings that change together are joined by ` + `"
+            )
+    out: dict[str, Variant] = {}
+    for run in design.runs:
+        digits = run if len(run) == len(design.factors) and run.isdecimal() else ""
+        if not digits or any(int(d) >= len(levels) for d, levels in zip(digits, design.factors.values(), strict=True)):
+            raise InputError(
+                f"{path}: `design.runs`: found {run!r}, needed a digit for each of the {len(design.factors)} factors, the number of"
+                " one of its levels, counted from 0"
+            )
+        if run in others:
+            raise InputError(f"{path}: `design.runs`: variant {run} is there already; give it another name")
+        out[run] = Variant(label=run, overrides=design.overrides(run))
+    whole = len(design.factors) + 1
+    if len(design.runs) < design.trajectories * whole:
+        raise InputError(
+            f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
+            f" there are {len(design.runs)}. `python -m workflow design {path.stem}` makes them"
+        )
     return out
 
 
@@ -282,6 +335,16 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
         candidates += [scene_of(parts.study, parts.scene, variant, seed) for variant in earlier for seed in seeds]
     candidates = list(dict.fromkeys(candidates))
     return candidates[: candidates.index(name)] if name in candidates else candidates
+
+
+def shared_scene(name: str, root: Path = Path(".")) -> str:
+    """Return the scene whose photographs all variants and seeds of a derived scene are compared at; any other scene is its own.
+
+    >>> shared_scene("kitchen--aggregation-full-s2"), shared_scene("kitchen")
+    ('kitchen--s0', 'kitchen')
+    """
+    parts = derived(name, root)
+    return f"{parts.scene}--s0" if parts else name
 
 
 def scene_of(study: str, scene: str, variant: str, seed: int) -> str:

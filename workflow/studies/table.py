@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from iif_core.errors import InputError
 from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF
 from workflow.artifacts.files import write_atomically
+from workflow.costs.records import disk_mb
+from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings import study_files
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RESULTS = Path("results/studies")
-COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb")
+COSTS = ("seconds", "cpu_seconds", "solver_seconds", "solver_cpu_seconds", "max_rss_mb", "disk_mb")
 KEY = ["scene", "quantity", "metric", "protocol"]
 
 
@@ -88,9 +90,11 @@ def left_out(name: str, quality: str) -> list[str]:
 
 
 def inputs(name: str, quality: str) -> list[str]:
-    """List the manifests that the study collects; variants whose results agree share one."""
+    """List the manifests that the study collects; variants whose results agree share one. Stages whose costs it collects are
+    listed where the scores are not made from them."""
     study, cells, _ = plan(name, quality)
-    return sorted({str(home(cell, quality, study.scores) / "manifest.json") for cell in cells})
+    stages = {study.scores, *study.costs} - upstream_of(study.scores)
+    return sorted({str(home(cell, quality, stage) / "manifest.json") for cell in cells for stage in stages})
 
 
 def fingerprint(name: str, quality: str) -> str:
@@ -153,7 +157,10 @@ def _rows(name: str, study: study_files.Study, cell: Cell, quality: str) -> list
     return rows
 
 
-KEPT = ("scene", "variant", "seed", "quantity", "metric", "protocol", "value", "views", "cpu_seconds", "fingerprint")
+KEPT = (
+    *("scene", "variant", "seed", "quantity", "metric", "protocol", "value", "views"),
+    *("cpu_seconds", "seconds", "max_rss_mb", "disk_mb", "fingerprint"),
+)
 """Columns of the rows that outlive the folder of a study."""
 
 
@@ -223,7 +230,7 @@ def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, s
 
     directory = home(cell, quality, stage)
     reader = StageReader(directory, stage, directory.parent.name)
-    frame = pd.DataFrame(reader.table("scores.parquet" if stage == "base_scores" else "variants.parquet"))
+    frame = pd.DataFrame(reader.table("variants.parquet" if stage == "metrics" else "scores.parquet"))
     if "variant" in frame:
         if row not in set(frame["variant"]):
             known = ", ".join(sorted(set(frame["variant"])))
@@ -234,7 +241,7 @@ def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, s
 
 
 def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
-    """Time of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`).
+    """Time and disk of the jobs of some stages together, their peak memory, and the time of the last one's solver (`Job.timed`).
 
     A value that one of the jobs did not record is None. `stage_costs`: the same of each job alone, JSON.
     """
@@ -245,13 +252,20 @@ def _costs(cell: Cell, quality: str, stages: list[str]) -> dict[str, Any]:
         whole: dict[str, Any] = parts.get("job", {})
         jobs.append(whole or next((row for row in read_timings(scene) if row["rule"] == stage), {}))
         alone[stage] = {name: jobs[-1].get(name) for name in ("seconds", "cpu_seconds", "max_rss_mb")}
+        jobs[-1] = {**jobs[-1], "disk_mb": _disk_mb(scene, stage)}
         solver = parts.get("solve", {})
     out: dict[str, Any] = {}
-    for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("threads", max)):
+    for name, together in (("seconds", sum), ("cpu_seconds", sum), ("max_rss_mb", max), ("disk_mb", sum), ("threads", max)):
         known = [job[name] for job in jobs if job.get(name) is not None]
         out[name] = together(known) if known and len(known) == len(jobs) else None
     out["stage_costs"] = json.dumps(alone)
     return out | {f"solver_{name}": solver.get(name) for name in ("seconds", "cpu_seconds")}
+
+
+def _disk_mb(scene: str, stage: str) -> float | None:
+    """Size of the files of a stage; None while its manifest is not there."""
+    manifest = Path("results") / scene / stage / "manifest.json"
+    return disk_mb(json.loads(manifest.read_text())) if manifest.is_file() else None
 
 
 def _history(cell: Cell, quality: str) -> list[dict[str, float]]:
@@ -369,10 +383,10 @@ def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str])
     for scene in scenes:
         for name, label in labels.items():
             runs = shown[(shown["scene"] == scene) & (shown["variant"] == name)].groupby("seed")[list(COSTS)].first()
-            digits = [0 if cost == "max_rss_mb" else 1 for cost in COSTS]
+            digits = [0 if cost in ("max_rss_mb", "disk_mb") else 1 for cost in COSTS]
             cells = [_mean(runs[cost].dropna().tolist(), n) for cost, n in zip(COSTS, digits, strict=True)]
             body.append([scene, label, *cells])
-    return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB"], body, words=2)
+    return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB", "disk MB"], body, words=2)
 
 
 def _why(metric: str) -> str:

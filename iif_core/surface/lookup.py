@@ -1,0 +1,66 @@
+"""Values of surface cells at points, on the host: what `iif_core.light.transport.materials.CellMaterials` reads on the device."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+from iif_core.surface.cells import COARSE, CellTable, coarse_cells, pack_keys, voxel_indices
+
+Array = np.ndarray
+
+
+def values_at(
+    points: ArrayLike,
+    object_id: ArrayLike,
+    edge: float,
+    origin: ArrayLike,
+    ijk: ArrayLike,
+    cell_object: ArrayLike,
+    values: ArrayLike,
+    object_values: ArrayLike,
+) -> Array:
+    """Read the values of the surface at points: of the cell there; where none was observed, the mean of the coarse cell around,
+    then that of the object, and without an object the mean over all objects (docs/method/numerics.md#surface-that-nobody-saw).
+
+    Args:
+        points: (n, 3) metres.
+        object_id: (n,) of the surface there, -1 = none.
+        edge, origin: grid of the cells, metres (`iif_core.surface.cells.voxel_indices`).
+        ijk, cell_object: (c, 3) and (c,) of the cells, which are distinct.
+        values: (c, C) of the cells.
+        object_values: (objects, C), at least one row.
+
+    Returns:
+        (n, C) float32.
+
+    Raises:
+        InputError: points that are not finite, or no row of `object_values`.
+    """
+    values, object_values = np.asarray(values, np.float32), np.asarray(object_values, np.float32)
+    if not len(object_values):
+        raise InputError("values_at needs at least one row of object_values: the values of surface nobody saw")
+    points, object_id = np.asarray(points, np.float32).reshape(-1, 3), np.asarray(object_id, np.int64).reshape(-1)
+    known = (object_id >= 0) & (object_id < len(object_values))
+    out = np.where(known[:, None], object_values[np.where(known, object_id, 0)], object_values.mean(axis=0))
+    if not len(values):
+        return out
+    around_ijk, around_object, around = coarse_cells(ijk, cell_object, values)
+    grids = (
+        (COARSE * edge, around_ijk, around_object, around),
+        (edge, np.asarray(ijk).reshape(-1, 3), np.asarray(cell_object), values),
+    )
+    for size, own_ijk, own_object, own in grids:
+        table = CellTable.build(pack_keys(own_ijk, own_object))
+        row = _rows(table, voxel_indices(points, size, origin), object_id)
+        out = np.where((row >= 0)[:, None], own[row], out)
+    return out
+
+
+def _rows(table: CellTable, ijk: Array, object_id: Array) -> Array:
+    """Look up voxels of objects; -1 for those that the table lacks, and for indices that no key can hold."""
+    inside = ((ijk >= 0) & (ijk < 1 << 16)).all(1) & (object_id >= -1) & (object_id < (1 << 16) - 1)
+    row = np.full(len(ijk), -1, np.int32)
+    row[inside] = table.lookup(pack_keys(ijk[inside], object_id[inside]))
+    return row

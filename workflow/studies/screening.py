@@ -1,0 +1,87 @@
+"""Screening of many settings with few runs: elementary effects after Morris, by SALib.
+
+A design has factors with levels 0 ... p - 1 from cheap to dear. A run is a string of digits, the level of every factor. A trajectory
+changes one factor after the other, so that every step shows the effect of one of them at other values of the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+LEVELS = 4
+CANDIDATES = 20
+"""Random trajectories of which the most different ones are taken (Campolongo, Cariboni and Saltelli 2007)."""
+
+
+class Effect(NamedTuple):
+    """Effect of one factor on one score, over its whole range: from its cheapest level to its dearest.
+
+    Attributes:
+        mean: of the elementary effects, with their signs.
+        mean_size: of their absolute values (mu*), by which factors are ranked.
+        error: half of the 95 per cent interval of `mean_size` (bootstrap).
+        spread: standard deviation of the effects (sigma): large where the effect depends on the other settings.
+    """
+
+    mean: float
+    mean_size: float
+    error: float
+    spread: float
+
+
+def trajectories(factors: Sequence[str], count: int, seed: int = 0) -> list[str]:
+    """Choose the runs of `count` trajectories: count x (factors + 1) strings of levels; a run that two of them share is there twice."""
+    from SALib.sample import morris
+
+    points = morris.sample(_problem(factors), CANDIDATES, LEVELS, optimal_trajectories=count, seed=seed)
+    return ["".join(str(round(x * (LEVELS - 1))) for x in point) for point in points]
+
+
+def elementary_effects(factors: Sequence[str], runs: Sequence[str], values: Sequence[float]) -> dict[str, Effect]:
+    """Compute the effect of every factor from the values of all runs of all trajectories, in their order.
+
+    Args:
+        factors: names.
+        runs: as `trajectories` returned them.
+        values: a score of each run; NaN where it is not known.
+
+    Returns:
+        Factor -> effect. Trajectories with an unknown value are left out; without any left, the effects are NaN.
+    """
+    from SALib.analyze import morris
+
+    length = len(factors) + 1
+    groups = np.asarray(values, np.float64).reshape(-1, length)
+    kept = np.isfinite(groups).all(1)
+    if not kept.any():
+        return {factor: Effect(*[float("nan")] * 4) for factor in factors}
+    levels = np.array([[int(digit) for digit in run] for run in runs], np.float64).reshape(-1, length, len(factors))
+    points = levels[kept].reshape(-1, len(factors)) / (LEVELS - 1)
+    found = morris.analyze(_problem(factors), points, groups[kept].ravel(), num_levels=LEVELS, seed=0)
+    columns = (found[name] for name in ("mu", "mu_star", "mu_star_conf", "sigma"))
+    return {factor: Effect(*map(float, row)) for factor, row in zip(factors, zip(*columns, strict=True), strict=True)}
+
+
+def effect_lines(factors: Mapping[str, Sequence[object]], effects: Mapping[str, Mapping[str, Effect]]) -> tuple[list[str], list[list[str]]]:
+    """Format effects as a table: head and rows, a row for each factor, the most important for the first score first.
+
+    Args:
+        factors: name -> its levels.
+        effects: score -> factor -> effect.
+    """
+    first = next(iter(effects.values()))
+    ranked = sorted(factors, key=lambda factor: -np.nan_to_num(first[factor].mean_size))
+    head = ["setting", "from", "to", *effects]
+    rows = []
+    for factor in ranked:
+        levels = factors[factor]
+        cells = [f"{of[factor].mean:+.3g} (|{of[factor].mean_size:.2g}| ± {of[factor].error:.1g})" for of in effects.values()]
+        rows.append([factor, str(levels[0]), str(levels[-1]), *cells])
+    return head, rows
+
+
+def _problem(factors: Sequence[str]) -> dict[str, object]:
+    return {"num_vars": len(factors), "names": list(factors), "bounds": [[0.0, 1.0]] * len(factors)}
