@@ -1,8 +1,8 @@
 """`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
 `python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
-workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, and `python -m
-workflow lpips_vgg` fetches weights.
+workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
+design <study>` chooses the runs of a screening, and `python -m workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -41,6 +41,9 @@ def _arguments() -> argparse.Namespace:
     study.add_argument("--fingerprint", help="of the plan; recorded by Snakemake, not checked")
     study.add_argument("--keep", type=Path, help="CSV file to which the scores that are finished so far are added; nothing else")
     study.add_argument("--log", type=Path)
+    design = commands.add_parser("design")
+    design.add_argument("study", help="whose `design` has factors and a number of trajectories; its runs are printed")
+    design.add_argument("--seed", type=int, default=0)
     lpips = commands.add_parser("lpips_vgg")
     lpips.add_argument("--log", type=Path)
     batch = commands.add_parser("batch")
@@ -127,6 +130,21 @@ def _batch(arguments: argparse.Namespace) -> int:
     return _guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint))
 
 
+def _design(name: str, seed: int) -> None:
+    """Print the runs of a screening, as lines for the file of the study."""
+    from workflow.settings.study_files import load_study
+    from workflow.studies.screening import LEVELS, trajectories
+
+    design = load_study(name).design
+    if design is None or not design.trajectories:
+        raise InputError(f"config/studies/{name}.yaml: no `design` with a number of `trajectories`; config/studies/screening.yaml has one")
+    odd = [f"`{factor}`" for factor, levels in design.factors.items() if len(levels) != LEVELS]
+    if odd:
+        raise InputError(f"config/studies/{name}.yaml: `design.factors`: {', '.join(odd)}: a screening needs {LEVELS} levels of each factor")
+    for run in trajectories(list(design.factors), design.trajectories, seed):
+        print(f'    - "{run}"')
+
+
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
@@ -150,6 +168,8 @@ def main() -> int:
         name, quality, kept = arguments.study, arguments.quality, arguments.keep
         work = partial(keep_rows, name, quality, kept) if kept else partial(write_study, name, quality)
         return _guarded(f"study {name}", work, JobState("studies", name))
+    if arguments.command == "design":
+        return _guarded("design", lambda: _design(arguments.study, arguments.seed))
     if arguments.command == "lpips_vgg":
         from workflow.models.lpips import fetch_vgg
 

@@ -51,7 +51,7 @@ def run(job: Job) -> None:
         truth = scoring.material_truth(shared, job.read_shared("segmentation"), view, {"albedo": {"alex": networks["alex"]}})
         _, face_id = shared.gbuffer(view)
         for quantity in PROPERTIES:
-            rows.add("result", view.name, quantity, truth.scores(maps[quantity], quantity, METRICS[quantity], ("scaled",)))
+            rows.add("result", view.name, quantity, truth.scores(maps, quantity, METRICS[quantity], ("scaled",)))
         emission = scene.emission_map(face_id, view.world_from_camera[:3, 3])
         rows.add(
             "result",

@@ -65,22 +65,9 @@ def elementary_effects(factors: Sequence[str], runs: Sequence[str], values: Sequ
     return {factor: Effect(*map(float, row)) for factor, row in zip(factors, zip(*columns, strict=True), strict=True)}
 
 
-def effect_lines(factors: Mapping[str, Sequence[object]], effects: Mapping[str, Mapping[str, Effect]]) -> tuple[list[str], list[list[str]]]:
-    """Format effects as a table: head and rows, a row for each factor, the most important for the first score first.
-
-    Args:
-        factors: name -> its levels.
-        effects: score -> factor -> effect.
-    """
-    first = next(iter(effects.values()))
-    ranked = sorted(factors, key=lambda factor: -np.nan_to_num(first[factor].mean_size))
-    head = ["setting", "from", "to", *effects]
-    rows = []
-    for factor in ranked:
-        levels = factors[factor]
-        cells = [f"{of[factor].mean:+.3g} (|{of[factor].mean_size:.2g}| ± {of[factor].error:.1g})" for of in effects.values()]
-        rows.append([factor, str(levels[0]), str(levels[-1]), *cells])
-    return head, rows
+def ranked(effects: Mapping[str, Effect]) -> list[tuple[str, Effect]]:
+    """Return factors and effects, the largest first."""
+    return sorted(effects.items(), key=lambda item: -np.nan_to_num(item[1].mean_size))
 
 
 def _problem(factors: Sequence[str]) -> dict[str, object]:

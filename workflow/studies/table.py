@@ -357,6 +357,8 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
     lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
     if study.growth:
         lines += growth_lines(study, shown, scenes)
+    if study.design and study.design.trajectories:
+        lines += _effects(study, shown, scenes)
     return "\n".join(lines)
 
 
@@ -387,6 +389,39 @@ def _costs_table(shown: pd.DataFrame, scenes: list[str], labels: dict[str, str])
             cells = [_mean(runs[cost].dropna().tolist(), n) for cost, n in zip(COSTS, digits, strict=True)]
             body.append([scene, label, *cells])
     return _markdown(["scene", "variant", "s", "CPU s", "solver s", "solver CPU s", "peak MB", "disk MB"], body, words=2)
+
+
+def _effects(study: study_files.Study, shown: pd.DataFrame, scenes: list[str]) -> list[str]:
+    """Rank the factors of a screening by their effect on each score and on the costs (docs/development/studies.md#designs)."""
+    from workflow.studies.screening import elementary_effects, ranked
+
+    design, lines = study.design, []
+    assert design is not None
+    factors = list(design.factors)
+    runs = design.runs[: design.trajectories * (len(factors) + 1)]
+    wanted = [(*key.split("/"), protocol) for key in study.show for protocol in study.protocols]
+    wanted += [("", "cpu_seconds", ""), ("", "max_rss_mb", "")]
+    for scene in scenes:
+        of_scene = shown[shown["scene"] == scene]
+        for quantity, column, protocol in wanted:
+            chosen = of_scene[(of_scene["quantity"] == quantity) & (of_scene["metric"] == column)] if quantity else of_scene
+            chosen = chosen[chosen["protocol"] == protocol] if quantity else chosen
+            means = chosen.groupby("variant")["value" if quantity else column].mean()
+            if means.empty:
+                continue
+            found = elementary_effects(factors, runs, [means.get(run, float("nan")) for run in runs])
+            title = f"{quantity} {METRICS[column].label}, {PROTOCOLS[protocol].short}" if quantity else COST_WORDS[column]
+            body = []
+            for factor, effect in ranked(found):
+                levels = design.factors[factor]
+                size = f"{effect.mean_size:.3g} ± {effect.error:.1g}"
+                body.append([factor, str(levels[0]), str(levels[-1]), f"{effect.mean:+.3g}", size, f"{effect.spread:.2g}"])
+            head = ["setting", "from", "to", "effect", "size", "spread"]
+            lines += [f"## effects in {scene}: {title}", "", *_markdown(head, body), ""]
+    return lines
+
+
+COST_WORDS = {"cpu_seconds": "CPU seconds", "max_rss_mb": "peak memory in MB"}
 
 
 def _why(metric: str) -> str:
