@@ -137,10 +137,14 @@ def _design(name: str, seed: int) -> None:
 
     design = load_study(name).design
     if design is None or not design.trajectories:
-        raise InputError(f"config/studies/{name}.yaml: no `design` with a number of `trajectories`; config/studies/screening.yaml has one")
+        raise InputError(
+            f"config/studies/{name}.yaml: no `design` with a number of `trajectories`; config/studies/screening.yaml has one"
+        )
     odd = [f"`{factor}`" for factor, levels in design.factors.items() if len(levels) != LEVELS]
     if odd:
-        raise InputError(f"config/studies/{name}.yaml: `design.factors`: {', '.join(odd)}: a screening needs {LEVELS} levels of each factor")
+        raise InputError(
+            f"config/studies/{name}.yaml: `design.factors`: {', '.join(odd)}: a screening needs {LEVELS} levels of each factor"
+        )
     for run in trajectories(list(design.factors), design.trajectories, seed):
         print(f'    - "{run}"')
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from iif_core.errors import InputError
 from iif_core.surface import cells
+from iif_core.surface.lookup import values_at
 
 index = st.integers(0, cells.INDEX_LIMIT - 1)
 key_parts = st.tuples(index, index, index, st.integers(-1, cells.INDEX_LIMIT - 2))
@@ -119,3 +120,18 @@ def test_lowest_row_gets_a_slot_that_several_ask_for():
     assert not waiting
     found = {int(slot): int(table.slots[slot, 2]) for slot in np.flatnonzero(table.slots[:, 2] != cells.EMPTY)}
     assert found == owner
+
+
+def test_values_without_cells_are_those_of_the_object_and_far_points_find_none():
+    means = np.float32([[1, 2], [3, 6]])
+    none = np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
+    found = values_at(np.zeros((4, 3)), [0, 1, -1, 7], 0.1, np.zeros(3), *none, means)
+    np.testing.assert_array_equal(found, np.float32([[1, 2], [3, 6], [2, 4], [2, 4]]))
+    one = np.int32([[1, 1, 1]]), np.int32([0]), np.float32([[8, 9]])
+    points = [[0.15, 0.15, 0.15], [0.35, 0.35, 0.35], [-0.05, 0, 0], [1e4, 0, 0]]  # in the cell, around it, outside of the grid
+    found = values_at(points, [0, 0, 0, 0], 0.1, np.zeros(3), *one, means)
+    np.testing.assert_array_equal(found, np.float32([[8, 9], [8, 9], [1, 2], [1, 2]]))
+    with pytest.raises(InputError, match="at least one row"):
+        values_at(points, 0, 0.1, np.zeros(3), *one, means[:0])
+    with pytest.raises(InputError, match="NaN"):
+        values_at([[np.nan, 0, 0]], [0], 0.1, np.zeros(3), *one, means)

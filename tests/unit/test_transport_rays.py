@@ -6,6 +6,7 @@ import pytest
 from iif_core.errors import InputError
 from iif_core.reflectance import brdf
 from iif_core.surface import cells
+from iif_core.surface.lookup import values_at
 from tests.unit.transport_rooms import constant_cache, merge, quad, repeated
 
 
@@ -149,6 +150,9 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     expected[:, 3] = np.maximum(expected[:, 3], brdf.R_MIN)
     assert 0.2 < np.mean(row >= 0) < 0.8
     np.testing.assert_array_equal(got, expected.astype(np.float32))
+    on_host = values_at(room.points, objects[: len(ijk)], edge, origin, *cells.unpack_keys(keys), values, means)
+    on_host[:, 3] = np.maximum(on_host[:, 3], brdf.R_MIN)
+    np.testing.assert_array_equal(on_host, got[: len(ijk)])
     assert np.isfinite(room.render(T, 2, seed=0)).all()
     rendered = T.render(T.Scene(room.geometry, material, room.emitters), room.origin, room.directions, T.PathOptions(2, 3, 0))
     assert np.isfinite(rendered).all() and rendered.mean() > 0

@@ -125,6 +125,45 @@ def test_a_second_study_shares_and_a_label_reruns_the_table_alone(study):
     assert rules == {"study"}
 
 
+SHARED = """\
+title: Sizes
+scenes: [tiny]
+seeds: [0]
+scores: common_scores
+costs: [emission, metrics]
+protocols: [raw, scaled]
+common: {render: {samples: 2}, emission: {rows: 2000, samples: 4}, shading: {samples: 4, levels: 4}}
+design:
+  factors: {capture.views: [2, 3], capture.width + capture.height: [48, 64]}
+  runs: ["00", "11"]
+show: [albedo/psnr, rgb/psnr]
+plot: {kind: pareto}
+"""
+
+
+def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(study):
+    study.write("config/studies/sizes.yaml", SHARED)
+    result = study.run("results/studies/sizes.parquet")
+    assert result.returncode == 0, result.stderr[-4000:]
+    frame = pd.read_parquet(study.folder / "results/studies/sizes.parquet")
+    raw = frame[(frame["quantity"] == "albedo") & (frame["metric"] == "psnr") & (frame["protocol"] == "raw")].set_index("variant")
+    assert raw["views"].tolist() == [3, 3] and raw.loc["00", "value"] != raw.loc["11", "value"]
+    assert (raw["disk_mb"] > 0).all() and raw["cpu_seconds"].notna().all()
+    assert (frame[frame["quantity"] == "rgb"]["value"] > 0).all() and set(frame["quantity"]) >= {"rgb", "emission", "metallic"}
+    results = study.folder / "results"
+    manifest = json.loads((results / "tiny--sizes-00-s0/common_scores/manifest.json").read_text())
+    shared = json.loads((results / "tiny--s0/capture/manifest.json").read_text())
+    assert manifest["inputs"]["shared_capture"]["fingerprint"] == shared["fingerprint"]
+    assert manifest["inputs"]["capture"]["fingerprint"] != shared["fingerprint"]
+    # The variant whose photographs are the shared ones has the scores that stage metrics finds in its own maps.
+    own = pd.read_parquet(results / "tiny--sizes-11-s0/metrics/metrics.parquet")
+    common = pd.read_parquet(results / "tiny--sizes-11-s0/common_scores/scores.parquet")
+    keys, chosen = ["view", "quantity", "metric", "protocol"], ["albedo", "roughness", "metallic"]
+    both = common[common["quantity"].isin(chosen)].merge(own, on=keys)
+    both = both[both["metric"].isin(["psnr", "ssim"])]
+    assert len(both) >= 3 * 8 and (abs(both["value_x"] - both["value_y"]) < 0.02).all()
+
+
 @pytest.mark.parametrize(
     ("target", "text", "words"),
     [
@@ -132,6 +171,9 @@ def test_a_second_study_shares_and_a_label_reruns_the_table_alone(study):
         ("bad", STUDY + "sedes: [3]\n", ["config/studies/bad.yaml: `sedes`: unknown key", "Did you mean `seeds`?"]),
         ("bad", STUDY.replace("variant:", "varint:"), ["bad.yaml, variant mean: `base.varint`", "Did you mean `variant`?"]),
         ("bad", STUDY.replace("plain:", "pl.ain:"), ["bad.yaml", "'pl.ain'", "letters, digits"]),
+        ("bad", SHARED.replace('"11"', '"12"'), ["`design.runs`: found '12'", "which of its levels"]),
+        ("bad", SHARED.replace("capture.views:", "views:"), ["`design.factors`: found `views:", "needed <section>.<key>"]),
+        ("bad", SHARED.replace("  runs", "  trajectories: 2\n  runs"), ["which are 6 runs; there are 2", "design bad"]),
         ("bad", STUDY.replace("[tiny, else", "[tinny, else"), ["`scenes`: tinny is not in", "Did you mean tiny?"]),
     ],
 )

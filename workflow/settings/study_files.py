@@ -11,7 +11,7 @@ import itertools
 import re
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, PositiveFloat, ValidationError
 
@@ -67,7 +67,7 @@ class Design(Section):
 
     factors: dict[str, list[Any]] = Field(min_length=1)
     """Setting, or settings joined by ` + `, -> its levels, from cheap to dear."""
-    trajectories: int = Field(0, ge=0)
+    trajectories: Literal[0] | Annotated[int, Field(ge=2)] = 0
     """The first runs are this number of trajectories of Morris (`workflow/studies/screening.py`): the page then has the effect of
     each factor."""
     runs: list[str] = Field(min_length=1)
@@ -249,8 +249,8 @@ def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str,
         digits = run if len(run) == len(design.factors) and run.isdecimal() else ""
         if not digits or any(int(d) >= len(levels) for d, levels in zip(digits, design.factors.values(), strict=True)):
             raise InputError(
-                f"{path}: `design.runs`: found {run!r}, needed a digit for each of the {len(design.factors)} factors, the number of"
-                " one of its levels, counted from 0"
+                f"{path}: `design.runs`: found {run!r}, needed a digit for each of the {len(design.factors)} factors: which of"
+                " its levels, counted from 0"
             )
         if run in others:
             raise InputError(f"{path}: `design.runs`: variant {run} is there already; give it another name")

@@ -1,7 +1,7 @@
 """Screening of many settings with few runs: elementary effects after Morris, by SALib.
 
-A design has factors with levels 0 ... p - 1 from cheap to dear. A run is a string of digits, the level of every factor. A trajectory
-changes one factor after the other, so that every step shows the effect of one of them at other values of the rest.
+A design has factors with levels 0 ... p - 1 from cheap to dear. A run is a string of digits, the level of every factor. A
+trajectory changes one factor after the other, so that every step shows the effect of one of them at other values of the rest.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Effect(NamedTuple):
 
 
 def trajectories(factors: Sequence[str], count: int, seed: int = 0) -> list[str]:
-    """Choose the runs of `count` trajectories: count x (factors + 1) strings of levels; a run that two of them share is there twice."""
+    """Choose the runs of `count` trajectories: count x (factors + 1) strings of levels, some of which may be equal."""
     from SALib.sample import morris
 
     points = morris.sample(_problem(factors), CANDIDATES, LEVELS, optimal_trajectories=count, seed=seed)
