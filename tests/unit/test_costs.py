@@ -32,7 +32,14 @@ def planted(rooms=6, of_room=8, noise=0.0, seed=0):
             counts = {"job": 1.0, **{name: float(10 ** random.uniform(-2, 1)) for name in ("pixels", "faces", "paths")}}
             cost = factor * sum(TRUE[name] * counts[name] for name in counts)
             measures = {"cpu_seconds": cost, "seconds": cost / 2, "memory_mb": 100 * cost, "disk_mb": cost}
-            facts = {"scene": f"r{room}", "stage": "render", "kind": "all", "threads": 1 + i % 2, "fingerprint": "f"}
+            facts = {
+                "scene": f"r{room}",
+                "stage": "render",
+                "kind": "all",
+                "threads": 1 + i % 2,
+                "machine": 1.0,
+                "fingerprint": "f",
+            }
             rows.append({**facts, **measures, **counts})
     return rows
 
@@ -116,7 +123,8 @@ def test_size_from_headers(document, tmp_path):
     mesh, photo = tmp_path / "mesh.ply", tmp_path / "0.png"
     mesh.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nelement face 1234\nend_header\n" + b"\0" * 9999)
     Image.new("RGB", (640, 480)).save(photo)
-    folder = {**document, "source": {"kind": "folder"}}
+    box = {**document, "capture": {**document["capture"], "views": 16, "width": 160, "height": 160}}
+    folder = {**box, "source": {"kind": "folder"}}
     found = size.estimate(folder, [mesh, photo, tmp_path / "gone.png"])
     assert (found.views, found.pixels, found.faces, found.exact) == (1, 160 * 120, 1234, False)
     assert found.source_mb == pytest.approx((mesh.stat().st_size + photo.stat().st_size) / 1e6)
@@ -124,7 +132,7 @@ def test_size_from_headers(document, tmp_path):
     mesh.write_bytes(b"ply\nelement face 999999999999\n")  # a header that cannot be true
     found = size.estimate(folder, [mesh, photo])
     assert found.pixels == 160 * 160 and found.faces < 100
-    assert size.estimate(document, []).pixels == 16 * 160 * 160
+    assert size.estimate(box, []).pixels == 16 * 160 * 160
 
 
 def test_machine_factor_is_that_of_finished_jobs(tmp_path):
@@ -203,10 +211,10 @@ def test_what_snakemake_is_told():
 def test_the_forecast_names_every_stage_and_the_whole(repository, monkeypatch):
     monkeypatch.chdir(repository)
     machine.machine_factor.cache_clear()
-    lines = forecast.forecast([forecast.Planned(stage, "kitchen", 2) for stage in ("render", "capture")], "draft", 2)
+    lines = forecast.forecast([forecast.Planned(stage, "kitchen", 2, "draft") for stage in ("render", "capture")], 2)
     assert [line.split()[0] for line in lines] == ["stage", "capture", "render", "expected:"]
     assert lines[-1].endswith("of wall time on 2 cores")
-    assert forecast.forecast([], "draft", 2) == []
+    assert forecast.forecast([], 2) == []
     assert os.getcwd() == str(repository)
 
 
@@ -215,9 +223,22 @@ def test_jobs_are_added_once_and_the_fit_is_that_of_the_table(tmp_path, monkeypa
     records.write_rows(table, planted(rooms=3))
     new = planted(rooms=4)[-3:]
     monkeypatch.setattr(refit, "gather", lambda folders: [*new, *planted(rooms=3)[:2]])
-    lines = refit.refit([], table, fits)
-    assert lines[0] == f"{table}: 27 jobs, 3 of them new"
-    assert refit.refit([], table, fits)[0] == f"{table}: 27 jobs, 0 of them new"
+    lines = refit.refit([tmp_path], table, fits)
+    assert lines[1] == f"{table}: 27 jobs, 3 of them new"
+    assert refit.refit([tmp_path], table, fits)[1] == f"{table}: 27 jobs, 0 of them new"
     assert any(line.startswith("| render, all | 27 | 4 | ") for line in lines)
     found = model.read_fits(fits)
     assert found == model.fit_rows(records.read_rows(table)) and len(found) == 4
+
+
+def test_jobs_of_a_slower_machine_fit_as_if_they_were_of_the_first(tmp_path, monkeypatch):
+    table, fits = tmp_path / "costs.csv", tmp_path / "coefficients.json"
+    records.write_rows(table, planted(rooms=3))
+    slow = [row for row in planted(rooms=5) if row["scene"] in ("r3", "r4")]
+    for row in slow:
+        row.update(cpu_seconds=1.6 * row["cpu_seconds"], seconds=1.6 * row["seconds"])
+    monkeypatch.setattr(refit, "gather", lambda folders: slow)
+    assert "16 new jobs of a machine that takes 1.6 times as long" in refit.refit([tmp_path], table, fits)[0]
+    found = model.read_fits(fits)["render", "all", "cpu_seconds"]
+    assert found.coefficients == pytest.approx({name: value for name, value in TRUE.items() if value}, rel=1e-3)
+    assert {row["machine"] for row in records.read_rows(table)} == {1.0, 1.6}

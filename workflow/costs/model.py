@@ -20,6 +20,8 @@ from workflow.costs.work import SceneSize, Work, work_of
 
 SHIPPED = Path(__file__).with_name("coefficients.json")
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
+TIMES = ("cpu_seconds", "seconds")
+"""Measures that follow the speed of the machine."""
 FEWEST_ROOMS = 3
 """Rooms from which on errors at unseen rooms are measured; with fewer, the range is that of `UNMEASURED`."""
 LEAST_RATIO = 2.0
@@ -105,12 +107,13 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
     """Fit the cost of every kind of job.
 
     Args:
-        rows: of `workflow.costs.records`: scene, stage, kind, threads, the measures and the counts. Wall seconds are fitted to
-            jobs of two threads alone.
+        rows: of `workflow.costs.records`: scene, stage, kind, threads, machine, the measures and the counts. Wall seconds are
+            fitted to jobs of two threads alone, and times of all machines are brought to those of factor 1.
     """
     of_kind: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
-        of_kind[row["stage"], row["kind"]].append(row)
+        times = {name: row[name] / row.get("machine", 1.0) for name in TIMES if name in row}
+        of_kind[row["stage"], row["kind"]].append({**row, **times})
     fits = {}
     for (stage, kind), jobs in sorted(of_kind.items()):
         for measure in MEASURES:
@@ -121,9 +124,9 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
 
 
 def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
-    fixed = {"scene", "stage", "kind", "threads", "fingerprint", *MEASURES}
+    fixed = {"scene", "stage", "kind", "threads", "machine", "fingerprint", *MEASURES}
     names = [name for name in rows[0] if name not in fixed]
-    if measure in ("cpu_seconds", "seconds") and not _sizes_differ(rows, names):
+    if measure in TIMES and not _sizes_differ(rows, names):
         names.remove("job")
     coefficients = _coefficients(rows, names, measure)
     rooms = sorted({row["scene"] for row in rows})

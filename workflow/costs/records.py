@@ -13,8 +13,9 @@ from workflow.costs.work import work_of
 from workflow.registry import SHARED, STAGES
 
 MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
-FIXED = ("scene", "stage", "kind", "threads", "fingerprint")
-"""Columns of the table beside measures and counts; `scene` is the room, without the study that took it."""
+FIXED = ("scene", "stage", "kind", "threads", "machine", "fingerprint")
+"""Columns of the table beside measures and counts; `scene` is the room, without the study that took it, and `machine` how many
+times as long the machine takes as that of the first rows."""
 
 
 def disk_mb(manifest: dict[str, Any]) -> float:
@@ -65,6 +66,7 @@ def _row(path: Path, manifest: dict[str, Any], known: dict[tuple[str, str], dict
         "stage": stage,
         "kind": work.kind,
         "threads": job["threads"],
+        "machine": 1.0,
         "fingerprint": manifest["fingerprint"],
         "cpu_seconds": job["cpu_seconds"],
         "seconds": job["seconds"],
@@ -103,4 +105,4 @@ def read_rows(path: Path) -> Iterator[dict[str, Any]]:
     with path.open(newline="") as file:
         for row in csv.DictReader(file):
             named = {name: text if name in FIXED else float(text) for name, text in row.items() if text != ""}
-            yield {**named, "threads": int(named["threads"])}
+            yield {**named, "threads": int(named["threads"]), "machine": float(named["machine"])}

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
+from statistics import median
 from typing import Any
 
+from workflow.costs.machine import SHORTEST
 from workflow.costs.model import MEASURES, SHIPPED, Fits, fit_rows, write_fits
 from workflow.costs.records import gather, read_rows, write_rows
 
@@ -17,19 +20,37 @@ def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED) ->
     """Add the finished jobs under `folders` to the table, fit all costs again, and return lines that say how well they fit.
 
     Args:
-        folders: like `results/`; with none, the table stays as it is. A job that the table has already is not added twice.
+        folders: like `results/`; with none, the table stays as it is. A job that the table has already is not added twice. All
+            jobs of a folder are of one machine, whose factor is found by what the table says of such jobs.
         table: CSV file of rows (`workflow.costs.records.write_rows`).
         fits: JSON file that is written.
     """
     rows = list(read_rows(table)) if table.is_file() else []
-    known = {_identity(row) for row in rows}
-    new = [row for row in gather(folders) if _identity(row) not in known]
-    if new:
-        write_rows(table, rows + new)
+    before, lines = len(rows), []
+    for folder in folders:
+        known = {_identity(row) for row in rows}
+        new = [row for row in gather([folder]) if _identity(row) not in known]
+        factor = _factor(new, fit_rows(rows)) if rows else 1.0
+        rows += [{**row, "machine": factor} for row in new]
+        lines.append(f"{folder}: {len(new)} new jobs of a machine that takes {factor:.3g} times as long")
+    if len(rows) > before:
+        write_rows(table, rows)
         rows = list(read_rows(table))
     found = fit_rows(rows)
     write_fits(fits, found)
-    return [f"{table}: {len(rows)} jobs, {len(new)} of them new", *_lines(found)]
+    return [*lines, f"{table}: {len(rows)} jobs, {len(rows) - before} of them new", *_lines(found)]
+
+
+def _factor(rows: list[dict[str, Any]], fits: Fits) -> float:
+    """Return how many times as long some jobs took as those that were fitted, in the median over stages and kinds; 1 where
+    nothing tells."""
+    ratios: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for row in rows:
+        fit = fits.get((row["stage"], row["kind"], "cpu_seconds"))
+        expected = fit.predict(row).middle if fit else 0.0
+        if expected > 0 and row["cpu_seconds"] >= SHORTEST:
+            ratios[row["stage"], row["kind"]].append(row["cpu_seconds"] / expected)
+    return float(f"{median(median(of_kind) for of_kind in ratios.values()):.3g}") if ratios else 1.0
 
 
 def _identity(row: dict[str, Any]) -> tuple[str, str, float]:
