@@ -11,13 +11,14 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always plan relight results \
+.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always plan relight bench results \
   config envs iif_core profiles tests workflow
 
 help:
 	@echo 'make scenes/<name>    install what is missing, then make the scene (config/scenes/<name>.yaml)'
 	@echo 'make relight/<name>   the scene under other light and from other cameras, as its file says'
 	@echo 'make plan/<name>      what the scene requires, before any long work'
+	@echo 'make bench/<name>     three points of speed and accuracy in this room'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make verify           re-hash every artefact against its manifest'
@@ -43,12 +44,15 @@ relight/%: setup always
 plan/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
+bench/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
 results/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
 # Folders of the checkout, which make would take for targets that are up to date.
-plan relight results:
-	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter plan relight,$@),kitchen,kitchen/capture/manifest.json)' >&2; exit 1
+plan relight bench results:
+	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter plan relight bench,$@),kitchen,kitchen/capture/manifest.json)' >&2; exit 1
 
 config envs iif_core profiles tests workflow:
 	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1

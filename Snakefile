@@ -1,6 +1,6 @@
 # Intrinsic Image Fusion: photographs, cameras and a mesh -> scenes/<name>/ with materials, lights and camera response.
 #   snakemake --cores 2 scenes/kitchen
-#   snakemake --cores 2 scenes/kitchen --config quality=standard
+#   snakemake --cores 2 scenes/kitchen --config quality=standard       or budget=120 (seconds), target=held_out:24, point=p07
 #   snakemake --cores 2 scenes                                     every scene of config/batch.tsv
 # The rules are in workflow/rules/, the computations in iif_core/; docs/development/architecture.md is the map.
 from snakemake.utils import min_version
@@ -51,7 +51,12 @@ include: "workflow/rules/unknown.smk"
 
 
 onstart:
+    choose.keep(REQUEST, CHOSEN)
     tell_costs()
+
+
+onsuccess:
+    tell_target()
 
 
 onerror:

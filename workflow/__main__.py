@@ -2,7 +2,8 @@
 
 `python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
 workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
-design <study>` chooses the runs of a screening, and `python -m workflow lpips_vgg` fetches weights.
+design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
+`python -m workflow bench <scene>` shows what three of them did in a room, and `python -m workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -44,6 +45,11 @@ def _arguments() -> argparse.Namespace:
     design = commands.add_parser("design")
     design.add_argument("study", help="whose `design` has factors and a number of trajectories; its runs are printed")
     design.add_argument("--seed", type=int, default=0)
+    points = commands.add_parser("points")
+    points.add_argument("--log", type=Path)
+    bench = commands.add_parser("bench")
+    bench.add_argument("scene")
+    bench.add_argument("--log", type=Path)
     lpips = commands.add_parser("lpips_vgg")
     lpips.add_argument("--log", type=Path)
     batch = commands.add_parser("batch")
@@ -133,18 +139,11 @@ def _batch(arguments: argparse.Namespace) -> int:
 def _design(name: str, seed: int) -> None:
     """Print the runs of a screening, as lines for the file of the study."""
     from workflow.settings.study_files import load_study
-    from workflow.studies.screening import LEVELS, trajectories
+    from workflow.studies.screening import trajectories
 
     design = load_study(name).design
     if design is None or not design.trajectories:
-        raise InputError(
-            f"config/studies/{name}.yaml: no `design` with a number of `trajectories`; config/studies/screening.yaml has one"
-        )
-    odd = [f"`{factor}`" for factor, levels in design.factors.items() if len(levels) != LEVELS]
-    if odd:
-        raise InputError(
-            f"config/studies/{name}.yaml: `design.factors`: {', '.join(odd)}: a screening needs {LEVELS} levels of each factor"
-        )
+        raise InputError(f"config/studies/{name}.yaml: no `design` with `trajectories`, as tradeoff_screening.yaml has")
     for run in trajectories(list(design.factors), design.trajectories, seed):
         print(f'    - "{run}"')
 
@@ -172,6 +171,14 @@ def main() -> int:
         name, quality, kept = arguments.study, arguments.quality, arguments.keep
         work = partial(keep_rows, name, quality, kept) if kept else partial(write_study, name, quality)
         return _guarded(f"study {name}", work, JobState("studies", name))
+    if arguments.command == "points":
+        from workflow.trade.front import write_points
+
+        return _guarded("points", lambda: print("\n".join(write_points())))
+    if arguments.command == "bench":
+        from workflow.trade.bench import write_bench
+
+        return _guarded("bench", partial(write_bench, arguments.scene))
     if arguments.command == "design":
         return _guarded("design", lambda: _design(arguments.study, arguments.seed))
     if arguments.command == "lpips_vgg":

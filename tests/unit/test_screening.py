@@ -1,9 +1,14 @@
 """Screening of settings: trajectories, and effects against closed forms."""
 
+import json
+
 import numpy as np
 import pytest
 
-from workflow.studies.screening import LEVELS, elementary_effects, ranked, trajectories
+from iif_core.errors import InputError
+from workflow.settings import study_files
+from workflow.settings.study_files import MORRIS_LEVELS as LEVELS
+from workflow.studies.screening import elementary_effects, ranked, trajectories
 
 FACTORS = ["a", "b", "c", "d"]
 
@@ -28,6 +33,36 @@ def test_effects_of_a_plane_are_its_slopes_and_interaction_shows_as_spread():
     assert [name for name, _ in ranked(plane)][:2] == ["a", "b"]
     product = elementary_effects(FACTORS, runs, at[:, 2] * at[:, 3])
     assert product["c"].spread > 0.1 and product["d"].spread > 0.1 and product["a"].mean_size < 1e-9
+
+
+def study(tmp_path, monkeypatch, runs, count=2):
+    """A study of two factors with these runs, loaded."""
+    (tmp_path / "config/studies").mkdir(parents=True)
+    (tmp_path / "config/studies/scenes.yaml").write_text("a: {source: {kind: builtin, scene: tiny}, prior: {kind: simulated}}\n")
+    levels = "{base.ridge: [1, 2, 3, 4], prior.samples: [1, 2, 3, 4]}"
+    design = f"{{trajectories: {count}, factors: {levels}, runs: {json.dumps(runs)}}}"
+    (tmp_path / "config/studies/s.yaml").write_text(f"title: T\nscenes: [a]\ndesign: {design}\n")
+    monkeypatch.chdir(tmp_path)
+    return study_files.load_study("s")
+
+
+def test_runs_become_variants_and_a_run_that_is_there_twice_is_one(tmp_path, monkeypatch):
+    found = study(tmp_path, monkeypatch, ["00", "20", "22", "22", "02", "00"])
+    assert list(found.variants) == ["00", "20", "22", "02"]
+    assert found.variants["20"].overrides == {"base": {"ridge": 3}, "prior": {"samples": 1}}
+
+
+@pytest.mark.parametrize("runs", [["00", "10", "12"], ["00", "22", "20"], ["00", "20", "00"], ["00", "00", "02"]])
+def test_runs_that_are_no_trajectories_are_refused(tmp_path, monkeypatch, runs):
+    with pytest.raises(InputError, match=f"those from '{runs[0]}' on are no trajectory"):
+        study(tmp_path, monkeypatch, [*runs, "00", "20", "22"])
+
+
+def test_too_few_runs_for_the_trajectories_are_refused(tmp_path, monkeypatch):
+    with pytest.raises(InputError, match="found 3, which are 9 runs; there are 6"):
+        study(tmp_path, monkeypatch, ["00", "20", "22"] * 2, 3)
+    with pytest.raises(InputError, match="needed are 2 to 19"):
+        trajectories(FACTORS, 20)
 
 
 @pytest.mark.filterwarnings("error")

@@ -9,7 +9,7 @@ from iif_core.errors import InputError
 from iif_core.fusion.options import FusionOptions
 from workflow import settings
 from workflow.registry import STAGES
-from workflow.settings import batch_table, study_files, yaml_file
+from workflow.settings import batch_table, loading, study_files, yaml_file
 from workflow.settings.names import did_you_mean_path
 
 GOOD = "source: {kind: builtin}\nprior: {kind: simulated}\n"
@@ -181,8 +181,8 @@ def test_a_folder_without_configuration_uses_that_of_the_repository(tmp_path, re
 def test_a_folder_with_scenes_of_its_own_uses_these_alone_with_the_presets_of_the_repository(scene, repository):
     root = scene(GOOD)
     (root / "config/quality/draft.yaml").unlink()
-    draft = settings.read_yaml(repository / "config/quality/draft.yaml")
-    assert settings.load("x", "draft", root).capture.samples == draft["capture"]["samples"] != 128
+    paper = settings.read_yaml(repository / "config/quality/paper.yaml")
+    assert settings.load("x", "paper", root).capture.samples == paper["capture"]["samples"] != 64
     assert [line.name for line in batch_table.read_table(root)] == ["x"]
     with pytest.raises(InputError, match="config/scenes/kitchen.yaml: not found. Known scenes: x"):
         settings.load("kitchen", "draft", root)
@@ -322,3 +322,58 @@ def test_an_override_that_cannot_be(scene, text, words):
     with pytest.raises(InputError) as caught:
         settings.load("x", "draft", scene(f"{GOOD}{text}\n"))
     assert words in str(caught.value), caught.value
+
+
+def test_limits_of_a_scene_hold_for_every_quality_and_raise_nothing(repository, tmp_path, monkeypatch):
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    text = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\nlimits: {views: 20, width: 200, predictions: 6}\n"
+    (tmp_path / "config/scenes/t.yaml").write_text(text)
+    draft, paper = (settings.load("t", quality, tmp_path) for quality in ("draft", "paper"))
+    assert (paper.capture.views, paper.capture.width, paper.capture.height, paper.prior.samples) == (20, 200, 200, 6)
+    assert draft.capture.views <= 20 and draft.capture.width <= 200 and draft.prior.samples <= 6
+    (tmp_path / "config/scenes/t.yaml").write_text(text + "capture: {views: 30}\n")  # what the scene sets itself, holds
+    assert settings.load("t", "paper", tmp_path).capture.views == 30
+    (tmp_path / "config/scenes/t.yaml").write_text(text.replace("views: 20", "views: 0"))
+    with pytest.raises(InputError, match=r"`limits.views`: found 0"):
+        settings.load("t", "draft", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("draft", "message"),
+    [
+        ("point: draft\n", r"config/quality/draft.yaml: `point`: found 'draft'; needed is the name of a file beside it"),
+        ("point: nowhere\n", r"config/quality/draft.yaml: `point`: found 'nowhere'"),
+        ("point: [p01]\n", r"config/quality/draft.yaml: `point`: found \['p01'\]"),
+        ("capture: {veiws: 3}\n", r"config/quality/draft.yaml: `capture.veiws`: unknown key. Did you mean `views`?"),
+        ("point: p01\nmetrics: {veiws: 3}\n", r"config/quality/draft.yaml: `metrics.veiws`"),
+    ],
+)
+def test_mistakes_in_a_quality_are_blamed_on_its_file(tmp_path, draft, message):
+    for part in ("scenes", "quality"):
+        (tmp_path / "config" / part).mkdir(parents=True)
+    (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
+    (tmp_path / "config/quality/draft.yaml").write_text(draft)
+    with pytest.raises(InputError, match=message):
+        settings.load("t", "draft", tmp_path)
+
+
+def test_a_quality_may_be_a_point_with_a_change_and_a_point_alone_is_known_by_its_name(tmp_path):
+    for part in ("scenes", "quality"):
+        (tmp_path / "config" / part).mkdir(parents=True)
+    (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n")
+    (tmp_path / "config/quality/p91.yaml").write_text("capture: {views: 9, width: 90}\nprior: {samples: 3}\n")
+    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\ncapture: {views: 7}\n")
+    found = settings.load("t", "draft", tmp_path)
+    assert (found.capture.views, found.capture.width, found.prior.samples) == (7, 90, 3)
+    assert loading.canonical("p91", tmp_path) == "p91"
+    (tmp_path / "config/quality/draft.yaml").write_text("point: p91\n")
+    assert loading.canonical("p91", tmp_path) == "draft" and loading.canonical("paper", tmp_path) == "paper"
+    assert loading.overridden("t", "p91", tmp_path) == []
+    (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, samples: 5}\n")
+    assert loading.overridden("t", "draft", tmp_path) == ["prior.samples"]
+
+
+def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):
+    (tmp_path / "config/scenes").mkdir(parents=True)
+    with pytest.raises(InputError, match=r"config/scenes/typo.yaml: not found"):
+        settings.load("typo--bench-p01-s0", "draft", tmp_path)

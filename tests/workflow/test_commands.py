@@ -94,7 +94,7 @@ def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant
     last = result.stderr.strip().splitlines()[-1]
     assert result.returncode == 1 and "Exception" not in result.stderr
     assert last.startswith(
-        f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name>, plan/<name> and "
+        f"error: {found}: no rule makes this. Did you mean {meant}? Targets are scenes/<name>, plan/<name>, bench/<name> and "
     )
 
 

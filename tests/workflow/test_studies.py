@@ -173,7 +173,7 @@ def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(s
         ("bad", STUDY.replace("plain:", "pl.ain:"), ["bad.yaml", "'pl.ain'", "letters, digits"]),
         ("bad", SHARED.replace('"11"', '"12"'), ["`design.runs`: found '12'", "which of its levels"]),
         ("bad", SHARED.replace("capture.views:", "views:"), ["`design.factors`: found `views:", "needed <section>.<key>"]),
-        ("bad", SHARED.replace("  runs", "  trajectories: 2\n  runs"), ["which are 6 runs; there are 2", "design bad"]),
+        ("bad", SHARED.replace("  runs", "  trajectories: 2\n  runs"), ["capture.views", "trajectories need 4 levels of each"]),
         ("bad", STUDY.replace("[tiny, else", "[tinny, else"), ["`scenes`: tinny is not in", "Did you mean tiny?"]),
     ],
 )

@@ -53,6 +53,6 @@ def plan(quality: str) -> Plan:
 def fingerprint(quality: str) -> str:
     """Return a digest that changes with the scenes, their results, the refused scenes and the code of the summary."""
     found = plan(quality)
-    code = [fp.modules_digest(fp.import_closure("workflow.batch.summary")), sha256_of(TEMPLATE)]
+    code = [fp.modules_digest(fp.modules_of("workflow.batch")), sha256_of(TEMPLATE)]
     facts = [[line.number, line.name] for line in found.lines], found.ready, found.refused, quality, code
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]

@@ -17,9 +17,10 @@ from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
-from workflow.settings import QUALITIES, SCENE_NAME, require_relighting, scene_file
+from workflow.settings import SCENE_NAME, require_relighting, scene_file
 from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table
+from workflow.trade import bench, choose
 
 STARTED = time.time()
 FOLDER = os.getcwd()
@@ -50,16 +51,22 @@ for place in (".", "results", "scenes", ".snakemake"):
         )
 
 
-QUALITY = str(config.get("quality", "draft"))
-if QUALITY not in QUALITIES:
-    stop(
-        f"--config quality={QUALITY}: unknown quality; allowed: {', '.join(QUALITIES)}"
-    )
-if set(config) - {"quality"}:
-    stop(
-        f"--config {', '.join(sorted(set(config) - {'quality'}))}: unknown key; allowed: quality."
-        " Everything else belongs into config/scenes/<scene>.yaml (docs/reference/settings.md)."
-    )
+# `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
+REQUEST = or_stop(
+    choose.read,
+    dict(config),
+    set(workflow.config_settings.overwrite_config or {}),
+    workflow.resource_settings.cores,
+)
+QUALITY = REQUEST.quality  # of studies and batches
+CHOSEN = {}
+
+
+def quality_of(scene):
+    """The quality of a scene; it is chosen once in a run."""
+    if scene not in CHOSEN:
+        CHOSEN[scene] = or_stop(choose.choice, REQUEST, scene)
+    return CHOSEN[scene].quality
 
 
 def image(wildcards):
@@ -97,7 +104,8 @@ def reads(stage, *names):
     assert tuple(shared) == fingerprints.STAGES[stage].shared, (stage, names)
 
     def inputs(wildcards):
-        or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
+        quality = quality_of(wildcards.scene)
+        or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
         common = study_files.shared_scene(wildcards.scene)
         found = {name: manifest(name, wildcards.scene) for name in own}
         return found | {f"{SHARED}{name}": manifest(name, common) for name in shared}
@@ -107,7 +115,8 @@ def reads(stage, *names):
 
 def manifest(stage, scene):
     """Manifest of a stage, in the folder of the scene that computes it."""
-    return f"results/{fingerprints.home(stage, scene, QUALITY)}/{stage}/manifest.json"
+    home = fingerprints.home(stage, scene, quality_of(scene))
+    return f"results/{home}/{stage}/manifest.json"
 
 
 def job(stage):
@@ -117,8 +126,9 @@ def job(stage):
     """
 
     def arguments(wildcards):
-        mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, QUALITY)
-        return f"{stage} {wildcards.scene} --quality {QUALITY} --fingerprint {mark}"
+        scene, quality = wildcards.scene, quality_of(wildcards.scene)
+        mark = or_stop(fingerprints.fingerprint, stage, scene, quality)
+        return f"{stage} {scene} --quality {quality} --fingerprint {mark}"
 
     return arguments
 
@@ -128,8 +138,8 @@ def needs(stage):
 
     def value(of, grows):
         def resource(wildcards, threads, attempt):
-            scene = wildcards.scene
-            cost = or_stop(forecast.job_cost, stage, scene, QUALITY, threads)
+            scene, quality = wildcards.scene, quality_of(wildcards.scene)
+            cost = or_stop(forecast.job_cost, stage, scene, quality, threads)
             return of(cost) * (attempt if grows else 1)
 
         return resource
@@ -143,7 +153,7 @@ def needs(stage):
 
 def resolved(scene):
     """All settings of a scene, as plain values."""
-    return json.loads(or_stop(fingerprints.resolved, scene, QUALITY))
+    return json.loads(or_stop(fingerprints.resolved, scene, quality_of(scene)))
 
 
 def no_stage(wildcards):
@@ -197,6 +207,26 @@ def plan_inputs(wildcards):
         f"plan/{wildcards.scene}", f"results/{wildcards.scene}/plan/manifest.json"
     )
     return {"manifest": manifest("plan", wildcards.scene)}
+
+
+def bench_inputs(wildcards):
+    """Scores of the three points that are run in this room; a bench of which a file is gone is written again."""
+    folder = f"bench/{wildcards.scene}"
+    folder_or_stop(folder)
+    names = ("bench.json", "bench.md")
+    if os.path.isdir(folder) and not all(
+        os.path.exists(f"{folder}/{name}") for name in names
+    ):
+        workflow.dag.forcefiles.add(folder)
+    return [
+        manifest("metrics", scene) for scene in bench.scenes(wildcards.scene).values()
+    ]
+
+
+def tell_target():
+    """Say of each scene that was made whether it reached the score that was asked for."""
+    for line in choose.reached(REQUEST, CHOSEN):
+        print(line, file=sys.stderr)
 
 
 def relight_inputs(*names):
@@ -256,6 +286,11 @@ batch_asked = []
 
 def batch_plan():
     """What can be run; a table that cannot be read stops here, before any job."""
+    if REQUEST.key in ("budget", "target"):
+        stop(
+            f"--config {REQUEST.key}={REQUEST.value}: it is for scenes that are named, such as scenes/kitchen; a batch has one"
+            " quality, so that its scenes can be compared. Give it quality=... or point=..."
+        )
     plan = or_stop(batch_table.plan, QUALITY)
     if not batch_asked:
         batch_asked.append(True)
@@ -284,13 +319,20 @@ def batch_targets(wildcards):
 
 
 def tell_costs():
-    """Say what the jobs that are needed will take."""
+    """Say which quality was chosen, and what the jobs that are needed will take."""
     jobs = [
-        forecast.Planned(job.rule.name, job.wildcards.scene, job.threads)
+        forecast.Planned(
+            job.rule.name,
+            job.wildcards.scene,
+            job.threads,
+            quality_of(job.wildcards.scene),
+        )
         for job in workflow.dag.needrun_jobs(exclude_finished=False)
         if job.rule.name in fingerprints.STAGES
     ]
-    for line in forecast.forecast(jobs, QUALITY, workflow.cores):
+    for line in forecast.forecast(jobs, workflow.cores):
+        print(line, file=sys.stderr)
+    for line in choose.told(REQUEST, CHOSEN) if jobs else []:
         print(line, file=sys.stderr)
 
 

@@ -75,3 +75,20 @@ rule relit:
     shell:
         "mkdir -p {output.pictures:q} && cp -r results/{wildcards.scene}/relight/. {output.pictures:q}"
         " && rm {output.pictures:q}/manifest.json > {log:q} 2>&1"
+
+
+rule bench:
+    """Run three points of the measured front in this room: what they take on this machine, and what they score."""
+    input:
+        bench_inputs,
+    output:
+        page=directory("bench/{scene}"),
+    log:
+        "results/{scene}/logs/bench.log",
+    localrule: True
+    params:
+        mark=lambda wildcards: or_stop(bench.marks, wildcards.scene),
+    message:
+        "{wildcards.scene}: three points of speed and accuracy, in bench/{wildcards.scene}/bench.md"
+    shell:
+        "python3 -m workflow bench {wildcards.scene} --log {log:q}"

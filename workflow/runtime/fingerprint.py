@@ -149,6 +149,12 @@ def import_closure(*modules: str) -> list[str]:
     return sorted(seen)
 
 
+def modules_of(package: str) -> list[str]:
+    """Return the modules of one of our packages, also of the infrastructure."""
+    folder = REPOSITORY.joinpath(*package.split("."))
+    return sorted(f"{package}.{path.stem}" for path in folder.glob("*.py") if path.stem != "__init__")
+
+
 def _digest_of(tree: ast.Module) -> str:
     for node in ast.walk(tree):  # docstrings do not change results, and the tree holds no comments
         body = getattr(node, "body", None)

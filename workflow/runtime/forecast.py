@@ -9,6 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from iif_core.errors import InputError
 from workflow.costs.machine import machine_factor
 from workflow.costs.model import Cost, Range, predict
 from workflow.costs.size import estimate, size_of_capture
@@ -23,6 +24,12 @@ UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
 """Of kinds of jobs that nobody has measured yet: priors that are networks, and segmentation by masks of a network."""
 START, START_OF_JOB = 5.0, 0.9
 """Wall seconds that Snakemake takes to start, and for the start of each job beside what the job measures itself."""
+ONE_THREAD = ("export", "report", "publish")
+"""Stages whose rules take one thread; the others take two."""
+COMPILATION = {"base": 15.0, "affines": 15.0}
+"""CPU seconds that the first job of a stage takes longer in a checkout whose kernels were never compiled."""
+COMPILED = "iif_core/{}/__pycache__/kernels.*.nbi"
+"""Where numba keeps what it compiled."""
 
 
 @lru_cache(None)
@@ -77,20 +84,72 @@ def _rounded(mb: float) -> int:
     return math.ceil(mb / 100) * 100
 
 
+class Wall(NamedTuple):
+    """Wall time of a whole scene from its photographs to scenes/<scene>, and what is not counted in it, in words."""
+
+    seconds: Range
+    beside: str
+
+
+def wall(scene: str, quality: str, cores: int) -> Wall:
+    """Return how long a scene takes on this machine, with the start of Snakemake and of the jobs and compilation, whatever is
+    finished already. Photographs that are rendered are taken as given: making them is no part of it.
+
+    Raises:
+        InputError: the settings or files of the scene cannot be used, or a stage is of a kind that was never measured.
+    """
+    settings = json.loads(fingerprints.resolved(scene, quality))
+    rendered = settings["source"]["kind"] in ("builtin", "mitsuba")
+    total = [START, START, START]
+    for stage in STAGES.values():
+        if stage.on_demand or (stage.name == "capture" and rendered):
+            continue
+        threads = min(1 if stage.name in ONE_THREAD else 2, cores)
+        cost = job_cost(stage.name, scene, quality, threads)
+        if cost.seconds is None:
+            kind = job_work(stage.name, scene, quality).kind
+            raise InputError(
+                f"scene {scene}: how long stage {stage.name} takes with {kind!r} was never measured, so no time can be promised;"
+                " choose a quality by name, or fit the costs to a finished run (docs/development/costs.md)"
+            )
+        more = START_OF_JOB + _compilation(
+            stage.name
+        )  # one after the other: nothing of one scene fits beside a job of two threads
+        total = [sum_ + part + more for sum_, part in zip(total, cost.seconds, strict=True)]
+    making = job_cost("capture", scene, quality, min(2, cores)).seconds if rendered else None
+    beside = f", beside some {duration(making.middle)} to render the photographs" if making else ""
+    return Wall(Range(*total), beside)
+
+
+@lru_cache(None)
+def _compilation(stage: str) -> float:
+    """Return the seconds that numba will take to compile the kernels of a stage, which it keeps in the checkout."""
+    package = {"base": "fusion", "affines": "fitting"}.get(stage)
+    if package is None or any(fingerprints.REPOSITORY.glob(COMPILED.format(package))):
+        return 0.0
+    return COMPILATION[stage]
+
+
+def span(seconds: Range) -> str:
+    """Return a range of seconds in words."""
+    return _span(seconds.low, seconds.high, duration)
+
+
 class Planned(NamedTuple):
     """A job that Snakemake is going to run."""
 
     stage: str
     scene: str
     threads: int
+    quality: str
 
 
-def forecast(jobs: Iterable[Planned], quality: str, cores: int) -> list[str]:
+def forecast(jobs: Iterable[Planned], cores: int) -> list[str]:
     """Return lines for a person: a range of time, memory and disk for each stage, and for all jobs together."""
     of_stage: dict[str, list[Cost]] = {}
     busy = [0.0, 0.0, 0.0]  # middle, low, high of the seconds, times the share of the cores
     for job in jobs:
-        cost = job_cost(job.stage, job.scene, quality, job.threads)
+        cost = job_cost(job.stage, job.scene, job.quality, job.threads)
         of_stage.setdefault(job.stage, []).append(cost)
         if cost.seconds:
             share = min(job.threads, cores) / max(cores, 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,19 @@ from pydantic import ValidationError
 from iif_core.errors import InputError
 from workflow.settings import batch_table, study_files
 from workflow.settings.explain import explain
-from workflow.settings.names import PRESETS, QUALITIES, RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
+from workflow.settings.names import (
+    PRESETS,
+    QUALITIES,
+    RESERVED,
+    SCENE_NAME,
+    configuration,
+    did_you_mean,
+    quality_names,
+    scene_names,
+    scene_path,
+)
 from workflow.settings.scene import SECTIONS_THAT_CHOOSE, SceneSettings
+from workflow.settings.source import Capture
 from workflow.settings.yaml_file import read_yaml
 
 
@@ -75,34 +87,125 @@ def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSet
     Raises:
         InputError: names the file, the key, what was found and what is allowed.
     """
-    if quality not in QUALITIES:
-        raise InputError(f"--config quality={quality}: unknown quality; allowed: {', '.join(QUALITIES)}")
-    preset = read_yaml(configuration(f"quality/{quality}.yaml", root))
-    if line := batch_table.find(scene, root):
-        layers = _with_preset([(f"config/quality/{quality}.yaml", preset), *batch_table.layers(line, root)], root)
-        try:
-            return SceneSettings.model_validate(_merged(layers))
-        except ValidationError as error:
-            raise InputError(explain(error, batch_table.blame(line, layers))) from None
-    path = scene_file(scene, root)
-    shown = path.relative_to(root) if path.is_relative_to(root) else path
-    layers = [("", preset)]
-    if path != study_files.scenes_path(root):
-        layers.append((str(shown), read_yaml(path)))
-    if parts := study_files.derived(scene, root):
-        layers += study_files.layers(parts, root)
-    layers = _with_preset(layers, root)
+    below, above, line = _layers(scene, quality, root)
+    layers = _with_preset([*below, *above], root)
     try:
         return SceneSettings.model_validate(_merged(layers))
-    except ValidationError:
+    except ValidationError as error:
+        if line:
+            raise InputError(explain(error, batch_table.blame(line, layers))) from None
         for count, (place, _) in enumerate(layers, 1):  # blame the first file that spoils it, but who names a preset for that
             if not place or place.startswith(batch_table.CHOSEN):
                 continue
             try:
                 SceneSettings.model_validate(_merged(layers[:count]))
-            except ValidationError as error:
-                raise InputError(explain(error, lambda _, blamed=place: blamed)) from None
-        raise
+            except ValidationError as found:
+                raise InputError(explain(found, partial(_blamed, place, layers[:count]))) from None
+        raise InputError(explain(error, lambda _: f"{scene_file(scene, root)}")) from None
+
+
+Layers = list[tuple[str, dict[str, Any]]]
+"""(place, settings), the lowest first; settings of a place without a name are blamed on nobody."""
+
+
+def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch_table.Line | None]:
+    """Return the layers of the quality, those of the scene over them, and its line of the batch table if it has one."""
+    parts = study_files.derived(scene, root)
+    of_bench = parts is not None and parts.study == study_files.BENCH
+    if parts and of_bench:
+        scene, quality = parts.scene, parts.variant
+    settings = _quality(quality, root)
+    line = batch_table.find(scene, root)
+    if line:
+        above = batch_table.layers(line, root)
+    else:
+        path = scene_file(scene, root)
+        shown = path.relative_to(root) if path.is_relative_to(root) else path
+        above = [(str(shown), read_yaml(path))] if path != study_files.scenes_path(root) else []
+        if parts and not of_bench:
+            above += study_files.layers(parts, root)
+    limits = _merged(above).get("limits")
+    if isinstance(limits, dict):
+        settings = limited(settings, limits)
+    below = [(f"config/quality/{quality}.yaml", settings)]
+    return ([*below, ("", study_files.BENCH_HELD_OUT)] if of_bench else below), above, line
+
+
+def _blamed(place: str, layers: Layers, dotted: str) -> str:
+    """Return which of some layers sets a key: the one at `place`, or else a quality or preset below it."""
+    for name, layer in reversed(layers):
+        node: Any = layer
+        for part in dotted.split("."):
+            node = node.get(part) if isinstance(node, dict) else None
+        if node is not None:
+            return name if name.startswith(batch_table.CHOSEN) else place
+    return place
+
+
+def _quality(quality: str, root: Path) -> dict[str, Any]:
+    """Return the settings of a quality; where its file names a `point`, those of the point with its own over them."""
+    names = quality_names(root)
+    if quality not in names:
+        hint = did_you_mean(quality, names)
+        raise InputError(f"--config quality={quality}: unknown quality.{hint} Allowed: {', '.join(names)}")
+    settings = read_yaml(configuration(f"quality/{quality}.yaml", root))
+    if "point" not in settings:
+        return settings
+    point, own = settings["point"], {key: value for key, value in settings.items() if key != "point"}
+    below = read_yaml(configuration(f"quality/{point}.yaml", root)) if point in names else {"point": None}
+    if "point" in below:
+        raise InputError(
+            f"config/quality/{quality}.yaml: `point`: found {point!r}; needed is the name of a file beside it that has no `point`"
+            " itself, such as p01"
+        )
+    return merge(below, own)
+
+
+def limited(settings: dict[str, Any], limits: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of a quality with no more than a scene allows; width and height keep their ratio.
+
+    Args:
+        settings: of a quality.
+        limits: of the scene, not checked yet (`workflow.settings.limits`).
+    """
+    most = {name: value for name, value in limits.items() if isinstance(value, int) and value > 0}
+    capture = {
+        **{name: Capture.model_fields[name].default for name in ("views", "width", "height")},
+        **settings.get("capture", {}),
+    }
+    out = dict(settings)
+    if all(isinstance(capture[name], int) for name in ("views", "width", "height")):
+        share = min(1.0, *(most.get(name, capture[name]) / capture[name] for name in ("width", "height")))
+        sizes = {name: max(round(share * capture[name]), 16) for name in ("width", "height")}
+        out["capture"] = {**capture, **sizes, "views": min(capture["views"], most.get("views", capture["views"]))}
+    prior = settings.get("prior", {})
+    if isinstance(prior, dict) and isinstance(prior.get("samples"), int):
+        out["prior"] = {**prior, "samples": min(prior["samples"], most.get("predictions", prior["samples"]))}
+    return out
+
+
+def overridden(scene: str, quality: str, root: Path = Path(".")) -> list[str]:
+    """Return the settings of a quality, dotted, that the scene sets itself to other values.
+
+    Raises:
+        InputError: as `load`.
+    """
+    _, above, _ = _layers(scene, quality, root)
+    own, out = _merged(above), []
+    for section, keys in _quality(quality, root).items():
+        for key, value in keys.items() if isinstance(keys, dict) else ():
+            found = own.get(section)
+            if isinstance(found, dict) and found.get(key, value) != value:
+                out.append(f"{section}.{key}")
+    return out
+
+
+def canonical(quality: str, root: Path = Path(".")) -> str:
+    """Return the name under which a quality is run: a point that is all of a named quality has that name."""
+    for name in QUALITIES:
+        if read_yaml(configuration(f"quality/{name}.yaml", root)) == {"point": quality}:
+            return name
+    return quality
 
 
 def _with_preset(layers: list[tuple[str, dict[str, Any]]], root: Path) -> list[tuple[str, dict[str, Any]]]:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 QUALITIES = ("draft", "standard", "paper")
+DEFAULT = "draft"
+"""Quality of what is given none."""
 PRESETS = ("published", "published_repaired")
 """Methods other than ours that have a file in config/presets/."""
 SCENE_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
@@ -25,6 +28,13 @@ def configuration(part: str, root: Path = Path(".")) -> Path:
     """
     own = root / "config" / part
     return own if own.exists() else REPOSITORY / "config" / part
+
+
+def quality_names(root: Path = Path(".")) -> list[str]:
+    """Return every quality: the named ones, then the points of the front, and those of the working folder."""
+    folders = (REPOSITORY / "config/quality", root / "config/quality")
+    found = {path.stem for folder in folders for path in folder.glob("*.yaml") if re.fullmatch(SCENE_NAME, path.stem)}
+    return [*QUALITIES, *sorted(found - set(QUALITIES))]
 
 
 def scene_path(scene: str, root: Path = Path(".")) -> Path:

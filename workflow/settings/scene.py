@@ -9,6 +9,7 @@ from pydantic import Field, field_validator, model_validator
 from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
+from workflow.settings.limits import Limits
 from workflow.settings.outputs import Export, Metrics, Render, Report
 from workflow.settings.override import Override
 from workflow.settings.prior import Prior
@@ -27,6 +28,8 @@ class SceneSettings(Section):
     source: Source
     """Where photographs, cameras and mesh come from."""
     capture: Capture = Capture()
+    limits: Limits = Limits()
+    """What a quality may ask for at most."""
     prior: Prior
     """Where the K material predictions come from."""
     segmentation: Segmentation = GivenSegmentation()

@@ -120,7 +120,7 @@ class Capture(Section):
     """Image width in pixels; existing photographs are reduced to fit width x height, with their aspect ratio kept."""
     height: int = Field(160, ge=16, le=8192)
     """Image height in pixels."""
-    samples: int = Field(128, ge=1)
+    samples: int = Field(64, ge=1)
     """Paths per pixel for rendered photographs."""
     exposure: Literal["given", "estimate"] = "given"
     """`estimate`: find the exposures of the photographs from surface that several of them show."""

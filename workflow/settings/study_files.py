@@ -30,6 +30,15 @@ _DERIVED = re.compile(
     rf"(?P<scene>[A-Za-z0-9_-]+?)--(?:(?P<study>{STUDY})-(?P<variant>{_VARIANT.pattern})-)?s(?P<seed>0|[1-9]\d{{0,8}})"
 )
 
+MORRIS_LEVELS = 4
+"""Levels of each factor of a screening."""
+SHARED_VARIANT = "shared"
+"""Name of the derived scene at whose views all variants of a study are scored."""
+BENCH = "bench"
+"""The variants of this study are points of the front, of any scene: `<scene>--bench-p03-s0` (workflow/trade/bench.py)."""
+BENCH_HELD_OUT = {"capture": {"test_every": 8}}
+"""Set where the scene holds no photograph out."""
+
 METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
 """Metrics that a study can show."""
 QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out")
@@ -120,6 +129,9 @@ class Study(Section):
     """Rows of the printed tables; with `scenes` each protocol has a table of its own."""
     common: dict[str, dict[str, Any]] = {}
     """Settings of all variants; those of a variant override them."""
+    shared: dict[str, dict[str, Any]] = {}
+    """`scores: common_scores`: settings, over `common`, of the capture at whose last views all variants are scored. With more
+    views than any variant has, these are views that none was fitted to. Default: the capture that all studies share."""
     reference: str = ""
     """Variant with which the printed table compares the others; differences are in brackets."""
     variants: dict[str, Variant] = {}
@@ -157,6 +169,8 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
     """
     path = FOLDER / f"{name}.yaml"
     names = study_names(root)
+    if name == BENCH:
+        raise InputError(f"{path}: a study cannot be called {BENCH}, which stands for the points of the front; rename it")
     if name not in names:
         raise InputError(
             f"{path}: not found.{did_you_mean(name, names)} Known studies: {', '.join(names) or 'none'}; benchmarks"
@@ -182,6 +196,8 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
             variants[name] = variant
     if study.design:
         variants |= _design(study.design, path, variants)
+    if study.shared and SHARED_VARIANT in variants:
+        raise InputError(f"{path}: a variant cannot be called {SHARED_VARIANT}, which is the capture of `shared`; rename it")
     if not variants:
         raise InputError(f"{path}: no variants; add `variants: {{<name>: {{overrides: ...}}}}` or `grids`")
     for name in variants:
@@ -256,12 +272,37 @@ def _design(design: Design, path: Path, others: dict[str, Variant]) -> dict[str,
             raise InputError(f"{path}: `design.runs`: variant {run} is there already; give it another name")
         out[run] = Variant(label=run, overrides=design.overrides(run))
     whole = len(design.factors) + 1
+    if design.trajectories:
+        _check_trajectories(design, whole, path)
     if len(design.runs) < design.trajectories * whole:
         raise InputError(
             f"{path}: `design.trajectories`: found {design.trajectories}, which are {design.trajectories * whole} runs;"
             f" there are {len(design.runs)}. `python -m workflow design {path.stem}` makes them"
         )
     return out
+
+
+def _check_trajectories(design: Design, whole: int, path: Path) -> None:
+    """Refuse runs that are no trajectories: steps of one factor by two of four levels, each factor once."""
+    odd = [name for name, levels in design.factors.items() if len(levels) != MORRIS_LEVELS]
+    if odd:
+        raise InputError(f"{path}: `design.factors`: {', '.join(odd)}: trajectories need {MORRIS_LEVELS} levels of each factor")
+    runs = design.runs[: design.trajectories * whole]
+    for number in range(0, len(runs) - whole + 1, whole):
+        one = runs[number : number + whole]
+        moved = [[i for i, (a, b) in enumerate(zip(*pair, strict=True)) if a != b] for pair in itertools.pairwise(one)]
+        far = all(
+            abs(int(a) - int(b)) in (0, MORRIS_LEVELS // 2) for x, y in itertools.pairwise(one) for a, b in zip(x, y, strict=True)
+        )
+        if (
+            not far
+            or sorted(i for step in moved for i in step) != list(range(whole - 1))
+            or any(len(step) != 1 for step in moved)
+        ):
+            raise InputError(
+                f"{path}: `design.runs`: those from {one[0]!r} on are no trajectory, in which each step changes one factor by"
+                f" two levels and each factor changes once. `python -m workflow design {path.stem}` makes them"
+            )
 
 
 def scenes_path(root: Path = Path(".")) -> Path:
@@ -299,12 +340,17 @@ def derived(name: str, root: Path = Path(".")) -> Derived | None:
 
 def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
     """Return (place, settings) of the layers that a derived scene puts over the file of its scene, in order."""
+    if parts.study == BENCH:
+        return []
     shared = scene_overrides(root)
     if parts.scene not in shared:
         raise InputError(f"{SCENES}: {parts.scene} is not listed. Known there: {', '.join(shared) or 'none'}.")
     out = [(f"{SCENES}, {parts.scene}", shared[parts.scene])]
     if parts.study:
         study = load_study(parts.study, root)
+        if parts.variant == SHARED_VARIANT and study.shared:
+            places = ((f"{FOLDER / parts.study}.yaml, `{name}`", getattr(study, name)) for name in ("common", "shared"))
+            return [*out, *((place, settings) for place, settings in places if settings)]
         if parts.variant not in study.variants:
             hint = did_you_mean(parts.variant, study.variants)
             raise InputError(
@@ -324,7 +370,7 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
     first variant.
     """
     parts = derived(name, root)
-    if parts is None:
+    if parts is None or parts.study == BENCH:
         return []
     candidates = [f"{parts.scene}--s0", f"{parts.scene}--s{parts.seed}"]
     if parts.study:
@@ -344,7 +390,10 @@ def shared_scene(name: str, root: Path = Path(".")) -> str:
     ('kitchen--s0', 'kitchen')
     """
     parts = derived(name, root)
-    return f"{parts.scene}--s0" if parts else name
+    if parts is None:
+        return name
+    study = load_study(parts.study, root) if parts.study and parts.study != BENCH else None
+    return scene_of(parts.study, parts.scene, SHARED_VARIANT, 0) if study and study.shared else f"{parts.scene}--s0"
 
 
 def scene_of(study: str, scene: str, variant: str, seed: int) -> str:

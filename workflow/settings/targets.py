@@ -25,19 +25,19 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
     scenes = [*scene_names(root), *(line.name for line in batch_table.read_table(root))]
     hint = _meant(target, list(dict.fromkeys(scenes)), list(rules), root)
     raise InputError(
-        f"{target}: no rule makes this.{hint} Targets are scenes/<name>, plan/<name> and relight/<name> with the name of one"
-        " scene (letters, digits, _ and -), results/<name>/<stage>/manifest.json, results/studies/<study>.parquet, `scenes` and"
-        " `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
+        f"{target}: no rule makes this.{hint} Targets are scenes/<name>, plan/<name>, bench/<name> and relight/<name> with the"
+        " name of one scene (letters, digits, _ and -), results/<name>/<stage>/manifest.json, results/studies/<study>.parquet,"
+        " `scenes` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
     )
 
 
 def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
     parts = Path(target).parts or (target,)
-    if parts[0] in ("scenes", "plan", "relight") and len(parts) > 1 and parts[1] in scenes:
+    if parts[0] in ("scenes", "plan", "bench", "relight") and len(parts) > 1 and parts[1] in scenes:
         return f" Did you mean {parts[0]}/{parts[1]}?"
     if parts[0] in scenes:
         return f" Did you mean scenes/{parts[0]}?"
-    if parts[0] in ("scenes", "plan", "relight") and len(parts) > 1:
+    if parts[0] in ("scenes", "plan", "bench", "relight") and len(parts) > 1:
         return did_you_mean(parts[-1], scenes, parts[0] + "/{}") or did_you_mean(parts[1], scenes, parts[0] + "/{}")
     if parts[:2] == ("results", "studies"):
         return did_you_mean(target, [f"results/studies/{name}.parquet" for name in study_files.study_names(root)])

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-LEVELS = 4
+from iif_core.errors import InputError
+from workflow.settings.study_files import MORRIS_LEVELS as LEVELS
+
 CANDIDATES = 20
 """Random trajectories of which the most different ones are taken (Campolongo, Cariboni and Saltelli 2007)."""
 
@@ -35,6 +37,9 @@ class Effect(NamedTuple):
 def trajectories(factors: Sequence[str], count: int, seed: int = 0) -> list[str]:
     """Choose the runs of `count` trajectories: count x (factors + 1) strings of levels, some of which may be equal."""
     from SALib.sample import morris
+
+    if not 2 <= count < CANDIDATES:
+        raise InputError(f"{count} trajectories: needed are 2 to {CANDIDATES - 1}")
 
     points = morris.sample(_problem(factors), CANDIDATES, LEVELS, optimal_trajectories=count, seed=seed)
     return ["".join(str(round(x * (LEVELS - 1))) for x in point) for point in points]

@@ -64,6 +64,7 @@ def plan(name: str, quality: str) -> Plan:
         ]
         for cell in of_scene:
             fp.resolved(cell.name, quality)
+            fp.resolved(study_files.shared_scene(cell.name), quality)
         try:
             fp.fingerprint("prior", f"{scene}--s{study.seeds[0]}", quality)
         except InputError as error:
@@ -104,7 +105,7 @@ def fingerprint(name: str, quality: str) -> str:
         "study": study.model_dump(mode="json"),
         "skipped": skipped,
         "scores": [fp.fingerprint(study.scores, cell.name, quality) for cell in cells],
-        "code": fp.modules_digest(fp.import_closure("workflow.studies.table")),
+        "code": fp.modules_digest(fp.modules_of("workflow.studies")),
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -183,10 +184,10 @@ def keep_rows(name: str, quality: str, path: Path) -> None:
     frame, cell_of = pd.DataFrame(rows, columns=list(KEPT)), ["scene", "variant", "seed"]
     done = set(map(tuple, frame[cell_of].drop_duplicates().to_numpy().tolist()))
     if path.is_file():
-        older = pd.read_csv(path)
+        older = pd.read_csv(path, dtype={"variant": str})  # runs of a design are digits
         left = [tuple(row) not in done for row in older[cell_of].to_numpy().tolist()]
         frame = pd.concat([part for part in (older[left], frame) if len(part)] or [frame])
-    frame = frame.sort_values(list(KEPT[:6]), kind="stable")
+    frame = frame.sort_values(list(KEPT[:6]), kind="stable").reindex(columns=list(KEPT))
     write_atomically(path, lambda temporary: frame.to_csv(temporary, index=False, float_format="%.6g"))
     logging.getLogger("study").info("%s: %d cells of this run, %d rows", path, len(done), len(frame))
 

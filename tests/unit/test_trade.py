@@ -1,0 +1,240 @@
+"""Speed against accuracy: the front, and the point that a budget or a target asks for."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from iif_core.errors import InputError
+from workflow.costs.model import Range
+from workflow.registry import STAGES
+from workflow.runtime import fingerprint as fp
+from workflow.runtime import forecast
+from workflow.settings import loading
+from workflow.settings.names import QUALITIES, REPOSITORY, quality_names
+from workflow.settings.yaml_file import read_yaml
+from workflow.trade import bench, choose, front
+from workflow.trade import points as trade_points
+from workflow.trade.points import Point, Pooled
+
+SECONDS = {"p01": 30, "p02": 60, "p03": 110, "p04": 400}
+ALBEDO = {"p01": 20.0, "p02": 22.0, "p03": 23.0, "p04": 25.0}
+
+
+@pytest.fixture
+def table(monkeypatch, tmp_path):
+    """Four points, what they take and what they score in two rooms; the current folder is empty."""
+    known = {
+        name: Point(name, {"a": {"albedo": a - 1, "held_out": a + 1}, "b": {"albedo": a + 1, "held_out": a + 3}})
+        for name, a in ALBEDO.items()
+    }
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(choose, "points", lambda: known)
+    monkeypatch.setattr(choose, "overridden", lambda scene, name: ["capture.views"] if scene == "fixed" else [])
+    monkeypatch.setattr(choose, "named", lambda: {"draft": "p02"})
+    monkeypatch.setattr(choose, "scene_origin", lambda scene: f"config/scenes/{scene}.yaml")
+    monkeypatch.setattr(choose, "canonical", lambda name: name)
+    monkeypatch.setattr(choose.fingerprints, "fingerprint", lambda stage, scene, quality: f"{stage} {scene} {quality}")
+    document = {"capture": {"test_every": 8}}
+    resolved = {"bare": json.dumps({"capture": {"test_every": 0}})}
+    monkeypatch.setattr(choose.fingerprints, "resolved", lambda scene, quality: resolved.get(scene, json.dumps(document)))
+
+    def wall(scene, name, cores):
+        middle = float(SECONDS[name])
+        return forecast.Wall(Range(middle, middle * 0.8, middle * 1.3), "")
+
+    monkeypatch.setattr(choose.forecast, "wall", wall)
+    return known
+
+
+def chosen(key, value, scene="room"):
+    return choose.choice(choose.read({"quality": "draft", key: value}, {key}, 2), scene)
+
+
+@pytest.mark.parametrize(("budget", "point"), [(30, "p01"), (59.9, "p01"), (60, "p02"), (399, "p03"), ("1e6", "p04")])
+def test_a_budget_gets_the_best_point_that_keeps_to_it(table, budget, point):
+    assert chosen("budget", budget).quality == point
+
+
+def test_a_budget_below_the_cheapest_point_is_refused_with_the_least_and_what_holds_it_up(table):
+    with pytest.raises(InputError, match=r"room takes at least 30 s on this machine, at point p01 \(24 s to 39 s\)"):
+        chosen("budget", 29)
+    with pytest.raises(InputError, match=r"config/scenes/fixed.yaml sets capture.views itself"):
+        chosen("budget", 29, "fixed")
+    assert "sets capture.views itself" in chosen("budget", 70, "fixed").line
+    assert "point p02 (draft), about 60 s (48 s to 1 min 18 s)" in chosen("budget", 70).line
+
+
+@pytest.mark.parametrize(("target", "point"), [("albedo:19", "p01"), ("albedo:22.5", "p03"), ("held_out:27", "p04")])
+def test_a_target_gets_the_cheapest_point_that_reaches_it(table, target, point):
+    assert chosen("target", target).quality == point
+
+
+def test_a_target_follows_what_was_measured_in_the_room(table, tmp_path, monkeypatch):
+    (tmp_path / "bench/room").mkdir(parents=True)
+    scores = {"p01": {"albedo": 17.5}, "p03": {"albedo": 19.5}, "p04": {"albedo": 99.0}}  # 2.5 and 3.5 dB worse than in the table
+    found = {name: {"metrics": "old" if name == "p04" else name, "scores": of} for name, of in scores.items()}
+    (tmp_path / "bench/room/bench.json").write_text(json.dumps({"points": found}))
+    monkeypatch.setattr(bench, "marks", lambda scene: {name: name for name in ALBEDO})
+    assert chosen("target", "albedo:19.5").quality == "p03" and chosen("target", "albedo:19.5", "other").quality == "p01"
+    assert "from bench/room/bench.json" in chosen("target", "albedo:19.5").line
+    with pytest.raises(InputError, match=r"p04, is expected to reach albedo 22.0 dB in room \(from bench/room"):
+        chosen("target", "albedo:22.5")
+    with pytest.raises(InputError, match="no such score: no photograph was held out"):
+        chosen("target", "held_out:20")
+    with pytest.raises(InputError, match="bare holds no photograph out; set"):
+        chosen("target", "held_out:20", "bare")
+    (tmp_path / "bench/room/bench.json").write_text("{")
+    with pytest.raises(InputError, match="damaged; make it again: snakemake --cores 2 bench/room --force"):
+        chosen("target", "albedo:19.5")
+
+
+@pytest.mark.parametrize(
+    ("config", "given", "cores", "words"),
+    [
+        ({"budjet": 3}, {"budjet"}, 2, "budjet: unknown key. Did you mean budget?"),
+        ({"budget": 3, "point": "p01"}, {"budget", "point"}, 2, "each of them chooses the quality"),
+        ({"budget": "soon"}, {"budget"}, 2, "budget: found 'soon', needed seconds"),
+        ({"budget": "nan"}, {"budget"}, 2, "budget: found 'nan'"),
+        ({"budget": -3}, {"budget"}, 2, "budget: found '-3'"),
+        ({"quality": "draft", "budget": 60, "point": "p01"}, {"budget"}, 2, "each of them chooses"),  # the one is of config.yaml
+        ({"target": "beauty:3"}, {"target"}, 2, "needed <score>:<dB> with albedo or held_out"),
+        ({"target": "albedo"}, {"target"}, 2, "found '', needed decibels"),
+        ({"target": "albedo:inf"}, {"target"}, 2, "found 'inf', needed decibels"),
+        ({"point": "p99"}, {"point"}, 2, "point=p99: unknown point"),
+        ({"quality": "drafty"}, {"quality"}, 2, "unknown quality. Did you mean draft?"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_one_clear_error(config, given, cores, words):
+    with pytest.raises(InputError) as error:
+        choose.read(config, given, cores)
+    assert words in str(error.value)
+
+
+def test_a_choice_is_kept_while_nothing_but_the_machine_changes(table, monkeypatch, tmp_path):
+    asked = choose.read({"budget": 110}, {"budget"}, 2)
+    made = choose.choice(asked, "room")
+    choose.keep(asked, {"room": made})
+    monkeypatch.setitem(SECONDS, "p03", 130)  # the machine turns out to be slower
+    assert choose.choice(asked, "room") == made and made.quality == "p03"
+    assert chosen("budget", 111).quality == "p02"
+    monkeypatch.setattr(choose.fingerprints, "resolved", lambda scene, quality: "{}")  # the scene file changed
+    assert choose.choice(asked, "room").quality == "p02"
+    (tmp_path / "results/room/choice.json").write_text("{")
+    assert choose.choice(asked, "room").quality == "p02"
+
+
+def test_points_that_do_not_go_with_a_scene_are_left_out(table, monkeypatch):
+    def wall(scene, name, cores):
+        if name != "p04":
+            raise InputError(f"{name} contradicts the scene")
+        return forecast.Wall(Range(50.0, 40.0, 60.0), "")
+
+    monkeypatch.setattr(choose.forecast, "wall", wall)
+    assert chosen("budget", 60).quality == "p04"
+    monkeypatch.setattr(choose, "points", lambda: {"p01": table["p01"]})
+    with pytest.raises(InputError, match="p01 contradicts the scene"):
+        chosen("budget", 60)
+
+
+def test_studies_and_named_qualities_are_not_chosen_anew(table):
+    assert chosen("budget", 60, "room--aggregation-full-s0").quality == "draft"
+    assert choose.choice(choose.read({"quality": "paper"}, set(), None), "room").quality == "paper"
+    point = choose.read({"quality": "draft", "point": "p01"}, {"point"}, 2)
+    assert choose.choice(point, "room").quality == "p01"
+
+
+def test_after_the_run_a_person_learns_whether_the_target_was_reached(table, tmp_path):
+    folder = tmp_path / "results/room/metrics"
+    folder.mkdir(parents=True)
+    means = {"result": {"albedo": {"scaled": {"psnr": {"mean": 21.456, "views": 3}}}}}
+    (folder / "summary.json").write_text(json.dumps({"means": means}))
+    (folder / "manifest.json").write_text(json.dumps({"fingerprint": "metrics room p03"}))
+
+    def said(target):
+        return choose.reached(choose.read({"target": target}, {"target"}, 2), ["room", "elsewhere"])
+
+    assert said("albedo:23") == [
+        "room: target albedo:23: missed, 21.46 dB; `snakemake --cores 2 bench/room` measures what this room can"
+        " reach, and the same command then chooses by that"
+    ]
+    assert said("albedo:21") == []  # the scores that are there are not of the point that this asks for
+    (folder / "manifest.json").write_text(json.dumps({"fingerprint": "metrics room p02"}))
+    assert said("albedo:21") == ["room: target albedo:21: reached, 21.46 dB"]
+    assert "no such score" in said("held_out:23.5")[0]
+    assert choose.reached(choose.read({"budget": 3}, {"budget"}, 2), ["room"]) == []
+
+
+def rows(costs, scores, rooms=("a", "b")):
+    columns = ["scene", "variant", "seed", "quantity", "metric", "protocol", "value", "cpu_seconds", "max_rss_mb", "disk_mb"]
+    out = []
+    for name in costs:
+        for room in rooms:
+            facts = [costs[name], 100.0, 10.0]
+            out.append([room, name, 0, "albedo", "psnr", "scaled", scores[name], *facts])
+            out.append([room, name, 0, "rgb", "psnr", "raw", scores[name], *facts])
+    return pd.DataFrame(out, columns=columns)
+
+
+def test_the_front_has_no_point_that_is_dearer_and_worse():
+    costs = {"a": 10.0, "b": 20.0, "c": 15.0, "d": 40.0, "e": 41.0}
+    scores = {"a": 20.0, "b": 21.0, "c": 19.0, "d": 22.0, "e": 22.5}
+    found = front.front(front.pool(rows(costs, scores)))
+    assert [one.variant for one in found] == ["a", "b", "e"]  # d and e are closer than a step: the better one is kept
+    frame = rows(costs, scores)
+    lacking = frame[~((frame["variant"] == "b") & (frame["scene"] == "a"))]
+    assert [one.variant for one in front.front(front.pool(lacking))] == ["a", "e"]
+
+
+@given(st.lists(st.tuples(st.floats(1, 1e4), st.floats(10, 40)), min_size=1, max_size=30))
+def test_points_of_the_front_are_apart_and_each_is_better_than_all_cheaper_ones(pairs):
+    pooled = sorted((Pooled(str(i), cost, albedo, {}) for i, (cost, albedo) in enumerate(pairs)), key=lambda one: one.cpu_seconds)
+    found = front.front(pooled)
+    assert found and found[0].cpu_seconds <= front.STEP * pooled[0].cpu_seconds
+    for before, after in zip(found, found[1:], strict=False):
+        assert after.albedo >= before.albedo + front.LEAST_GAIN
+    costs = np.array([one.cpu_seconds for one in found])
+    assert (costs[1:] / costs[:-1] >= 1 - 1e-12).all()
+    best = max(one.albedo for one in pooled)
+    assert found[-1].albedo >= best - front.LEAST_GAIN - 1e-9
+
+
+def test_shipped_points_are_a_front_and_every_quality_can_be_loaded():
+    known = trade_points.points()
+    assert len(known) >= 6 and list(known) == sorted(known) and set(known) <= set(quality_names())
+    albedo = [point.expected("albedo").mean for point in known.values()]
+    cost = [np.exp(np.mean([np.log(room["cpu_seconds"]) for room in point.rooms.values()])) for point in known.values()]
+    assert (np.diff(albedo) > 0).all() and (np.diff(cost) > 0).all()
+    assert set(trade_points.named().values()) <= set(known)
+    for name in (*known, *QUALITIES):
+        loading.load("kitchen", name, REPOSITORY)
+    assert len(trade_points.bench_points()) == 3
+
+
+def test_a_bench_runs_the_point_that_its_name_says_and_holds_photographs_out():
+    for point, scene in bench.scenes("kitchen").items():
+        found = loading.load(scene, "draft", REPOSITORY)
+        wanted = read_yaml(REPOSITORY / f"config/quality/{point}.yaml")["capture"]
+        assert found.capture.views == wanted["views"] and found.capture.test_every == 8
+        assert loading.load(scene, "paper", REPOSITORY) == found
+
+
+def test_wall_time_grows_along_the_front_and_threads_are_those_of_the_rules():
+    seconds = [forecast.wall("kitchen", name, 2).seconds.middle for name in trade_points.points()]
+    assert seconds[0] < 120 and seconds[-1] > 2 * seconds[0]
+    assert forecast.wall("kitchen", "draft", 1).seconds.middle > forecast.wall("kitchen", "draft", 2).seconds.middle
+    text = (REPOSITORY / "workflow/rules/stages.smk").read_text()
+    rules = {part.split()[0]: "threads: 1" in part for part in text.split("use rule stage as ")[1:]}
+    assert {name for name, alone in rules.items() if alone} == set(forecast.ONE_THREAD) - {"publish"}
+    assert set(rules) >= set(STAGES) - {"publish"}
+
+
+def test_a_kind_of_work_that_was_never_measured_has_no_promised_time(monkeypatch):
+    document = json.loads(fp.resolved("kitchen", "draft"))
+    document["prior"]["kind"] = "rgbx"
+    monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps(document))
+    with pytest.raises(InputError, match="stage prior takes with 'rgbx' was never measured"):
+        forecast.wall("kitchen", "draft", 2)

@@ -1,0 +1,21 @@
+"""Upper limits of a scene on what a quality asks for; `workflow.settings.loading.limited` applies them."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from workflow.settings.section import Section
+
+
+class Limits(Section):
+    """A quality may ask for less than this, and gets no more. A number that the scene file sets itself instead, such as
+    `capture: {views: 60}`, holds for every quality."""
+
+    views: int | None = Field(None, ge=1)
+    """Photographs (`capture.views`)."""
+    width: int | None = Field(None, ge=16)
+    """Pixels (`capture.width`); width and height are reduced together."""
+    height: int | None = Field(None, ge=16)
+    """Pixels (`capture.height`)."""
+    predictions: int | None = Field(None, ge=1)
+    """Predictions of each photograph (`prior.samples`)."""
