@@ -181,6 +181,8 @@ def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
     ("text", "words"),
     [
         (LATE + "reference: best\n", ["`reference: best`: no such variant", "first, same"]),
+        (LATE + "repeats: {best: [3]}\n", ["`repeats.best`: no such variant", "first, same"]),
+        (LATE + "repeats: {far: []}\n", ["`repeats.far`", "found []"]),
         (LATE.replace("affines]", "affine]"), ["`costs`: affine is no stage", "affines"]),
         (LATE.replace("scores: metrics", "scores: report"), ["`scores`", "'report'", "'metrics'"]),
         (LATE.replace("[raw, scaled]", "[raw, best]"), ["`protocols.1`", "'best'"]),
@@ -197,6 +199,16 @@ def test_mistakes_in_a_study_of_the_result(folder, text, words):
         study_table.plan("late", "draft")
     for word in words:
         assert word in str(caught.value)
+
+
+def test_a_variant_has_further_seeds(folder):
+    folder("studies/late", LATE + "repeats: {far: [1, 3]}\n")
+    cells = study_table.plan("late", "draft").cells
+    assert [(cell.variant, cell.seed) for cell in cells if cell.variant in ("other", "far")] == [
+        *(("other", 0), ("other", 1)),
+        *(("far", 0), ("far", 1), ("far", 3)),
+    ]
+    assert fp.home("capture", "t--late-far-s3", "draft") == "t--s0" and fp.home("prior", "t--late-far-s3", "draft") == "t--s3"
 
 
 def test_costs_are_added_over_stages(folder, tmp_path):

@@ -116,6 +116,8 @@ class Study(Section):
     """Names of entries in config/studies/scenes.yaml."""
     seeds: list[int] = Field([0, 1, 2], min_length=1)
     """Seeds of the prior; everything else keeps the seed of the scene."""
+    repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
+    """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
     scores: Literal["base_scores", "metrics", "common_scores"] = "base_scores"
     """Stage whose scores are collected: of the base texture, of the result and its re-rendering, or of the result at views that
     all variants share."""
@@ -145,6 +147,10 @@ class Study(Section):
     show: list[str] = ["albedo/psnr", "albedo/ssim", "albedo/lpips", "roughness/l2", "metallic/l2"]
     """`quantity/metric` in the printed table and the picture; the Parquet file has all."""
     plot: Plot = Plot()
+
+    def seeds_of(self, variant: str) -> list[int]:
+        """Return the seeds of a variant, those of all variants first."""
+        return list(dict.fromkeys([*self.seeds, *self.repeats.get(variant, [])]))
 
 
 class Derived(NamedTuple):
@@ -224,6 +230,9 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     shared = scene_overrides(root)
     if study.reference and study.reference not in variants:
         raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
+    for name in study.repeats:
+        if name not in variants:
+            raise InputError(f"{path}: `repeats.{name}`: no such variant. Allowed here: {', '.join(variants)}.")
     for stage in study.costs:
         if stage not in STAGES:
             raise InputError(f"{path}: `costs`: {stage} is no stage. Allowed here: {', '.join(STAGES)}.")

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from iif_core.camera.pinhole import direction_derivatives
@@ -21,7 +23,7 @@ from workflow.scoring import scores as scoring
 SCORED_VIEWS = 12
 """Views whose materials and emission are scored: the last ones of the shared capture."""
 RENDERED_VIEWS, SAMPLES, MAX_BOUNCES = 4, 8, 6
-"""Every third of them is rendered again, with this number of paths a pixel and a denoiser."""
+"""At most this number of them, in equal steps, is rendered again, with this number of paths a pixel and a denoiser."""
 GAIN_STEP = 2
 """The gain of a photograph is found at every second pixel in both directions."""
 METRICS = {"albedo": ("l2", "psnr", "ssim", "flip", "lpips"), "roughness": ("l2", "psnr"), "metallic": ("l2", "psnr")}
@@ -46,7 +48,7 @@ def run(job: Job) -> None:
         )
     networks = scoring.perceptual_networks()
     views = shared.views[-SCORED_VIEWS:]
-    rendered = {views[place].name for place in _spread(len(views), RENDERED_VIEWS)}
+    rendered = {view.name for view in views[:: math.ceil(len(views) / RENDERED_VIEWS)]}
     rows, render = scoring.ScoreRows(), _Renderer(job, scene, shared)
     for done, (view, maps) in enumerate(zip(views, _maps(scene.surface, shared, views), strict=True)):
         job.progress(done, len(views), "shared views scored")
@@ -68,11 +70,6 @@ def run(job: Job) -> None:
     job.progress(len(views), len(views), "shared views scored")
     job.writer.table("scores.parquet", rows.table(job.scene, {"result"}), scoring.UNITS)
     job.writer.json("scores.json", {"means": rows.means().get("result", {}), "not_scored": rows.missing})
-
-
-def _spread(count: int, wanted: int) -> list[int]:
-    """Return places spread evenly over 0 ... count - 1."""
-    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(int)).tolist()
 
 
 def _maps(surface: BaseScene, shared: CaptureReader, views: list[View]) -> list[dict[str, np.ndarray]]:

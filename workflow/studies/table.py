@@ -60,7 +60,7 @@ def plan(name: str, quality: str) -> Plan:
         of_scene = [
             Cell(scene, variant, seed, study_files.scene_of(name, scene, variant, seed))
             for variant in study.variants
-            for seed in study.seeds
+            for seed in study.seeds_of(variant)
         ]
         for cell in of_scene:
             fp.resolved(cell.name, quality)
@@ -308,6 +308,8 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
         return "\n".join([*lines, "Nothing was scored.", ""])
     seeds = len(study.seeds)
     note = f"Mean over views and {seeds} seed{'s' * (seeds > 1)} of the prior" + (" (± standard deviation)" if seeds > 1 else "")
+    if study.repeats:
+        note += "; variants with further seeds have the standard deviation over them"
     if study.reference:
         label = study.variants[study.reference].label or study.reference
         lines += [f"In brackets: by how much a number moves from that of *{label}* with the same seed.", ""]
