@@ -1,27 +1,29 @@
 """A model of what jobs cost, fitted to jobs that are done.
 
-cost = factor of the machine x sum over counts of (coefficient x count), for CPU seconds, wall seconds of two threads, memory
-and disk, for every stage and kind. Coefficients are non-negative and minimise the squared relative error. The range is that of
-the errors at rooms that the fit has not seen.
+cost = factor of the machine x sum over counts of (coefficient x count), for CPU seconds, memory and disk, for every stage and
+kind. Coefficients are non-negative and minimise the squared error of the logarithm, which counts large errors by their size
+(Huber) and many jobs of one room as the square root of their number. The range is that of the errors at rooms that the fit has
+not seen. Wall seconds follow from CPU seconds and from the share of them that threads divide.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple
 
 from workflow.costs.work import SceneSize, Work, work_of
 
 SHIPPED = Path(__file__).with_name("coefficients.json")
-MEASURES = ("cpu_seconds", "seconds", "memory_mb", "disk_mb")
+MEASURES = ("cpu_seconds", "memory_mb", "disk_mb")
 TIMES = ("cpu_seconds", "seconds")
-"""Measures that follow the speed of the machine."""
+"""Columns that follow the speed of the machine."""
 FEWEST_ROOMS = 3
 """Rooms from which on errors at unseen rooms are measured; with fewer, the range is that of `UNMEASURED`."""
 LEAST_RATIO = 2.0
@@ -30,6 +32,10 @@ LEAST_SHARE = 1e-4
 """Share of the cost below which a count is left out."""
 UNMEASURED = (0.5, 2.0)
 """Range of a cost of which nothing better is known, as factors on it."""
+HUBER = 0.4
+"""Logarithm of actual over predicted cost from which on an error counts by its size instead of its square."""
+ROUNDS = 40
+"""Least-squares problems that are solved for one fit."""
 
 
 class Range(NamedTuple):
@@ -45,13 +51,17 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """Coefficients of one measure of one kind of job, and factors for the bounds of 10 and 90 per cent."""
+    """Coefficients of one measure of one kind of job, and factors for the bounds of 10 and 90 per cent.
+
+    `divided`: share of the CPU seconds that threads divide among them, 0 ... 1; 0 where no job of two threads tells.
+    """
 
     coefficients: dict[str, float]
     low: float
     high: float
     jobs: int
     rooms: int
+    divided: float = 0.0
 
     def predict(self, counts: dict[str, float]) -> Range:
         middle = sum(value * counts.get(name, 0.0) for name, value in self.coefficients.items())
@@ -80,8 +90,7 @@ def shipped() -> Fits:
 def predict(stage: str, work: Work, threads: int = 2, machine: float = 1.0, fits: Fits | None = None) -> Cost:
     """Return what a job will cost.
 
-    Wall seconds of other numbers of threads follow from those of two and from the CPU seconds, after Amdahl: with p seconds that
-    all threads share and s that one thread has to itself, two threads take s + p/2 of wall time and s + p of CPU time.
+    Of c CPU seconds, of which threads divide the share s, n threads take c (1 - s + s/n) of wall time (Amdahl).
 
     Args:
         stage, work: the job (`workflow.costs.work.work_of`).
@@ -91,24 +100,19 @@ def predict(stage: str, work: Work, threads: int = 2, machine: float = 1.0, fits
     """
     fits = shipped() if fits is None else fits
     of_kind = {name: fits.get((stage, work.kind, name)) for name in MEASURES}
-    found = {name: fit.predict(work.counts) if fit else None for name, fit in of_kind.items()}
-    cpu, wall = found["cpu_seconds"], found["seconds"]
-    if cpu is not None:
-        two = wall.middle if wall else cpu.middle
-        shared = min(max(2 * (cpu.middle - two), 0.0), cpu.middle)
-        middle = max(two, cpu.middle / 2) + shared * (1 / max(threads, 1) - 0.5)
-        bounds = wall or cpu
-        found["seconds"] = Range(middle, middle * bounds.low / bounds.middle, middle * bounds.high / bounds.middle) * machine
-        found["cpu_seconds"] = cpu * machine
-    return Cost(**found)
+    cpu, memory, disk = (fit.predict(work.counts) if fit else None for fit in of_kind.values())
+    if cpu is None:
+        return Cost(None, None, memory, disk)
+    divided = of_kind["cpu_seconds"].divided
+    return Cost(cpu * machine, cpu * (machine * (1 - divided + divided / max(threads, 1))), memory, disk)
 
 
 def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
     """Fit the cost of every kind of job.
 
     Args:
-        rows: of `workflow.costs.records`: scene, stage, kind, threads, machine, the measures and the counts. Wall seconds are
-            fitted to jobs of two threads alone, and times of all machines are brought to those of factor 1.
+        rows: of `workflow.costs.records`: scene, stage, kind, threads, machine, the measures, wall seconds and the counts. Times
+            of all machines are brought to those of factor 1.
     """
     of_kind: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
@@ -117,14 +121,14 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
     fits = {}
     for (stage, kind), jobs in sorted(of_kind.items()):
         for measure in MEASURES:
-            used = [row for row in jobs if row.get(measure, 0.0) > 0 and (measure != "seconds" or row["threads"] == 2)]
+            used = [row for row in jobs if row.get(measure, 0.0) > 0]
             if used:
                 fits[stage, kind, measure] = _fit(used, measure)
     return fits
 
 
 def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
-    fixed = {"scene", "stage", "kind", "threads", "machine", "fingerprint", *MEASURES}
+    fixed = {"scene", "stage", "kind", "threads", "machine", "fingerprint", *MEASURES, *TIMES}
     names = [name for name in rows[0] if name not in fixed]
     if measure in TIMES and not _sizes_differ(rows, names):
         names.remove("job")
@@ -132,12 +136,18 @@ def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
     rooms = sorted({row["scene"] for row in rows})
     low, high = UNMEASURED
     if len(rooms) >= FEWEST_ROOMS:
-        errors = []
+        errors = {}
         for room in rooms:
             others = _coefficients([row for row in rows if row["scene"] != room], names, measure)
-            errors += [_error(row, others, measure) for row in rows if row["scene"] == room]
+            errors[room] = [_error(row, others, measure) for row in rows if row["scene"] == room]
         low, high = _quantiles(errors)
-    return Fit(coefficients, low, high, len(rows), len(rooms))
+    return Fit(coefficients, low, high, len(rows), len(rooms), _divided(rows) if measure == "cpu_seconds" else 0.0)
+
+
+def _divided(rows: list[dict[str, Any]]) -> float:
+    """Return the share s of CPU seconds that threads divide, from jobs of two: their wall time is c (1 - s/2)."""
+    ratios = [row["seconds"] / row["cpu_seconds"] for row in rows if row["threads"] == 2 and row.get("seconds", 0.0) > 0]
+    return float(f"{min(max(2 * (1 - median(ratios)), 0.0), 1.0):.3g}") if ratios else 0.0
 
 
 def _sizes_differ(rows: list[dict[str, Any]], names: list[str]) -> bool:
@@ -148,15 +158,25 @@ def _sizes_differ(rows: list[dict[str, Any]], names: list[str]) -> bool:
 
 
 def _coefficients(rows: list[dict[str, Any]], names: list[str], measure: str) -> dict[str, float]:
+    """Minimise the sum of rho(log p) over non-negative coefficients, p = predicted over actual cost, rho Huber's function: a
+    sequence of non-negative least-squares problems in p - 1 with the weights that make their gradients agree."""
     import numpy as np
     from scipy.optimize import nnls
 
     counts = np.array([[row.get(name, 0.0) for name in names] for row in rows])
-    costs = np.array([row[measure] for row in rows])
-    relative = counts / costs[:, None]
+    relative = counts / np.array([row[measure] for row in rows])[:, None]
     scale = np.maximum(np.sqrt((relative**2).mean(axis=0)), 1e-300)
-    solution, _ = nnls(relative / scale, np.ones(len(rows)))
-    share = solution * relative.mean(axis=0) / scale  # of the cost of the jobs, in the mean
+    of_room = Counter(row["scene"] for row in rows)
+    balance = np.array([of_room[row["scene"]] ** -0.5 for row in rows])
+    weights = balance
+    for _ in range(ROUNDS):
+        root = np.sqrt(weights)
+        solution, _ = nnls(relative / scale * root[:, None], root)
+        p = np.maximum(relative / scale @ solution, 1e-3)
+        log = np.log(p)
+        slope = np.where(np.abs(p - 1) > 1e-6, log / np.where(p == 1, 1.0, p - 1), 1.0)
+        weights = balance * slope / p / np.maximum(1.0, np.abs(log) / HUBER)
+    share = solution * np.average(relative, axis=0, weights=balance) / scale  # of the cost of the jobs, in the mean
     found = zip(names, solution / scale, share, strict=True)
     return {name: float(f"{value:.5g}") for name, value, part in found if part > LEAST_SHARE}
 
@@ -167,10 +187,13 @@ def _error(row: dict[str, Any], coefficients: dict[str, float], measure: str) ->
     return math.log(row[measure] / predicted) if predicted > 0 else 0.0
 
 
-def _quantiles(errors: list[float]) -> tuple[float, float]:
+def _quantiles(errors: dict[str, list[float]]) -> tuple[float, float]:
+    """Return the factors of 10 and 90 per cent; rooms count as in the fit."""
     import numpy as np
 
-    low, high = np.quantile(errors, [0.1, 0.9])
+    values = np.concatenate(list(errors.values()))
+    weights = np.concatenate([np.full(len(own), len(own) ** -0.5) for own in errors.values()])
+    low, high = np.quantile(values, [0.1, 0.9], weights=weights, method="inverted_cdf")
     return float(f"{min(math.exp(low), 1.0):.3g}"), float(f"{max(math.exp(high), 1.0):.3g}")
 
 
@@ -179,6 +202,7 @@ def write_fits(path: Path, fits: Fits) -> None:
     tree: dict[str, Any] = {}
     for (stage, kind, measure), fit in fits.items():
         entry = {"coefficients": fit.coefficients, "range": [fit.low, fit.high], "jobs": fit.jobs, "rooms": fit.rooms}
+        entry |= {"divided": fit.divided} if measure == "cpu_seconds" else {}
         tree.setdefault(stage, {}).setdefault(kind, {})[measure] = entry
     lines = json.dumps(tree, indent=1)
     path.write_text(lines + "\n")
@@ -188,7 +212,9 @@ def read_fits(path: Path) -> Fits:
     """Read what `write_fits` wrote."""
     tree = json.loads(path.read_text())
     return {
-        (stage, kind, measure): Fit(entry["coefficients"], *entry["range"], entry["jobs"], entry["rooms"])
+        (stage, kind, measure): Fit(
+            entry["coefficients"], *entry["range"], entry["jobs"], entry["rooms"], entry.get("divided", 0.0)
+        )
         for stage, kinds in tree.items()
         for kind, measures in kinds.items()
         for measure, entry in measures.items()

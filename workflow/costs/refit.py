@@ -60,12 +60,13 @@ def _identity(row: dict[str, Any]) -> tuple[str, str, float]:
 def _lines(fits: Fits) -> list[str]:
     lines = [
         "Range of actual over predicted cost, from the 10 to the 90 % quantile, in rooms that a fit did not see:",
-        "| stage, kind | jobs | rooms | CPU seconds | seconds | memory | disk |",
-        "|---|---:|---:|---|---|---|---|",
+        "| stage, kind | jobs | rooms | CPU seconds | memory | disk | divided by threads |",
+        "|---|---:|---:|---|---|---|---:|",
     ]
     for stage, kind in sorted({key[:2] for key in fits}):
         cells = [fits.get((stage, kind, measure)) for measure in MEASURES]
         counted = max((fit for fit in cells if fit), key=lambda fit: fit.jobs)
         ranges = [f"{fit.low:.2f} to {fit.high:.2f}" if fit else "" for fit in cells]
-        lines.append(f"| {stage}, {kind} | {counted.jobs} | {counted.rooms} | {' | '.join(ranges)} |")
+        divided = f"{100 * cells[0].divided:.0f} %" if cells[0] else ""
+        lines.append(f"| {stage}, {kind} | {counted.jobs} | {counted.rooms} | {' | '.join([*ranges, divided])} |")
     return lines
