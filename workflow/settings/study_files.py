@@ -92,6 +92,15 @@ class Design(Section):
         return out
 
 
+class Opposite(Section):
+    """The variants that force a component of the plan."""
+
+    forced_in: str = ""
+    """Variant that has it; "" where nothing can put it in."""
+    forced_out: str = ""
+    """Variant without it."""
+
+
 class Plot(Section):
     """The picture."""
 
@@ -134,6 +143,9 @@ class Study(Section):
     shared: dict[str, dict[str, Any]] = {}
     """`scores: common_scores`: settings, over `common`, of the capture at whose last views all variants are scored. With more
     views than any variant has, these are views that none was fitted to. Default: the capture that all studies share."""
+    opposites: dict[str, Opposite] = {}
+    """Component of the plan -> variants that force it: the page then says whether the plan, which `reference` follows, was right
+    about it."""
     reference: str = ""
     """Variant with which the printed table compares the others; differences are in brackets."""
     variants: dict[str, Variant] = {}
@@ -230,6 +242,12 @@ def _load_study(path: Path, file: Path, root: Path, _stamp: int) -> Study:
     shared = scene_overrides(root)
     if study.reference and study.reference not in variants:
         raise InputError(f"{path}: `reference: {study.reference}`: no such variant. Allowed here: {', '.join(variants)}.")
+    if study.opposites and not study.reference:
+        raise InputError(f"{path}: `opposites` need a `reference`, the variant that leaves them to the plan")
+    for component, opposite in study.opposites.items():
+        for name in filter(None, (opposite.forced_in, opposite.forced_out)):
+            if name not in variants:
+                raise InputError(f"{path}: `opposites.{component}`: no variant {name}. Allowed here: {', '.join(variants)}.")
     for name in study.repeats:
         if name not in variants:
             raise InputError(f"{path}: `repeats.{name}`: no such variant. Allowed here: {', '.join(variants)}.")

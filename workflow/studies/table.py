@@ -21,6 +21,7 @@ from workflow.runtime import fingerprint as fp
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings import study_files
 from workflow.studies.growth import growth_lines
+from workflow.studies.regret import judge, regret_lines
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -360,6 +361,9 @@ def page(study: study_files.Study, frame: pd.DataFrame, skipped: dict[str, str])
     lines += [f"## cost of {what}", "", *_costs_table(shown, scenes, labels), ""]
     if study.growth:
         lines += growth_lines(study, shown, scenes)
+    if study.opposites:
+        scores = [(*key.split("/"), protocol) for key in study.show for protocol in study.protocols]
+        lines += regret_lines(*judge(shown, study.opposites, study.reference, scores))
     if study.design and study.design.trajectories:
         lines += _effects(study, shown, scenes)
     return "\n".join(lines)
