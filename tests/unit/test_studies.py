@@ -151,6 +151,17 @@ def test_variants_share_what_an_earlier_one_made(folder):
     assert len(study_table.inputs("late", "draft")) == 6  # `same` needs nothing of its own
 
 
+def test_a_study_does_not_move_with_what_draft_is(folder):
+    """Its variants start from the defaults of the settings; another quality can be asked for by name."""
+    folder("quality/draft", "shading: {samples: 16}\n")
+    folder("quality/standard", "shading: {samples: 64}\n")
+    folder("studies/late", LATE)
+    default = settings.load("t--late-far-s0").shading.samples
+    assert default == settings.load("t--s0").shading.samples == 32
+    assert settings.load("t").shading.samples == 16
+    assert settings.load("t--late-far-s0", "standard").shading.samples == 64
+
+
 def test_a_variant_chooses_a_preset_over_what_the_study_shares(folder):
     text = "title: x\nscenes: [t]\ncommon: {shading: {pixels: 500000}}\nvariants:\n  ours: {}\n"
     folder("studies/a", text + "  theirs: {preset: published, overrides: {emission: {iterations: 7}}}\n")

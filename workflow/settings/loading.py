@@ -13,6 +13,7 @@ from iif_core.errors import InputError
 from workflow.settings import batch_table, study_files
 from workflow.settings.explain import explain
 from workflow.settings.names import (
+    DEFAULT,
     PRESETS,
     QUALITIES,
     RESERVED,
@@ -114,7 +115,9 @@ def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch
     of_bench = parts is not None and parts.study == study_files.BENCH
     if parts and of_bench:
         scene, quality = parts.scene, parts.variant
-    settings = _quality(quality, root)
+    of_study = parts is not None and not of_bench
+    # What a study compares must not move with what `draft` is.
+    settings = {} if of_study and quality == DEFAULT else _quality(quality, root)
     line = batch_table.find(scene, root)
     if line:
         above = batch_table.layers(line, root)
@@ -122,7 +125,7 @@ def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch
         path = scene_file(scene, root)
         shown = path.relative_to(root) if path.is_relative_to(root) else path
         above = [(str(shown), read_yaml(path))] if path != study_files.scenes_path(root) else []
-        if parts and not of_bench:
+        if parts and of_study:
             above += study_files.layers(parts, root)
     limits = _merged(above).get("limits")
     if isinstance(limits, dict):
