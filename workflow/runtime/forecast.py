@@ -112,9 +112,8 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
                 f"scene {scene}: how long stage {stage.name} takes with {kind!r} was never measured, so no time can be promised;"
                 " choose a quality by name, or fit the costs to a finished run (docs/development/costs.md)"
             )
-        more = START_OF_JOB + _compilation(
-            stage.name
-        )  # one after the other: nothing of one scene fits beside a job of two threads
+        # One after the other: nothing of one scene fits beside a job of two threads.
+        more = START_OF_JOB + _compilation(stage.name)
         total = [sum_ + part + more for sum_, part in zip(total, cost.seconds, strict=True)]
     making = job_cost("capture", scene, quality, min(2, cores)).seconds if rendered else None
     beside = f", beside some {duration(making.middle)} to render the photographs" if making else ""

@@ -222,8 +222,8 @@ def _by_target(text: str, scene: str, cores: int) -> Choice:
     score, wanted = _score(text)
     if score == "held_out" and not json.loads(fingerprints.resolved(scene, DEFAULT))["capture"]["test_every"]:
         raise InputError(f"--config target={text}: {scene} holds no photograph out; set `capture: {{test_every: 8}}` in its file")
-    shift, basis = _shift(scene, score)
-    expected = {name: point.expected(score).mean + shift for name, point in points().items()}
+    shifts, basis = _shifts(scene, score)
+    expected = {name: point.expected(score).mean + shifts[name] for name, point in points().items()}
     name = next((name for name in points() if expected[name] >= wanted), "")
     if not name:
         best = max(expected, key=lambda name: expected[name])
@@ -238,18 +238,24 @@ def _by_target(text: str, scene: str, cores: int) -> Choice:
     return Choice(canonical(name), f"{scene}, target {text}: {expected[name]:.1f} dB expected ({basis}); {about}")
 
 
-def _shift(scene: str, score: str) -> tuple[float, str]:
-    """How much better a score is in this room than in the rooms of the table, and on what that is based."""
-    found = bench.measured(scene, score)
+def _shifts(scene: str, score: str) -> tuple[dict[str, float], str]:
+    """How much better a score is in this room than in the rooms of the table, point by point, and on what that is based. Between
+    the points that `bench` ran it is interpolated along the front, and beyond them it stays what it is at the last one."""
+    import numpy as np  # not for runs that ask for no target
+
+    found, names = bench.measured(scene, score), list(points())
     if found is None:
         rooms = sorted({room for point in points().values() for room in point.rooms})
-        return 0.0, f"the mean of {', '.join(rooms)}; `snakemake --cores 2 bench/{scene}` measures it in this room"
-    moved = [value - points()[name].expected(score).mean for name, value in found.items() if name in points()]
-    if not moved:
+        said = f"the mean of {', '.join(rooms)}; `snakemake --cores 2 bench/{scene}` measures it in this room"
+        return dict.fromkeys(names, 0.0), said
+    known = [(place, found[name] - points()[name].expected(score).mean) for place, name in enumerate(names) if name in found]
+    if not known:
         raise InputError(
             f"--config target={score}: {scene} has no such score{_missing(score)}, or its bench is of other settings"
         )
-    return sum(moved) / len(moved), f"from {bench.FOLDER / scene / 'bench.json'}"
+    places, moved = zip(*known, strict=True)
+    shifts = np.interp(range(len(names)), places, moved).tolist()
+    return dict(zip(names, shifts, strict=True)), f"from {bench.FOLDER / scene / 'bench.json'}"
 
 
 def _missing(score: str) -> str:
