@@ -56,6 +56,16 @@ def test_columns_may_come_in_any_order_and_cells_may_be_missing(project):
     ]
 
 
+def test_a_scene_of_the_table_can_be_benched(project):
+    """At the sizes of the points, with what its line and the scene file of its column `base` set."""
+    project("room\tscannetpp\tdata/room\ttpl\tseed=9\n")
+    found = settings.load("room--bench-p01-s0")
+    point = settings.load("tpl", "p01")
+    assert (found.source.kind, str(found.source.path), found.seed) == ("scannetpp", "data/room", 9)
+    assert found.prior.samples == 5 and found.capture.width == point.capture.width == 128
+    assert found.capture.test_every == 8
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 def test_what_spreadsheets_write_is_read(project, end, mark):
