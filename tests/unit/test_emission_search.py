@@ -146,7 +146,8 @@ def _room(strip, reflects=0.1, seed=3):
 
 def _growth(candidates, *chosen, doubtful=()):
     """Proposals as families -> the growth of the misfit that they may have, in order."""
-    return dict(candidates.proposals(frozenset(chosen), frozenset(doubtful)))
+    found = candidates.proposals(frozenset(chosen), frozenset(doubtful))
+    return {proposal.families: proposal.largest_growth for proposal in found}
 
 
 def test_a_strip_that_no_camera_sees_takes_the_place_of_what_it_lights():
@@ -172,6 +173,26 @@ def test_saturated_surface_is_judged_by_a_trace_of_its_own():
     dark = replace(room, shown=room.shown * [[1.0], [0.5], [1.0], [1.0]])
     assert frozenset({0, 2}) not in _growth(dark, 0, 1, 2)
     assert frozenset({0, 2}) in _growth(replace(dark, reflecting=replace(room.reflecting, rows=bounds)), 0, 1, 2)
+
+
+def test_what_could_take_the_place_of_a_suspect_is_always_traced():
+    """The look says that the room is worse without the lamp and with another family in its place; a trace has to say so."""
+    room = _room(1.0)
+    every = {p.families: p for p in room.proposals(frozenset({0, 1}), suspects=frozenset({0}))}
+    always = {families for families, proposal in every.items() if proposal.always}
+    assert always and all(0 not in families and 1 in families and len(families) == 2 for families in always)
+    assert not any(p.always for p in room.proposals(frozenset({0, 1})))
+    assert always - set(_growth(room, 0, 1))  # which the look alone would not have offered
+    # Neither their number nor their rank matters to the search.
+    traced: list[frozenset[int]] = []
+
+    def misfit(families):
+        traced.append(families)
+        return 0.2 if families == {7} else 1.0
+
+    first = [Proposal(frozenset({f})) for f in (3, 4, 5)]
+    found, changes = search(frozenset({0}), lambda c: [*first, Proposal(frozenset({7}), always=True)] if c == {0} else [], misfit)
+    assert found == {7} and len(changes) == 1 and frozenset({5}) not in traced
 
 
 def test_unseen_surface_that_a_white_one_could_match_is_no_lamp():

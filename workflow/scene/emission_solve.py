@@ -160,11 +160,13 @@ def search_emitters(
     sky: Sky | None,
     threshold: float,
     hits: np.ndarray,
+    certain: float,
 ) -> tuple[Traced, np.ndarray, list[str]]:
     """Find whether other emitters explain the photographs better: with objects that no camera sees, with others of the `groups`
     than those that are `lit` (G,) bool, or without some.
 
-    excess: (G,) brightness of the groups relative to a white surface; hits: (F,) rays from visible surface that meet each face.
+    excess: (G,) brightness of the groups relative to a white surface, of which more than `certain` says that a group shines;
+    hits: (F,) rays from visible surface that meet each face.
     Returns the problem of the emitters, which of `groups` are among them, and what was changed, in words.
     """
     scene = photos.scene
@@ -191,9 +193,11 @@ def search_emitters(
 
     start = frozenset(family[: groups.size][lit].tolist())
     look = _first_look(photos, unseen, every, lit, family, sky, threshold)
+    brightest = {f: float(excess[family[: groups.size] == f].max()) for f in start}
+    suspects = frozenset(f for f, value in brightest.items() if value < certain)
     # Without light from outside something in the room has to shine.
-    doubtful = frozenset(f for f in start if sky is not None and excess[family[: groups.size] == f].max() < HIDDEN_EXCESS)
-    chosen, changes = search(start, lambda present: look.proposals(present, doubtful), misfit)
+    doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS)
+    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, suspects), misfit)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]

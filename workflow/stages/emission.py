@@ -160,12 +160,12 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
     unseen = scene.with_gains(gain).repainted(photos.world[1])
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
-    # What was dropped for giving little light, and not for being no brighter than a white surface, may be needed after all.
-    offered = pruned.kept[: groups.size] | (pruned.excess[: groups.size] >= certain)
+    # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
+    offered = pruned.may_shine(certain, job.settings.emission.prune)[: groups.size]
     hits = np.bincount(met[met >= 0], minlength=len(scene.faces))
     lit = pruned.kept[: groups.size][offered]
     excess, some = pruned.excess[: groups.size][offered], groups.select(offered)
-    found, shines, changes = search_emitters(photos, unseen, some, lit, excess, outside, threshold, hits)
+    found, shines, changes = search_emitters(photos, unseen, some, lit, excess, outside, threshold, hits, certain)
     for change in changes:
         job.log.info("emitters: %s", change)
     notes.extend(changes)

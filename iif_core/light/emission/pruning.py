@@ -18,6 +18,9 @@ surface would reflect is known only as well as the other emitters."""
 CERTAIN_EXCESS_OPEN = 8.0
 """The same where much of the light comes through large openings of the mesh: surface below a lamp that no camera sees is much
 brighter than a white surface under the mean light."""
+POSSIBLE_EXCESS = 1.0
+"""The same from which a group that was dropped may shine after all: its light may have been taken for that of others, and of
+saturated surface only a bound of its brightness was seen."""
 MAX_RESIDUAL_GROWTH = 0.03
 """Growth of the residual from which the scene needs a group; with albedos that are only predicted, one more free column always
 explains something."""
@@ -61,13 +64,21 @@ class WhiteSurface:
 
 @dataclass(frozen=True)
 class PrunedEmission:
-    """Result of `prune_groups`: radiance (G, 3) with dropped groups at 0, which were kept, why others were dropped, and `excess`
-    (G,) of the last round in which a group took part."""
+    """Result of `prune_groups`: radiance (G, 3) with dropped groups at 0, which were kept, why others were dropped, `excess` (G,)
+    of the last round in which a group took part, and `power` (G,), the share of the light that its family would give if it
+    shone as bright as it was seen."""
 
     radiance: np.ndarray
     kept: np.ndarray
     reason: list[str]
     excess: np.ndarray
+    power: np.ndarray
+
+    def may_shine(self, certain: float, share: float) -> np.ndarray:
+        """Return the groups, (G,) bool, among which emitters are to be looked for: those that were kept, those that are brighter
+        than `certain` white surfaces, and those brighter than one whose light would be at least a `share` of all."""
+        doubtful = (self.excess >= POSSIBLE_EXCESS) & (self.power >= share)
+        return self.kept | (self.excess >= certain) | doubtful
 
 
 def prune_groups(
@@ -101,6 +112,7 @@ def prune_groups(
     members = np.unique(family, return_inverse=True)[1]
     kept, reason = np.ones(rows.groups, bool), [""] * rows.groups
     excess, missed, singly = np.full(rows.groups, np.inf), np.zeros(rows.groups, bool), False
+    possible = np.bincount(members, _light_shares(rows, white.seen, elsewhere))[members]
     radiance = prior.radiance(rows, _TRIAL_ROUNDS)
     while True:
         emission = radiance.sum(1)
@@ -133,7 +145,7 @@ def prune_groups(
         for g in np.flatnonzero(drop):
             reason[g] = _reason(dark[g], bool(reflecting[g]), excess[g], power[g])
         kept, radiance = kept & ~drop, trial
-    return PrunedEmission(radiance, kept, reason, excess)
+    return PrunedEmission(radiance, kept, reason, excess, possible)
 
 
 def _reason(dark: bool, reflecting: bool, excess: float, power: float) -> str:

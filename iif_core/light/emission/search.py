@@ -41,10 +41,12 @@ class Proposal(NamedTuple):
     Attributes:
         families: that shine.
         largest_growth: factor by which the misfit of the present ones may change for these to take their place.
+        always: they are traced, whatever the first look says of them.
     """
 
     families: Families
     largest_growth: float = 1.0 - STEP
+    always: bool = False
 
 
 @dataclass(frozen=True)
@@ -72,16 +74,18 @@ class Candidates:
     white: WhiteSurface
     albedo: BaseAlbedo
 
-    def proposals(self, chosen: Families, doubtful: Families = frozenset()) -> list[Proposal]:
+    def proposals(self, chosen: Families, doubtful: Families = frozenset(), suspects: Families = frozenset()) -> list[Proposal]:
         """Return sets of families that may explain the photographs better than `chosen`, the most promising first.
 
         Families are taken out, added, or put in the place of one of the chosen; added ones in the order of what their light alone
         would take off the misfit. Families that are `doubtful` are taken out if the misfit does not grow, and those that are no
-        brighter than a white surface in their place unless it grows by half.
+        brighter than a white surface in their place unless it grows by half. `suspects` may only seem to shine because the light
+        of others was given to them; the first look is wrong while they do, so what could take their place is always traced.
         """
         misfit, lit, _ = self._look(chosen)
         found: dict[Families, float] = {}
         largest: dict[Families, tuple[float, float]] = {}  # growth of the misfit, in this look and in a trace of its own
+        always: set[Families] = set()
 
         def with_added(families: Families, value: float, lit: EmissionProblem, most: int) -> None:
             for f in self._best_added(families, lit, NOTICEABLE * misfit)[:most]:
@@ -95,6 +99,10 @@ class Candidates:
             found[rest], lit, white = self._look(rest)
             if found[rest] <= _MISSED * misfit:
                 with_added(rest, found[rest], lit, _SWAPPED)
+            if out in suspects:
+                instead = {rest | {f} for f in self._best_added(rest, lit, NOTICEABLE * misfit)[:_SWAPPED]}
+                found |= {families: self._look(families)[0] for families in instead - set(found)}
+                always |= instead
             # Fewer families are worth a trace of their own if they explain nearly as much. How bright saturated surface is that
             # only reflects is not known before that trace.
             look = _MISSED if self._is_saturated(out) else 1.0 + PROMISING
@@ -102,7 +110,8 @@ class Candidates:
             largest[rest] = look, _MISSED if reflects else 1.0 if out in doubtful else 1.0 - STEP
         order = sorted(found, key=lambda f: found[f] * (1.0 + PROMISING) ** len(f))
         growth = {families: largest.get(families, (1.0 - PROMISING, 1.0 - STEP)) for families in order}
-        return [Proposal(f, growth[f][1]) for f in order if found[f] <= growth[f][0] * misfit]
+        worth = (f for f in order if f in always or found[f] <= growth[f][0] * misfit)
+        return [Proposal(f, growth[f][1], f in always) for f in worth]
 
     def _look(self, chosen: Families) -> tuple[float, EmissionProblem, np.ndarray]:
         """Misfit of the families; the problem with all columns, scaled by the gains, in which their light is cached; and (n, 3)
@@ -194,7 +203,8 @@ def search(
     changes: list[tuple[Families, float, float]] = []
     gone: Families = frozenset()
     for _ in range(_MAX_CHANGES):
-        tried = [proposal for proposal in proposals(chosen) if not proposal.families & gone][:_CONFIRMED]
+        possible = [proposal for proposal in proposals(chosen) if not proposal.families & gone]
+        tried = [proposal for place, proposal in enumerate(possible) if place < _CONFIRMED or proposal.always]
         # What takes the place of a family is compared with nothing in its place.
         known = {proposal.families for proposal in tried}
         rest = {p.families & chosen for p in tried if not p.families >= chosen} - known
