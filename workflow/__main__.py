@@ -3,7 +3,9 @@
 `python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
 workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
 design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
-`python -m workflow bench <scene>` shows what three of them did in a room, and `python -m workflow lpips_vgg` fetches weights.
+`python -m workflow bench <scene>` shows what three of them did in a room, `python -m workflow planned <scene>` what a room was
+found to require, `python -m workflow claims` takes from the study `regret` what is expected of that, and `python -m workflow
+lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -47,6 +49,12 @@ def _arguments() -> argparse.Namespace:
     design.add_argument("--seed", type=int, default=0)
     points = commands.add_parser("points")
     points.add_argument("--log", type=Path)
+    claims = commands.add_parser("claims")
+    claims.add_argument("--log", type=Path)
+    planned = commands.add_parser("planned")
+    planned.add_argument("scene")
+    planned.add_argument("--quality", default="draft")
+    planned.add_argument("--log", type=Path)
     bench = commands.add_parser("bench")
     bench.add_argument("scene")
     bench.add_argument("--log", type=Path)
@@ -148,6 +156,20 @@ def _design(name: str, seed: int) -> None:
         print(f'    - "{run}"')
 
 
+def _planned(scene: str, quality: str) -> None:
+    """Write plan/<scene>/plan.yaml: the decisions of stage `plan`, and what is expected of them."""
+    from workflow.artifacts import StageReader
+    from workflow.artifacts.files import write_atomically
+    from workflow.decisions.expected import whole, with_expectation
+    from workflow.decisions.record import plan_text
+
+    plan = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")["plan"]
+    cost = whole(scene, quality)
+    text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
+    write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
+    print(text)
+
+
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
@@ -175,6 +197,14 @@ def main() -> int:
         from workflow.trade.front import write_points
 
         return _guarded("points", lambda: print("\n".join(write_points())))
+    if arguments.command == "claims":
+        from workflow.decisions.expected import SHIPPED
+        from workflow.settings.study_files import load_study
+        from workflow.studies.regret import TABLE, write_claims
+
+        return _guarded("claims", lambda: write_claims(load_study("regret"), TABLE, SHIPPED))
+    if arguments.command == "planned":
+        return _guarded("planned", partial(_planned, arguments.scene, arguments.quality))
     if arguments.command == "bench":
         from workflow.trade.bench import write_bench
 

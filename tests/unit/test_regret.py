@@ -1,8 +1,10 @@
+import json
 import math
 
 import pandas as pd
 import pytest
 
+from iif_core.errors import InputError
 from workflow.settings.study_files import Opposite, load_study
 from workflow.studies import regret
 from workflow.studies.table import KEPT
@@ -37,7 +39,9 @@ def test_what_is_kept_is_worth_the_gain_on_held_out_photographs():
     assert [one.gain for one in kept] == pytest.approx([4.0, 6.0, 20.0])
     assert [one.claim for one in kept] == pytest.approx([13.0, 12.0, 5.0])
     assert [one.as_claimed for one in kept] == [False, True, False]
-    assert kept[0].error == pytest.approx(2 * 0.1 / math.sqrt(3)) and kept[0].shares == pytest.approx((0.25, 0.0, 0.0))
+    assert kept[0].error == pytest.approx(2 * 0.1 / math.sqrt(3)) and kept[0].shares == pytest.approx(
+        {"cpu_seconds": 0.25, "max_rss_mb": 0.0, "disk_mb": 0.0}
+    )
     text = "\n".join(regret.regret_lines(kept, left_out))
     assert "| denoiser | a | 4.0 ± 0.1 | 13.0 | no | 25 % | 0 % | 0 % |" in text and "1 of 3 within" in text
 
@@ -53,7 +57,7 @@ def test_a_variant_that_does_what_the_plan_does_says_nothing():
     )
     kept, left_out = regret.judge(table, OPPOSITES, "plan", SCORES)
     assert not kept and [one.scene for one in left_out] == ["b", "c", "d"]
-    assert left_out[0].helped == () and left_out[0].shares == pytest.approx((0.5, 0.0, 0.0))
+    assert left_out[0].helped == () and left_out[0].shares["cpu_seconds"] == pytest.approx(0.5)
     assert left_out[2].helped == ()
     (helped,) = left_out[1].helped
     assert helped[:3] == ("roughness", "l2", "raw") and helped[3] == pytest.approx(0.2)
@@ -62,7 +66,7 @@ def test_a_variant_that_does_what_the_plan_does_says_nothing():
 
 
 def test_a_gain_that_is_none_is_not_as_claimed():
-    one = regret.Kept("denoiser", "a", -0.2, math.nan, 3.0, (0.0, 0.0, 0.0))
+    one = regret.Kept("denoiser", "a", -0.2, math.nan, 3.0, {})
     assert not one.as_claimed and not one._replace(gain=3.0, claim=math.nan).as_claimed
     assert one._replace(gain=3.0).as_claimed
 
@@ -76,3 +80,22 @@ def test_the_study_names_the_components_that_can_be_forced(repository, monkeypat
     for component, opposite in study.opposites.items():
         forced = study.variants[opposite.forced_out].overrides["override"]["components"]
         assert list(forced) == [component]
+
+
+def test_claims_are_medians_of_the_rooms_and_old_tables_lack_costs(tmp_path):
+    table = frame(
+        *(rows(room, "plan", 0, 25.0, 0.1, 30.0) for room in "abc"),
+        *(rows(room, "noisy", 0, 25.0, 0.1, 30.0 - gain, cpu=75.0) for room, gain in zip("abc", (4.0, 6.0, 20.0), strict=True)),
+        rows("a", "outside", 0, 24.0, 0.1, 29.0, cpu=110.0),
+    ).drop(columns=["disk_mb"])
+    found = regret.claims(*regret.judge(table, OPPOSITES, "plan", SCORES))
+    assert found == {
+        "denoiser": {"included": {"held_out_db": [6.0, 4.0, 20.0], "cpu_seconds": 0.25, "max_rss_mb": 0.0, "rooms": 3}},
+        "environment": {"left_out": {"held_out_db": [-1.0, -1.0, -1.0], "cpu_seconds": 0.1, "max_rss_mb": 0.0, "rooms": 1}},
+    }
+    study = load_study("regret").model_copy(update={"opposites": OPPOSITES})
+    with pytest.raises(InputError, match="not found; `python -m workflow study regret --keep"):
+        regret.write_claims(study, tmp_path / "none.csv", tmp_path / "claims.json")
+    table.to_csv(tmp_path / "rows.csv", index=False)
+    regret.write_claims(study, tmp_path / "rows.csv", tmp_path / "claims.json")
+    assert json.loads((tmp_path / "claims.json").read_text()) == found

@@ -19,6 +19,11 @@ def test_the_plan_needs_capture_alone_and_is_shown(workflow):
     assert of["environment"]["status"] == "settled" and "closed" in of["environment"]["reason"]
     assert of["camera_response"]["included"] is False  # linear photographs
     assert of["metallic"]["status"] == "provisional" and of["metallic"]["override"].startswith("override: {components")
+    expected = of["radiance_cache"]["expected"]
+    assert expected["rooms"] >= 3 and "cpu_seconds" in expected and len(expected["held_out_db_range"]) == 2
+    assert not planned(workflow.run("-n", "plan/tiny"))
+    (workflow.folder / "plan/tiny/plan.yaml").unlink()
+    assert planned(workflow.run("-n", "plan/tiny")) == {"planned"}
     # The plan is cheap, and says what it looked at.
     probes = json.loads((workflow.folder / "results/tiny/plan/plan.json").read_text())["probes"]
     assert 0 < probes["points"] <= 2000 and probes["escape_share"] == {"primary": 0.0, "secondary": 0.0}

@@ -201,11 +201,11 @@ def again_without(folder, manifest):
 
 
 def plan_inputs(wildcards):
-    """The plan of a scene; a plan whose copy is gone is copied again."""
-    folder_or_stop(f"plan/{wildcards.scene}")
-    again_without(
-        f"plan/{wildcards.scene}", f"results/{wildcards.scene}/plan/manifest.json"
-    )
+    """The plan of a scene; if it is gone from plan/<scene>/, it is written there again."""
+    folder = Path("plan") / wildcards.scene
+    folder_or_stop(str(folder))
+    if folder.is_dir() and not (folder / "plan.yaml").is_file():
+        workflow.dag.forcefiles.add(str(folder))
     return {"manifest": manifest("plan", wildcards.scene)}
 
 

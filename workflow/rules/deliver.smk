@@ -40,7 +40,7 @@ rule publish:
 
 
 rule planned:
-    """Copy what a scene requires to plan/<scene>/, and show it; no stage after `plan` runs."""
+    """Write what a scene requires, and what is expected of it, to plan/<scene>/, and show it; no stage after `plan` runs."""
     input:
         unpack(plan_inputs),
     output:
@@ -48,11 +48,12 @@ rule planned:
     log:
         "results/{scene}/logs/planned.log",
     localrule: True
+    params:
+        quality=lambda wildcards: quality_of(wildcards.scene),
     message:
         "{wildcards.scene}: what it requires, in plan/{wildcards.scene}/plan.yaml"
     shell:
-        "mkdir -p {output.plan:q} && cp results/{wildcards.scene}/plan/plan.yaml {output.plan:q} 2> {log:q}"
-        " && cat {output.plan:q}/plan.yaml"
+        "python3 -m workflow planned {wildcards.scene} --quality {params.quality} --log {log:q}"
 
 
 rule relit:

@@ -8,6 +8,7 @@ import numpy as np
 
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
+from workflow.decisions.expected import whole, with_expectation
 from workflow.decisions.plan import GAINS, with_override
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
 from workflow.report import pictures as pic
@@ -41,7 +42,8 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     summary = job.read("metrics").json("summary.json")
-    plan = collect_plan(job)
+    cost = whole(job.scene, job.quality)
+    plan = [with_expectation(item, cost) for item in collect_plan(job)]
     job.writer.bytes("plan.yaml", plan_text(job.scene, job.quality, plan).encode())
     response_svg, response_note = _response(job, capture)
     emission = _document(job, "emission", "emission.json")

@@ -3,19 +3,25 @@ would have helped (docs/results/plan.md)."""
 
 from __future__ import annotations
 
+import json
+import logging
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from iif_core.errors import InputError
 from iif_core.evaluation.catalogue import METRICS
+from workflow.artifacts.files import write_atomically
+from workflow.settings.study_files import Opposite, Study
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from workflow.settings.study_files import Opposite
-
+TABLE = Path("docs/results/data/regret.csv")
+"""The rows from which the claims of the plan are made."""
 CURRENCY = ("rgb_held_out", "psnr", "raw")
 """The score in which gains are counted, dB. Of residuals with a fitted scale, 1 dB is ln(10)/20 = 0.115 nats of log likelihood
 for each value (equation N.2)."""
@@ -33,7 +39,7 @@ class Kept(NamedTuple):
         component, scene: which.
         gain, error: of held-out photographs by it, dB: mean over the seeds, and two standard errors of it (NaN for one seed).
         claim: median of the gains in the other rooms where it was kept, dB; NaN where there is none.
-        shares: of CPU seconds, peak memory and disk that it takes, in the order of `COSTS`, relative to the plan.
+        shares: of each of `COSTS` that was recorded, what it takes relative to the plan.
     """
 
     component: str
@@ -41,7 +47,7 @@ class Kept(NamedTuple):
     gain: float
     error: float
     claim: float
-    shares: tuple[float, float, float]
+    shares: Mapping[str, float]
 
     @property
     def as_claimed(self) -> bool:
@@ -53,15 +59,18 @@ class LeftOut(NamedTuple):
 
     Attributes:
         component, scene: which.
+        gain, error: of held-out photographs with it, dB: mean over the seeds, and two standard errors of it (NaN for one seed).
         helped: (quantity, metric, protocol, relative improvement) of the scores that it improves by more than 1 % and by more
             than two standard errors.
-        shares: of CPU seconds, peak memory and disk that it would add, relative to the plan.
+        shares: the same, what it would add.
     """
 
     component: str
     scene: str
+    gain: float
+    error: float
     helped: tuple[tuple[str, str, str, float], ...]
-    shares: tuple[float, float, float]
+    shares: Mapping[str, float]
 
 
 def judge(
@@ -78,7 +87,8 @@ def judge(
         scores: (quantity, metric, protocol) that a component which was left out must not improve.
     """
     value_of = frame.set_index(["scene", "variant", "seed", "quantity", "metric", "protocol"])["value"].sort_index()
-    cost_of = frame.groupby(["scene", "variant", "seed"])[list(COSTS)].first()
+    recorded = [name for name in COSTS if name in frame and frame[name].notna().any()]
+    cost_of = frame.groupby(["scene", "variant", "seed"])[recorded].first()
     kept, left_out = [], []
     for component, opposite in opposites.items():
         for scene in sorted(frame["scene"].unique()):
@@ -87,12 +97,13 @@ def judge(
                 if not seeds:
                     continue
                 shares = _shares(cost_of, str(scene), reference, variant, seeds, -1 if removes else 1)
+                pair = (reference, variant) if removes else (variant, reference)
+                gain = _mean_and_error(_differences(value_of, str(scene), pair, seeds, CURRENCY))
                 if removes:
-                    gains = _differences(value_of, str(scene), (reference, variant), seeds, CURRENCY)
-                    kept.append(Kept(component, str(scene), *_mean_and_error(gains), math.nan, shares))
+                    kept.append(Kept(component, str(scene), *gain, math.nan, shares))
                 else:
-                    helped = _helped(value_of, str(scene), (variant, reference), seeds, scores)
-                    left_out.append(LeftOut(component, str(scene), tuple(helped), shares))
+                    helped = _helped(value_of, str(scene), pair, seeds, scores)
+                    left_out.append(LeftOut(component, str(scene), *gain, tuple(helped), shares))
     return [one._replace(claim=_claim(one, kept)) for one in kept], left_out
 
 
@@ -151,13 +162,14 @@ def _helped(
     return out
 
 
-def _shares(
-    cost_of: pd.DataFrame, scene: str, reference: str, variant: str, seeds: list[int], sign: int
-) -> tuple[float, float, float]:
+def _shares(cost_of: pd.DataFrame, scene: str, reference: str, variant: str, seeds: list[int], sign: int) -> dict[str, float]:
     """Costs of a variant minus those of the reference, relative to the latter, in the median over the seeds, times `sign`."""
     pairs = [(cost_of.loc[(scene, variant, seed)], cost_of.loc[(scene, reference, seed)]) for seed in seeds]
-    out = [sign * float(np.median([(other[name] - plan[name]) / plan[name] for other, plan in pairs])) for name in COSTS]
-    return out[0] + 0.0, out[1] + 0.0, out[2] + 0.0  # no -0
+
+    def share(name: str) -> float:
+        return sign * float(np.median([(other[name] - plan[name]) / plan[name] for other, plan in pairs])) + 0.0  # no -0
+
+    return {name: share(name) for name in cost_of.columns}
 
 
 def regret_lines(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> list[str]:
@@ -166,18 +178,61 @@ def regret_lines(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> list[str]
     lines += ["| component | scene | gain, held-out dB | of the other scenes | as claimed | CPU | memory | disk |"]
     lines += ["|---|---|---:|---:|---|---:|---:|---:|"]
     for one in kept:
-        error = "" if math.isnan(one.error) else f" ± {one.error:.1f}"
         claim = "" if math.isnan(one.claim) else f"{one.claim:.1f}"
-        shares = " | ".join(f"{100 * share:.0f} %" for share in one.shares)
+        shares = _percent(one.shares)
         said = "yes" if one.as_claimed else "no"
-        lines.append(f"| {one.component} | {one.scene} | {one.gain:.1f}{error} | {claim} | {said} | {shares} |")
+        lines.append(f"| {one.component} | {one.scene} | {_gain(one)} | {claim} | {said} | {shares} |")
     good = sum(one.as_claimed for one in kept)
     lines += ["", f"{good} of {len(kept)} within a factor {WITHIN:g} of the median of the other scenes.", ""]
     lines += ["## what was left out, against having it", ""]
-    lines += ["| component | scene | scores that it improves | CPU | memory | disk |", "|---|---|---|---:|---:|---:|"]
+    lines += ["| component | scene | gain, held-out dB | scores that it improves | CPU | memory | disk |"]
+    lines += ["|---|---|---:|---|---:|---:|---:|"]
     for other in left_out:
         better = ", ".join(f"{q} {m} ({protocol}) by {100 * share:.1f} %" for q, m, protocol, share in other.helped) or "none"
-        shares = " | ".join(f"{100 * share:.0f} %" for share in other.shares)
-        lines.append(f"| {other.component} | {other.scene} | {better} | {shares} |")
+        shares = _percent(other.shares)
+        lines.append(f"| {other.component} | {other.scene} | {_gain(other)} | {better} | {shares} |")
     quiet = sum(not other.helped for other in left_out)
     return [*lines, "", f"{quiet} of {len(left_out)} improve no score by more than 1 % and two standard errors.", ""]
+
+
+def _percent(shares: Mapping[str, float]) -> str:
+    return " | ".join(f"{round(100 * shares[name])} %" if name in shares else "" for name in COSTS)
+
+
+def _gain(one: Kept | LeftOut) -> str:
+    return f"{one.gain:.1f}" + ("" if math.isnan(one.error) else f" ± {one.error:.1f}")
+
+
+def claims(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> dict[str, dict[str, dict[str, float | list[float]]]]:
+    """Return component -> `included` or `left_out` -> what is to be expected of having it in another room: the gain in held-out
+    dB (median, smallest and largest of the rooms), and the median shares of CPU seconds, memory and disk."""
+    out: dict[str, dict[str, dict[str, float | list[float]]]] = {}
+    for name, judged in (("included", kept), ("left_out", left_out)):
+        for component in dict.fromkeys(one.component for one in judged):
+            own = [one for one in judged if one.component == component and math.isfinite(one.gain)]
+            if not own:
+                continue
+            gains = [one.gain for one in own]
+            costs = [name for name in COSTS if all(name in one.shares for one in own)]
+            shares = {name: round(float(np.median([one.shares[name] for one in own])), 3) for name in costs}
+            out.setdefault(component, {})[name] = {
+                "held_out_db": [round(float(value), 2) for value in (np.median(gains), min(gains), max(gains))],
+                **shares,
+                "rooms": len(own),
+            }
+    return out
+
+
+def write_claims(study: Study, table: Path, path: Path) -> None:
+    """Write what the plan says about its components (`workflow.decisions.expected`) from the kept rows of the study."""
+    import pandas as pd
+
+    if not table.is_file():
+        raise InputError(f"{table}: not found; `python -m workflow study regret --keep {table}` makes it from a run of the study")
+    if not study.opposites:
+        raise InputError("config/studies/regret.yaml: no `opposites`, so nothing says what its variants force")
+    scores = [(*key.split("/"), protocol) for key in study.show for protocol in study.protocols]
+    kept, left_out = judge(pd.read_csv(table, dtype={"variant": str}), study.opposites, study.reference, scores)
+    text = json.dumps(claims(kept, left_out), indent=1) + "\n"
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+    logging.getLogger("claims").info("%s\n%s", path, "\n".join(regret_lines(kept, left_out)))

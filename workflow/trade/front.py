@@ -22,7 +22,7 @@ STUDY = "tradeoff"
 TABLE = Path("docs/results/data/tradeoff.csv")
 STEP = 1.2
 """Of the runs that cost less than this many times the cheapest of them, the best one becomes a point."""
-LEAST_GAIN = 0.02
+LEAST_GAIN = 0.1
 """And has at least this many dB more."""
 
 
