@@ -57,6 +57,8 @@ SATURATED_PIXELS = 20_000
 """Pixels of saturated surface that are traced."""
 SATURATED_SHARE_COMPARED = 0.1
 """The same share while emitters are compared."""
+SUSPECTS = 2
+"""Families that stayed although white surface would be about as bright, of which it is traced what could take their place."""
 HIDDEN_POINTS = 32
 """Points of each hidden surface at which the light that falls on it is estimated."""
 COMPARED_TILES_ACROSS = 8
@@ -155,20 +157,23 @@ def search_emitters(
     photos: Photographs,
     unseen: CellMaterials,
     groups: EmitterGroups,
-    lit: np.ndarray,
-    excess: np.ndarray,
+    pruned: PrunedEmission,
+    certain: float,
     sky: Sky | None,
     threshold: float,
     hits: np.ndarray,
-    certain: float,
 ) -> tuple[Traced, np.ndarray, list[str]]:
-    """Find whether other emitters explain the photographs better: with objects that no camera sees, with others of the `groups`
-    than those that are `lit` (G,) bool, or without some.
+    """Find whether other emitters explain the photographs better than those that the trial kept: with objects that no camera
+    sees, with groups that were dropped although they may shine, or without some.
 
-    excess: (G,) brightness of the groups relative to a white surface, of which more than `certain` says that a group shines;
+    pruned: of the trial, for all `groups`; certain: brightness relative to a white surface from which a group shines for certain;
     hits: (F,) rays from visible surface that meet each face.
     Returns the problem of the emitters, which of `groups` are among them, and what was changed, in words.
     """
+    # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
+    offered = np.flatnonzero(pruned.may_shine(certain, photos.job.settings.emission.prune)[: groups.size])
+    lit, excess, power = (of_group[offered] for of_group in (pruned.kept, pruned.excess, pruned.power))
+    groups, all_groups = groups.select(np.isin(np.arange(groups.size), offered)), groups.size
     scene = photos.scene
     every = with_hidden_surface(groups, seen_faces(photos), scene.object_id, scene.areas, hits)
     family = _families(photos, every, every.size)
@@ -194,10 +199,11 @@ def search_emitters(
     start = frozenset(family[: groups.size][lit].tolist())
     look = _first_look(photos, unseen, every, lit, family, sky, threshold)
     brightest = {f: float(excess[family[: groups.size] == f].max()) for f in start}
-    suspects = frozenset(f for f, value in brightest.items() if value < certain)
+    given = {f: float(power[family[: groups.size] == f].max()) for f in start}
+    suspects = sorted((f for f, value in brightest.items() if value < certain), key=lambda f: -given[f])[:SUSPECTS]
     # Without light from outside something in the room has to shine.
     doubtful = frozenset(f for f, value in brightest.items() if sky is not None and value < HIDDEN_EXCESS)
-    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, suspects), misfit)
+    chosen, changes = search(start, lambda present: look.proposals(present, doubtful, frozenset(suspects)), misfit)
     told, before = [], start
     for after, old, new in changes:
         parts = [(after - before, "added"), (before - after, "taken out")]
@@ -205,8 +211,9 @@ def search_emitters(
         turn = "falls" if new < old else "grows, as white surface would be no less bright,"
         told.append(f"{' and '.join(what)}: the misfit of the light {turn} from {old:.4f} to {new:.4f}")
         before = after
-    emitters = every.select(np.isin(family, [*chosen]))
-    return traced(photos, unseen, emitters, sky, threshold), np.isin(family[: groups.size], [*chosen]), told
+    emitters, shines = every.select(np.isin(family, [*chosen])), np.zeros(all_groups, bool)
+    shines[offered] = np.isin(family[: groups.size], [*chosen])
+    return traced(photos, unseen, emitters, sky, threshold), shines, told
 
 
 def solve_with_saturated_surface(

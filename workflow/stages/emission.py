@@ -160,23 +160,19 @@ def _light(photos: Photographs, adjacency: np.ndarray) -> tuple[FoundLight, np.n
     pruned, gain = trial(photos, groups, cache, outside, certain, threshold)
     unseen = scene.with_gains(gain).repainted(photos.world[1])
     reasons = np.array(pruned.reason[: groups.size], dtype=object)
-    # Groups were dropped one after the other; of some the light was given to others, and they may be needed after all.
-    offered = pruned.may_shine(certain, job.settings.emission.prune)[: groups.size]
     hits = np.bincount(met[met >= 0], minlength=len(scene.faces))
-    lit = pruned.kept[: groups.size][offered]
-    excess, some = pruned.excess[: groups.size][offered], groups.select(offered)
-    found, shines, changes = search_emitters(photos, unseen, some, lit, excess, outside, threshold, hits, certain)
+    found, shines, changes = search_emitters(photos, unseen, groups, pruned, certain, outside, threshold, hits)
     for change in changes:
         job.log.info("emitters: %s", change)
     notes.extend(changes)
-    reasons[np.flatnonzero(offered)[lit & ~shines]] = "the photographs are explained better without it"
-    reasons[np.flatnonzero(offered)[shines]] = ""
+    reasons[pruned.kept[: groups.size] & ~shines] = "the photographs are explained better without it"
+    reasons[shines] = ""
     candidates = groups.size + len(groups.dropped) + int(found.groups.is_hidden.sum())
     found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
     weak = in_doubt(photos, found, solution)
     if weak.any() and (outside is not None or not weak.all()):  # without light from outside something in the room has to shine
         job.log.info("%d groups radiate no more than their error allows, and are taken out", weak.sum())
-        visible = np.flatnonzero(offered)[shines]
+        visible = np.flatnonzero(shines)
         reasons[visible[weak[: len(visible)]]] = f"its radiance is within {SIGNIFICANT:.0f} standard errors of zero"
         found = traced(photos, unseen, found.groups.select(~weak), outside, threshold)
         found, solution, loss = solve_with_saturated_surface(photos, unseen, found, outside, threshold)
