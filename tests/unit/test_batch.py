@@ -62,7 +62,7 @@ def test_a_scene_of_the_table_can_be_benched(project):
     found = settings.load("room--bench-p01-s0")
     point = settings.load("tpl", "p01")
     assert (found.source.kind, str(found.source.path), found.seed) == ("scannetpp", "data/room", 9)
-    assert found.prior.samples == 5 and found.capture.width == point.capture.width == 128
+    assert found.prior.samples == 5 and found.capture.width == point.capture.width
     assert found.capture.test_every == 8
 
 
