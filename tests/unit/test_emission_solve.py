@@ -267,6 +267,22 @@ def test_wall_that_is_dropped_keeps_reflecting():
     np.testing.assert_allclose(out.radiance[0], 8.0, rtol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("white", "reach", "offered"),
+    [(0.3, 1.0, True), (0.3, 1e-3, False), (0.6, 1.0, False)],
+    ids=["brighter than white", "without light", "no brighter than white"],
+)
+def test_what_was_dropped_may_shine_if_it_is_brighter_than_white_and_gives_light(white, reach, offered):
+    """A window of radiance 4 beside a lamp of 8, under which a white surface in its place would show 2.4 or 4.8."""
+    matrix = np.zeros((3, 3))
+    matrix[1, 0] = white
+    out = _pruning([8.0, 4.0, 0.0], [8.0, 4.0, 0.0], matrix, reach=[1.0, reach, 1.0])
+    assert not out.kept[1] and out.excess[1] == pytest.approx(4 / (8 * white), rel=0.1)
+    assert out.power[1] == pytest.approx(reach * 4 / 12, rel=0.2 if reach == 1.0 else 0.8)
+    assert out.may_shine(2.0, 0.01).tolist() == [True, offered, True]
+    assert out.may_shine(1.5, 1.0)[1] == (out.excess[1] >= 1.5)  # for certain, however little its light
+
+
 def test_false_emitter_goes_before_the_lamp_it_hides():
     """A shade around a bulb: each makes the other look like a reflector; the less credible one goes."""
     matrix = np.array([[0.0, 0.9, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.0]])
