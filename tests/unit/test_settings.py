@@ -371,6 +371,10 @@ def test_a_quality_may_be_a_point_with_a_change_and_a_point_alone_is_known_by_it
     assert loading.overridden("t", "p91", tmp_path) == []
     (tmp_path / "config/scenes/t.yaml").write_text("source: {kind: builtin, scene: tiny}\nprior: {kind: simulated, samples: 5}\n")
     assert loading.overridden("t", "draft", tmp_path) == ["prior.samples"]
+    (tmp_path / "config/scenes/t.yaml").write_text(
+        "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\nlimits: {views: 8, width: 200}\n"
+    )
+    assert loading.overridden("t", "draft", tmp_path) == ["capture.views"]
 
 
 def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):

@@ -215,6 +215,27 @@ def test_shipped_points_are_a_front_and_every_quality_can_be_loaded():
     assert len(trade_points.bench_points()) == 3
 
 
+def test_a_quality_by_name_says_what_it_takes_what_it_scored_and_which_scenes_set_it_themselves(monkeypatch):
+    monkeypatch.chdir(REPOSITORY)  # in a checkout the folder of the run is that of the shipped points
+    request = choose.read({"quality": "draft"}, set(), 2)
+    point = trade_points.point_of("draft")
+    assert point is trade_points.points()[trade_points.named()["draft"]]
+    lines = choose.told(request, {"kitchen": choose.Choice("draft")})
+    taken = read_yaml(REPOSITORY / f"config/quality/{point.name}.yaml")["capture"]
+    assert len(lines) == 1 and f"at most {taken['views']} photographs of {taken['width']} x {taken['height']}" in lines[0]
+    assert f"albedo {point.expected('albedo').mean:.1f} dB" in lines[0]
+    lines = choose.told(request, dict.fromkeys(["kitchen", "redkitchen"], choose.Choice("draft")))
+    assert lines[1:] == ["redkitchen: not so, as config/scenes/redkitchen.yaml sets capture.views itself"]
+    monkeypatch.setattr(choose, "MOST_SCENES", 0)
+    assert choose.told(request, {"redkitchen": choose.Choice("draft")})[1:] == ["1 of 1 scenes set some of it themselves"]
+
+
+def test_named_qualities_are_points_in_order_and_neither_end_of_the_front():
+    order, named = list(trade_points.points()), trade_points.named()
+    assert set(named) == {"draft", "standard"}  # the paper's sizes are dearer than every point that was measured
+    assert 0 < order.index(named["draft"]) < order.index(named["standard"])
+
+
 def test_a_bench_runs_the_point_that_its_name_says_and_holds_photographs_out():
     for point, scene in bench.scenes("kitchen").items():
         found = loading.load(scene, "draft", REPOSITORY)

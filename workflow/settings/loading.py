@@ -188,19 +188,35 @@ def limited(settings: dict[str, Any], limits: dict[str, Any]) -> dict[str, Any]:
 
 
 def overridden(scene: str, quality: str, root: Path = Path(".")) -> list[str]:
-    """Return the settings of a quality, dotted, that the scene sets itself to other values.
+    """Return the settings of a quality, dotted, that the scene sets to other values itself, or that its `limits` lower.
 
     Raises:
         InputError: as `load`.
     """
     _, above, _ = _layers(scene, quality, root)
-    own, out = _merged(above), []
-    for section, keys in _quality(quality, root).items():
+    own, settings, out = _merged(above), _quality(quality, root), []
+    limits = own.get("limits")
+    left = limited(settings, limits) if isinstance(limits, dict) else settings
+    for section, keys in settings.items():
         for key, value in keys.items() if isinstance(keys, dict) else ():
             found = own.get(section)
-            if isinstance(found, dict) and found.get(key, value) != value:
+            if (found.get(key, left[section][key]) if isinstance(found, dict) else left[section][key]) != value:
                 out.append(f"{section}.{key}")
     return out
+
+
+def photographs(quality: str, root: Path = Path(".")) -> str:
+    """Return in words how many photographs a quality takes, and at which size.
+
+    Raises:
+        InputError: an unknown quality, or one whose file says something else than numbers there.
+    """
+    file = f"config/quality/{quality}.yaml"
+    try:
+        found = Capture.model_validate(_quality(quality, root).get("capture", {}))
+    except ValidationError as error:
+        raise InputError(explain(error, lambda _: file)) from None
+    return f"at most {found.views} photographs of {found.width} x {found.height}"
 
 
 def canonical(quality: str, root: Path = Path(".")) -> str:

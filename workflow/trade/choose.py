@@ -13,13 +13,17 @@ from workflow.artifacts.files import write_json
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast
 from workflow.settings import study_files
-from workflow.settings.loading import canonical, overridden, scene_origin
+from workflow.settings.loading import canonical, overridden, photographs, scene_origin
 from workflow.settings.names import DEFAULT, did_you_mean, quality_names
 from workflow.trade import bench
 from workflow.trade.points import SCORES, SHIPPED, Point, measured_scores, named, point_of, points, unknown
 
 CHOOSES = ("quality", "point", "budget", "target")
 """Keys of `--config`, of which one may be given."""
+
+
+MOST_SCENES = 5
+"""As many scenes are told one by one how they differ from a quality."""
 
 
 class Request(NamedTuple):
@@ -129,9 +133,16 @@ def _marks(request: Request, scene: str, quality: str) -> dict[str, str]:
 def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
     """Return what is said about the qualities of a run, `chosen` for each scene."""
     point = point_of(request.quality) if request.key in ("quality", "point") else None
-    if point:
-        return [_expectation(request.quality, point)]
-    return [choice.line for choice in chosen.values() if choice.line]
+    if not point:
+        return [choice.line for choice in chosen.values() if choice.line]
+    lines = [_expectation(request.quality, point)]
+    for scene in chosen:
+        changed = [] if study_files.derived(scene) else overridden(scene, request.quality)
+        if changed:
+            lines.append(f"{scene}: not so, as {scene_origin(scene)} sets {', '.join(changed)} itself")
+    if len(lines) > MOST_SCENES + 1:
+        return [lines[0], f"{len(lines) - 1} of {len(chosen)} scenes set some of it themselves"]
+    return lines
 
 
 def reached(request: Request, scenes: Iterable[str]) -> list[str]:
@@ -276,4 +287,4 @@ def _expectation(quality: str, point: Point) -> str:
     for score in SCORES:
         expected = point.expected(score)
         parts.append(f"{score} {expected.mean:.1f} dB ({expected.low:.1f} to {expected.high:.1f})")
-    return f"quality {quality}: in {len(point.rooms)} measured rooms {', '.join(parts)}"
+    return f"quality {quality}, {photographs(quality)}: in {len(point.rooms)} measured rooms {', '.join(parts)}"

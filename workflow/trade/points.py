@@ -67,7 +67,7 @@ def point_of(quality: str) -> Point | None:
     """Return the point of a quality; None for one that was not measured, such as a file of the working folder's own."""
     name = named().get(quality, quality)
     file = configuration(f"quality/{name}.yaml")
-    return points().get(name) if file.is_relative_to(REPOSITORY) else None
+    return points().get(name) if file.resolve().is_relative_to(REPOSITORY) else None
 
 
 def bench_points() -> list[str]:
