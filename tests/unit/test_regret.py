@@ -43,7 +43,12 @@ def test_what_is_kept_is_worth_the_gain_on_held_out_photographs():
         {"cpu_seconds": 0.25, "max_rss_mb": 0.0, "disk_mb": 0.0}
     )
     text = "\n".join(regret.regret_lines(kept, left_out))
-    assert "| denoiser | a | 4.0 ± 0.1 | 13.0 | no | 25 % | 0 % | 0 % |" in text and "1 of 3 within" in text
+    assert [one.claimed for one in kept] == [pytest.approx(pair) for pair in ((6.0, 20.0), (4.0, 20.0), (4.0, 6.0))]
+    assert [one.in_range for one in kept] == [True, True, False]
+    assert "| denoiser | a | 4.0 ± 0.1 | 13.0 (6.0 to 20.0) | in the range | none | 25 % | 0 % | 0 % |" in text
+    assert "1 of 3 within" in text and "2 within that of their range; 0 improve a score" in text
+    (one, *_), _ = regret.judge(table, OPPOSITES, "plan", [*SCORES, regret.CURRENCY])
+    assert [score[:2] for score in one.helped] == [regret.CURRENCY[:2]] and one.helped[0][3] > 0.1
 
 
 def test_a_variant_that_does_what_the_plan_does_says_nothing():
@@ -66,7 +71,10 @@ def test_a_variant_that_does_what_the_plan_does_says_nothing():
 
 
 def test_a_gain_that_is_none_is_not_as_claimed():
-    one = regret.Kept("denoiser", "a", -0.2, math.nan, 3.0, {})
+    one = regret.Kept("denoiser", "a", -0.2, math.nan, 3.0, (2.0, 4.0), (), {})
+    assert not one.in_range and one._replace(gain=0.9, error=0.1).in_range and one._replace(gain=8.0).in_range
+    assert one._replace(gain=-0.5, claimed=(-0.4, 1.0)).in_range and not one._replace(gain=-0.9, claimed=(-0.4, 1.0)).in_range
+    assert not one._replace(gain=math.nan).in_range and not one._replace(claimed=(math.nan, math.nan)).in_range
     assert not one.as_claimed and not one._replace(gain=3.0, claim=math.nan).as_claimed
     assert one._replace(gain=3.0).as_claimed
 

@@ -39,6 +39,9 @@ class Kept(NamedTuple):
         component, scene: which.
         gain, error: of held-out photographs by it, dB: mean over the seeds, and two standard errors of it (NaN for one seed).
         claim: median of the gains in the other rooms where it was kept, dB; NaN where there is none.
+        claimed: smallest and largest of these gains.
+        helped: (quantity, metric, protocol, relative improvement) of the scores that are better with it by more than 1 % and by
+            more than two standard errors.
         shares: of each of `COSTS` that was recorded, what it takes relative to the plan.
     """
 
@@ -47,11 +50,21 @@ class Kept(NamedTuple):
     gain: float
     error: float
     claim: float
+    claimed: tuple[float, float]
+    helped: tuple[tuple[str, str, str, float], ...]
     shares: Mapping[str, float]
 
     @property
     def as_claimed(self) -> bool:
+        """Whether the gain is within a factor of two of the median."""
         return self.gain > 0 and self.claim > 0 and 1 / WITHIN <= self.gain / self.claim <= WITHIN
+
+    @property
+    def in_range(self) -> bool:
+        """Whether it is within a factor of two of the range, up to two standard errors of its own."""
+        low, high = (end * (WITHIN if (end > 0) == up else 1 / WITHIN) for end, up in zip(self.claimed, (False, True), strict=True))
+        error = 0.0 if math.isnan(self.error) else self.error
+        return low - error <= self.gain <= high + error
 
 
 class LeftOut(NamedTuple):
@@ -99,17 +112,17 @@ def judge(
                 shares = _shares(cost_of, str(scene), reference, variant, seeds, -1 if removes else 1)
                 pair = (reference, variant) if removes else (variant, reference)
                 gain = _mean_and_error(_differences(value_of, str(scene), pair, seeds, CURRENCY))
+                helped = tuple(_helped(value_of, str(scene), pair, seeds, scores))
                 if removes:
-                    kept.append(Kept(component, str(scene), *gain, math.nan, shares))
+                    kept.append(Kept(component, str(scene), *gain, math.nan, (math.nan, math.nan), helped, shares))
                 else:
-                    helped = _helped(value_of, str(scene), pair, seeds, scores)
-                    left_out.append(LeftOut(component, str(scene), *gain, tuple(helped), shares))
-    return [one._replace(claim=_claim(one, kept)) for one in kept], left_out
+                    left_out.append(LeftOut(component, str(scene), *gain, helped, shares))
+    return [_with_claim(one, kept) for one in kept], left_out
 
 
-def _claim(one: Kept, kept: Iterable[Kept]) -> float:
+def _with_claim(one: Kept, kept: Iterable[Kept]) -> Kept:
     others = [other.gain for other in kept if other.component == one.component and other.scene != one.scene]
-    return float(np.median(others)) if others else math.nan
+    return one._replace(claim=float(np.median(others)), claimed=(min(others), max(others))) if others else one
 
 
 def _seeds_that_differ(value_of: pd.Series, scene: str, reference: str, variant: str) -> list[int]:
@@ -175,15 +188,20 @@ def _shares(cost_of: pd.DataFrame, scene: str, reference: str, variant: str, see
 def regret_lines(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> list[str]:
     """Return the verdicts as Markdown."""
     lines = ["## what was kept, against leaving it out", ""]
-    lines += ["| component | scene | gain, held-out dB | of the other scenes | as claimed | CPU | memory | disk |"]
-    lines += ["|---|---|---:|---:|---|---:|---:|---:|"]
+    lines += ["| component | scene | gain, held-out dB | of the other scenes | as claimed | scores that it improves | CPU | memory | disk |"]
+    lines += ["|---|---|---:|---:|---|---|---:|---:|---:|"]
     for one in kept:
-        claim = "" if math.isnan(one.claim) else f"{one.claim:.1f}"
-        shares = _percent(one.shares)
-        said = "yes" if one.as_claimed else "no"
-        lines.append(f"| {one.component} | {one.scene} | {_gain(one)} | {claim} | {said} | {shares} |")
-    good = sum(one.as_claimed for one in kept)
-    lines += ["", f"{good} of {len(kept)} within a factor {WITHIN:g} of the median of the other scenes.", ""]
+        claim = "" if math.isnan(one.claim) else f"{one.claim:.1f} ({one.claimed[0]:.1f} to {one.claimed[1]:.1f})"
+        said = "yes" if one.as_claimed else "in the range" if one.in_range else "no"
+        better = ", ".join(f"{q} {m}" for q, m, protocol, _ in one.helped if protocol == "raw") or "none"
+        lines.append(f"| {one.component} | {one.scene} | {_gain(one)} | {claim} | {said} | {better} | {_percent(one.shares)} |")
+    good, near = (sum(getattr(one, name) for one in kept) for name in ("as_claimed", "in_range"))
+    lines += [
+        "",
+        f"{good} of {len(kept)} within a factor {WITHIN:g} of the median of the other scenes, {near} within that of their range;"
+        f" {sum(bool(one.helped) for one in kept)} improve a score by more than 1 % and two standard errors.",
+        "",
+    ]
     lines += ["## what was left out, against having it", ""]
     lines += ["| component | scene | gain, held-out dB | scores that it improves | CPU | memory | disk |"]
     lines += ["|---|---|---:|---|---:|---:|---:|"]
