@@ -30,6 +30,7 @@ WITHIN = 2.0
 TOLERANCE = 0.01
 """Relative improvement that a component which was left out may bring."""
 COSTS = ("cpu_seconds", "max_rss_mb", "disk_mb")
+NAMES = ("CPU", "memory", "disk")
 
 
 class Kept(NamedTuple):
@@ -62,7 +63,9 @@ class Kept(NamedTuple):
     @property
     def in_range(self) -> bool:
         """Whether it is within a factor of two of the range, up to two standard errors of its own."""
-        low, high = (end * (WITHIN if (end > 0) == up else 1 / WITHIN) for end, up in zip(self.claimed, (False, True), strict=True))
+        low, high = self.claimed
+        low *= 1 / WITHIN if low > 0 else WITHIN
+        high *= WITHIN if high > 0 else 1 / WITHIN
         error = 0.0 if math.isnan(self.error) else self.error
         return low - error <= self.gain <= high + error
 
@@ -188,7 +191,8 @@ def _shares(cost_of: pd.DataFrame, scene: str, reference: str, variant: str, see
 def regret_lines(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> list[str]:
     """Return the verdicts as Markdown."""
     lines = ["## what was kept, against leaving it out", ""]
-    lines += ["| component | scene | gain, held-out dB | of the other scenes | as claimed | scores that it improves | CPU | memory | disk |"]
+    columns = ("component", "scene", "gain, held-out dB", "of the other scenes", "as claimed", "scores that it improves", *NAMES)
+    lines += [f"| {' | '.join(columns)} |"]
     lines += ["|---|---|---:|---:|---|---|---:|---:|---:|"]
     for one in kept:
         claim = "" if math.isnan(one.claim) else f"{one.claim:.1f} ({one.claimed[0]:.1f} to {one.claimed[1]:.1f})"
