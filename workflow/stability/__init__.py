@@ -1,0 +1,1 @@
+"""How many digits kernels, solvers and stages have, and where they end."""
