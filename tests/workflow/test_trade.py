@@ -13,7 +13,7 @@ def test_a_budget_chooses_a_point_and_says_what_is_expected(workflow):
     assert found and float(found[2]) < 600
     assert "config/scenes/tiny.yaml sets capture.height, capture.views, capture.width" in result.stderr
     same = workflow.run("-n", "scenes/tiny", "--config", f"point={found[1]}")
-    assert planned(same) == planned(result) and f"quality {found[1]}: in " in same.stderr
+    assert planned(same) == planned(result) and f"quality {found[1]}, at most " in same.stderr
 
 
 def test_what_cannot_be_had_ends_before_any_job_with_one_error(workflow):
