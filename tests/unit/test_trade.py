@@ -13,8 +13,9 @@ from workflow.costs.model import Range
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import forecast
-from workflow.settings import loading
+from workflow.settings import loading, study_files
 from workflow.settings.names import QUALITIES, REPOSITORY, quality_names
+from workflow.settings.scene import SceneSettings
 from workflow.settings.yaml_file import read_yaml
 from workflow.trade import bench, choose, front
 from workflow.trade import points as trade_points
@@ -225,9 +226,21 @@ def test_a_quality_by_name_says_what_it_takes_what_it_scored_and_which_scenes_se
     assert len(lines) == 1 and f"at most {taken['views']} photographs of {taken['width']} x {taken['height']}" in lines[0]
     assert f"albedo {point.expected('albedo').mean:.1f} dB" in lines[0]
     lines = choose.told(request, dict.fromkeys(["kitchen", "redkitchen"], choose.Choice("draft")))
-    assert lines[1:] == ["redkitchen: not so, as config/scenes/redkitchen.yaml sets capture.views itself"]
+    assert lines[1:] == ["redkitchen: other than that, because config/scenes/redkitchen.yaml sets capture.views"]
     monkeypatch.setattr(choose, "MOST_SCENES", 0)
     assert choose.told(request, {"redkitchen": choose.Choice("draft")})[1:] == ["1 of 1 scenes set some of it themselves"]
+
+
+def test_the_points_that_are_checked_in_other_rooms_are_those_of_the_front(monkeypatch):
+    monkeypatch.chdir(REPOSITORY)
+    design = study_files.load_study("tradeoff_check").design
+    scene = {"source": {"kind": "builtin", "scene": "tiny"}, "prior": {"kind": "simulated"}}
+
+    def settings(layer):
+        return SceneSettings.model_validate(loading.merge(scene, layer))
+
+    checked = [settings(design.overrides(run)) for run in design.runs]
+    assert checked == [settings(read_yaml(REPOSITORY / f"config/quality/{name}.yaml")) for name in trade_points.points()]
 
 
 def test_named_qualities_are_points_in_order_and_neither_end_of_the_front():

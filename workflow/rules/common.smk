@@ -332,7 +332,9 @@ def tell_costs():
     ]
     for line in forecast.forecast(jobs, workflow.cores):
         print(line, file=sys.stderr)
-    for line in choose.told(REQUEST, CHOSEN) if jobs else []:
+    scenes = {job.scene for job in jobs}
+    chosen = {scene: choice for scene, choice in CHOSEN.items() if scene in scenes}
+    for line in choose.told(REQUEST, chosen) if jobs else []:
         print(line, file=sys.stderr)
 
 

@@ -270,7 +270,10 @@ def _exact_response(curve: Response, x: Any) -> Any:
         return _power(lambda z: 1 / theta[0], lambda z: mp.mpf(0), x)
     if curve.family == "ggcm":
         a0, a1, a2 = theta
-        exponent = lambda z: mp.exp(a0 + z * (a1 + z * a2))  # noqa: E731
+
+        def exponent(z: Any) -> Any:
+            return mp.exp(a0 + z * (a1 + z * a2))
+
         return _power(exponent, lambda z: exponent(z) * (a1 + 2 * a2 * z), x)
     return _exact_spline(theta, x)
 

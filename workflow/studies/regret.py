@@ -29,8 +29,8 @@ WITHIN = 2.0
 """Factor within which a gain has to be what was claimed."""
 TOLERANCE = 0.01
 """Relative improvement that a component which was left out may bring."""
-COSTS = ("cpu_seconds", "max_rss_mb", "disk_mb")
-NAMES = ("CPU", "memory", "disk")
+COSTS = {"cpu_seconds": "CPU", "max_rss_mb": "memory", "disk_mb": "disk"}
+"""Columns of the table that are compared -> their names in the verdicts."""
 
 
 class Kept(NamedTuple):
@@ -191,13 +191,13 @@ def _shares(cost_of: pd.DataFrame, scene: str, reference: str, variant: str, see
 def regret_lines(kept: Sequence[Kept], left_out: Sequence[LeftOut]) -> list[str]:
     """Return the verdicts as Markdown."""
     lines = ["## what was kept, against leaving it out", ""]
-    columns = ("component", "scene", "gain, held-out dB", "of the other scenes", "as claimed", "scores that it improves", *NAMES)
-    lines += [f"| {' | '.join(columns)} |"]
+    costs = " | ".join(COSTS.values())
+    lines += [f"| component | scene | gain, held-out dB | of the other scenes | as claimed | scores that it improves | {costs} |"]
     lines += ["|---|---|---:|---:|---|---|---:|---:|---:|"]
     for one in kept:
         claim = "" if math.isnan(one.claim) else f"{one.claim:.1f} ({one.claimed[0]:.1f} to {one.claimed[1]:.1f})"
         said = "yes" if one.as_claimed else "in the range" if one.in_range else "no"
-        better = ", ".join(f"{q} {m}" for q, m, protocol, _ in one.helped if protocol == "raw") or "none"
+        better = ", ".join(dict.fromkeys(f"{q} {m}" for q, m, _, _ in one.helped)) or "none"
         lines.append(f"| {one.component} | {one.scene} | {_gain(one)} | {claim} | {said} | {better} | {_percent(one.shares)} |")
     good, near = (sum(getattr(one, name) for one in kept) for name in ("as_claimed", "in_range"))
     lines += [

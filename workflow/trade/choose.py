@@ -139,7 +139,7 @@ def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
     for scene in chosen:
         changed = [] if study_files.derived(scene) else overridden(scene, request.quality)
         if changed:
-            lines.append(f"{scene}: not so, as {scene_origin(scene)} sets {', '.join(changed)} itself")
+            lines.append(f"{scene}: other than that, because {scene_origin(scene)} sets {', '.join(changed)}")
     if len(lines) > MOST_SCENES + 1:
         return [lines[0], f"{len(lines) - 1} of {len(chosen)} scenes set some of it themselves"]
     return lines
