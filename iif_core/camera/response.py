@@ -237,17 +237,14 @@ class Response:
         a, b, c = h * (s - d0) + bend, h * d0 - bend, -s * part
         xi = 2.0 * c / (-b - np.sqrt(np.maximum(b**2 - 4.0 * a * c, 0.0)))
         u, p = (j + xi) / bins, _SPLINE_POWER
-        # Toe: u = u_t t ((2 - p) - (1 - p) t).
-        low = np.minimum(u / _TOE**p, 1.0)
-        t = 2.0 * low / ((2.0 - p) + np.sqrt(np.maximum((2.0 - p) ** 2 - 4.0 * (1.0 - p) * low, 0.0)))
-        return np.where(low < 1.0, _TOE * t, u ** (1.0 / p))
+        return _invert_power(u, p)
 
     def _inverse_shared(self, y: np.ndarray) -> np.ndarray:
         inside = np.clip(y, 0.0, 1.0)
         if self.family == "srgb":
             x = np.where(inside <= 12.92 * SRGB_KNEE, inside / 12.92, ((inside + 0.055) / 1.055) ** 2.4)
-        elif self.family == "gamma" and not np.any(inside < self(np.array(_TOE))):
-            x = inside ** self.params[0]
+        elif self.family == "gamma":
+            x = _invert_power(inside, 1.0 / self.params[0])
         elif self.family == "sampled":
             assert self.samples is not None
             x = np.interp(inside, self.samples[1], self.samples[0])
@@ -271,6 +268,13 @@ class Response:
             newton = x - (f - y) / slope
             x = np.where((newton >= low) & (newton <= high), newton, 0.5 * (low + high))
         return x
+
+
+def _invert_power(y: np.ndarray, p: float) -> np.ndarray:
+    """x with x^p = y; below the end of the toe, with y = y_t t ((2 - p) + (p - 1) t) for x = t x_t (Eq. C.15)."""
+    low = np.minimum(y / _TOE**p, 1.0)
+    t = 2.0 * low / ((2.0 - p) + np.sqrt(np.maximum((2.0 - p) ** 2 + 4.0 * (p - 1.0) * low, 0.0)))
+    return np.where(low < 1.0, _TOE * t, y ** (1.0 / p))
 
 
 def response(family: str, params: np.ndarray | None = None) -> Response:

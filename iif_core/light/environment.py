@@ -59,11 +59,17 @@ def direction_in(xp: Namespace, row: Any, column: Any, u1: Any, u2: Any, height:
     Returns:
         Unit vector, three arrays.
     """
-    upper, lower = xp.cos(row * (xp.pi / height)), xp.cos((row + 1) * (xp.pi / height))
-    z = upper + u1 * (lower - upper)
+    half = xp.pi / (2 * height)
+
+    def between(first: Any, last: Any) -> Any:
+        """2 sin^2 of half the angles from a pole, which keeps its digits where 1 - cos does not."""
+        near, far = xp.sin(first * half), xp.sin(last * half)
+        return 2 * ((1 - u1) * near * near + u1 * far * far)
+
+    above, below = between(row, row + 1), between(height - row, height - row - 1)  # 1 - z and 1 + z
     phi = (column + u2) * (2 * xp.pi / width)
-    sine = xp.sqrt(xp.maximum((1 - z) * (1 + z), 0.0))
-    return sine * xp.cos(phi), sine * xp.sin(phi), z
+    sine = xp.sqrt(above * below)
+    return sine * xp.cos(phi), sine * xp.sin(phi), 0.5 * (below - above)
 
 
 def texel_weights(radiance: ArrayLike) -> Array:

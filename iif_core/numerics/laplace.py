@@ -25,7 +25,9 @@ def floored(scale: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
 def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
     """Compute the divergence KL(reference || texture) of two Laplace distributions (Eq. F.7).
 
-    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1, which is 0 for d = 0 and equal scales.
+    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1, which is 0 for d = 0 and equal scales. It is summed as two terms
+    that are not negative, (q - 1 - log q) + q (x + exp(-x) - 1) with q = b_r / b_p and x = d / b_r
+    (docs/method/numerics.md#divergence-of-equal-distributions).
 
     Args:
         distance: |mu_ref - mu_pred|; the sign is ignored.
@@ -41,7 +43,25 @@ def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_
     """
     d = np.abs(distance)
     b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
-    return np.log(b_p) - np.log(b_r) + (d + b_r * np.exp(-d / b_r)) / b_p - 1.0
+    x, off = d / b_r, (b_r - b_p) / b_p
+    near = np.abs(off) < 0.5
+    scales = np.where(near, off - np.log1p(np.where(near, off, 0.0)), b_r / b_p - 1.0 - np.log(b_r / b_p))
+    return scales + b_r / b_p * _above_tangent(x)
+
+
+_SMALL = 0.25
+_SERIES = [1.0]  # of (x + exp(-x) - 1) 2 / x^2 in powers of x, exact in double precision below _SMALL
+for _n in range(3, 14):
+    _SERIES.append(-_SERIES[-1] / _n)
+
+
+def _above_tangent(x: NDArray) -> NDArray:
+    """x + exp(-x) - 1 for x >= 0, without cancellation."""
+    small = np.minimum(x, _SMALL)
+    series = np.full_like(small, _SERIES[-1])
+    for coefficient in reversed(_SERIES[:-1]):
+        series = series * small + coefficient
+    return np.where(x < _SMALL, 0.5 * small * small * series, x + np.expm1(-x))
 
 
 def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
@@ -60,8 +80,7 @@ def kl_weight(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float =
     d = np.abs(distance)
     b_r, b_p = floored(b_ref, floor), floored(b_pred, floor)
     x = d / b_r
-    # Below 1e-4 the series 1 - x / 2 is exact in float32.
-    ratio = np.where(x > 1e-4, -np.expm1(-x) / np.where(x > 1e-4, x, 1.0), 1.0 - 0.5 * x)
+    ratio = np.where(x > 0, -np.expm1(-x) / np.where(x > 0, x, 1.0), 1.0)
     return ratio / (b_r * b_p)
 
 

@@ -174,7 +174,8 @@ SCALE = Argument(1e-4, 4.0, (laplace.SCALE_FLOOR, 1.0))
 
 def _kl(d: Any, b_r: Any, b_p: Any) -> Any:
     b_r, b_p = _above(b_r, laplace.SCALE_FLOOR), _above(b_p, laplace.SCALE_FLOOR)
-    return mp.log(b_p / b_r) + (d + b_r * mp.exp(-d / b_r)) / b_p - 1
+    with mp.workdps(700):  # of d^2, for d down to 1e-308
+        return mp.log(b_p / b_r) + (d + b_r * mp.exp(-d / b_r)) / b_p - 1
 
 
 def _kl_weight(d: Any, b_r: Any, b_p: Any) -> Any:
@@ -300,10 +301,10 @@ def _exact_spline(theta: list[Any], x: Any) -> Any:
 
 
 def _inverse_of(exact: Callable[[Any], Any], y: Any) -> Any:
-    """Root of an increasing function on [0, 1]."""
+    """Root of an increasing function between 0 and 2; f(1) = 1 holds to the rounding of its constants."""
     if y <= 0:
         return mp.mpf(0)
-    low, high = mp.mpf(0), mp.mpf(1)
+    low, high = mp.mpf(0), mp.mpf(2)
     x = y
     for _ in range(400):
         value = exact(x)
@@ -311,10 +312,10 @@ def _inverse_of(exact: Callable[[Any], Any], y: Any) -> Any:
         step = x * mp.mpf(10) ** -25
         slope = (exact(x + step) - value) / step
         newton = x - (value - y) / slope if slope > 0 else low
-        previous, x = x, newton if low < newton < high else (low + high) / 2
-        if abs(x - previous) <= abs(x) * mp.mpf(10) ** -40:
-            break
-    return x
+        if abs(newton - x) <= abs(x) * mp.mpf(10) ** -40:
+            return newton
+        x = newton if low < newton < high else (low + high) / 2
+    raise ArithmeticError(f"no root of f(x) = {y} was found")
 
 
 CURVES = {
