@@ -173,9 +173,9 @@ def _interpolation_weights(levels, r):
         j += 1
     span = levels[j + 1] - levels[j]
     t = min(max((r - levels[j]) / span, 0.0), 1.0)
-    one = t * t * (3.0 - 2.0 * t)
-    steep = 6.0 * t * (1.0 - t) / span
-    value = (1.0 - one, one, span * t * (1.0 - t) * (1.0 - t), -span * t * t * (1.0 - t))
+    left = 1.0 - t
+    steep = 6.0 * t * left / span
+    value = (left * left * (1.0 + 2.0 * t), t * t * (3.0 - 2.0 * t), span * t * left * left, -span * t * t * left)
     return j, value, (-steep, steep, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0))
 
 

@@ -25,7 +25,8 @@ def interpolate_levels(shading: np.ndarray, levels: np.ndarray, roughness: np.nd
     d1 = np.where(h_after > 0, inner1, _end(mean, mean_before, h, h_before))
     t = (r - levels[j])[:, None] / h
     bend0, bend1 = d0 - mean, d1 - mean
-    value = y0 + h * t * (mean + (1 - t) * ((1 - t) * bend0 - t * bend1))
+    # Hermite's form has all digits at both ends, also where the two values differ by many orders of magnitude.
+    value = (1 - t) ** 2 * ((1 + 2 * t) * y0 + h * t * d0) + t**2 * ((3 - 2 * t) * y1 - h * (1 - t) * d1)
     slope = mean + (1 - t) * (1 - 3 * t) * bend0 + t * (3 * t - 2) * bend1
     return value, slope
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,7 +14,7 @@ from iif_core.camera import distortion
 from iif_core.camera.response import START, Response, response
 from iif_core.fusion.selection import selection_weights
 from iif_core.light import environment
-from iif_core.numerics import color, laplace, xp
+from iif_core.numerics import color, laplace, normal_tail, xp
 from iif_core.reflectance import brdf
 from workflow.stability.scalar import Argument, Form, Kernel
 
@@ -400,15 +401,112 @@ def _texels(height: int, width: int, drawn: list[np.ndarray], rng: np.random.Gen
     return [rows, rng.integers(width, size=len(rows)).astype(dtype), *drawn[2:]]
 
 
+def _hazard(z: Any) -> tuple[Any, Any]:
+    ratio = mp.npdf(z) / mp.ncdf(-z)
+    return ratio, ratio - z
+
+
 DENSITY = Argument(0.0, 1e38, (1e-30, 1.0, 1e30))
 LIGHT = [
     Kernel("power heuristic", _power_weight, ("weight",), {"p": DENSITY, "q": DENSITY},
            {("drjit", np.float32): partial(_drjit, _power_form)}),
+    Kernel("hazard of the normal distribution", _hazard, ("h", "h - z"), {"z": Argument(0.0, 30.0, (4.0, 29.0), signed=True)},
+           of_numpy(normal_tail.hazard)),
     Kernel("direction in a texel, 512 x 1024", partial(_texel_direction, 512, 1024), ("x", "y", "z"),
            {"row": UNIT, "column": UNIT, "u1": UNIFORM, "u2": UNIFORM},
            of_namespace(lambda space, row, column, u1, u2: environment.direction_in(space, row, column, u1, u2, 512, 1024)),
            partial(_texels, 512, 1024)),
 ]  # fmt: skip
 
-KERNELS = [*REFLECTANCE, *FUSION, *CAMERA, *LIGHT]
+# ----------------------------------------------------------------------------------------------------- interpolation
+
+LEVELS = np.array([0.02, 0.1, 0.4, 1.0])
+
+
+def _slopes_of(y: tuple[Any, ...], levels: list[Any]) -> list[Any]:
+    """Slopes of the monotone cubic (Eq. M.5)."""
+    h = [b - a for a, b in itertools.pairwise(levels)]
+    mean = [(b - a) / step for (a, b), step in zip(itertools.pairwise(y), h, strict=True)]
+    out = []
+    for left, right, h_left, h_right in zip(mean, mean[1:], h, h[1:], strict=False):
+        w_left, w_right = 2 * h_right + h_left, h_right + 2 * h_left
+        alike = left * right > 0
+        out.append((w_left + w_right) * left * right / (w_left * right + w_right * left) if alike else mp.mpf(0))
+
+    def end(own: Any, beyond: Any, width: Any, width_beyond: Any) -> Any:
+        slope = ((2 * width + width_beyond) * own - width * beyond) / (width + width_beyond)
+        return mp.mpf(0) if slope * own <= 0 else 3 * own if abs(slope) > 3 * abs(own) else slope
+
+    return [end(mean[0], mean[1], h[0], h[1]), *out, end(mean[-1], mean[-2], h[-1], h[-2])]
+
+
+def _exact_slopes(*y: Any) -> tuple[Any, ...]:
+    return tuple(_slopes_of(y, [mp.mpf(float(level)) for level in LEVELS]))
+
+
+def _exact_cubic(*arguments: Any) -> Any:
+    *y, r = arguments
+    levels = [mp.mpf(float(level)) for level in LEVELS]
+    slope = _slopes_of(tuple(y), levels)
+    j = min(sum(r >= level for level in levels[1:]), len(levels) - 2)
+    h = levels[j + 1] - levels[j]
+    t, mean = (r - levels[j]) / h, (y[j + 1] - y[j]) / h
+    return y[j] + h * t * (mean + (1 - t) * ((1 - t) * (slope[j] - mean) - t * (slope[j + 1] - mean)))
+
+
+def _compiled_slopes(arrays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+    from iif_core.fitting.kernels import slopes
+
+    shading = np.ascontiguousarray(np.repeat(np.stack(arrays, 1)[..., None], 3, -1))
+    out = np.zeros(shading.shape)
+    slopes(shading, LEVELS, out)
+    return tuple(out[..., 0].T)
+
+
+def _cubic(arrays: list[np.ndarray]) -> np.ndarray:
+    from iif_core.fitting.levels import interpolate_levels
+
+    *y, r = arrays
+    return interpolate_levels(np.repeat(np.stack(y, 1)[..., None], 3, -1), LEVELS, r)[0][:, 0]
+
+
+SIDE = 5
+TABLE = np.random.default_rng(0).uniform(0.5, 2.0, (SIDE**3, 2)).astype(np.float32)
+"""A dense level of the hash grid with `SIDE` vertices per side."""
+
+
+def _exact_level(*u: Any) -> tuple[Any, ...]:
+    at = [coordinate * (SIDE - 1) for coordinate in u]
+    cell = [min(int(mp.floor(value)), SIDE - 2) for value in at]
+    out = [mp.mpf(0), mp.mpf(0)]
+    for corner in itertools.product((0, 1), repeat=3):
+        weight = mp.mpf(1)
+        for value, first, side in zip(at, cell, corner, strict=True):
+            weight *= value - first if side else 1 - (value - first)
+        row = sum((first + side) * SIDE**axis for axis, (first, side) in enumerate(zip(cell, corner, strict=True)))
+        out = [total + weight * mp.mpf(float(value)) for total, value in zip(out, TABLE[row], strict=True)]
+    return tuple(out)
+
+
+def _compiled_level(arrays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
+    from iif_core.fusion.hashgrid import kernels as hashgrid
+
+    count = len(arrays[0])
+    encoded = np.zeros((-(-count // hashgrid.BLOCK), 2, hashgrid.BLOCK), np.float32)
+    hashgrid.encode_level(np.stack(arrays), SIDE, False, TABLE, encoded, 0)
+    return tuple(encoded[:, row].reshape(-1)[:count] for row in range(2))
+
+
+NODE = Argument(1e-6, 1e6)
+PLACE = Argument(0.0, 1.0 - 2.0**-24, (0.25, 0.5, 0.75), towards_one=True, zero=True)
+INTERPOLATION = [
+    Kernel("slopes of the monotone cubic", _exact_slopes, ("d0", "d1", "d2", "d3"),
+           {f"y{j}": NODE for j in range(4)}, {("numba", np.float32): _compiled_slopes}),
+    Kernel("monotone cubic", _exact_cubic, ("y",),
+           {**{f"y{j}": NODE for j in range(4)}, "r": Argument(0.02, 1.0, (0.1, 0.4))}, {("numpy", np.float64): _cubic}),
+    Kernel("hash grid, one level", _exact_level, ("feature 1", "feature 2"),
+           {axis: PLACE for axis in "xyz"}, {("numba", np.float32): _compiled_level}),
+]  # fmt: skip
+
+KERNELS = [*REFLECTANCE, *FUSION, *CAMERA, *LIGHT, *INTERPOLATION]
 """All of them, in the order of the table."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.light.emission.rows import EmissionRows
+from iif_core.numerics.normal_tail import hazard
 
 TRUSTED_RELIABILITY = 1.5
 """Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
@@ -245,8 +246,6 @@ def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | Non
     One Newton step on the likelihood of saturation at noise sigma (Tobin 1958; Eq. L.25, L.26). For sigma -> 0 rows below
     their bound count fully and the others not at all.
     """
-    from scipy.special import log_ndtr
-
     share, shift = np.ones(len(difference)), np.zeros(len(difference))
     missed = bound & (difference > 0)
     share[bound] = missed[bound]
@@ -254,8 +253,8 @@ def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | Non
         return share, shift
     sigma = noise * scale[bound]
     z = np.clip(difference[bound] / sigma, -30.0, 30.0)
-    ratio = np.exp(-0.5 * z * z - 0.5 * np.log(2 * np.pi) - log_ndtr(-z))
-    delta = np.clip(ratio * (ratio - z), 0.0, 1.0)
+    ratio, excess = hazard(z)
+    delta = np.clip(ratio * excess, 0.0, 1.0)
     far = np.abs(difference[bound]) >= 29.0 * sigma
     soft = ~far & (delta > 1e-4)
     share[bound] = np.where(far, missed[bound], np.where(soft, delta, 0.0))
