@@ -25,8 +25,8 @@ def floored(scale: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
 def kl(distance: NDArray, b_ref: NDArray, b_pred: NDArray, floor: float = SCALE_FLOOR) -> NDArray:
     """Compute the divergence KL(reference || texture) of two Laplace distributions (Eq. F.7).
 
-    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1, which is 0 for d = 0 and equal scales. It is summed as two terms
-    that are not negative, (q - 1 - log q) + q (x + exp(-x) - 1) with q = b_r / b_p and x = d / b_r
+    KL = log(b_p / b_r) + d / b_p + (b_r / b_p) exp(-d / b_r) - 1, which is 0 for d = 0 and equal scales. It is the sum of two
+    terms that are not negative, (q - 1 - log q) + q (x + exp(-x) - 1) with q = b_r / b_p and x = d / b_r
     (docs/method/numerics.md#divergence-of-equal-distributions).
 
     Args:

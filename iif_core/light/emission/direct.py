@@ -13,11 +13,10 @@ from functools import cached_property
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.light.emission.normal import NormalSums, NormalSystem, normal_system
 from iif_core.light.emission.rows import EmissionRows
 from iif_core.numerics.normal_tail import hazard
 
-TRUSTED_RELIABILITY = 1.5
-"""Reliability of a direction, relative to the noise of reliabilities, from which the data alone decide it."""
 RIDGE = 1e-4
 """Weight of the initial value relative to the diagonal of the normal matrix."""
 _DAMPED_AFTER = 6  # rounds of re-weighting after which steps are halved (docs/method/numerics.md#answers-that-alternate)
@@ -227,19 +226,6 @@ def solve_families(
     return solve_emission(rows, start, prior_width=np.where(together, width, prior.width), family=family, correlation=correlation)
 
 
-def _definite(normal: _Normal, ridge: float) -> tuple[np.ndarray, np.ndarray]:
-    """(H lifted, the lift), in units in which the diagonal of M is 1 (Eq. L.24)."""
-    values, vectors = np.linalg.eigh(normal.m)
-    values = np.maximum(values, 1e-9 * values[-1])
-    root, inverse = (vectors * np.sqrt(values)) @ vectors.T, (vectors / np.sqrt(values)) @ vectors.T
-    share, directions = np.linalg.eigh(inverse @ normal.h @ inverse)
-    noise = float(np.linalg.norm(inverse @ normal.k @ inverse, 2)) if normal.k.any() else 0.0
-    lift = np.where(share < max(TRUSTED_RELIABILITY * noise, 1e-6), 1.0 - share, 0.0)
-    whole = root @ directions
-    lifted = (whole * lift) @ whole.T + ridge * np.eye(len(values))
-    return normal.h + lifted, lifted
-
-
 def _censored(difference: np.ndarray, bound: np.ndarray, scale: np.ndarray | None, noise: float) -> tuple[np.ndarray, np.ndarray]:
     """Saturated rows as equalities of the next step: share of their weight, and what is added to their target.
 
@@ -278,57 +264,12 @@ class _Channel:
     radiance: np.ndarray
     light: np.ndarray
     variance: np.ndarray
-    system: _System | None
+    system: NormalSystem | None
     violated: int
     rounds: int
     converged: bool
     square: float
     square_target: float
-
-
-@dataclass(frozen=True)
-class _Normal:
-    """H, its noise part K, M and b of one channel (Eq. L.22, L.23), float64."""
-
-    h: np.ndarray
-    k: np.ndarray
-    m: np.ndarray
-    b: np.ndarray
-
-
-@dataclass(frozen=True)
-class _System:
-    """Normal equations of the groups to which some row responds, scaled to unit diagonal of M.
-
-    Attributes:
-        known: (G,) bool; scale: of the unknowns; matrix: lifted H plus prior; lifted: the part of it that belongs to the
-            prior; right: b; data: lifted H alone; ridge: what was added to its diagonal.
-    """
-
-    known: np.ndarray
-    scale: np.ndarray
-    matrix: np.ndarray
-    lifted: np.ndarray
-    right: np.ndarray
-    data: np.ndarray
-    ridge: float
-
-    @property
-    def condition(self) -> float:
-        """Condition number of the lifted H."""
-        spectrum = np.linalg.eigvalsh(self.data)
-        return float(spectrum[-1] / max(spectrum[0] - self.ridge, 1e-10))
-
-    def solve(self, initial: np.ndarray) -> np.ndarray:
-        """Non-negative least squares; groups that are not known stay at `initial` (G,)."""
-        from scipy.linalg import solve_triangular
-        from scipy.optimize import nnls
-
-        lower = np.linalg.cholesky(self.matrix)
-        right = solve_triangular(lower, self.right + self.lifted @ (initial[self.known] * self.scale), lower=True)
-        answer = initial.copy()
-        answer[self.known] = nnls(lower.T, right, maxiter=50 * len(self.scale) + 50)[0] / self.scale
-        return answer
 
 
 @dataclass(frozen=True)
@@ -369,11 +310,11 @@ class _ChannelRows:
         step = max(1, _CHUNK_BYTES // (8 * max(self.first.shape[1], 1)))
         return [slice(start, start + step) for start in range(0, len(self.target), step)]
 
-    def normal(self, weight: np.ndarray, shift: np.ndarray) -> _Normal:
+    def normal(self, weight: np.ndarray, shift: np.ndarray) -> NormalSums:
         """Sums over the rows; `weight` and `shift` (n,) of the targets differ from those of `sure` for bounds alone."""
         own = np.flatnonzero(self.bound & (weight > 0))
         bounds = self._sums(own, weight[own], shift[own])
-        return _Normal(*(a + b for a, b in zip(self._equalities, bounds, strict=True)))
+        return NormalSums(*(a + b for a, b in zip(self._equalities, bounds, strict=True)))
 
     @cached_property
     def _equalities(self) -> tuple[np.ndarray, ...]:
@@ -422,23 +363,10 @@ class _ChannelRows:
         together = csr_matrix((np.ones(len(number)), (number, np.arange(len(number)))), shape) @ single[~alone]
         return single[alone].T @ single[alone] + together.T @ together
 
-    def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> _System | None:
+    def system(self, weight: np.ndarray, shift: np.ndarray, variance: np.ndarray) -> NormalSystem | None:
         """Normal equations with the given weights and shifts; `variance` (G,) of a row of weight 1 weighs the prior. None when no
         row responds to any group."""
-        normal = self.normal(weight, shift)
-        diagonal = np.diag(normal.m)
-        known = diagonal > 1e-12 * max(diagonal.max(), 1e-300)
-        if not known.any():
-            return None
-        scale = np.sqrt(diagonal[known])
-        unit, pick = np.outer(scale, scale), np.ix_(known, known)
-        scaled = _Normal(normal.h[pick] / unit, normal.k[pick] / unit, normal.m[pick] / unit, normal.b[known] / scale)
-        matrix, lifted = _definite(scaled, self.ridge)
-        each = np.sqrt(variance[known]) / (self.width[known] * scale)
-        prior = np.diag(each**2)
-        if self.correlation is not None:
-            prior = each[:, None] * np.linalg.inv(self.correlation[pick]) * each
-        return _System(known, scale, matrix + prior, lifted + prior, scaled.b, matrix, self.ridge)
+        return normal_system(self.normal(weight, shift), self.width, variance, self.ridge, self.correlation)
 
     def solve(self, max_rounds: int) -> _Channel:
         """Solve and re-weight until the answer rests, then once more with the prior weighed by the design effect."""
@@ -506,7 +434,7 @@ class _ChannelRows:
             effect[known] = np.maximum(np.divide(real, claimed, out=np.ones(len(real)), where=claimed > 0), 1.0)
         return effect
 
-    def _score_covariance(self, system: _System, answer: np.ndarray) -> np.ndarray:
+    def _score_covariance(self, system: NormalSystem, answer: np.ndarray) -> np.ndarray:
         """`scores` of the known groups in units of the system's scale."""
         return self.scores(answer)[np.ix_(system.known, system.known)] / np.outer(system.scale, system.scale)
 
