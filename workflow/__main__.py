@@ -65,6 +65,11 @@ def _arguments() -> argparse.Namespace:
     batch.add_argument("--fingerprint", help="of the plan whose jobs are all done; without it the summary is a partial one")
     batch.add_argument("--refused", action="store_true", help="only say which scenes cannot be run, and fail")
     batch.add_argument("--log", type=Path)
+    stability = commands.add_parser("stability")
+    stability.add_argument("part", nargs="?", help="part that is measured; without it, the parts are collected")
+    stability.add_argument("--keep", action="store_true", help="copy the collected table to docs/results/ and make its page")
+    stability.add_argument("--fingerprint", help="of the code; recorded by Snakemake, not checked")
+    stability.add_argument("--log", type=Path)
     costs = commands.add_parser("costs")
     costs.add_argument("--log", type=Path)
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
@@ -215,6 +220,12 @@ def main() -> int:
         from workflow.models.lpips import fetch_vgg
 
         return _guarded("fetching VGG16", fetch_vgg, JobState("weights", "lpips_vgg"))
+    if arguments.command == "stability":
+        from workflow.stability import record
+
+        part = arguments.part
+        work = partial(record.write_part, part) if part else record.keep if arguments.keep else record.collect
+        return _guarded(f"stability {part or ''}".strip(), work)
     if arguments.command == "batch":
         return _batch(arguments)
     if arguments.command == "costs":

@@ -25,6 +25,7 @@ from workflow.trade import bench, choose
 STARTED = time.time()
 FOLDER = os.getcwd()
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
+STABILITY_PARTS = ("kernels", "solvers", "sums")
 
 native.process_environment()
 
@@ -85,8 +86,9 @@ def image(wildcards):
 
 wildcard_constraints:
     scene=SCENE_NAME,
-    study=rf"(?!(?:{KERNEL_BENCHMARKS})\.){study_files.STUDY}",
+    study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){study_files.STUDY}",
     benchmark=KERNEL_BENCHMARKS,
+    part="|".join(STABILITY_PARTS),
 
 
 # ---------------------------------------------------------------------------------------------------------- stages

@@ -31,6 +31,52 @@ rule study:
         "python3 -m workflow study {wildcards.study} --quality {params.quality} --fingerprint {params.mark} --log {log:q}"
 
 
+def stability_code(wildcards):
+    """Digest of everything that the study of stability measures, and measures with."""
+    return fingerprints.modules_digest(
+        fingerprints.import_closure("workflow.stability.rows")
+    )
+
+
+rule stability_part:
+    """Measure the numerical errors of kernels, solvers or sums."""
+    output:
+        table="results/studies/stability/{part}.parquet",
+    log:
+        "results/studies/logs/stability_{part}.log",
+    resources:
+        mem_mb=6000,
+    params:
+        mark=stability_code,
+    message:
+        "stability: {wildcards.part}"
+    shell:
+        "python3 -m workflow stability {wildcards.part} --fingerprint {params.mark} --log {log:q}"
+
+
+rule stability:
+    """Collect the numerical errors of all parts: table and page."""
+    input:
+        parts=expand("results/studies/stability/{part}.parquet", part=STABILITY_PARTS),
+    output:
+        table="results/studies/stability.parquet",
+        page=report(
+            "results/studies/stability.md",
+            caption="../report/captions/stability.rst",
+            category="Studies",
+            subcategory="stability",
+        ),
+    log:
+        "results/studies/logs/stability.log",
+    localrule: True
+    params:
+        mark=stability_code,
+    message:
+        "stability: table"
+    shell:
+        "python3 -m workflow stability --fingerprint {params.mark} --log {log:q}"
+
+
 # Once, with a connection; LPIPS on VGG16 is then part of every score of a study.
 rule lpips_vgg:
     """Fetch the weights of VGG16, with which the paper computes LPIPS."""

@@ -1,0 +1,133 @@
+"""The tables of docs/results/stability.md, made from the rows of the study."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from iif_core.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_FORMS = ("numpy float32", "numpy float64", "torch float32", "drjit float32", "numba float32")
+_BLOCK = re.compile(r"<!-- table: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
+
+
+def tables(frame: pd.DataFrame) -> dict[str, str]:
+    """Return the tables in Markdown by name: `measured`, `verdict`, `kernels`, `solvers`, `sums`, `orders`.
+
+    Args:
+        frame: rows of all parts (`workflow.stability.rows.COLUMNS`).
+    """
+    made = {
+        "measured": _measured,
+        "verdict": _verdict,
+        "kernels": _kernels,
+        "solvers": _solvers,
+        "sums": _sums,
+        "orders": _orders,
+    }
+    return {name: "\n".join(make(frame)) for name, make in made.items()}
+
+
+def fill(text: str, blocks: dict[str, str]) -> str:
+    """Put tables into a page between `<!-- table: name -->` and `<!-- end -->`.
+
+    Raises:
+        InputError: the page asks for a table that does not exist.
+    """
+
+    def block(found: re.Match[str]) -> str:
+        name = found.group(1)
+        if name not in blocks:
+            raise InputError(f"the page asks for table {name}; there are {', '.join(blocks)}")
+        return f"<!-- table: {name} -->\n\n{blocks[name]}\n\n<!-- end -->"
+
+    return _BLOCK.sub(block, text)
+
+
+def whole(frame: pd.DataFrame) -> str:
+    """Return a page of all tables."""
+    return "\n".join(f"## {name.capitalize()}\n\n{table}\n" for name, table in tables(frame).items())
+
+
+def _markdown(head: Iterable[str], body: Iterable[Iterable[str]], words: int = 1) -> list[str]:
+    head = list(head)
+    lines = [head, ["---"] * words + ["---:"] * (len(head) - words), *body]
+    return [f"| {' | '.join(line)} |" for line in lines]
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return ""
+    if math.isinf(value):
+        return "∞"
+    if value == 0 or 0.1 <= abs(value) < 1e4:
+        return f"{value:.3g}" if value != int(value) or abs(value) < 1 else f"{value:.0f}"
+    return f"{value:.1e}".replace("e-0", "e-").replace("e+0", "e").replace("e+", "e")
+
+
+def _measured(frame: pd.DataFrame) -> list[str]:
+    rows = frame[frame["part"] == "measured"]
+    return _markdown(
+        ["part", "commit", "machine", "seconds"],
+        [[r.subject, r.form, r.case, f"{r.value:.0f}"] for r in rows.itertuples()],
+        3,
+    )
+
+
+def _verdict(frame: pd.DataFrame) -> list[str]:
+    body = []
+    for part, rows in frame[frame["part"] != "measured"].groupby("part", sort=False):
+        judged = rows[rows["limit"].notna()]
+        guarded = rows[rows["says"].ne("") & rows["quantity"].eq("backward error / eps") & rows["limit"].isna()]
+        forms = rows.groupby(["subject", "form"]).ngroups
+        body.append([str(part), str(forms), str(len(judged)), str(int((~judged["in_order"]).sum())), str(len(guarded))])
+    return _markdown(["part", "subjects x forms", "figures with a limit", "above it", "known limits, with a guard"], body)
+
+
+def _kernels(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "kernels"]
+    body = []
+    for kernel, rows in own.groupby("subject", sort=False):
+        ratio = rows[rows["quantity"] == "ratio"].groupby("form")["value"].max()
+        ulp = rows[rows["quantity"] == "largest error / ulp"].groupby("form")["value"].max()
+        median = rows[rows["quantity"] == "median error / ulp"]["value"].max()
+        lost = rows[rows["quantity"] == "lost"]["value"].sum()
+        cells = [f"{_number(ratio[form])} ({_number(ulp[form])})" if form in ratio else "" for form in _FORMS]
+        body.append([str(kernel), *cells, _number(median), _number(lost)])
+    return _markdown(["kernel", *_FORMS, "largest median", "lost"], body)
+
+
+def _solvers(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "solvers"]
+    body = []
+    for (solver, case), rows in own.groupby(["subject", "case"], sort=False):
+        value = rows.set_index("quantity")["value"]
+        names = ("size", "condition", "backward error / eps", "forward error", "growth")
+        says = " ".join(dict.fromkeys(text for text in rows["says"] if text))
+        body.append([str(solver), str(case), *(_number(value[name]) for name in names), _number(value["lost"]), says])
+    head = ["solver", "matrix", "size", "condition", "backward error / eps", "forward error", "growth", "lost", "what it does"]
+    return _markdown(head, body, 2)
+
+
+def _sums(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "sums"]
+    kinds = list(dict.fromkeys(own["case"]))
+    body = []
+    for way, rows in own.groupby("subject", sort=False):
+        error = rows[rows["quantity"] == "error / eps"].set_index("case")
+        count = rows[rows["quantity"] == "terms"]["value"].max()
+        cells = [_number(error.loc[kind, "value"]) for kind in kinds]
+        body.append([str(way), str(rows["form"].iloc[0]), _number(count), *cells, _number(error["limit"].max())])
+    return _markdown(["sum", "accumulator", "terms", *kinds, "bound"], body, 2)
+
+
+def _orders(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "orders"]
+    same = {True: "the same bytes", False: ""}
+    body = [[r.subject, r.case, same[r.value == 0] or _number(r.value), _number(r.limit)] for r in own.itertuples()]
+    return _markdown(["result", "changed", "largest difference", "allowed"], body, 2)

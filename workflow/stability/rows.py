@@ -1,0 +1,118 @@
+"""The measurements of all parts as rows of one table, `results/studies/stability.parquet`.
+
+A row is one figure: what was measured (`part`, `subject`, `form`, `case`), the `quantity` with its `value`, the `limit` above
+which it is a defect (NaN: none), whether it is `in_order`, and what `says` of it, such as the guard of a limit that is known.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from workflow.stability.scalar import THRESHOLD, Accuracy
+from workflow.stability.solvers import BACKWARD_LIMIT, Solved
+from workflow.stability.sums import Order, Summed
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = ("part", "subject", "form", "case", "quantity", "value", "limit", "in_order", "says")
+POINTS = 400
+"""Points at which each form of a kernel is tried."""
+TERMS = 10**8
+"""Terms of the sums; the paper's kitchen has 53 million pixels."""
+
+LIMITS = {
+    ("step of materials and response", "condition 0.1 / eps"),
+    ("step of materials and response", "duplicate columns"),
+}
+"""Solvers and matrices beyond which the arithmetic ends; `says` names the guard."""
+
+
+Row = dict[str, Any]
+
+
+def _row(part: str, subject: str, form: str, case: str, quantity: str, value: float, limit: float, says: str = "") -> Row:
+    in_order = bool(value <= limit) if math.isfinite(limit) else True
+    row = (part, subject, form, case, quantity, float(value), float(limit), in_order, says)
+    return dict(zip(COLUMNS, row, strict=True))
+
+
+def of_kernels(found: Iterable[Accuracy]) -> Iterator[Row]:
+    """Rows of the kernels: errors in units in the last place, and the ratio to condition x eps with LAPACK's limit."""
+    for one in found:
+        key = ("kernels", one.kernel, f"{one.library} {one.dtype}", one.output)
+        worst = "at " + ", ".join(f"{value:.9g}" for value in one.at)
+        yield _row(*key, "points", one.points, math.nan)
+        yield _row(*key, "median error / ulp", one.median_ulp, math.nan)
+        yield _row(*key, "largest error / ulp", one.worst_ulp, math.nan)
+        yield _row(*key, "ratio", one.worst_ratio, THRESHOLD, worst)
+        yield _row(*key, "lost", one.lost, 0.0)
+
+
+def of_solvers(found: Iterable[Solved]) -> Iterator[Row]:
+    """Rows of the solvers; the limit of the backward error is void where a guard is named (`LIMITS`)."""
+    for one in found:
+        form = "single" if one.eps > 1e-10 else "double"
+        key = ("solvers", one.solver, form, one.kind)
+        known = (one.solver, one.kind) in LIMITS
+        yield _row(*key, "size", one.size, math.nan)
+        yield _row(*key, "condition", one.condition, math.nan)
+        yield _row(*key, "backward error / eps", one.backward, math.nan if known else BACKWARD_LIMIT, one.says)
+        yield _row(*key, "forward error", one.forward, math.nan)
+        yield _row(*key, "growth", one.growth, math.nan)
+        yield _row(*key, "lost", one.lost, 0.0)
+
+
+def of_sums(found: Iterable[Summed]) -> Iterator[Row]:
+    """Rows of the sums; the limit is the bound of the way in which is added."""
+    for one in found:
+        key = ("sums", one.way, one.accumulator, one.terms)
+        yield _row(*key, "terms", one.count, math.nan)
+        yield _row(*key, "error / eps", one.error, one.bound)
+
+
+def of_orders(found: Iterable[Order]) -> Iterator[Row]:
+    """Rows of what another order changes."""
+    for one in found:
+        yield _row("orders", one.what, "float32", one.changed, "difference", one.difference, one.allowed)
+
+
+def _kernels() -> Iterator[Row]:
+    from workflow.stability import kernels, scalar
+
+    log = logging.getLogger("stability")
+    for number, kernel in enumerate(kernels.KERNELS, 1):
+        log.info("kernels: %d of %d: %s", number, len(kernels.KERNELS), kernel.name)
+        yield from of_kernels(scalar.accuracy(kernel, POINTS))
+
+
+def _solvers() -> Iterator[Row]:
+    from workflow.stability import solvers
+
+    return of_solvers(solvers.table())
+
+
+def _sums() -> Iterator[Row]:
+    from workflow.stability import sums
+
+    log = logging.getLogger("stability")
+    for one in sums.table(TERMS):
+        log.info("sums: %s, %s", one.way, one.terms)
+        yield from of_sums([one])
+    yield from of_orders(sums.orders())
+
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {"kernels": _kernels, "solvers": _solvers, "sums": _sums}
+"""Name of a part -> its rows."""
+
+
+def measure(part: str) -> pd.DataFrame:
+    """Measure one of `PARTS`."""
+    import numpy as np
+    import pandas as pd
+
+    with np.errstate(all="ignore"):
+        return pd.DataFrame(list(PARTS[part]()), columns=list(COLUMNS))
