@@ -111,7 +111,7 @@ def run(job: Job) -> None:
     records = ViewRecords(job, capture, scene)
     photos, camera = calibrated(Photographs(job, capture, scene, capture.used, unknown, known, records))
     notes.extend([camera.gauge] if camera.gauge else [])
-    adjacency = face_adjacency(scene.faces)
+    adjacency = face_adjacency(scene.faces, scene.vertices)
     light, glowing = _light(photos, adjacency)
     plan: list[decisions.Decision] = []
     sheer = translucent_objects(photos, glowing)
