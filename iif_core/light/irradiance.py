@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from iif_core.numerics.frames import tangent_frame
 from iif_core.numerics.graph import component_labels
+from iif_core.numerics.xp import NUMPY
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
 
 Trace = Callable[[NDArray, NDArray], tuple[NDArray, NDArray]]
@@ -364,12 +366,9 @@ def _sides(normals: NDArray) -> NDArray:
 
 
 def _tangents(n: NDArray) -> tuple[NDArray, NDArray]:
-    """Two unit vectors (n, 3) that form a right-handed frame with each unit normal (Duff et al. 2017)."""
-    sign = np.where(n[:, 2] >= 0, 1.0, -1.0)
-    a = -1 / (sign + n[:, 2])
-    b = n[:, 0] * n[:, 1] * a
-    first = np.stack([1 + sign * n[:, 0] ** 2 * a, sign * b, -sign * n[:, 0]], 1)
-    return first, np.stack([b, sign + n[:, 1] ** 2 * a, -n[:, 1]], 1)
+    """Two unit vectors (n, 3) that form a right-handed frame with each unit normal."""
+    first, second = tangent_frame(NUMPY, *n.T)
+    return np.stack(first, 1), np.stack(second, 1)
 
 
 def _sums(row: NDArray, count: int, values: NDArray) -> NDArray:

@@ -54,6 +54,15 @@ class ShadingCells:
     def __len__(self) -> int:
         return len(self.object_id)
 
+    @property
+    def number(self) -> Array:
+        """(c,) uint32 hash of place, object and normal: what a cell draws does not depend on the other cells
+        (docs/method/numerics.md#random-numbers-that-shift)."""
+        row, side = np.divmod(self._cells, _BINS)
+        mixed = (self._voxels[row] ^ (side.astype(np.uint64) << np.uint64(57))) * np.uint64(0x9E3779B97F4A7C15)
+        mixed = (mixed ^ (mixed >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
+        return (mixed >> np.uint64(32)).astype(np.uint32)
+
     def find(self, points: ArrayLike, normals: ArrayLike, object_id: ArrayLike) -> Array:
         """Return the cell (n,) int64 of every surface point; raise InputError for a point whose cell does not exist."""
         voxel = pack_keys(voxel_indices(points, self.edge, self.origin), object_id)
@@ -154,7 +163,7 @@ class DiffuseShading:
     noisy_objects: int
 
 
-Tracer = Callable[[Array, Array, int, int], Array]
+Tracer = Callable[[Array, Array, int, int, Array], Array]
 
 
 def diffuse_of_cells(
@@ -167,7 +176,8 @@ def diffuse_of_cells(
 
     Args:
         cells: of `ShadingCellBuilder`.
-        trace: function (points (n, 3), normals (n, 3), paths, seed) that returns (n, 3), the mean over `paths` paths.
+        trace: function (points (n, 3), normals (n, 3), paths, seed, number (n,)) that returns (n, 3), the mean over `paths`
+            paths; a point draws by its number (uint32).
         samples: first number of paths per cell, both halves together.
         noise: relative standard error of the mean of the halves that an object may have.
         max_samples: largest number of paths per cell, both halves together.
@@ -176,7 +186,7 @@ def diffuse_of_cells(
     Returns:
         Two independent estimates per cell, and their noise.
     """
-    count = len(cells)
+    count, number = len(cells), cells.number
     sums, paths = np.zeros((2, count, 3)), np.zeros(count, np.int64)  # paths of one half
     each, first, work = max(1, samples // 2), None, np.arange(count)
     owner = cells.object_id.astype(np.int64) + 1
@@ -185,8 +195,9 @@ def diffuse_of_cells(
         starts = min(REPRESENTATIVES, each)
         a_start = -(-each // starts)
         for half in range(2):
-            points = cells.points[work, :starts].reshape(-1, 3)
-            traced = trace(points, cells.normals[work, :starts].reshape(-1, 3), a_start, (seed * 2 + half) * 64 + turn)
+            points, normals = (of[work, :starts].reshape(-1, 3) for of in (cells.points, cells.normals))
+            own = (number[work, None] * np.uint32(REPRESENTATIVES) + np.arange(starts, dtype=np.uint32)).ravel()
+            traced = trace(points, normals, a_start, (seed * 2 + half) * 64 + turn, own)
             sums[half, work] += a_start * traced.reshape(len(work), starts, 3).sum(1, dtype=np.float64)
         paths[work] += starts * a_start
         diffuse = sums / paths[:, None]

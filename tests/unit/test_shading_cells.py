@@ -89,7 +89,7 @@ def test_representatives_are_a_fair_sample_of_all_views():
 def tracer(sigma_of, log=None):
     """Noisy radiance 1 + x with the standard deviation sigma_of(points) of one path."""
 
-    def trace(points, normals, paths, seed):
+    def trace(points, normals, paths, seed, number):
         if log is not None:
             log.append((len(points), paths, seed))
         noise = np.random.default_rng(seed).normal(size=(len(points), 3)) / np.sqrt(paths)
@@ -130,7 +130,7 @@ def test_most_paths_stop_it_and_reruns_are_the_same():
     assert runs[0].diffuse.tobytes() == runs[1].diffuse.tobytes()
     few = diffuse_of_cells(cells, tracer(lambda p: np.full(len(p), 9.0)), 2, 1e-3, 2, 5)
     assert (few.samples == 2).all()
-    dark = diffuse_of_cells(cells, lambda p, n, s, seed: np.zeros((len(p), 3)), 16, 0.1, 64, 5)
+    dark = diffuse_of_cells(cells, lambda p, n, s, seed, number: np.zeros((len(p), 3)), 16, 0.1, 64, 5)
     assert not dark.diffuse.any() and dark.noise_last == 0 and (dark.samples == 16).all()
 
 
@@ -177,8 +177,8 @@ def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
     points[:, 2] = 0
     cells = built([(points, normals, np.zeros(6000, np.int64))], edge=0.1)
 
-    def trace(p, n, paths, seed):
-        return shading_caches(Scene(geometry, material, emitters), p, n, n, [], PathOptions(paths, 2, seed))[0]
+    def trace(p, n, paths, seed, number=None):
+        return shading_caches(Scene(geometry, material, emitters), p, n, n, [], PathOptions(paths, 2, seed), number)[0]
 
     found = diffuse_of_cells(cells, trace, 64, 0.02, 1024, 1)
     assert found.noise_last < 0.03
@@ -188,3 +188,22 @@ def test_light_of_the_cells_is_the_light_of_the_pixels(llvm):
         truth = np.bincount(row, each[:, channel]) / np.bincount(row)
         ratio = found.diffuse.mean(0)[:, channel] / truth
         assert abs(ratio.mean() - 1) < 5e-3 and ratio.std() < 0.04
+
+
+def test_random_numbers_of_a_cell_do_not_depend_on_other_cells():
+    points, normals = patch(4000, size=3.0)
+    ids = np.zeros(4000, np.int64)
+    numbers = []
+
+    def trace(points, normals, paths, seed, number):
+        assert len(np.unique(number)) == len(number) == len(points) and number.dtype == np.uint32
+        numbers.append(set(number.tolist()))
+        return np.ones((len(points), 3))
+
+    whole = built([(points, normals, ids)])
+    diffuse_of_cells(whole, trace, 16, 0.1, 64, 5)
+    part = points[:, 0] < 1.5
+    fewer = built([(points[part], normals[part], ids[part])])
+    diffuse_of_cells(fewer, trace, 16, 0.1, 64, 5)
+    assert 10 < len(fewer) < len(whole)
+    assert numbers[0] == numbers[1] and numbers[2] == numbers[3] and numbers[2] < numbers[0]  # both halves, other seeds

@@ -14,7 +14,7 @@ from iif_core.camera import distortion
 from iif_core.camera.response import START, Response, response
 from iif_core.fusion.selection import selection_weights
 from iif_core.light import environment
-from iif_core.numerics import color, laplace, normal_tail, xp
+from iif_core.numerics import color, frames, laplace, normal_tail, xp
 from iif_core.reflectance import brdf
 from workflow.stability.scalar import Argument, Form, Kernel
 
@@ -407,7 +407,33 @@ def _hazard(z: Any) -> tuple[Any, Any]:
 
 
 DENSITY = Argument(0.0, 1e38, (1e-30, 1.0, 1e30))
+
+
+def _frame(x: Any, y: Any, z: Any) -> tuple[Any, ...]:
+    sign = -1 if z < mp.mpf(frames.SEAM) else 1
+    a = -1 / (sign + z)
+    return 1 + sign * x * x * a, sign * x * y * a, -sign * x, x * y * a, sign + y * y * a, -y
+
+
+def _frame_form(space: Any, *normal: Any) -> tuple[Any, ...]:
+    tangent, bitangent = frames.tangent_frame(space, *normal)
+    return (*tangent, *bitangent)
+
+
+def _normals(drawn: list[np.ndarray], rng: np.random.Generator) -> list[np.ndarray]:
+    """Unit vectors, many of them close to an axis or to the seam."""
+    dtype, count = drawn[0].dtype, len(drawn[0])
+    n = rng.normal(size=(3, count)) * np.exp(rng.uniform(np.log(1e-12), 0, (3, count)))
+    n /= np.linalg.norm(n, axis=0)
+    seam = rng.random(count) < 0.2
+    n[2, seam] = frames.SEAM * (1 + rng.uniform(-1e-6, 1e-6, seam.sum()))
+    n[:2, seam] *= np.sqrt((1 - n[2, seam] ** 2) / np.maximum((n[:2, seam] ** 2).sum(0), 1e-300))
+    return [row.astype(dtype) for row in n]
+
+
 LIGHT = [
+    Kernel("frame of a normal", _frame, ("tx", "ty", "tz", "bx", "by", "bz"), {axis: UNIT for axis in "xyz"},
+           of_namespace(_frame_form), _normals),
     Kernel("power heuristic", _power_weight, ("weight",), {"p": DENSITY, "q": DENSITY},
            {("drjit", np.float32): partial(_drjit, _power_form)}),
     Kernel("hazard of the normal distribution", _hazard, ("h", "h - z"), {"z": Argument(0.0, 30.0, (4.0, 29.0), signed=True)},

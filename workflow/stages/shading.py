@@ -139,9 +139,9 @@ def _diffuse(job: Job, world: Scene, cells: ShadingCells) -> DiffuseShading:
 
     settings = job.settings.shading
 
-    def trace(points: np.ndarray, normals: np.ndarray, paths: int, seed: int) -> np.ndarray:
+    def trace(points: np.ndarray, normals: np.ndarray, paths: int, seed: int, number: np.ndarray) -> np.ndarray:
         # Seen head-on: without specular levels the direction of the viewer does not matter.
-        return shading_caches(world, points, normals, normals, [], PathOptions(paths, settings.max_bounces, seed))[0]
+        return shading_caches(world, points, normals, normals, [], PathOptions(paths, settings.max_bounces, seed), number)[0]
 
     found = diffuse_of_cells(
         cells, trace, settings.samples, settings.noise, settings.max_samples, (job.seed << 32 | _SEEDS) << 32 | 0xFFFFFFFF

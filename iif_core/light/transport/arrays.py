@@ -138,11 +138,20 @@ class Batch:
         """Sum over the lanes of every point, (points,) or (points, width)."""
         return to_numpy(dr.block_sum(lane_sums, self.split) if self.split > 1 else lane_sums)
 
-    def streams(self, seed: int) -> Any:
+    def streams(self, seed: int, number: Array | None = None) -> Any:
         """One PCG32 stream per lane, hashed from seed (any integer >= 0) and lane number
-        (docs/method/numerics.md#correlated-random-streams)."""
+        (docs/method/numerics.md#correlated-random-streams).
+
+        `number`: (n,) uint32 of the caller's points, by which their lanes are numbered, so that a point has the same random
+        numbers whatever other points there are; None = by their place among all points.
+        """
         words = np.random.SeedSequence(seed).generate_state(4)
-        lane = dr.arange(mi.UInt32, self.lanes) + dr.opaque(mi.UInt32, self.first_lane)
+        lane = dr.arange(mi.UInt32, self.lanes)
+        if number is None:
+            lane += dr.opaque(mi.UInt32, self.first_lane)
+        else:
+            split = dr.opaque(mi.UInt32, self.split)
+            lane = dr.repeat(on_device(number[self.part], mi.UInt32), self.split) * split + lane % split
         a, b = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[0])), dr.opaque(mi.UInt32, int(words[1])), 8)
         c, d = mi.sample_tea_32(lane ^ dr.opaque(mi.UInt32, int(words[2])), dr.opaque(mi.UInt32, int(words[3])), 8)
         return mi.PCG32(1, (mi.UInt64(a) << 32) | mi.UInt64(b), (mi.UInt64(c) << 32) | mi.UInt64(d))

@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from iif_core.light.transport.geometry import nearest_hit, offset_from
 from iif_core.light.transport.scene import Scene
+from iif_core.numerics.frames import tangent_frame
 from iif_core.numerics.xp import DRJIT
 from iif_core.reflectance import brdf
 
@@ -88,8 +89,8 @@ def uniform(rng: Any) -> Any:
 
 
 def to_world(local: tuple[Any, Any, Any], normal: Any) -> Any:
-    """Turn a local vector (z = normal) into world axes, with the branch-free frame of Duff et al. (2017)."""
-    tangent, bitangent = mi.coordinate_system(normal)
+    """Turn a local vector (z = normal) into world axes."""
+    tangent, bitangent = (mi.Vector3f(*axis) for axis in tangent_frame(DRJIT, normal.x, normal.y, normal.z))
     return mi.Vector3f(tangent * local[0] + bitangent * local[1] + normal * local[2])
 
 

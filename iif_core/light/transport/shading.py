@@ -103,7 +103,13 @@ def _lobe_sums(
 
 
 def shading_caches(
-    scene: Scene, points: ArrayLike, normals: ArrayLike, wo: ArrayLike, levels: ArrayLike, paths: PathOptions
+    scene: Scene,
+    points: ArrayLike,
+    normals: ArrayLike,
+    wo: ArrayLike,
+    levels: ArrayLike,
+    paths: PathOptions,
+    number: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """Integrate the light that arrives at points over the lobes of the BRDF (Eq. S.3).
 
@@ -116,6 +122,7 @@ def shading_caches(
         points, normals, wo: (n, 3) metres; normals, flipped to the viewer; towards the viewer.
         levels: (J,) roughness in [0.02, 1], increasing; may be empty.
         paths: bounces include the point.
+        number: (n,) uint32, by which the points draw their random numbers; None = by their order.
 
     Returns:
         diffuse (n, 3), s0 (n, J, 3), s1 (n, J, 3), float32 radiance, linear.
@@ -137,7 +144,7 @@ def shading_caches(
         sums = _lobe_sums(
             world,
             lobes,
-            batch.streams(paths.seed),
+            batch.streams(paths.seed, number),
             *(batch.spread(kind, rows) for kind, rows in ((mi.Point3f, points), (mi.Vector3f, normals), (mi.Vector3f, wo))),
             dr.opaque(mi.UInt32, paths.samples),
             *batch.samples(paths.samples),
@@ -145,9 +152,9 @@ def shading_caches(
         )
         dr.eval(sums)
         diffuse[batch.part] = batch.collect(sums[0])
-        for number in range(count):
-            s0[batch.part, number] = batch.collect(sums[1 + number])
-            s1[batch.part, number] = batch.collect(sums[1 + count + number])
+        for level in range(count):
+            s0[batch.part, level] = batch.collect(sums[1 + level])
+            s1[batch.part, level] = batch.collect(sums[1 + count + level])
     for result in (diffuse, s0, s1):
         result /= paths.samples
     return diffuse, s0, s1
