@@ -25,7 +25,7 @@ from workflow.trade import bench, choose
 STARTED = time.time()
 FOLDER = os.getcwd()
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
-STABILITY_PARTS = ("kernels", "solvers", "sums")
+STABILITY_PARTS = ("kernels", "solvers", "sums", "relations", "digits")
 
 native.process_environment()
 

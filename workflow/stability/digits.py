@@ -1,9 +1,9 @@
 """How many digits of the result survive when its input moves by its own rounding, and what amplifies the movement.
 
-All rasters, the mesh and the cameras of a capture are moved by at most one unit in the last place, each number up, down or not at
-all by chance; in a second series 8-bit photographs by at most one grey level, linear ones by their half-precision rounding. Of
-each output the number of significant digits is -log10(spread / |mean|) over the runs (Parker 1997), and the amplification of a
-stage is the relative change of its output over that of the photographs.
+Photographs, depths, mesh and cameras of a capture are moved by at most one unit in the last place of their formats, each number
+up, down or not at all by chance; in other series the predictions are, which have half precision, and 8-bit photographs by at most
+one grey level (linear ones by their rounding to half precision). Of each output the number of significant digits is
+-log10(spread / |mean|) over the runs (Parker 1997), and the amplification is its relative change over that of what was moved.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Digits(NamedTuple):
     Attributes:
         room, moved: which capture, and what was moved; stage, column: the output.
         median, low: median over the pixels, and the digits that `SHARE` of them have; enough: share with `ENOUGH` digits.
-        amplification: root mean square of the relative change over that of the photographs.
+        amplification: root mean square of the relative change over that of the input that was moved most.
     """
 
     room: str
@@ -65,16 +65,21 @@ def _ulp(values: NDArray, rng: np.random.Generator) -> NDArray:
 
 
 def one_ulp(capture: Capture, rng: np.random.Generator) -> Capture:
-    """Move every number of a capture by at most one unit in the last place; predictions stay in [0, 1]."""
+    """Move photographs, depths, mesh and cameras by at most one unit in the last place."""
     rasters = {name: {view: _ulp(raster, rng) for view, raster in getattr(capture, name).items()} for name in ("photo", "depth")}
-    maps = {view: np.clip(_ulp(raster, rng), 0, 1).astype(raster.dtype) for view, raster in capture.maps.items()}
     views = []
     for view in capture.views:
         pose = view.world_from_camera.copy()
         pose[:3] = _ulp(pose[:3], rng)
         fx, fy, cx, cy = (float(value) for value in _ulp(np.array([view.fx, view.fy, view.cx, view.cy]), rng))
         views.append(replace(view, world_from_camera=pose, fx=fx, fy=fy, cx=cx, cy=cy))
-    return replace(capture, views=tuple(views), vertices=_ulp(capture.vertices, rng), maps=maps, **rasters)
+    return replace(capture, views=tuple(views), vertices=_ulp(capture.vertices, rng), **rasters)
+
+
+def half_ulp(capture: Capture, rng: np.random.Generator) -> Capture:
+    """Move predictions by at most one unit in the last place of half precision; they stay in [0, 1]."""
+    maps = {view: np.clip(_ulp(raster, rng), 0, 1).astype(raster.dtype) for view, raster in capture.maps.items()}
+    return replace(capture, maps=maps)
 
 
 def last_bit(capture: Capture, rng: np.random.Generator) -> Capture:
@@ -87,8 +92,9 @@ def last_bit(capture: Capture, rng: np.random.Generator) -> Capture:
 
 
 MOVEMENTS: dict[str, Callable[[Capture, np.random.Generator], Capture]] = {
-    "one ulp of everything": one_ulp,
-    "last bit of the photographs": last_bit,
+    "photographs, mesh and cameras by one ulp": one_ulp,
+    "predictions by one ulp (half precision)": half_ulp,
+    "photographs by their last bit": last_bit,
 }
 
 
@@ -110,7 +116,10 @@ def measure(room: str, runs: int = RUNS) -> Iterator[Digits | Flips]:
         reference = chain.run(capture, folder / "reference")
         for moved, movement in MOVEMENTS.items():
             captures = [movement(capture, np.random.default_rng([13, run])) for run in range(runs)]
-            by = np.sqrt(np.mean([_relative(one.photo, capture.photo) ** 2 for one in captures]))
+            by = max(
+                np.sqrt(np.mean([_relative(getattr(one, of), getattr(capture, of)) ** 2 for one in captures]))
+                for of in ("photo", "maps")
+            )
             results = [chain.run(one, folder / "run") for one in captures]
             yield from _digits(room, moved, reference, results, float(by))
             yield from _flips(room, moved, reference, results)

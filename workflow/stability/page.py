@@ -17,7 +17,7 @@ _BLOCK = re.compile(r"<!-- table: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def tables(frame: pd.DataFrame) -> dict[str, str]:
-    """Return the tables in Markdown by name: `measured`, `verdict`, `kernels`, `solvers`, `sums`, `orders`.
+    """Return the tables in Markdown by name: `measured`, `verdict`, and one for each part.
 
     Args:
         frame: rows of all parts (`workflow.stability.rows.COLUMNS`).
@@ -29,6 +29,9 @@ def tables(frame: pd.DataFrame) -> dict[str, str]:
         "solvers": _solvers,
         "sums": _sums,
         "orders": _orders,
+        "relations": _relations,
+        "digits": _digits,
+        "flips": _flips,
     }
     return {name: "\n".join(make(frame)) for name, make in made.items()}
 
@@ -131,3 +134,38 @@ def _orders(frame: pd.DataFrame) -> list[str]:
     same = {True: "the same bytes", False: ""}
     body = [[r.subject, r.case, same[r.value == 0] or _number(r.value), _number(r.limit)] for r in own.itertuples()]
     return _markdown(["result", "changed", "largest difference", "allowed"], body, 2)
+
+
+def _relations(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "relations"]
+    names = list(dict.fromkeys(own["quantity"]))
+    body = []
+    for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
+        found = rows.set_index("quantity")
+        cells = [
+            _number(found.loc[name, "value"]) if found.loc[name, "in_order"] else f"**{_number(found.loc[name, 'value'])}**"
+            for name in names
+        ]
+        says = next((text for text in rows["says"] if text), "")
+        body.append([str(room), str(case), str(form), *cells, says])
+    return _markdown(["room", "changed", "yardstick", *names, "why"], body, 3)
+
+
+def _digits(frame: pd.DataFrame) -> list[str]:
+    own = frame[(frame["part"] == "digits") & ~frame["quantity"].isin(["flips", "of"])]
+    names = list(dict.fromkeys(own["quantity"]))
+    body = []
+    for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
+        value = rows.set_index("quantity")["value"]
+        share = [f"{100 * value[name]:.1f} %" if name.startswith("share") else _number(value[name]) for name in names]
+        body.append([str(room), str(form), str(case), *share])
+    return _markdown(["room", "moved", "output", *names], body, 3)
+
+
+def _flips(frame: pd.DataFrame) -> list[str]:
+    own = frame[(frame["part"] == "digits") & frame["quantity"].isin(["flips", "of"])]
+    body = []
+    for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
+        value = rows.set_index("quantity")["value"]
+        body.append([str(room), str(form), str(case), f"{value['flips']:.0f}", f"{value['of']:.0f}"])
+    return _markdown(["room", "moved", "decision", "otherwise", "of"], body, 3)

@@ -120,9 +120,15 @@ def _of_photos(change: Callable[[NDArray], NDArray]) -> Callable[[Mapping[str, N
 
 
 def _brighter(factor: float) -> Change:
+    """Brighter linear photographs; photographs of a sensor stay as they are, and are exposed so much less."""
+
     def change(capture: Capture, rng: np.random.Generator) -> Capture:
+        emission = capture.emission * np.float32(factor)
+        if capture.facts["dynamic_range"] == "ldr":
+            views = tuple(replace(view, exposure=view.exposure / factor) for view in capture.views)
+            return replace(capture, views=views, emission=emission)
         photo = {name: image * np.float32(factor) for name, image in capture.photo.items()}
-        return replace(capture, photo=photo, emission=capture.emission * np.float32(factor))
+        return replace(capture, photo=photo, emission=emission)
 
     return change
 

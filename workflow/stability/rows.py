@@ -11,6 +11,9 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from workflow.stability import chain, digits, relations
+from workflow.stability.digits import Digits, Flips
+from workflow.stability.relations import Related
 from workflow.stability.scalar import THRESHOLD, Accuracy
 from workflow.stability.solvers import BACKWARD_LIMIT, Solved
 from workflow.stability.sums import Order, Summed
@@ -80,6 +83,28 @@ def of_orders(found: Iterable[Order]) -> Iterator[Row]:
         yield _row("orders", one.what, "float32", one.changed, "difference", one.difference, one.allowed)
 
 
+def of_relations(found: Iterable[Related]) -> Iterator[Row]:
+    """Rows of the relations: how far the result is from that of the unchanged capture; no limit where that is explained."""
+    for one in found:
+        for name, value, most in zip(one.found._fields, one.found, one.allowed, strict=True):
+            yield _row("relations", one.room, one.yardstick, one.relation, name, value, most, one.explained)
+
+
+def of_digits(found: Iterable[Digits | Flips]) -> Iterator[Row]:
+    """Rows of significant digits, amplification, and decisions that came out otherwise."""
+    for one in found:
+        if isinstance(one, Flips):
+            key = ("digits", one.room, one.moved, one.decision)
+            yield _row(*key, "flips", one.count, math.nan)
+            yield _row(*key, "of", one.of, math.nan)
+            continue
+        key = ("digits", one.room, one.moved, f"{one.stage}: {one.column}")
+        yield _row(*key, "median digits", one.median, math.nan)
+        yield _row(*key, "digits of 99 %", one.low, math.nan)
+        yield _row(*key, "share with 3 digits", one.enough, math.nan)
+        yield _row(*key, "amplification", one.amplification, math.nan)
+
+
 def _kernels() -> Iterator[Row]:
     from workflow.stability import kernels, scalar
 
@@ -105,7 +130,28 @@ def _sums() -> Iterator[Row]:
     yield from of_orders(sums.orders())
 
 
-PARTS: dict[str, Callable[[], Iterator[Row]]] = {"kernels": _kernels, "solvers": _solvers, "sums": _sums}
+def _relations() -> Iterator[Row]:
+    log = logging.getLogger("stability")
+    for room in chain.ROOMS:
+        for one in relations.measure(room):
+            log.info("relations: %s: %s%s", room, one.relation, f": beyond: {', '.join(one.beyond)}" if one.beyond else "")
+            yield from of_relations([one])
+
+
+def _digits() -> Iterator[Row]:
+    log = logging.getLogger("stability")
+    for room in chain.ROOMS:
+        log.info("digits: %s", room)
+        yield from of_digits(digits.measure(room))
+
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "kernels": _kernels,
+    "solvers": _solvers,
+    "sums": _sums,
+    "relations": _relations,
+    "digits": _digits,
+}
 """Name of a part -> its rows."""
 
 

@@ -1,0 +1,124 @@
+"""Relations and digits through the stages: the changes show the same room, and the stages find it again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workflow.stability import chain, digits, relations
+from workflow.stability.relations import RELATIONS, Distance, Relation
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory, llvm):
+    """The tiny room, captured and fitted once: (capture, result, folder)."""
+    folder = tmp_path_factory.mktemp("stability")
+    capture = chain.make_capture(folder / "capture", chain.ROOMS["tiny"])
+    return capture, chain.run(capture, folder / "reference"), folder
+
+
+def _off_surface(capture):
+    """Largest distance of a pixel's point from the face that it shows, relative to the distance from the camera."""
+    worst = 0.0
+    for view in capture.views:
+        face, depth = capture.face[view.name], capture.depth[view.name].astype(np.float64)
+        hit = face >= 0
+        point = view.world_from_camera[:3, 3] + depth[..., None] * view.directions().astype(np.float64)
+        corners = capture.vertices[capture.faces[face[hit]]].astype(np.float64)
+        inside = relations._barycentric(point[hit], corners)
+        on_plane = (inside[..., None] * corners).sum(1)
+        scale = depth[hit] + np.abs(point[hit]).max() * 1e-3  # coordinates are rounded
+        apart = np.linalg.norm(on_plane - point[hit], axis=1) / scale
+        worst = max(worst, float(apart.max()), float(-inside.min()) - 1e-2)
+    return worst
+
+
+@pytest.mark.parametrize("relation", RELATIONS, ids=lambda relation: relation.name)
+def test_changed_captures_show_the_same_room(room, relation):
+    capture, result, _ = room
+    changed = relation.change(capture, np.random.default_rng(0))
+    assert _off_surface(changed) < 1e-3
+    owner = {view.name: np.unique(changed.instance[changed.face[view.name]]) for view in changed.views}
+    assert len(owner) >= len(capture.views)
+    assert len(np.unique(changed.instance)) >= len(np.unique(capture.instance))
+    shapes = {name: raster.shape[:2] for name, raster in changed.photo.items()}
+    assert all(shapes[view.name] == (view.height, view.width) for view in changed.views)
+    assert all(maps.shape[1:3] == shapes[name] for name, maps in changed.maps.items())
+
+
+def test_pictures_and_colours_are_turned_back(room):
+    capture, result, _ = room
+    for name in ("cameras rolled by 90 degrees", "world mirrored", "colour channels permuted"):
+        relation = next(one for one in RELATIONS if one.name == name)
+        changed = relation.change(capture, np.random.default_rng(0))
+        as_if = replace(result, maps={view: _five(changed.photo[view]) for view in changed.photo}, seen=_seen(changed))
+        back = relation.undo(as_if)
+        for view in capture.views:
+            np.testing.assert_array_equal(back.maps[view.name][..., :3], capture.photo[view.name])
+            np.testing.assert_array_equal(back.seen[view.name], capture.face[view.name] >= 0)
+
+
+def _five(photo):
+    return np.concatenate([photo, np.zeros((*photo.shape[:2], 2), photo.dtype)], -1)
+
+
+def _seen(capture):
+    return {view.name: capture.face[view.name] >= 0 for view in capture.views}
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"),
+    [
+        ("faces share no vertices", 1e-6),
+        ("vertices permuted", 1e-6),
+        ("radiance times 1e+06", 1e-4),
+        ("world turned and tilted", 0.1),
+    ],
+)
+def test_stages_find_the_same_room_again(room, name, allowed):
+    capture, reference, folder = room
+    relation = next(one for one in RELATIONS if one.name == name)
+    result = relation.undo(chain.run(relation.change(capture, np.random.default_rng(0)), folder / "changed"))
+    found = relations.distance(replace(result, power=result.power / relation.power), reference)
+    assert found.albedo < allowed and found.light < max(allowed, 1e-5), found
+
+
+def test_the_last_bit_of_the_mesh_does_not_draw_the_light_anew(room):
+    capture, reference, folder = room
+    result = chain.run(digits.one_ulp(capture, np.random.default_rng(3)), folder / "moved")
+    apart = np.concatenate([(result.diffuse[name] - reference.diffuse[name])[reference.seen[name]] for name in reference.diffuse])
+    light = np.concatenate([reference.diffuse[name][reference.seen[name]] for name in reference.diffuse])
+    assert 0 < np.sqrt((apart**2).mean()) < 2e-3 * np.sqrt((light**2).mean())  # 6e-2 with the noise of other paths
+    assert relations.distance(result, reference).albedo < 1e-3
+
+
+def test_distances_count_what_they_say(room):
+    _, reference, _ = room
+    assert relations.distance(reference, reference) == Distance(0, 0, 0, 0, 0, 0)
+    first = next(iter(reference.maps))
+    moved = dict(reference.maps) | {first: reference.maps[first] + np.float32([0.1, 0.1, 0.1, 0.2, 0])}
+    found = relations.distance(replace(reference, maps=moved, power=2 * reference.power), reference)
+    share = reference.seen[first].sum() / sum(seen.sum() for seen in reference.seen.values())
+    assert found.albedo == pytest.approx(0.1 * np.sqrt(share), rel=1e-3) and found.light == pytest.approx(np.log(2))
+    assert found.flipped == pytest.approx(share)
+    decided = {**reference.decisions, "specular": not reference.decisions["specular"]}
+    assert relations.distance(replace(reference, decisions=decided), reference).decisions == 1
+
+
+def test_a_relation_that_does_not_hold_is_seen(room, monkeypatch):
+    capture, reference, folder = room
+    monkeypatch.setattr(chain, "make_capture", lambda *_: capture)
+    monkeypatch.setattr(chain, "run", lambda changed, _: replace(reference, power=reference.power * changed.emission.sum()))
+    monkeypatch.setattr(relations, "SEEDS", 2)
+    bad = Relation("lamps twice as bright", lambda c, rng: replace(c, emission=2 * c.emission), relations.EXACT)
+    *_, found = relations.measure("tiny", (bad,))
+    assert found.beyond == ["light"]
+
+
+def test_digits_of_known_spreads():
+    rng = np.random.default_rng(0)
+    values = 5.0 + 1e-4 * rng.standard_normal((400, 3))
+    np.testing.assert_allclose(digits.digits_of(values), np.log10(5e4), atol=0.1)
+    exact = np.stack([np.ones(4), np.ones(4)])
+    assert (digits.digits_of(exact) == digits.MOST_DIGITS).all()
+    assert (digits.digits_of(np.array([[-1.0], [1.0]])) == 0).all()
