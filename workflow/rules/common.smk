@@ -25,7 +25,14 @@ from workflow.trade import bench, choose
 STARTED = time.time()
 FOLDER = os.getcwd()
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
-STABILITY_PARTS = ("kernels", "solvers", "sums", "relations", "digits")
+STABILITY_PARTS = (
+    "kernels",
+    "solvers",
+    "sums",
+    "relations",
+    "digits",
+    "renderings",
+)
 
 native.process_environment()
 

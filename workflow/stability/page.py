@@ -32,6 +32,7 @@ def tables(frame: pd.DataFrame) -> dict[str, str]:
         "relations": _relations,
         "digits": _digits,
         "flips": _flips,
+        "renderings": _renderings,
     }
     return {name: "\n".join(make(frame)) for name, make in made.items()}
 
@@ -169,3 +170,13 @@ def _flips(frame: pd.DataFrame) -> list[str]:
         value = rows.set_index("quantity")["value"]
         body.append([str(room), str(form), str(case), f"{value['flips']:.0f}", f"{value['of']:.0f}"])
     return _markdown(["room", "moved", "decision", "otherwise", "of"], body, 3)
+
+
+def _renderings(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "renderings"]
+    names = list(dict.fromkeys(own["quantity"]))
+    body = []
+    for room, rows in own.groupby("subject", sort=False):
+        value = rows.set_index("quantity")["value"]
+        body.append([str(room), *(_number(value[name]) for name in names)])
+    return _markdown(["room", *names], body)

@@ -344,6 +344,7 @@ def _of_radiance(factor: float) -> Relation:
     return Relation(f"radiance times {factor:g}", _brighter(factor), NOISE, power=factor, radiance=factor)
 
 
+_EVIDENCE = "pixels are taken for independent, so that twice the photographs weigh twice against what is assumed beforehand"
 TILT = _turn(np.array([1.0, 2.0, 0.5]), 0.7)
 QUARTER = _turn(np.array([0.0, 0.0, 1.0]), np.pi / 2).round()
 RELATIONS = (
@@ -362,7 +363,7 @@ RELATIONS = (
     Relation("faces share no vertices", _unwelded, EXACT),
     Relation("a hidden object outside", _hidden_added, CELLS),
     Relation("one photograph twice", _copies(lambda view: view == 0), NOISE),
-    Relation("every photograph twice", _copies(lambda view: True), NOISE),
+    Relation("every photograph twice", _copies(lambda view: True), NOISE, explained=_EVIDENCE),
     Relation("cameras rolled by 90 degrees", _rolled, NOISE, _rolled_back),
     Relation("world mirrored", _mirrored, CELLS, _mirrored_back),
     Relation("world turned by 90 degrees", _moved(QUARTER, np.zeros(3)), CELLS),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from workflow.stability import chain, digits, relations
 from workflow.stability.digits import Digits, Flips
+from workflow.stability.monte_carlo import SIGMAS, Agreement
 from workflow.stability.relations import Related
 from workflow.stability.scalar import THRESHOLD, Accuracy
 from workflow.stability.solvers import BACKWARD_LIMIT, Solved
@@ -90,6 +91,19 @@ def of_relations(found: Iterable[Related]) -> Iterator[Row]:
             yield _row("relations", one.room, one.yardstick, one.relation, name, value, most, one.explained)
 
 
+def of_renderings(found: Iterable[Agreement]) -> Iterator[Row]:
+    """Rows of the renderings: smallest probability below its threshold as a quotient, bias, its error, and fireflies."""
+    for one in found:
+        key = ("renderings", one.room, "drjit float32", "against Mitsuba")
+        yield _row(*key, "pixels x channels", one.tests, math.nan)
+        yield _row(*key, "threshold / smallest p", one.threshold / max(one.smallest, 1e-300), 1.0)
+        yield _row(*key, "bias / %", 100 * one.bias, math.nan)
+        yield _row(*key, "standard error / %", 100 * one.error, math.nan)
+        yield _row(*key, "bias / standard error", one.sigmas, SIGMAS)
+        yield _row(*key, "fireflies / million", 1e6 * one.fireflies, math.nan)
+        yield _row(*key, "of Mitsuba", 1e6 * one.of_reference, math.nan)
+
+
 def of_digits(found: Iterable[Digits | Flips]) -> Iterator[Row]:
     """Rows of significant digits, amplification, and decisions that came out otherwise."""
     for one in found:
@@ -145,12 +159,22 @@ def _digits() -> Iterator[Row]:
         yield from of_digits(digits.measure(room))
 
 
+def _renderings() -> Iterator[Row]:
+    from workflow.stability import monte_carlo
+
+    log = logging.getLogger("stability")
+    for one in monte_carlo.measure():
+        log.info("renderings: %s", one.room)
+        yield from of_renderings([one])
+
+
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "kernels": _kernels,
     "solvers": _solvers,
     "sums": _sums,
     "relations": _relations,
     "digits": _digits,
+    "renderings": _renderings,
 }
 """Name of a part -> its rows."""
 
