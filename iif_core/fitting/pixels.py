@@ -139,7 +139,7 @@ def _finite(problem: FitProblem) -> np.ndarray:
     """Which pixels are finite, exposed, and of an object, (n,) bool."""
     ids = np.asarray(problem.object_id)
     use = np.isfinite(problem.base).all(1) & np.isfinite(problem.value).all(1)
-    use &= np.isfinite(problem.exposure) & (problem.exposure > 1e-6) & (ids >= 0) & (ids < problem.n_objects)
+    use &= np.isfinite(problem.exposure) & (problem.exposure > 0) & (ids >= 0) & (ids < problem.n_objects)
     for d, s0, s1 in zip(problem.diffuse, problem.s0, problem.s1, strict=True):
         use &= np.isfinite(d).all(1) & np.isfinite(s0).all((1, 2)) & np.isfinite(s1).all((1, 2))
     return use

@@ -175,10 +175,10 @@ class Photographs:
 def view_exposures(capture: CaptureReader, notes: list[str]) -> CameraGains:
     """Return the exposures of the views as the source knows them."""
     exposures = capture.exposures()
-    bad = [view.name for view in capture.views if not view.exposure > 1e-6]
+    bad = [view.name for view in capture.views if not 0 < view.exposure < np.inf]
     if bad:  # docs/method/numerics.md#exposure-at-zero
         notes.append(f"exposure not positive, taken as 1: {', '.join(bad)}")
-        exposures = np.where(exposures > 1e-6, exposures, 1.0)
+        exposures = np.where((exposures > 0) & (exposures < np.inf), exposures, 1.0)
     return CameraGains.plain(exposures)
 
 

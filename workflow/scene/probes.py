@@ -62,7 +62,7 @@ def read_radiance(capture: CaptureReader, view: View, saturation: float) -> View
     """Read a photograph; 8-bit values become radiance by the sRGB curve and the exposure, which no probe improves on."""
     value, valid = capture.photo(view)
     depth, face = capture.gbuffer(view)
-    exposure = view.exposure if view.exposure > 1e-6 else 1.0  # docs/method/numerics.md#exposure-at-zero
+    exposure = view.exposure if 0 < view.exposure < np.inf else 1.0  # docs/method/numerics.md#exposure-at-zero
     if capture.is_hdr:
         return ViewRadiance(view, value / exposure, valid, np.zeros(valid.shape, bool), depth, face)
     radiance = linear_from_srgb(np.clip(value, 0, 1)).astype(np.float32) / exposure

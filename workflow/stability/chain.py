@@ -67,6 +67,7 @@ class Capture:
         views: cameras; photo, valid, depth, face: view name -> its raster; maps: view name -> predictions (K, H, W, 5) half.
         vertices: (n, 3) float32 m; faces: (m, 3); instance: (m,) object of each face; names: of the objects.
         emission: (m, 3) true radiance of the faces.
+        truth, known: view name -> true materials (H, W, 5), and the pixels where they mean something.
         facts: capture.json; document: settings of all stages.
     """
 
@@ -81,6 +82,8 @@ class Capture:
     instance: NDArray
     names: tuple[str, ...]
     emission: NDArray
+    truth: Mapping[str, NDArray]
+    known: Mapping[str, NDArray]
     facts: Mapping[str, Any]
     document: Mapping[str, Any]
 
@@ -127,20 +130,13 @@ def run_stages(folder: Path, document: Mapping[str, Any], stages: tuple[str, ...
 
 
 def make_capture(folder: Path, settings: dict[str, Any]) -> Capture:
-    """Render or read a scene and its predictions once, and hold them in memory."""
+    """Render a scene with ground truth and its predictions once, and hold them in memory."""
     document = document_of(settings)
     run_stages(folder, document, SOURCES)
     capture = CaptureReader(StageReader(folder / "capture", "capture", "free"))
-    prior = StageReader(folder / "prior", "prior", "free")
     photos = {view.name: capture.photo(view) for view in capture.used}
     surface = {view.name: capture.gbuffer(view) for view in capture}
-    maps = {}
-    for view in capture.used:
-        channels = prior.exr(f"maps/{view.name}.exr")
-        numbers = prediction_numbers(channels)
-        maps[view.name] = np.stack(
-            [np.stack([channels[f"prior.{k:03d}.{name}"] for name in _CHANNELS], -1) for k in numbers]
-        ).astype(np.float16)
+    truths = {view.name: capture.truth(view) for view in capture}
     vertices, faces = capture.mesh()
     columns = capture.faces()
     names = capture.reader.table("instances.parquet")["name"] if capture.reader.has("instances.parquet") else ()
@@ -150,15 +146,33 @@ def make_capture(folder: Path, settings: dict[str, Any]) -> Capture:
         {name: valid for name, (_, valid) in photos.items()},
         {name: depth for name, (depth, _) in surface.items()},
         {name: face for name, (_, face) in surface.items()},
-        maps,
+        _predictions(capture, folder),
         vertices,
         faces,
         columns["instance_id"],
         tuple(str(name) for name in names),
         np.stack([columns[f"emission_{c}"] for c in "rgb"], 1),
+        {name: np.concatenate([t.albedo, t.roughness[..., None], t.metallic[..., None]], -1) for name, t in truths.items()},
+        {name: t.valid & ~t.emission.any(-1) for name, t in truths.items()},
         capture.facts,
         document,
     )
+
+
+def with_predictions(capture: Capture, folder: Path, **prior: Any) -> Capture:
+    """Return a capture whose predictions were made with other settings of the prior, from the folder of `make_capture`."""
+    changed = capture.with_settings(prior=prior)
+    run_stages(folder, changed.document, ("prior",))
+    return replace(changed, maps=_predictions(CaptureReader(StageReader(folder / "capture", "capture", "free")), folder))
+
+
+def _predictions(capture: CaptureReader, folder: Path) -> dict[str, NDArray]:
+    prior, maps = StageReader(folder / "prior", "prior", "free"), {}
+    for view in capture.used:
+        channels = prior.exr(f"maps/{view.name}.exr")
+        layers = [f"prior.{k:03d}" for k in prediction_numbers(channels)]
+        maps[view.name] = np.stack([np.stack([channels[f"{layer}.{name}"] for name in _CHANNELS], -1) for layer in layers])
+    return {name: values.astype(np.float16) for name, values in maps.items()}
 
 
 def run(capture: Capture, folder: Path) -> Result:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from iif_core.surface.triangles import quarter
 from workflow.scene.normal_form import View
 from workflow.stability import chain
 from workflow.stability.chain import Capture, Result
@@ -251,24 +252,16 @@ def _rolled_back(result: Result) -> Result:
 
 def _subdivided(capture: Capture, rng: np.random.Generator) -> Capture:
     """Every face in four by the middles of its edges; neighbours share the new vertices."""
-    f = capture.faces
-    edges = np.sort(np.concatenate([f[:, [0, 1]], f[:, [1, 2]], f[:, [2, 0]]]), axis=1)
-    unique, number = np.unique(edges, axis=0, return_inverse=True)
-    middle = capture.vertices[unique].mean(1)
-    n, m = len(capture.vertices), len(f)
-    ab, bc, ca = (n + number.reshape(-1)[i * m : (i + 1) * m] for i in range(3))
-    a, b, c = f.T
-    parts = [np.stack(p, 1) for p in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
-    faces = np.concatenate(parts).astype(np.int32)
-    vertices = np.concatenate([capture.vertices, middle.astype(np.float32)])
-    parent = np.tile(np.arange(m), 4)
-    divided = _with_faces(replace(capture, vertices=vertices), faces, parent, np.arange(3 * m, 4 * m, dtype=np.int32))
+    vertices, faces = quarter(capture.vertices, capture.faces)
+    count = len(capture.faces)
+    parent, first = np.repeat(np.arange(count), 4), 4 * np.arange(count, dtype=np.int32)
+    moved = replace(capture, vertices=vertices.astype(np.float32))
+    divided = _with_faces(moved, faces.astype(np.int32), parent, first)
     return replace(divided, face=_true_faces(divided, capture))
 
 
 def _true_faces(divided: Capture, before: Capture) -> dict[str, NDArray]:
     """The part of each face that a pixel shows: of the four, the one whose corners hold its point."""
-    m = len(before.faces)
     out = {}
     for view in before.views:
         ids = before.face[view.name]
@@ -276,10 +269,11 @@ def _true_faces(divided: Capture, before: Capture) -> dict[str, NDArray]:
         point = view.world_from_camera[:3, 3] + before.depth[view.name][..., None] * view.directions()
         best, inside = np.full(ids.shape, -1, np.int32), np.full(ids.shape, -np.inf)
         for part in range(4):
-            corners = divided.vertices[divided.faces[part * m + np.where(hit, ids, 0)]].astype(np.float64)
+            number = 4 * np.where(hit, ids, 0) + part
+            corners = divided.vertices[divided.faces[number]].astype(np.float64)
             least = _barycentric(point.astype(np.float64), corners).min(-1)
             better = hit & (least > inside)
-            best[better], inside[better] = (part * m + ids)[better], least[better]
+            best[better], inside[better] = number[better], least[better]
         out[view.name] = best
     return out
 
