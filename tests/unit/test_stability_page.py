@@ -55,7 +55,7 @@ def test_unknown_and_missing_parts_are_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="no such part.*kernels"):
         record.write_part("kernel")
-    with pytest.raises(InputError, match="without kernels, solvers, sums"):
+    with pytest.raises(InputError, match="without kernels, solvers, sums, relations"):
         record.collect()
     with pytest.raises(InputError, match="not found"):
         record.keep()

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workflow.stability import chain, digits, relations
+from workflow.stability import chain, digits, extremes, relations, sensitivity
+from workflow.stability.accuracy import accuracy
 from workflow.stability.relations import RELATIONS, Distance, Relation
 
 
@@ -122,3 +123,52 @@ def test_digits_of_known_spreads():
     exact = np.stack([np.ones(4), np.ones(4)])
     assert (digits.digits_of(exact) == digits.MOST_DIGITS).all()
     assert (digits.digits_of(np.array([[-1.0], [1.0]])) == 0).all()
+
+
+def test_extremes_are_scored_and_what_is_lost_is_counted(room):
+    capture, reference, _ = room
+    found = accuracy(reference, capture)
+    assert found.albedo > 25 and found.albedo >= found.albedo_as_is - 1e-6 and found.lost == 0 and found.light < 0.05
+    first = capture.views[0].name
+    broken = dict(reference.maps) | {first: np.full_like(reference.maps[first], np.nan)}
+    pixels = int((capture.known[first] & reference.seen[first]).sum())
+    assert accuracy(replace(reference, maps=broken), capture).lost == 5 * pixels
+    twice = accuracy(replace(reference, power=2 * reference.power), capture)
+    assert twice.light == pytest.approx(np.log(2), abs=0.05)
+
+
+@pytest.mark.parametrize("case", [case for case in extremes.CASES if not case.settings], ids=lambda case: case.name)
+def test_extreme_captures_are_captures(room, case):
+    capture, _, folder = room
+    changed = case.change(capture)
+    assert changed.faces.max() < len(changed.vertices) and len(changed.instance) == len(changed.faces) == len(changed.emission)
+    assert all(np.isfinite(changed.photo[view.name]).all() for view in changed.views)
+    if changed.names:
+        assert changed.instance.max() < len(changed.names)
+    chain._write(changed, folder / "written")
+
+
+def test_errors_of_the_input_change_what_they_say(room):
+    capture, _, _ = room
+    rng = np.random.default_rng(0)
+    by_name = {factor.name: factor for factor in sensitivity.FACTORS}
+    for factor in sensitivity.FACTORS:
+        assert len(factor.levels) == 4
+        if factor.name not in (sensitivity.PRIOR, sensitivity.SHARED, "number of predictions") and factor.levels[0] == 0.0:
+            same = factor.change(capture, 0.0, np.random.default_rng(0))
+            assert _off_surface(same) < 1e-3 and len(np.unique(same.instance)) == len(np.unique(capture.instance))
+    moved = by_name["poses"].change(capture, 3.0, rng)
+    view, other = capture.views[0], moved.views[0]
+    turn = other.world_from_camera[:3, :3].T @ view.world_from_camera[:3, :3]
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
+    assert 0.1 < np.degrees(np.arccos((np.trace(turn) - 1) / 2)) * np.pi / 180 * view.fx < 10
+    assert _off_surface(moved) > 1e-3 > _off_surface(sensitivity._retraced(moved))
+    holes = by_name["holes in the mesh"].change(capture, 0.2, rng)
+    assert 0.7 < len(holes.faces) / len(capture.faces) < 0.9 and holes.emission.sum() == capture.emission.sum()
+    parted = by_name["objects parted"].change(capture, 1.0, rng)
+    joined = by_name["objects joined"].change(capture, 0.6, rng)
+    assert len(np.unique(joined.instance)) < len(np.unique(capture.instance)) < len(np.unique(parted.instance))
+    shaken = by_name["vertices of the mesh"].change(capture, 10.0, rng)
+    assert (shaken.vertices - capture.vertices).std() == pytest.approx(0.01, rel=0.1)
+    same_place = np.unique(capture.vertices, axis=0, return_inverse=True)[1].reshape(-1)
+    assert len(np.unique(shaken.vertices, axis=0)) == same_place.max() + 1  # seams stay closed

@@ -32,6 +32,8 @@ STABILITY_PARTS = (
     "relations",
     "digits",
     "renderings",
+    "extremes",
+    "sensitivity",
 )
 
 native.process_environment()

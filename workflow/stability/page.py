@@ -33,6 +33,8 @@ def tables(frame: pd.DataFrame) -> dict[str, str]:
         "digits": _digits,
         "flips": _flips,
         "renderings": _renderings,
+        "extremes": _extremes,
+        "sensitivity": _sensitivity,
     }
     return {name: "\n".join(make(frame)) for name, make in made.items()}
 
@@ -180,3 +182,48 @@ def _renderings(frame: pd.DataFrame) -> list[str]:
         value = rows.set_index("quantity")["value"]
         body.append([str(room), *(_number(value[name]) for name in names)])
     return _markdown(["room", *names], body)
+
+
+def _extremes(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "extremes"]
+    names = ["albedo", "albedo_as_is", "roughness", "metallic", "light", "lost", "seconds"]
+    rooms = list(dict.fromkeys(own["subject"]))
+    body = []
+    for case, rows in own.groupby("case", sort=False):
+        for room in rooms:
+            one = rows[rows["subject"] == room]
+            if not len(one):
+                continue
+            value = one.set_index("quantity")["value"]
+            says = next((text for text in one["says"] if text), "")
+            body.append([str(case), str(room), *(_number(value[name]) if name in value else "" for name in names), says])
+    head = ["extreme", "room", "albedo, dB", "as it is, dB", "roughness", "metallic", "log light", "lost", "seconds", "message"]
+    return _markdown(head, body, 2)
+
+
+def ranked(frame: pd.DataFrame, room: str, score: str) -> list[tuple[str, str, float, float, float]]:
+    """Return (factor, levels, effect, size, error) of a room and a score, the largest size first."""
+    own = frame[(frame["part"] == "sensitivity") & (frame["subject"] == room)]
+    out = []
+    for (case, levels), rows in own.groupby(["case", "form"], sort=False):
+        value = rows.set_index("quantity")["value"]
+        numbers = [float(value[f"{score}: {name}"]) for name in ("effect", "size", "error")]
+        out.append((str(case), str(levels), numbers[0], numbers[1], numbers[2]))
+    return sorted(out, key=lambda row: -row[3])
+
+
+def _sensitivity(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "sensitivity"]
+    rooms, scores = list(dict.fromkeys(own["subject"])), ("albedo", "albedo_as_is", "roughness", "light")
+    found = {(room, score): {row[0]: row for row in ranked(frame, room, score)} for room in rooms for score in scores}
+    body = []
+    for factor, levels, *_ in ranked(frame, rooms[-1], "albedo") if rooms else []:
+        cells = []
+        for room in rooms:
+            for score in scores:
+                _, _, effect, size, error = found[room, score][factor]
+                text = f"{effect:+.2f} ({size:.2f} ± {error:.2f})"
+                cells.append(f"**{text}**" if size > error and size > 0.05 else text)
+        body.append([factor, levels, *cells])
+    head = ["factor", "levels", *(f"{room}: {score.replace('_', ' ')}" for room in rooms for score in scores)]
+    return _markdown(head, body, 2)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from iif_core.errors import InputError
 from workflow.artifacts.files import write_atomically
 from workflow.settings.names import REPOSITORY, did_you_mean
-from workflow.stability import page
+from workflow.stability import page, picture
 from workflow.stability.rows import COLUMNS, PARTS, measure
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def collect() -> None:
 
 
 def keep() -> None:
-    """Copy the table to docs/results/data/stability.csv, and make the tables of docs/results/stability.md from it anew.
+    """Copy the table to docs/results/data/stability.csv, and make tables and picture of docs/results/stability.md from it anew.
 
     Raises:
         InputError: there is no table.
@@ -71,6 +71,7 @@ def keep() -> None:
     write_atomically(KEPT, lambda path: frame.to_csv(path, index=False, float_format="%.4g"))
     text = page.fill(PAGE.read_text(), page.tables(kept()))
     write_atomically(PAGE, lambda path: path.write_text(text))
+    picture.draw(frame, picture.PICTURE)
 
 
 def kept() -> pd.DataFrame:

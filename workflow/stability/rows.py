@@ -11,11 +11,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from workflow.stability import chain, digits, relations
+from workflow.stability import chain, digits, extremes, relations, sensitivity
 from workflow.stability.digits import Digits, Flips
+from workflow.stability.extremes import Extreme
 from workflow.stability.monte_carlo import SIGMAS, Agreement
 from workflow.stability.relations import Related
 from workflow.stability.scalar import THRESHOLD, Accuracy
+from workflow.stability.sensitivity import Effect
 from workflow.stability.solvers import BACKWARD_LIMIT, Solved
 from workflow.stability.sums import Order, Summed
 
@@ -104,6 +106,26 @@ def of_renderings(found: Iterable[Agreement]) -> Iterator[Row]:
         yield _row(*key, "of Mitsuba", 1e6 * one.of_reference, math.nan)
 
 
+def of_extremes(found: Iterable[Extreme]) -> Iterator[Row]:
+    """Rows of the extremes: errors against the truth, or the message with which the capture was refused."""
+    for one in found:
+        key = ("extremes", one.room, "", one.extreme)
+        yield _row(*key, "seconds", one.seconds, math.nan, one.says)
+        if one.found is None:
+            continue
+        for name, value in zip(one.found._fields, one.found, strict=True):
+            yield _row(*key, name, value, 0.0 if name == "lost" else math.nan)
+
+
+def of_sensitivity(found: Iterable[Effect]) -> Iterator[Row]:
+    """Rows of the effects of factors, in dB or as logarithms."""
+    for one in found:
+        key = ("sensitivity", one.room, one.levels, one.factor)
+        yield _row(*key, f"{one.score}: effect", one.mean, math.nan)
+        yield _row(*key, f"{one.score}: size", one.size, math.nan)
+        yield _row(*key, f"{one.score}: error", one.error, math.nan)
+
+
 def of_digits(found: Iterable[Digits | Flips]) -> Iterator[Row]:
     """Rows of significant digits, amplification, and decisions that came out otherwise."""
     for one in found:
@@ -168,6 +190,18 @@ def _renderings() -> Iterator[Row]:
         yield from of_renderings([one])
 
 
+def _extremes() -> Iterator[Row]:
+    log = logging.getLogger("stability")
+    for one in extremes.measure():
+        log.info("extremes: %s: %s", one.room, one.extreme)
+        yield from of_extremes([one])
+
+
+def _sensitivity() -> Iterator[Row]:
+    for room in chain.ROOMS:
+        yield from of_sensitivity(sensitivity.measure(room))
+
+
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "kernels": _kernels,
     "solvers": _solvers,
@@ -175,6 +209,8 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "relations": _relations,
     "digits": _digits,
     "renderings": _renderings,
+    "extremes": _extremes,
+    "sensitivity": _sensitivity,
 }
 """Name of a part -> its rows."""
 
