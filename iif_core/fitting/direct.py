@@ -15,6 +15,7 @@ from iif_core.fitting.covariance import sandwich_covariance
 from iif_core.fitting.descent import (
     DescentState,
     GaussianPrior,
+    Spectrum,
     decompose_objects,
     descend,
     eliminate_objects,
@@ -317,6 +318,7 @@ def result_of(
         covariance[:] = (spread * albedo)[:, :, None] * (spread * albedo)[:, None, :]
     affine[members], free[members] = state.affine, state.free
     final, of_response = tone.at(state.params), np.zeros((tone.size, tone.size))
+    spectrum: Spectrum | None = None
     if len(px.obj):
         terms = evaluate(px, state.affine, final, opt, True)
         fitted = bool(opt.free_response and tone.size)
@@ -324,7 +326,7 @@ def result_of(
         if fit.levels is not None:
             by_light = light_scatter(fit.levels, terms.h[:, :NUMBERS, :NUMBERS], state.affine)
             prior = replace(prior, scatter=by_light if prior.scatter is None else prior.scatter + by_light)
-        blocks = decompose_objects(terms.h, state.free, fit.prior)
+        blocks = spectrum = decompose_objects(terms.h, state.free, fit.prior)
         curve_prior = make_response_prior(opt, len(px.obj), start_params)
         system = eliminate_objects(terms, state, fit.prior, curve_prior, fitted, blocks, damped=False)
         covariance[members], of_response = sandwich_covariance(px, state, system, prior, curve_prior, final, opt)
@@ -335,6 +337,7 @@ def result_of(
     light_gain = np.ones(n_objects)
     if fit.levels is not None:
         light_gain[members] = fit.levels.light_gain
+    facts = {**_facts(fit), "numerics": _numerics(px, fit, spectrum)} if len(members) else {}
     rank = np.zeros(n_objects, np.int64)
     rank[members] = texture.rank
     return FitResult(
@@ -351,9 +354,18 @@ def result_of(
         of_response,
         max(len(state.history) - 1, 0),
         state.reason or "nothing to fit",
-        _facts(fit) if len(members) else {},
+        facts,
         light_gain,
     )
+
+
+def _numerics(px: Pixels, fit: FitProgress, blocks: Spectrum | None) -> dict[str, float]:
+    """Return the largest condition of an object's block, and the share of pixels with less than half of their weight."""
+    own = np.ones(px.n_objects) if fit.response_weight is None else fit.response_weight
+    weight = px.trust.mean(1) / np.repeat(own, px.counts)
+    size = np.abs(blocks.values) if blocks is not None else np.ones((1, 1))
+    condition = size.max(1) / np.maximum(size.min(1), 1e-300)
+    return {"condition": float(condition.max()), "downweighted": float((weight < 0.5).mean()) if len(weight) else 0.0}
 
 
 def _facts(fit: FitProgress) -> dict[str, object]:

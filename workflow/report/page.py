@@ -71,6 +71,7 @@ class Page:
     headline: str
     facts: Sequence[tuple[str, str]]
     notes: Sequence[str]
+    warnings: Sequence[str]
     plan: Sequence[dict[str, Any]]
     tables: Sequence[Table]
     views: Sequence[ViewRows]

@@ -22,7 +22,7 @@ from iif_core.fitting.sgd import fit_affines_sgd
 from iif_core.reflectance.material import CHANNELS, NUMBERS_OF, apply_affines
 from workflow.artifacts.scratch import Joined
 from workflow.artifacts.store import ids_from_disk, split_rgb
-from workflow.decisions import camera, materials
+from workflow.decisions import camera, materials, numerics
 from workflow.decisions.record import Decision
 from workflow.fitting import baselines
 from workflow.fitting.cell_textures import CellTextures
@@ -119,12 +119,14 @@ def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[De
     """Write affines.json."""
     spread = np.sqrt(np.clip(np.diagonal(fit.response_covariance), 0.0, None))
     weight = np.maximum(fit.pixels, 1e-9)
+    facts = dict(fit.facts)
     job.writer.json(
         "affines.json",
         {
             "solver": job.settings.affines.solver,
             "light_scale": float(fit.light_scale),
-            **fit.facts,
+            "numerics": numerics.of_affines(facts.pop("numerics", {}), bool(fit.converged)),
+            **facts,
             "history": [float(x) for x in fit.history],
             "converged": bool(fit.converged),
             "iterations": int(fit.iterations),

@@ -24,6 +24,7 @@ from iif_core.surface.cells import neighbour_pairs, unpack_keys
 from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageReader, ids_from_disk, ids_to_disk, rgb, split_rgb
+from workflow.decisions import numerics
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -101,6 +102,7 @@ def _write_facts(job: Job, grid: CellGrid, problem: FusionProblem, result: Fusio
             "filled_share": float((result.coverage == 0).mean()),
             "seen_once_share": float((result.views == 1).mean()),
             "uncertainty_calibrated": _calibrated(job),
+            "numerics": numerics.of_base(result, used * len(problem.cell_of_pixel)),
             **({"reference_loss": _judged(job, problem, result, fit)} if settings.judge else {}),
         },
     )

@@ -17,6 +17,7 @@ from iif_core.light.emission.pruning import CERTAIN_EXCESS, CERTAIN_EXCESS_OPEN,
 from iif_core.light.emission.sensor import Sensor
 from iif_core.surface.segments import face_adjacency
 from workflow.decisions import light as decisions
+from workflow.decisions import numerics
 from workflow.decisions.plan import included
 from workflow.decisions.record import SETTLED
 from workflow.runtime.job import Job
@@ -227,6 +228,7 @@ def _write_facts(
             "gain": photos.gains.gain.tolist(),
             "vignetting": photos.gains.vignetting.tolist(),
             "response": {**response_facts(camera.response), "calibration": calibration_facts(camera)},
+            "numerics": numerics.of_emission(solution.condition, solution.converged),
             "plan": plan,
             "notes": notes,
         },

@@ -8,6 +8,7 @@ import numpy as np
 
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
+from workflow.decisions import numerics
 from workflow.decisions.expected import whole, with_expectation
 from workflow.decisions.plan import GAINS, with_override
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
@@ -37,6 +38,10 @@ UNCERTAINTY_RANGE = 0.2
 CHANNEL_COLOURS = ("#c33", "#292", "#34c")
 
 
+NUMERICS = ("base", "emission", "shading", "affines")
+"""Stages that say where their arithmetic came close to its end."""
+
+
 def run(job: Job) -> None:
     """Write report.html and plan.yaml."""
     capture = CaptureReader(job.read("capture"))
@@ -53,6 +58,7 @@ def run(job: Job) -> None:
         headline=_headline(summary, capture, recovered),
         facts=_facts(job, capture, recovered),
         notes=[str(note) for note in capture.facts.get("notes", [])] + [str(n) for n in emission.get("notes", [])],
+        warnings=numerics.warnings((stage, _document(job, stage, f"{stage}.json")) for stage in NUMERICS),
         plan=plan,
         tables=_tables(summary),
         views=_views(job, capture, recovered),

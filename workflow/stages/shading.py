@@ -14,6 +14,7 @@ from iif_core.surface.cells import grid_origin
 from iif_core.surface.shading_cells import DiffuseShading, ShadingCellBuilder, ShadingCells, combine_estimates, diffuse_of_cells
 from workflow.artifacts.store import split_rgb
 from workflow.decisions import light as decisions
+from workflow.decisions import numerics
 from workflow.decisions.materials import METALLIC_PRIOR
 from workflow.decisions.plan import included, matte_by_predictions
 from workflow.decisions.record import PROVISIONAL, Decision
@@ -78,9 +79,8 @@ def run(job: Job) -> None:
         lit = world if specular["included"] else None
         traced = _views(job, capture, scene, lit, levels, cells, diffuse, drawn)
     job.writer.table("levels.parquet", {"level": np.arange(len(levels), dtype=np.int32), "roughness": levels})
-    job.writer.json(
-        "shading.json", {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [specular, decision]}
-    )
+    facts = {"diffuse": _facts(cells, diffuse), "specular": {"pixels": traced}, "plan": [specular, decision]}
+    job.writer.json("shading.json", {**facts, "numerics": numerics.of_shading(diffuse, job.settings.shading.noise)})
 
 
 def _cells(job: Job, capture: CaptureReader, scene: BaseScene, mixed: np.ndarray) -> tuple[ShadingCells, np.ndarray]:
