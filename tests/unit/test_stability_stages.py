@@ -70,6 +70,7 @@ def _seen(capture):
 @pytest.mark.parametrize(
     ("name", "allowed"),
     [
+        ("three threads", 1e-12),
         ("faces share no vertices", 1e-6),
         ("vertices permuted", 1e-6),
         ("radiance times 1e+06", 1e-4),

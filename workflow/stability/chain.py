@@ -31,8 +31,9 @@ _CHANNELS = ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")
 class FreeJob(Job):
     """A job whose settings are given and whose folders are not those of a scene; it checks no fingerprints."""
 
-    def __init__(self, stage: str, folder: Path, document: dict[str, Any]):  # not that of Job, which looks a scene up
-        self.stage, self.scene, self.quality, self.threads = STAGES[stage], "free", "draft", 1
+    def __init__(self, stage: str, folder: Path, document: dict[str, Any], threads: int = 1):
+        # Not that of Job, which looks a scene up.
+        self.stage, self.scene, self.quality, self.threads = STAGES[stage], "free", "draft", threads
         self.log = logging.getLogger(stage)
         self.document, self._folder = document, folder
         self.device = device.use(document["device"])
@@ -68,7 +69,7 @@ class Capture:
         vertices: (n, 3) float32 m; faces: (m, 3); instance: (m,) object of each face; names: of the objects.
         emission: (m, 3) true radiance of the faces.
         truth, known: view name -> true materials (H, W, 5), and the pixels where they mean something.
-        facts: capture.json; document: settings of all stages.
+        facts: capture.json; document: settings of all stages; threads: of each stage.
     """
 
     views: tuple[View, ...]
@@ -86,6 +87,7 @@ class Capture:
     known: Mapping[str, NDArray]
     facts: Mapping[str, Any]
     document: Mapping[str, Any]
+    threads: int = 1
 
     def with_settings(self, **sections: dict[str, Any]) -> Capture:
         """Return the same capture with some settings changed."""
@@ -121,10 +123,10 @@ def document_of(settings: dict[str, Any]) -> dict[str, Any]:
     return dict(settings_module.dump(SceneSettings.model_validate(settings)))
 
 
-def run_stages(folder: Path, document: Mapping[str, Any], stages: tuple[str, ...]) -> None:
+def run_stages(folder: Path, document: Mapping[str, Any], stages: tuple[str, ...], threads: int = 1) -> None:
     """Run stages one after the other in a folder that has what they read."""
     for stage in stages:
-        job = FreeJob(stage, folder, dict(document))
+        job = FreeJob(stage, folder, dict(document), threads)
         importlib.import_module(job.stage.module).run(job)
         job.writer.finish()
 
@@ -178,7 +180,7 @@ def _predictions(capture: CaptureReader, folder: Path) -> dict[str, NDArray]:
 def run(capture: Capture, folder: Path) -> Result:
     """Write a capture to a folder as the stages `SOURCES` would have, and run the stages `FITTED` on it."""
     _write(capture, folder)
-    run_stages(folder, capture.document, FITTED)
+    run_stages(folder, capture.document, FITTED, capture.threads)
     return _read(capture, folder)
 
 

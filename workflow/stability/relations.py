@@ -342,6 +342,8 @@ _EVIDENCE = "pixels are taken for independent, so that twice the photographs wei
 TILT = _turn(np.array([1.0, 2.0, 0.5]), 0.7)
 QUARTER = _turn(np.array([0.0, 0.0, 1.0]), np.pi / 2).round()
 RELATIONS = (
+    Relation("two threads", lambda capture, rng: replace(capture, threads=2), EXACT),
+    Relation("three threads", lambda capture, rng: replace(capture, threads=3), EXACT),
     Relation("views permuted", _views_permuted, NOISE),
     Relation("views renamed", _names_changed, EXACT),
     Relation("objects permuted", _objects_permuted, NOISE),

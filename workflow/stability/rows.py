@@ -63,10 +63,10 @@ def of_solvers(found: Iterable[Solved]) -> Iterator[Row]:
     for one in found:
         form = "single" if one.eps > 1e-10 else "double"
         key = ("solvers", one.solver, form, one.kind)
-        known = (one.solver, one.kind) in LIMITS
+        judged = (one.solver, one.kind) not in LIMITS and not math.isnan(one.backward)  # some have no matrix to judge
         yield _row(*key, "size", one.size, math.nan)
         yield _row(*key, "condition", one.condition, math.nan)
-        yield _row(*key, "backward error / eps", one.backward, math.nan if known else BACKWARD_LIMIT, one.says)
+        yield _row(*key, "backward error / eps", one.backward, BACKWARD_LIMIT if judged else math.nan, one.says)
         yield _row(*key, "forward error", one.forward, math.nan)
         yield _row(*key, "growth", one.growth, math.nan)
         yield _row(*key, "lost", one.lost, 0.0)
