@@ -151,6 +151,11 @@ def _setting(section: str, key: str) -> Change:
     return apply
 
 
+def _fit_pixels(capture: Capture, value: float, rng: np.random.Generator) -> Capture:
+    """Specular light is traced at the pixels that the fit reads."""
+    return capture.with_settings(affines={"pixels": int(value)}, shading={"pixels": int(value)})
+
+
 def _fewer_predictions(capture: Capture, count: float, rng: np.random.Generator) -> Capture:
     return replace(capture, maps={name: maps[: int(count)] for name, maps in capture.maps.items()})
 
@@ -184,7 +189,7 @@ FACTORS = (
     Factor("shading.samples", (64.0, 32.0, 16.0, 8.0), "", _setting("shading", "samples")),
     Factor("shading.cell_edge", (0.025, 0.05, 0.1, 0.2), "m", _setting("shading", "cell_edge")),
     Factor("shading.noise", (0.1, 0.2, 0.4, 1.0), "", _setting("shading", "noise")),
-    Factor("affines.pixels", (100000.0, 50000.0, 20000.0, 5000.0), "", _setting("affines", "pixels")),
+    Factor("affines.pixels", (100000.0, 50000.0, 20000.0, 5000.0), "", _fit_pixels),
 )  # fmt: skip
 GEOMETRY = ("poses", "vertices of the mesh", "holes in the mesh")
 
