@@ -88,7 +88,7 @@ def _measured(frame: pd.DataFrame) -> list[str]:
 def _verdict(frame: pd.DataFrame) -> list[str]:
     body = []
     for part, rows in frame[frame["part"] != "measured"].groupby("part", sort=False):
-        judged = rows[rows["limit"].notna()]
+        judged = rows[rows["limit"] < math.inf]
         guarded = rows[rows["says"].ne("") & rows["quantity"].eq("backward error / eps") & rows["limit"].isna()]
         forms = rows.groupby(["subject", "form"]).ngroups
         body.append([str(part), str(forms), str(len(judged)), str(int((~judged["in_order"]).sum())), str(len(guarded))])
