@@ -240,6 +240,13 @@ def tell_target():
         print(line, file=sys.stderr)
 
 
+def stability_code(wildcards):
+    """Digest of everything that the study of stability measures, and measures with."""
+    return fingerprints.modules_digest(
+        fingerprints.import_closure("workflow.stability.rows")
+    )
+
+
 def relight_inputs(*names):
     """What is relit; a scene without relightings stops here, before any job."""
     inputs_of = reads("relight", *names)

@@ -31,13 +31,6 @@ rule study:
         "python3 -m workflow study {wildcards.study} --quality {params.quality} --fingerprint {params.mark} --log {log:q}"
 
 
-def stability_code(wildcards):
-    """Digest of everything that the study of stability measures, and measures with."""
-    return fingerprints.modules_digest(
-        fingerprints.import_closure("workflow.stability.rows")
-    )
-
-
 rule stability_part:
     """Measure the numerical errors of kernels, solvers or sums."""
     output:
