@@ -225,7 +225,7 @@ def _score(text: str) -> tuple[str, float]:
     score, _, number = text.partition(":")
     if score not in SCORES:
         raise InputError(f"--config target={text}: needed <score>:<dB> with {' or '.join(SCORES)}, e.g. target=held_out:24")
-    return score, _number(f"target={score}:", number, "decibels, e.g. target=held_out:24")
+    return score, _number(f"target={score}", number, "decibels, e.g. target=held_out:24")
 
 
 def _by_target(text: str, scene: str, cores: int) -> Choice:
