@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.numerics.frames import dominant_side
 from iif_core.surface.cells import INDEX_LIMIT, pack_keys, voxel_indices
 
 PATCH_FOOTPRINTS = 3.2
@@ -22,8 +23,8 @@ class PatchRows:
     """Patches in photographs; n rows, one per (patch, view).
 
     Attributes:
-        patch: (n,) uint64 key of voxel and object; facing: (n,) int8 dominant axis and sign of the normal, 0 ... 5. Both
-            together identify the patch.
+        patch: (n,) uint64 key of voxel and object; facing: (n,) int8 side of the normal, 0 ... 5
+            (`frames.dominant_side`). Both together identify the patch.
         block: (n,) int32, patches whose errors may be correlated (their object).
         view: (n,) int32.
         value: (n, 3) float64 sensor value; NaN where a channel cannot be used.
@@ -84,7 +85,7 @@ def patch_rows(
     """Collect the rows of one photograph.
 
     Args:
-        patch: (n,) uint64 of each pixel; normal: (n, 3), whose dominant axis and sign divide patches.
+        patch: (n,) uint64 of each pixel; normal: (n, 3), whose side divides patches.
         block: (n,) int, block of each pixel.
         value: (n, 3) sensor values; pixels that are not finite are ignored.
         view: number of the photograph.
@@ -102,8 +103,8 @@ def patch_rows(
     if share < 1.0:
         mixed = np.asarray(patch, np.uint64) * np.uint64(0x9E3779B97F4A7C15)
         good &= (mixed >> np.uint64(40)).astype(np.float64) < share * 2.0**24
-    value, patch, block, axis = value[good], np.asarray(patch)[good], np.asarray(block)[good], np.abs(normal[good]).argmax(1)
-    facing = (2 * axis + (np.take_along_axis(normal[good], axis[:, None], 1)[:, 0] > 0)).astype(np.int8)
+    value, patch, block = value[good], np.asarray(patch)[good], np.asarray(block)[good]
+    facing = dominant_side(normal[good]).astype(np.int8)
     order = np.lexsort((facing, patch))
     radius2 = (np.zeros(len(good)) if radius2 is None else np.asarray(radius2, np.float64))[good][order]
     value, patch, block, facing = value[order], patch[order], block[order], facing[order]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
-from iif_core.numerics.frames import tangent_frame
+from iif_core.numerics.frames import dominant_side, tangent_frame
 from iif_core.numerics.graph import component_labels
 from iif_core.numerics.xp import NUMPY
 from iif_core.surface.cells import grid_origin, pack_keys, unpack_keys, voxel_indices
@@ -100,7 +100,7 @@ class SurfaceCellsBuilder:
             saturated, exposure: (n,) bool, and of the view.
         """
         group = np.asarray(group, np.int64)
-        side = _sides(normals)
+        side = dominant_side(normals)
         keys = pack_keys(voxel_indices(points, self.edge, self.origin), ((group + 1) % _GROUPS) * 6 + side)
         clear = ~np.asarray(saturated, bool)
         log = np.log(np.maximum(radiance, DARKEST / exposure)) * clear[:, None]
@@ -296,7 +296,7 @@ def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDAr
     from scipy.spatial import cKDTree
 
     low = cells.origin - reach
-    side = _sides(cells.normals)
+    side = dominant_side(cells.normals)
     keys = pack_keys(voxel_indices(cells.points, reach / 2, low), ((cells.group + 1) % _GROUPS) * 6 + side)
     _, box = np.unique(keys, return_inverse=True)
     box = box.ravel()
@@ -357,12 +357,6 @@ def _find(cells: SurfaceCells, points: NDArray) -> NDArray:
     keys = pack_keys(ijk, np.full(len(ijk), -1))
     row = np.minimum(np.searchsorted(cells.voxel_key, keys), len(cells.voxel_key) - 1)
     return np.where(cells.voxel_key[row] == keys, row, -1)
-
-
-def _sides(normals: NDArray) -> NDArray:
-    """(n,) 0 ... 5: the axis nearest to each normal, and its sign."""
-    axis = np.abs(normals).argmax(1)
-    return 2 * axis + (normals[np.arange(len(normals)), axis] < 0)
 
 
 def _tangents(n: NDArray) -> tuple[NDArray, NDArray]:

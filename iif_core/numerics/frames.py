@@ -1,14 +1,21 @@
-"""An orthonormal frame around a direction, for any array namespace."""
+"""Frames around directions, for any array namespace, and the side of a cube that a direction passes through."""
 
 from __future__ import annotations
 
 from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from iif_core.numerics.xp import Namespace
 
 SEAM = -0.625
 """Height at which the frame turns over. It has to somewhere; at 0, where the customary form has it, it would on every vertical
 wall whose normal is horizontal to rounding (docs/method/numerics.md#frames-that-turn-over)."""
+
+AXIS_WEIGHTS = (1.0, 1.0477, 0.9431)
+"""Factors of |x|, |y| and |z| before they are compared. With equal ones rounding would decide on every surface at 45 degrees
+(docs/method/numerics.md#sides-of-slanted-surfaces)."""
 
 Vector = tuple[Any, Any, Any]
 
@@ -28,3 +35,17 @@ def tangent_frame(xp: Namespace, x: Any, y: Any, z: Any) -> tuple[Vector, Vector
     a = -1 / (sign + z)
     b = x * y * a
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y)
+
+
+def dominant_side(normals: ArrayLike) -> NDArray:
+    """Number the side of a box that each direction passes through.
+
+    Args:
+        normals: (n, 3) directions of any length.
+
+    Returns:
+        (n,) int64, 0 ... 5: twice the axis with the largest weighted component (`AXIS_WEIGHTS`), plus 1 where it is negative.
+    """
+    normals = np.asarray(normals)
+    axis = (np.abs(normals) * np.asarray(AXIS_WEIGHTS, normals.dtype)).argmax(1)
+    return 2 * axis + (np.take_along_axis(normals, axis[:, None], 1)[:, 0] < 0)

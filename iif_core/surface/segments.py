@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from iif_core.numerics.graph import component_labels
+
+WELD_ULPS = 4.0
+"""Vertices closer than so many spacings of single precision at the largest coordinate are one vertex."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,8 @@ def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
     """Find pairs of faces that share an edge: (M, 2) int32, lower face first, sorted; n > 2 faces at an edge give a chain of
     pairs.
 
-    If vertices are given, those at identical positions count as one, so that seams do not separate faces.
+    If vertices are given, those at one position to rounding count as one, so that seams do not separate faces
+    (docs/method/numerics.md#vertices-that-almost-coincide).
     """
     faces = np.asarray(faces)
     if faces.ndim != 2 or faces.shape[1] != 3:
@@ -89,10 +94,8 @@ def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
     if len(faces) == 0:
         return np.zeros((0, 2), np.int32)
     if vertices is not None:
-        faces = _welded(np.asarray(vertices))[faces]
-    corners = faces.astype(np.int64)
-    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    key = edges.min(1) * (corners.max() + 1) + edges.max(1)
+        faces = _welded(np.asarray(vertices), faces)
+    key = _edge_keys(faces)
     owner = np.tile(np.arange(len(faces), dtype=np.int32), 3)
     order = np.argsort(key, kind="stable")
     key, owner = key[order], owner[order]
@@ -104,14 +107,35 @@ def face_adjacency(faces: NDArray, vertices: NDArray | None = None) -> NDArray:
     return np.stack([code // len(faces), code % len(faces)], 1).astype(np.int32)
 
 
-def _welded(vertices: NDArray) -> NDArray:
-    """Index of the first vertex at the same position, for every vertex."""
+def _edge_keys(faces: NDArray) -> NDArray:
+    """A number for each edge, (3 F,) int64: first the edges v0v1 of all faces, then v1v2 and v2v0."""
+    corners = faces.astype(np.int64)
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    return edges.min(1) * (corners.max() + 1) + edges.max(1)
+
+
+def _welded(vertices: NDArray, faces: NDArray) -> NDArray:
+    """Faces (F, 3) int64 whose vertices at one position are one: equal positions first, and then those of edges with a single
+    face that lie within `WELD_ULPS` spacings of the coordinates, which is few of a mesh that is joined already."""
+    from scipy.spatial import cKDTree
+
     order = np.lexsort(vertices.T)
     ordered = vertices[order]
     new = np.r_[True, (ordered[1:] != ordered[:-1]).any(1)]
-    welded = np.empty(len(vertices), np.int64)
-    welded[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
-    return welded
+    number = np.empty(len(vertices), np.int64)
+    number[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    faces = number[faces]
+    _, first, count = np.unique(_edge_keys(faces), return_index=True, return_counts=True)
+    face, side = first[count == 1] % len(faces), first[count == 1] // len(faces)
+    loose = np.unique(np.concatenate([faces[face, side], faces[face, (side + 1) % 3]]))
+    if not len(loose):
+        return faces
+    reach = WELD_ULPS * float(np.finfo(np.float32).eps) * float(np.abs(vertices[loose]).max())
+    pairs = cKDTree(vertices[loose]).query_pairs(reach, output_type="ndarray")
+    _, lowest, part = np.unique(component_labels(len(loose), *pairs.T), return_index=True, return_inverse=True)
+    number = np.arange(len(vertices))
+    number[loose] = loose[lowest[part]]
+    return number[faces]
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,9 @@ def _pixels(seed=0, n=20_000):
     interior[np.flatnonzero((owner == 3) & interior)[30:]] = False
     face, way = rng.integers(0, 10, n).astype(np.int32), np.zeros((n, 3), np.float32)
     valid, front = rng.random(n) < 0.95, np.ones(n, bool)
-    return ViewPixels(np.arange(n), way, way, way, face, owner.astype(np.int32), front, way, valid, interior)
+    return ViewPixels(
+        np.arange(n), way, way, way, face, owner.astype(np.int32), front, way, valid, interior, np.arange(n, dtype=np.uint32)
+    )
 
 
 def test_objects_get_the_same_number_and_a_larger_draw_contains_a_smaller_one():

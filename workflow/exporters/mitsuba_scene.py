@@ -5,6 +5,7 @@ Meshes are PLY files with the material as vertex attributes, in world coordinate
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 import tempfile
@@ -14,8 +15,12 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from iif_core.numerics import xp
+from iif_core.reflectance import brdf
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
+from workflow.exporters import mitsuba_bsdf, mitsuba_render
+from workflow.exporters.mitsuba_lobes import blended
 from workflow.exporters.surface import Part
 from workflow.scene.normal_form import View
 
@@ -23,8 +28,9 @@ _NOTE = """
   Recovered by Intrinsic Image Fusion. Lengths in metres, all values linear, roughness perceptual (alpha = roughness^2).
 
   The model of the workflow: k_d = (1 - m) a, k_s = 0.04 (1 - m) + m a, GGX, Schlick, no loss of the diffuse lobe.
-  Mitsuba has no such BSDF; `principled` with specular 0.5 (the same F0 = 0.04) is the nearest one. Its diffuse lobe
-  has a retro-reflective term and its microfacets shadow less: surfaces are about 10 % brighter than in the workflow.
+  Mitsuba has no such BSDF. Half a `diffuse` of reflectance 2 k_d is its diffuse lobe; half a metal of `principled` is close
+  to its specular lobe, with base colours that reflect as much light in all. `albedo` and `metallic` of the meshes are the
+  recovered ones; `python render.py` beside this file renders them with the exact model.
 
   Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
   samples.
@@ -58,9 +64,9 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
         max_depth: path length; 1 = emitters only.
 
     Returns:
-        Content by relative name: `scene.xml` and `meshes/<part>.ply`.
+        Content by relative name: `scene.xml`, `meshes/<part>.ply`, and `render.py` with what it imports.
     """
-    files: dict[str, bytes] = {}
+    files = exact_files()
     body = []
     for part, stem in zip(parts, _stems(parts), strict=True):
         name = f"meshes/{stem}.ply"
@@ -91,6 +97,21 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
     return {"scene.xml": text.encode(), **files}
 
 
+def exact_files() -> dict[str, bytes]:
+    """Return `render.py` and the package `iif_bsdf`: the modules of the reflectance, with their imports made local."""
+    modules = {"iif_core.numerics.xp": xp, "iif_core.reflectance.brdf": brdf, "workflow.exporters.mitsuba_bsdf": mitsuba_bsdf}
+    files = {"render.py": mitsuba_render, **{f"iif_bsdf/{name.rpartition('.')[2]}.py": module for name, module in modules.items()}}
+    local = [(f"from {name} import", f"from iif_bsdf.{name.rpartition('.')[2]} import") for name in modules]
+    local += [(f"from {name.rpartition('.')[0]} import", "from iif_bsdf import") for name in modules]
+    out = {"iif_bsdf/__init__.py": b""}
+    for file, module in files.items():
+        text = inspect.getsource(module)
+        for before, after in local:
+            text = text.replace(before, after)
+        out[file] = text.encode()
+    return out
+
+
 def _environment_exr(environment: np.ndarray) -> bytes:
     repeat = max(1, ENVIRONMENT_ROWS // len(environment))
     image = environment[:, ::-1].repeat(repeat, 0).repeat(repeat, 1)
@@ -101,14 +122,17 @@ def _environment_exr(environment: np.ndarray) -> bytes:
 
 
 def ply_bytes(part: Part, back: bool = False) -> bytes:
-    """Return a binary PLY of x y z, nx ny nz, albedo_0..2, roughness_0, metallic_0 (Mitsuba reads `vertex_albedo`, ...).
+    """Return a binary PLY of x y z, nx ny nz, albedo_0..2, roughness_0, metallic_0, and diffuse_0..2 and specular_0..2 of
+    `mitsuba_lobes.blended`. Mitsuba reads them as `vertex_albedo` and so on.
 
     With `back` it is the other side of the same sheet, moved by `BACK_OFFSET` so that a ray meets only one of the two.
     """
     names = ["x", "y", "z", "nx", "ny", "nz", "albedo_0", "albedo_1", "albedo_2", "roughness_0", "metallic_0"]
+    names += [f"{lobe}_{c}" for lobe in ("diffuse", "specular") for c in range(3)]
     normals = -part.normals if back else part.normals
     vertices = part.vertices + BACK_OFFSET * normals if back else part.vertices
-    columns = [vertices, normals, part.albedo, part.roughness[:, None], part.metallic[:, None]]
+    lobes = blended(part.albedo, part.roughness, part.metallic)
+    columns = [vertices, normals, part.albedo, part.roughness[:, None], part.metallic[:, None], *lobes]
     faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
     faces["count"] = 3
     faces["corner"] = part.faces[:, ::-1] if back else part.faces
@@ -140,15 +164,17 @@ def _shape(part: Part, file: str) -> str:
     else:
         if part.opacity < 1:
             lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
-        lines += ['\t\t<bsdf type="twosided">', '\t\t\t<bsdf type="principled">']
-        for parameter, attribute in (("base_color", "albedo"), ("roughness", "roughness"), ("metallic", "metallic")):
-            lines.append(
-                f'\t\t\t\t<texture type="mesh_attribute" name="{parameter}">'
-                f'<string name="name" value="vertex_{attribute}"/></texture>'
-            )
-        lines += ['\t\t\t\t<float name="specular" value="0.5"/>', "\t\t\t</bsdf>", "\t\t</bsdf>"]
+        lines += ['\t\t<bsdf type="twosided"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>']
+        lines += [f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", "diffuse")}</bsdf>', '\t\t\t<bsdf type="principled">']
+        lines += [f"\t\t\t\t{_attribute(*names)}" for names in (("base_color", "specular"), ("roughness", "roughness"))]
+        lines += ['\t\t\t\t<float name="metallic" value="1"/>', "\t\t\t</bsdf>", "\t\t</bsdf></bsdf>"]
         lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])
+
+
+def _attribute(parameter: str, name: str) -> str:
+    text = f'<string name="name" value="vertex_{name}"/>'
+    return f'<texture type="mesh_attribute" name="{parameter}">{text}</texture>'
 
 
 def _sensor(view: View) -> str:

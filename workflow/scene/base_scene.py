@@ -144,6 +144,7 @@ class ViewPixels:
         points, normals, wo: (n, 3) float32, metres and unit vectors; normals face the camera.
         face, object_id: (n,) int32; from_front: (n,) bool, the camera is on the side of the face normal.
         value: (n, 3) photograph; valid, interior: (n,) bool.
+        number: (n,) uint32 of view and pixel, by which rays that start there draw their random numbers.
     """
 
     index: np.ndarray
@@ -156,6 +157,7 @@ class ViewPixels:
     value: np.ndarray
     valid: np.ndarray
     interior: np.ndarray
+    number: np.ndarray
 
     def take(self, choice: np.ndarray) -> ViewPixels:
         """Return the chosen pixels."""
@@ -239,6 +241,7 @@ def view_pixels(
         value,
         valid.ravel()[hit] & np.isfinite(value).all(1),
         interior.ravel()[hit],
+        ((hit + view.view_id * 0x9E3779B1) & 0xFFFFFFFF).astype(np.uint32),
     )
 
 

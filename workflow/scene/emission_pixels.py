@@ -340,7 +340,6 @@ def choose_rows(
     `rest` is the radiance from which surface may be an emitter; pixels of one object in a tile of `tile_edge`, None = `row_tile`,
     will be averaged. Returns the pixels three times: as surface points, as base materials (n, 5), and as what they show.
     """
-    rng = np.random.default_rng([photos.job.seed, SEEDS, 1])
     elsewhere, per_view = (-(-photos.job.settings.emission.rows // (t * len(photos.views))) for t in (thin, 1))
     per_group = max(-(-ANCHOR_PIXELS // len(photos.views)), 4)
     parts: list[tuple[ViewPixels, np.ndarray, EmissionPixels]] = []
@@ -351,10 +350,11 @@ def choose_rows(
         side = groups.side[pixels.face]
         dark_side = (group >= 0) & (side != 0) & ((side > 0) != pixels.from_front)
         usable = pixels.valid & ~dark_side & (pixels.interior | (group >= 0))
+        rng, of_parts = (np.random.default_rng([photos.job.seed, SEEDS, 1, view.view_id, turn]) for turn in range(2))
         choice = choose_pixels(group, usable, pixels.interior, elsewhere, per_group, rng)
         part = pixels.take(choice)
         shown, number = photos.radiance(view, part.value, part.index), np.full(len(choice), view.view_id)
-        covered = _coverage(photos, groups, view, part.index, group[choice], rng)
+        covered = _coverage(photos, groups, view, part.index, group[choice], of_parts)
         tile = tile_of(part.index, view.width, tile_edge or row_tile(view.width * view.height, per_view))
         rows = EmissionPixels(*shown, part.object_id, number, tile, group[choice], covered)
         parts.append((part, record.base[choice], rows))

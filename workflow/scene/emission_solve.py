@@ -66,11 +66,13 @@ COMPARED_TILES_ACROSS = 8
 
 
 class SurfacePoints(NamedTuple):
-    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from."""
+    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from; and the
+    numbers (n,) uint32 by which they draw."""
 
     points: np.ndarray
     normals: np.ndarray
     wo: np.ndarray
+    number: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -257,16 +259,17 @@ def _raised(
     bounds = pack_keys(cache.ijk[cache.censored])
     if not len(bounds):
         return cache
-    rng = np.random.default_rng([photos.job.seed, SEEDS, 2])
     parts, materials = [], []
     for view in photos.views:
         record = photos.records[view]
         pixels = record.pixels
+        drawn = np.random.default_rng([photos.job.seed, SEEDS, 2, view.view_id]).random(len(pixels.index))
         use = np.flatnonzero(pixels.valid & pixels.interior & (found.groups.of_face[pixels.face] < 0))
         keys = pack_keys(voxel_indices(pixels.points[use], cache.edge, cache.origin))
-        inside = rng.permutation(np.flatnonzero(np.isin(keys, bounds)))
-        first = use[inside[np.unique(keys[inside], return_index=True)[1]]]  # one pixel a voxel and view
-        first = rng.permutation(first)[: -(-SATURATED_PIXELS // len(photos.views))]
+        inside = np.flatnonzero(np.isin(keys, bounds))
+        inside = inside[np.argsort(drawn[use[inside]], kind="stable")]
+        first = use[np.sort(inside[np.unique(keys[inside], return_index=True)[1]])]  # one pixel a voxel and view
+        first = first[np.argsort(drawn[first], kind="stable")[: -(-SATURATED_PIXELS // len(photos.views))]]
         parts.append(pixels.take(first))
         materials.append(record.base[first])
     pixels, base = joined(parts), np.concatenate(materials)
@@ -320,7 +323,9 @@ def _white_hidden_surface(
         face, group = np.concatenate(drawn), np.repeat(own, HIDDEN_POINTS)
         normal = scene.normals[face] * np.where(np.arange(len(face)) % 2, -1.0, 1.0)[:, None]
         middle = scene.vertices[scene.faces[face]].mean(1) + 1e-3 * normal
-        points = SurfacePoints(*(part.astype(np.float32) for part in (middle, normal, normal)))
+        points = SurfacePoints(
+            *(part.astype(np.float32) for part in (middle, normal, normal)), np.arange(len(face), dtype=np.uint32)
+        )
         paint = np.tile(np.float32(WHITE), (len(face), 1))
         white = trace_rows(photos, points, paint, groups, voxels, sky, 1, unseen).without_lobes()
         np.add.at(matrix, group, white.matrix[:, 0].mean(0) / (0.5 * HIDDEN_POINTS))
@@ -432,7 +437,8 @@ def trace_rows(
     halves = []
     for half in range(2):
         job.progress(half, 2, "halves of the transport matrix traced")
-        found = transport_matrix(scene, points, columns, PathOptions(samples, settings.max_bounces, seed + half), drawn)
+        paths = PathOptions(samples, settings.max_bounces, seed + half)
+        found = transport_matrix(scene, points, columns, paths, drawn, pixels.number)
         halves.append([_albedo_and_gloss(values, metallic == 0) for values in found])
     job.progress(2, 2, "halves of the transport matrix traced")
     return TracedTransport(*(np.stack(part) for part in zip(*halves, strict=True)))

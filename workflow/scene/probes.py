@@ -10,6 +10,7 @@ import numpy as np
 from iif_core.camera.pinhole import project
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
+from iif_core.numerics.frames import dominant_side
 from iif_core.numerics.xp import NUMPY
 from iif_core.reflectance import brdf
 from iif_core.requirements.probes import MAX_POINTS, GlossRows, LightRows
@@ -197,8 +198,7 @@ def _draw(
         parts["face"].append(face)
     joined = {name: np.concatenate(part) for name, part in parts.items()}
     block = _keys(joined["position"], table.low, BLOCK_VOXELS * table.edge)
-    axis = np.abs(joined["normal"]).argmax(1)
-    side = 2 * axis + (np.take_along_axis(joined["normal"], axis[:, None], 1)[:, 0] > 0)
+    side = dominant_side(joined["normal"])
     owner = instance[joined.pop("face")].astype(np.int64)
     # Where nothing tells objects apart, a large block of surface with one orientation is one.
     piece = np.unique(_keys(joined["position"], table.low, GROUP_VOXELS * table.edge), return_inverse=True)[1]

@@ -101,8 +101,8 @@ class _Capture:
                 blind.append((frame, view))
                 continue
             photo, valid = self._photo(frame, view, given[i])
+            valid &= self._look_for_light(view.name, photo[valid])
             self.writer.photo(view.name, photo, valid, self.encoded)
-            self._look_for_light(view.name, photo[valid])
             self.writer.gbuffer(view.name, depth, face)
             self._extras(frame, view, photo, valid, face)
             self._compare(frame, view, photo, valid, depth, face)
@@ -285,14 +285,17 @@ class _Capture:
         if count - len(dropped) == 1:
             self.notes.append("one view only: nothing is seen twice, so materials and exposure rest on the prior alone")
 
-    def _look_for_light(self, name: str, pixels: np.ndarray) -> None:
-        """Remember a photograph whose usable pixels (n, 3) are all black or all white."""
+    def _look_for_light(self, name: str, pixels: np.ndarray) -> bool:
+        """Remember a photograph whose usable pixels (n, 3) are all black or all white. Returns whether they may be used: those of
+        a black one would say that all surface that it shows is black (docs/results/stability.md#extremes)."""
         if not len(pixels):
-            return
+            return True
         if (pixels.max(1) <= (BLACK if self.encoded else 0)).mean() >= EVERYWHERE:
             self.unexposed["black"].append(name)
-        elif self.encoded and (pixels.min(1) >= WHITE).mean() >= EVERYWHERE:
+            return False
+        if self.encoded and (pixels.min(1) >= WHITE).mean() >= EVERYWHERE:
             self.unexposed["white"].append(name)
+        return True
 
     def _check_exposed(self, count: int) -> None:
         """Refuse photographs that are all black or white; note those that are."""
@@ -305,9 +308,10 @@ class _Capture:
             )
         for kind, names in found.items():
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+            what = "are not used" if kind == "black" else "say no more than that their surface is bright"
             self.notes.append(
-                f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}): check their"
-                " exposure, or leave them out"
+                f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}) and {what}: check"
+                " their exposure"
             )
 
     def _check_alignment(self, used: list[Frame], views: list[View]) -> None:

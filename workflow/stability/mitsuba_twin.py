@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iif_core.numerics.xp import DRJIT
-from iif_core.reflectance import brdf
+from workflow.exporters import mitsuba_bsdf
 
 
 @dataclass(frozen=True)
@@ -44,81 +43,21 @@ class Room:
     directions: NDArray
 
 
-def plugin() -> type:
-    """Return the BSDF class: Cook-Torrance of Eq. R.1 to R.13 on both sides, with a constant material."""
-    import drjit as dr
-    import mitsuba as mi
-
-    class CookTorrance(mi.BSDF):  # type: ignore[misc]
-        def __init__(self, props: Any):
-            super().__init__(props)
-            base = mi.Color3f(*(props[name] for name in ("red", "green", "blue")))
-            self.kd, self.ks = brdf.kd_ks(base, mi.Float(props["metallic"]))
-            self.roughness = mi.Float(props["roughness"])
-            flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
-            self.m_flags, self.m_components = flags, [flags]
-
-        def _viewer(self, si: Any) -> tuple[Any, Any]:
-            """Direction to the viewer above the surface, and the sign that puts it there."""
-            side = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -1.0, mi.Float(1))
-            return mi.Vector3f(si.wi.x, si.wi.y, si.wi.z * side), side
-
-        def _evaluate(self, viewer: Any, light: Any) -> tuple[Any, Any]:
-            """f cos and the density of a direction."""
-            normal = (mi.Float(0), mi.Float(0), mi.Float(1))
-            NoL, NoV, NoH, VoH, sin2_h = brdf.half_angles(DRJIT, normal, light, viewer)
-            diffuse, spec, fc = brdf.lobes(DRJIT, NoL, NoV, NoH, VoH, sin2_h, self.roughness)
-            chance = brdf.specular_chance(DRJIT, dr.max(self.kd), dr.max(self.ks), viewer.z)
-            pdf = brdf.mixture_pdf(DRJIT, NoL, NoH, VoH, sin2_h, self.roughness, chance)
-            value = brdf.compose(self.kd, self.ks, diffuse, spec * (1 - fc), spec * fc)
-            above = (viewer.z > 0) & (light.z > 0)
-            return dr.select(above, value, 0), dr.select(above, pdf, 0)
-
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            viewer, side = self._viewer(si)
-            chance = brdf.specular_chance(DRJIT, dr.max(self.kd), dr.max(self.ks), viewer.z)
-            half = brdf.sample_ggx_half(DRJIT, sample2.x, sample2.y, self.roughness)
-            mirrored = dr.normalize(mi.Vector3f(*brdf.reflect(viewer, half)))
-            light = dr.select(sample1 < chance, mirrored, mi.Vector3f(*brdf.sample_cosine(DRJIT, sample2.x, sample2.y)))
-            value, pdf = self._evaluate(viewer, light)
-            found = mi.BSDFSample3f()
-            found.wo = mi.Vector3f(light.x, light.y, light.z * side)
-            found.pdf, found.eta = pdf, mi.Float(1)
-            found.sampled_type, found.sampled_component = mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(0)
-            return found, dr.select(active & (pdf > 0), value / pdf, 0)
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            viewer, side = self._viewer(si)
-            return self._evaluate(viewer, mi.Vector3f(wo.x, wo.y, wo.z * side))
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[1]
-
-        def traverse(self, callback: Any) -> None:
-            pass
-
-    return CookTorrance
-
-
-NAME = "iif_cook_torrance"
-_REGISTERED: set[str] = set()
-
-
 def scene_of(room: Room) -> Any:
     """Return a room as a scene of Mitsuba (variant `llvm_ad_rgb`)."""
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    if NAME not in _REGISTERED:
-        mi.register_bsdf(NAME, plugin())
-        _REGISTERED.add(NAME)
+    mitsuba_bsdf.register()
     document: dict[str, Any] = {"type": "scene"}
     for number, part in enumerate(room.parts):
-        names = ("red", "green", "blue", "roughness", "metallic")
-        bsdf = {"type": NAME, **{name: float(value) for name, value in zip(names, part.material, strict=True)}}
+        *base, roughness, metallic = (float(value) for value in part.material)
+        bsdf = {
+            "type": mitsuba_bsdf.NAME,
+            "base_color": {"type": "rgb", "value": base},
+            "roughness": roughness,
+            "metallic": metallic,
+        }
         props = mi.Properties()
         props["mesh_bsdf"] = mi.load_dict(bsdf)
         if any(part.radiance):

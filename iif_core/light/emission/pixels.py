@@ -74,6 +74,9 @@ def choose_pixels(
 ) -> np.ndarray:
     """Draw pixels of one view: some that look at no emitter, and some for every emitter group in sight.
 
+    Every pixel draws a number, and those with the smallest ones are taken, so that a pixel more or less in the view or in a group
+    changes the choice by one pixel (docs/method/numerics.md#random-numbers-that-shift).
+
     Args:
         group: (n,) int emitter group that each pixel looks at, -1 = none.
         usable: (n,) bool.
@@ -85,12 +88,16 @@ def choose_pixels(
     Returns:
         Indices of the chosen pixels, increasing.
     """
-    on_emitter = np.flatnonzero(usable & (group >= 0))
-    chosen = [rng.permutation(np.flatnonzero(usable & (group < 0)))[:elsewhere]]
+    on_emitter, drawn = np.flatnonzero(usable & (group >= 0)), rng.random(len(group))
+
+    def some(pixels: np.ndarray, count: int) -> np.ndarray:
+        return pixels[np.argsort(drawn[pixels], kind="stable")[:count]]
+
+    chosen = [some(np.flatnonzero(usable & (group < 0)), elsewhere)]
     for g in np.unique(group[on_emitter]):
         own = on_emitter[group[on_emitter] == g]
         inner = own[interior[own]]
-        chosen.append(rng.permutation(inner if len(inner) else own)[:per_group])
+        chosen.append(some(inner if len(inner) else own, per_group))
     return np.sort(np.concatenate(chosen))
 
 

@@ -20,6 +20,10 @@ Array = np.ndarray
 
 MIN_SLOTS = 4096  # entries of the table from which emitters are drawn, at least
 
+REMAINDER_STEP = 1 / 16
+"""Remainders of slots closer than this count as equal, so that rounding does not decide between faces of equal area: one slot
+more or less moves those of all faces after it."""
+
 SHARE_LIMITS = (0.1, 0.5)
 """Bounds of the environment's share of the draws beside emitting faces, so that a wrong guess of its power starves neither."""
 
@@ -198,8 +202,8 @@ def _scaled(weight: Array, total: float) -> Array:
 def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
     """(slots uint32, pdf (m,) float32): item of every slot and count / slots / measure, the density of one draw.
 
-    Each item of positive weight owns at least one slot; the rest follow the weights by largest remainder,
-    ties to the lower id (Eq. L.10; docs/method/numerics.md#searching-a-cumulative-sum).
+    Each item of positive weight owns at least one slot; the rest follow the weights by largest remainder in steps of
+    REMAINDER_STEP, ties to the lower id (Eq. L.10; docs/method/numerics.md#searching-a-cumulative-sum).
     """
     pdf = np.zeros(len(weight), np.float32)
     items = np.flatnonzero(weight > 0)
@@ -210,6 +214,6 @@ def _slots(weight: Array, measure: Array) -> tuple[Array, Array]:
     share *= (count - len(items)) / share.sum()
     counts = 1 + np.floor(share).astype(np.int64)
     rest = count - counts.sum()
-    counts[np.argsort(-(share - np.floor(share)), kind="stable")[:rest]] += 1
+    counts[np.argsort(-np.round((share - np.floor(share)) / REMAINDER_STEP), kind="stable")[:rest]] += 1
     pdf[items] = counts / count / measure[items]
     return np.repeat(items, counts).astype(np.uint32), pdf

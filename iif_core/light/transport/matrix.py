@@ -92,6 +92,7 @@ def transport_matrix(
     columns: EmitterColumns,
     paths: PathOptions,
     texel_weight: ArrayLike | None = None,
+    number: Array | None = None,
 ) -> tuple[Array, Array]:
     """Trace the transport matrix (Eq. L.14): a point reflects A @ E + h by each lobe, for emitter radiances E (G, 3).
 
@@ -103,6 +104,7 @@ def transport_matrix(
         columns: which faces and texels share an unknown radiance. A map of one texel is found by directions of the BRDF alone.
         paths: bounces include the point.
         texel_weight: (H, W) how often texels are drawn, None = by solid angle.
+        number: (n,) uint32, by which the points draw their random numbers; None = by their order.
 
     Returns:
         A (n, 2, G, 3) float32 by the diffuse (0) and the specular (1) lobe, and h (n, 2, 3) float32, the radiance that paths
@@ -132,7 +134,7 @@ def transport_matrix(
         rows = dr.zeros(mi.Float, batch.lanes * max(width, 1))
         lane = dr.arange(mi.UInt32, batch.lanes)
         world = World(scene, _ColumnCollector(rows, lane, n_groups, group_of_face, group_of_texel))
-        random, start = batch.streams(paths.seed), batch.spread(mi.Point3f, position)
+        random, start = batch.streams(paths.seed, number), batch.spread(mi.Point3f, position)
         normal, towards = batch.spread(mi.Vector3f, normals), batch.spread(mi.Vector3f, wo)
         material = batch.spread(mi.Color3f, kd), batch.spread(mi.Color3f, ks), batch.spread(mi.Float, roughness)
         vertex = Vertex(offset_from(start, normal), normal, towards, *material)
