@@ -22,6 +22,15 @@ def test_pixels_are_drawn_evenly_and_border_pixels_only_where_there_are_no_other
     assert np.bincount(group[few] + 1).tolist() == [100, 9, 20]
 
 
+def test_a_pixel_more_or_less_changes_the_draw_by_one_pixel():
+    rng = np.random.default_rng(5)
+    group, interior, usable = rng.integers(-1, 3, 4000), rng.random(4000) < 0.8, rng.random(4000) < 0.9
+    drawn = choose_pixels(group, usable, interior, 500, 50, np.random.default_rng(0))
+    for out in rng.choice(drawn, 20):
+        fewer = choose_pixels(group, usable & (np.arange(4000) != out), interior, 500, 50, np.random.default_rng(0))
+        assert set(drawn) - set(fewer) == {out} and len(fewer) == len(drawn)
+
+
 def test_tiles_are_squares_of_eight_pixels():
     index = np.arange(20 * 17)
     tile = tile_of(index, 20)

@@ -5,6 +5,7 @@ import os
 import shutil
 import struct
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_direct
 from iif_core.errors import InputError
 from iif_core.surface.triangles import subdivide, vertex_normals
 from workflow.exporters.glb import glb_bytes, rotation_to_y
-from workflow.exporters.mitsuba_scene import mitsuba_files
+from workflow.exporters.mitsuba_scene import mitsuba_files, slivers
 from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, up_axis
 from workflow.runtime import native
 from workflow.scene.normal_form import View
@@ -349,7 +350,8 @@ def test_mitsuba_files_are_plain():
     tree = ElementTree.fromstring(text)
     names = [node.get("value") for node in tree.iter("string") if node.get("name") == "filename"]
     assert names == ["meshes/walls.ply", "meshes/white_box.ply", "meshes/lamp.emitter0.ply"]
-    assert set(names) | {"scene.xml"} == set(files)
+    program = {"render.py", *(f"iif_bsdf/{name}.py" for name in ("__init__", "xp", "brdf", "mitsuba_bsdf"))}
+    assert set(names) | {"scene.xml"} | program == set(files)
     assert [node.get("id") for node in tree.iter("sensor")] == ["view-a", "view-b & c"]
     assert [node.get("type") for node in tree.iter("emitter")] == ["area", "constant"]
     assert "0.04" in text and "principled" in text
@@ -359,7 +361,7 @@ def test_names_that_clash_on_disk():
     parts = list(parts_of(room()).values())
     renamed = [replace(part, name=name) for part, name in zip(parts, ["A/b", "a b", "..."], strict=True)]
     files = mitsuba_files(renamed, [view()], np.zeros(3))
-    lower = [name.lower() for name in files]
+    lower = [name.lower() for name in files if name.startswith(("scene", "meshes"))]
     assert len(set(lower)) == len(lower) == 4
     assert all(".." not in name for name in files)
 
@@ -420,6 +422,41 @@ def test_mitsuba_renders_what_we_render(mi, tmp_path, monkeypatch):
     assert (structure(shifted) * structure(ours)).mean() < 0.9
 
 
+def test_the_program_beside_the_scene_renders_what_we_render(mi, tmp_path):
+    """It needs nothing of the project, and has the exact reflectance: a difference is noise alone."""
+    parts, camera = list(parts_of(room(), 0.1, 20000).values()), view()
+    folder = written(tmp_path / "out", mitsuba_files(parts, [camera], np.zeros(3))).parent
+    programs = [*folder.glob("iif_bsdf/*.py"), folder / "render.py"]
+    assert not any(line.startswith(("from iif_core", "from workflow")) for file in programs for line in file.read_text().splitlines())
+    command = [sys.executable, str(folder / "render.py"), "--samples", "512", "--output", str(tmp_path / "room.exr")]
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(command, cwd=tmp_path, env=clean, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    theirs, ours = np.array(mi.Bitmap(str(tmp_path / "room.exr")))[..., :3], own_render(parts, camera, 512)
+    assert theirs.mean() == pytest.approx(ours.mean(), rel=0.01)
+    assert np.median(np.abs(theirs / ours - 1)) < 0.05
+    wrong = subprocess.run([*command, "--view", "z"], cwd=tmp_path, env=clean, capture_output=True, text=True, timeout=120)
+    assert wrong.returncode == 2 and "no view z; there are a" in wrong.stderr
+
+
+def test_slivers_are_no_hole_and_no_nan(mi, tmp_path):
+    """Mitsuba cannot interpolate on a face of 6 m x 1 mm: it gets its material as a whole."""
+    scene = room()
+    part = parts_of(scene, 0.1)["walls"]
+    first = len(part.vertices)
+    thin = np.array([[0.3, 1.0, 1.0], [3.7, 1.0, 1.0], [2.0, 1.0, 1.0004]], np.float32)
+    ends = {name: np.concatenate([getattr(part, name), getattr(part, name)[:3]]) for name in ("albedo", "normals", "roughness", "metallic")}
+    part = replace(part, vertices=np.concatenate([part.vertices, thin]), faces=np.r_[part.faces, [[first, first + 1, first + 2]]], **ends)
+    files = mitsuba_files([part], [view()], np.zeros(3))
+    assert "meshes/walls.slivers.ply" in files and slivers(part).sum() == 1
+    loaded = mi.load_file(str(written(tmp_path, files)))
+    thin_shape = next(shape for shape in loaded.shapes() if "slivers" in shape.id())
+    x = np.linspace(0.5, 3.5, 1000).astype(np.float32)
+    si = loaded.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.5, 1.00005), mi.Vector3f(0, 1, 0)))
+    assert np.array(si.shape == mi.ShapePtr(thin_shape)).mean() > 0.5
+    assert np.isfinite(np.array(si.bsdf().eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, 1)))).all()
+
+
 def test_surface_that_lets_light_through(mi, tmp_path):
     """The box lets half of the light through: in Mitsuba's renderer as in ours, and as alpha in glTF."""
     scene = replace(room(), transmittance=np.array([0, 0.5, 0], np.float32))
@@ -432,8 +469,7 @@ def test_surface_that_lets_light_through(mi, tmp_path):
     solid = own_render(list(parts_of(room(), 0.1).values()), camera, 256)
     on_box = np.abs(ours - solid).mean(-1) > 0.15 * solid.mean()
     assert on_box.mean() > 0.02
-    # The ratio of the two renderers is that of their reflectances, on the box as elsewhere.
-    assert theirs[on_box].mean() / ours[on_box].mean() == pytest.approx(theirs[~on_box].mean() / ours[~on_box].mean(), rel=0.06)
+    assert theirs[on_box].mean() == pytest.approx(ours[on_box].mean(), rel=0.05)
     document, _ = chunks_of(glb_bytes(list(parts.values()), scene.up, {}))
     alphas = {m["name"]: (m.get("alphaMode"), m["pbrMetallicRoughness"]["baseColorFactor"][3]) for m in document["materials"]}
     assert alphas["white <box>"] == ("BLEND", 0.5) and alphas["walls"] == (None, 1.0)

@@ -78,6 +78,23 @@ def test_adjacency_of_a_grid():
     np.testing.assert_array_equal(segments.face_adjacency(own, split), pairs)
 
 
+def test_vertices_at_one_position_to_rounding_are_one():
+    """Every face has corners of its own, each a few spacings off: the neighbours are those of the joined mesh."""
+    n = 12
+    i, j = (axis.ravel() for axis in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    a = i * (n + 1) + j
+    faces = np.concatenate([np.stack([a, a + n + 1, a + n + 2], 1), np.stack([a, a + n + 2, a + 1], 1)])
+    grid = np.stack(np.meshgrid(np.arange(n + 1), np.arange(n + 1), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    grid = (0.05 * grid + [3.0, -1.0, 2.0]).astype(np.float32)
+    split, own = grid[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    rng = np.random.default_rng(0)
+    moved = np.nextafter(split, np.where(rng.random(split.shape) < 0.5, np.inf, -np.inf).astype(np.float32))
+    np.testing.assert_array_equal(segments.face_adjacency(own, moved), segments.face_adjacency(faces))
+    # A gap that is wider than rounding stays one: every other face 0.1 mm aside.
+    apart = split + np.float32(1e-4) * (np.arange(len(split)) // 3 % 2).astype(np.float32)[:, None]
+    assert len(segments.face_adjacency(own, apart)) < len(segments.face_adjacency(faces))
+
+
 def test_adjacency_of_odd_meshes():
     assert segments.face_adjacency(np.zeros((0, 3), int)).shape == (0, 2)
     assert segments.face_adjacency(np.array([[0, 1, 1]])).shape == (0, 2)

@@ -103,6 +103,17 @@ def test_light_slots_have_the_density_they_report(T):
     assert np.sum(emitters.pdf_area * geometry.areas) == pytest.approx(1)
 
 
+def test_rounding_does_not_decide_between_faces_of_equal_weight(T):
+    """100 faces of equal area share 4096 slots, some one more than others: which ones does not depend on the last bits."""
+    geometry = T.build_geometry(*merge([quad((x, 0, 0), (0.9, 0, 0), (0, 1, 0)) for x in range(50)]))
+    rng = np.random.default_rng(2)
+    slots = []
+    for _ in range(10):
+        weight = np.where(np.arange(100) % 2, 0.3, 0.7) * (1 + rng.integers(-4, 5, 100) * np.finfo(np.float32).eps)
+        slots.append(T.Emitters(geometry, np.zeros((100, 3)), sampling_weight=weight).slots)
+    assert all((one == slots[0]).all() for one in slots)
+
+
 def test_sampling_weights_do_not_change_the_mean(T, room):
     n, direction = 6000, room.directions[len(room.directions) // 2]
     means = []

@@ -10,10 +10,12 @@ import math
 import re
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iif_core.numerics import xp
 from iif_core.reflectance import brdf
@@ -51,6 +53,8 @@ ENVIRONMENT_ROWS = 256
 
 MASKS = 8
 """Passages through surface that lets light through that a path may have in addition."""
+THINNEST = 1e-3
+"""Height of a face over its longest edge below which it counts as a sliver."""
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
@@ -69,9 +73,12 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
     files = exact_files()
     body = []
     for part, stem in zip(parts, _stems(parts), strict=True):
-        name = f"meshes/{stem}.ply"
-        files[name] = ply_bytes(part)
-        body.append(_shape(part, name))
+        thin = slivers(part) & (part.emitter_id < 0)
+        for some, suffix in ((~thin, ""), (thin, ".slivers")):
+            if some.any():
+                name = f"meshes/{stem}{suffix}.ply"
+                files[name] = ply_bytes(replace(part, faces=part.faces[some]), of_faces=bool(suffix))
+                body.append(_shape(part, name, "face" if suffix else "vertex"))
         if part.emitter_id >= 0 and part.double_sided:
             back = f"meshes/{stem}.back.ply"
             files[back] = ply_bytes(part, back=True)
@@ -121,25 +128,41 @@ def _environment_exr(environment: np.ndarray) -> bytes:
         return path.read_bytes()
 
 
-def ply_bytes(part: Part, back: bool = False) -> bytes:
-    """Return a binary PLY of x y z, nx ny nz, albedo_0..2, roughness_0, metallic_0, and diffuse_0..2 and specular_0..2 of
-    `mitsuba_lobes.blended`. Mitsuba reads them as `vertex_albedo` and so on.
+def slivers(part: Part) -> NDArray:
+    """Return which faces (F,) are too thin for Mitsuba to interpolate the attributes of their corners: its barycentric coordinates
+    divide by a determinant that cancels in single precision, and the result is NaN."""
+    a, b, c = part.vertices[part.faces].astype(np.float64).transpose(1, 0, 2)
+    longest = np.max([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))], 0)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) < THINNEST * longest
+
+
+def ply_bytes(part: Part, back: bool = False, of_faces: bool = False) -> bytes:
+    """Return a binary PLY of x y z, nx ny nz; and albedo_0..2, roughness_0, metallic_0, with diffuse_0..2 and specular_0..2 of
+    `mitsuba_lobes.blended`, of the vertices or of the faces. Mitsuba reads them as `vertex_albedo` or `face_albedo` and so on.
 
     With `back` it is the other side of the same sheet, moved by `BACK_OFFSET` so that a ray meets only one of the two.
     """
-    names = ["x", "y", "z", "nx", "ny", "nz", "albedo_0", "albedo_1", "albedo_2", "roughness_0", "metallic_0"]
-    names += [f"{lobe}_{c}" for lobe in ("diffuse", "specular") for c in range(3)]
+    attributes = ["albedo_0", "albedo_1", "albedo_2", "roughness_0", "metallic_0"]
+    attributes += [f"{lobe}_{c}" for lobe in ("diffuse", "specular") for c in range(3)]
+    materials = part.albedo, part.roughness[:, None], part.metallic[:, None]
+    if of_faces:
+        materials = tuple(values[part.faces].mean(1) for values in materials)
+    values = np.concatenate([*materials, *blended(materials[0], materials[1][:, 0], materials[2][:, 0])], 1).astype("<f4")
     normals = -part.normals if back else part.normals
     vertices = part.vertices + BACK_OFFSET * normals if back else part.vertices
-    lobes = blended(part.albedo, part.roughness, part.metallic)
-    columns = [vertices, normals, part.albedo, part.roughness[:, None], part.metallic[:, None], *lobes]
-    faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
+    columns = np.concatenate([vertices, normals] if of_faces else [vertices, normals, values], 1).astype("<f4")
+    own = [(name, "<f4") for name in attributes] if of_faces else []
+    faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3), *own]))
     faces["count"] = 3
     faces["corner"] = part.faces[:, ::-1] if back else part.faces
+    for (name, _), column in zip(own, values.T, strict=False):
+        faces[name] = column
+    names = ["x", "y", "z", "nx", "ny", "nz", *([] if of_faces else attributes)]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(part.vertices)}"]
     header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    return "\n".join(header).encode() + np.concatenate(columns, 1).astype("<f4").tobytes() + faces.tobytes()
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += [f"property float {name}" for name, _ in own] + ["end_header", ""]
+    return "\n".join(header).encode() + columns.tobytes() + faces.tobytes()
 
 
 def _stems(parts: Sequence[Part]) -> list[str]:
@@ -155,7 +178,7 @@ def _stems(parts: Sequence[Part]) -> list[str]:
     return out
 
 
-def _shape(part: Part, file: str) -> str:
+def _shape(part: Part, file: str, place: str = "vertex") -> str:
     lines = [f'\t<shape type="ply" id={quoteattr(file.removeprefix("meshes/").removesuffix(".ply"))}>']
     lines.append(f'\t\t<string name="filename" value={quoteattr(file)}/>')
     if part.emitter_id >= 0:
@@ -165,15 +188,15 @@ def _shape(part: Part, file: str) -> str:
         if part.opacity < 1:
             lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
         lines += ['\t\t<bsdf type="twosided"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>']
-        lines += [f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", "diffuse")}</bsdf>', '\t\t\t<bsdf type="principled">']
-        lines += [f"\t\t\t\t{_attribute(*names)}" for names in (("base_color", "specular"), ("roughness", "roughness"))]
+        lines += [f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", place, "diffuse")}</bsdf>', '\t\t\t<bsdf type="principled">']
+        lines += [f"\t\t\t\t{_attribute(name, place, of)}" for name, of in (("base_color", "specular"), ("roughness", "roughness"))]
         lines += ['\t\t\t\t<float name="metallic" value="1"/>', "\t\t\t</bsdf>", "\t\t</bsdf></bsdf>"]
         lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])
 
 
-def _attribute(parameter: str, name: str) -> str:
-    text = f'<string name="name" value="vertex_{name}"/>'
+def _attribute(parameter: str, place: str, name: str) -> str:
+    text = f'<string name="name" value="{place}_{name}"/>'
     return f'<texture type="mesh_attribute" name="{parameter}">{text}</texture>'
 
 
