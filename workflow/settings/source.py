@@ -15,9 +15,11 @@ class BuiltinSource(Section):
 
     kind: Literal["builtin"]
     scene: Literal[
-        "kitchen", "matte", "tiny", "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening"
-    ] = "kitchen"
-    """`kitchen`: a furnished room; `matte`: the same in matte paint, without gloss and metal; `tiny`: a few boxes, for tests; the
+        "kitchen", "matte", "tiny", "tiny-gloss", "tiny-black-metal", "tiny-white", "tiny-lamp",
+        "sky", "sun", "blinds", "curtains", "door", "lamps", "gloss", "white", "single", "evening",
+    ] = "kitchen"  # fmt: skip
+    """`kitchen`: a furnished room; `matte`: the same in matte paint, without gloss and metal; `tiny`: a few boxes, for tests, and
+    the same with extreme materials and lamps (docs/results/stability.md#extremes); the
     others: rooms of the test bed, which differ in how light enters them (docs/development/rooms.md)."""
     quarterings: int = Field(0, ge=0, le=4)
     """How often every face of its mesh is split into four. The room stays the same; a scan is finer, and costs more."""

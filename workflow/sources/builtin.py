@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 Array = np.ndarray
 
 RESPONSE = "filmic"
-MAX_BOUNCES = 16
 METERING_PIXELS = 4096  # per view; their radiance sets the exposure
 COVERAGE_POINTS = 8000
 
@@ -121,7 +120,7 @@ class _Capture:
         steps = direction_derivatives(view.fx, view.fy, view.world_from_camera)
         seed = int(np.random.SeedSequence([self.job.seed, view.view_id]).generate_state(1)[0])
         scene = Scene(self.geometry, self.material, self.emitters)
-        image = render(scene, origin, rays, PathOptions(self.settings.samples, MAX_BOUNCES, seed), jitter=steps)
+        image = render(scene, origin, rays, PathOptions(self.settings.samples, self.room.max_bounces, seed), jitter=steps)
         if self.settings.denoise:
             normal = np.where(hit[:, None], -np.sign(cosine)[:, None] * self.surface.normals[on], 0)
             image = denoise(*(a.reshape(*shape, 3) for a in (image, albedo, normal))).reshape(-1, 3)
@@ -165,7 +164,7 @@ class _Capture:
         reachable = (views_of_point > 0) | (count(self.room.cameras(len(self.room.shots)), 1.0) > 0)
         once, twice = (float((views_of_point[reachable] >= n).mean()) for n in (1, 2))
         self.job.log.info("of the visible surface %.1f %% are seen, %.1f %% twice or more", 100 * once, 100 * twice)
-        notes = [f"{len(self.scan.names)} objects, {len(self.scan.faces)} faces; up to {MAX_BOUNCES} bounces"]
+        notes = [f"{len(self.scan.names)} objects, {len(self.scan.faces)} faces; up to {self.room.max_bounces} bounces"]
         if self.response is not None:
             notes.append(f"8-bit photographs through the response `{self.response.name}`; exposures differ")
         if self.settings.denoise:

@@ -181,7 +181,7 @@ def run(capture: Capture, folder: Path) -> Result:
     """Write a capture to a folder as the stages `SOURCES` would have, and run the stages `FITTED` on it."""
     _write(capture, folder)
     run_stages(folder, capture.document, FITTED, capture.threads)
-    return _read(capture, folder)
+    return read(capture, folder)
 
 
 def _write(capture: Capture, folder: Path) -> None:
@@ -213,7 +213,8 @@ def _write(capture: Capture, folder: Path) -> None:
     prior.finish()
 
 
-def _read(capture: Capture, folder: Path) -> Result:
+def read(capture: Capture, folder: Path) -> Result:
+    """Read what the stages wrote to a folder."""
     def reader(stage: str) -> StageReader:
         return StageReader(folder / stage, stage, "free")
 
@@ -244,7 +245,12 @@ def _read(capture: Capture, folder: Path) -> Result:
         outside.mean(0) if len(outside) else np.zeros(3),
         {item["component"]: bool(item["included"]) for plan in plans for item in plan["plan"]},
         weight.reshape(-1, numbers, 3).argmax(1),
-        {"base": base.json("base.json"), "emission": plans[1], "affines": affines.json("affines.json")},
+        {
+            "base": base.json("base.json"),
+            "emission": plans[1],
+            "shading": shading.json("shading.json"),
+            "affines": affines.json("affines.json"),
+        },
     )
 
 

@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.errors import InputError
+from workflow.decisions import numerics
 from workflow.stability import chain
 from workflow.stability.accuracy import Accuracy, accuracy
 from workflow.stability.chain import Capture
 
 
 class Extreme(NamedTuple):
-    """Accuracy of a room at one extreme; `says` is the message where it is refused, and `seconds` those of the stages."""
+    """Accuracy of a room at one extreme; `says` what the stages warn of, or the message where it is refused; `seconds`: of the
+    stages."""
 
     room: str
     extreme: str
@@ -100,9 +102,14 @@ def _with_more(capture: Capture, faces: NDArray, instance: NDArray, emission: ND
 
 def _hidden(times: int) -> Change:
     """So many times as many faces, in a sheet far outside that nothing sees."""
+    return lambda capture: _hidden_faces(times * len(capture.faces))(capture)
+
+
+def _hidden_faces(count: int) -> Change:
+    """About so many faces more, in a sheet far outside that nothing sees."""
 
     def apply(capture: Capture) -> Capture:
-        side = int(np.ceil(np.sqrt(times * len(capture.faces) / 2)))
+        side = int(np.ceil(np.sqrt(count / 2)))
         low = capture.vertices.min(0) - 5
         i, j = (axis.ravel() for axis in np.meshgrid(np.arange(side + 1), np.arange(side + 1), indexing="ij"))
         vertices = low + np.stack([i, j, np.zeros_like(i)], 1).astype(np.float32) / side
@@ -111,14 +118,47 @@ def _hidden(times: int) -> Change:
         faces = np.concatenate([np.stack([a, b, b + 1], 1), np.stack([a, b + 1, a + 1], 1)]) + len(capture.vertices)
         whole = replace(capture, vertices=np.concatenate([capture.vertices, vertices.astype(np.float32)]))
         whole = replace(whole, names=(*capture.names, "hidden"))
-        count = len(faces)
-        return _with_more(whole, faces.astype(np.int32), np.full(count, len(capture.names)), np.zeros((count, 3)))
+        hidden = len(faces)
+        return _with_more(whole, faces.astype(np.int32), np.full(hidden, len(capture.names)), np.zeros((hidden, 3)))
 
     return apply
 
 
 def _levels(count: int) -> Change:
     return _photos(lambda image, _: np.round(image * (count - 1)) / (count - 1))
+
+
+def _unlit(capture: Capture) -> Capture:
+    """One photograph is black, and its pixels are marked unusable, as the source of a folder does."""
+    changed = _photos(lambda image, view: image * (view != 1))(capture)
+    names = {view.name: view.view_id for view in capture.views}
+    return replace(changed, valid={name: valid & (names[name] != 1) for name, valid in capture.valid.items()})
+
+
+def _planted(scene: str, size: int = 48) -> dict[str, dict[str, Any]]:
+    return {"source": {"scene": scene}, "capture": {"width": size, "height": size}}
+
+
+def _spoilt(value: float) -> Change:
+    """One pixel in a hundred of the files has this value; they are read as those of a folder are."""
+    import OpenEXR
+
+    from workflow.sources.folder_scene.images import load_photo
+
+    def apply(capture: Capture) -> Capture:
+        photo, valid = dict(capture.photo), dict(capture.valid)
+        with tempfile.TemporaryDirectory() as place:
+            for view in capture.views:
+                image = capture.photo[view.name]
+                bad = np.random.default_rng([29, view.view_id]).random(image.shape[:2]) < 0.01
+                image = np.where(bad[..., None], np.float32(value), image).astype(np.float32)
+                file = Path(place) / f"{view.name}.exr"
+                OpenEXR.File({}, {"RGB": image}).write(str(file))
+                read = load_photo(file)
+                photo[view.name], valid[view.name] = read.pixels, capture.valid[view.name] & read.valid
+        return replace(capture, photo=photo, valid=valid)
+
+    return apply
 
 
 LDR, HDR = ("kitchen",), ("tiny",)
@@ -130,17 +170,27 @@ CASES = (
     Case("64 predictions", settings={"prior": {"samples": 64}}, rooms=HDR),
     Case("349 photographs", settings={"capture": {"views": 349}}, rooms=HDR),
     Case("one black photograph", _photos(lambda image, view: image * (view != 1))),
+    Case("the same, its pixels not used", _unlit),
     Case("one saturated photograph", _photos(lambda image, view: np.ones_like(image) if view == 1 else image), rooms=LDR),
     Case("all photographs saturated", _photos(lambda image, _: np.ones_like(image)), rooms=LDR),
     Case("all photographs black", _photos(lambda image, _: 0 * image)),
     Case("4 grey levels", _levels(4), rooms=LDR),
     Case("16 grey levels", _levels(16), rooms=LDR),
     Case("a pixel of 1e6 in every photograph", _photos(lambda image, _: _one_hot(image, 1e6)), rooms=HDR),
+    Case("1 % of the pixels NaN", _spoilt(np.nan), rooms=HDR),
+    Case("1 % of the pixels infinite", _spoilt(np.inf), rooms=HDR),
+    Case("1 % of the pixels negative", _spoilt(-1.0), rooms=HDR),
+    Case("roughness 0.02 and 1", settings=_planted("tiny-gloss"), rooms=HDR),
+    Case("metal of base colour 0", settings=_planted("tiny-black-metal"), rooms=HDR),
+    Case("albedo 0.95 everywhere", settings=_planted("tiny-white"), rooms=HDR),
+    Case("lamp of 4 cm2 and 1e6, smaller than a pixel", settings=_planted("tiny-lamp"), rooms=HDR),
+    Case("the same in 384 x 384 pixels", settings=_planted("tiny-lamp", 384), rooms=HDR),
     Case("one object", _one_object),
     Case("every face an object", _face_objects(60_000), rooms=HDR),
     Case("5,000 objects, faces dealt in turn", _face_objects(5000), rooms=LDR),
     Case("faces without area and slivers", _slivers),
     Case("99 % of the faces hidden", _hidden(99)),
+    Case("20 million faces hidden", _hidden_faces(20_000_000), rooms=HDR),
     Case("temperature 1e-12", _settings(base={"temperature": 1e-12, "final_temperature": 0.0})),
     Case("temperature 1e6", _settings(base={"temperature": 1e6, "final_temperature": 1e6})),
 )
@@ -150,6 +200,13 @@ def _one_hot(image: NDArray, value: float) -> NDArray:
     out = image.copy()
     out[len(out) // 2, len(out) // 2] = value
     return out
+
+
+def _warnings(result: chain.Result) -> list[str]:
+    """What the stages say of their own result: figures beyond their limits, and that there is no light."""
+    documents = result.documents
+    notes = [note for note in documents["emission"].get("notes", []) if note.startswith("no emitter")]
+    return [*notes, *numerics.warnings(documents.items())]
 
 
 def measure(cases: tuple[Case, ...] = CASES, rooms: tuple[str, ...] = tuple(chain.ROOMS)) -> Iterator[Extreme]:
@@ -171,4 +228,5 @@ def measure(cases: tuple[Case, ...] = CASES, rooms: tuple[str, ...] = tuple(chai
                 except InputError as error:
                     yield Extreme(room, case.name, None, time.monotonic() - start, str(error))
                     continue
-                yield Extreme(room, case.name, accuracy(result, capture), time.monotonic() - start)
+                found, seconds = accuracy(result, capture), time.monotonic() - start
+                yield Extreme(room, case.name, found, seconds, "; ".join(_warnings(result)))

@@ -57,6 +57,7 @@ class Room:
         environment: (H, W, 3) float32 radiance of what surrounds the room (`iif_core.light.environment`); None = nothing.
         scanned: object id -> shape that the delivered mesh has in place of the object's own.
         one_object: the delivered mesh tells no objects apart.
+        max_bounces: longest path of its photographs.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Room:
     environment: np.ndarray | None = None
     scanned: Mapping[int, Shape] = field(default_factory=dict)
     one_object: bool = False
+    max_bounces: int = 16
 
     @property
     def scan(self) -> Scan:
