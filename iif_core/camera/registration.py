@@ -18,6 +18,8 @@ SIGMA_ROTATION, SIGMA_TRANSLATION = 0.02, 0.03
 """Standard deviation of the correction of a view: radians, metres."""
 SIGMA_PRINCIPAL, SIGMA_FOCAL = 0.02, 0.02
 """Standard deviation of the common corrections, relative to the focal length."""
+DARK = 0.06
+"""Luminance relative to the median below which texture counts as noise; an 8-bit photograph has some five levels there."""
 BLURS = (2.5, 1.2, 0.7)
 """Standard deviations of the successive blurs of the feature images, in pixels."""
 STEPS_PER_BLUR = 6
@@ -94,11 +96,16 @@ class Registration:
 def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Compute log luminance less its surroundings (6 % of the width), in units of 0.35, clipped to +-3 (Eq. C.29).
 
-    The result, (H, W) float64, does not depend on exposure, white balance, vignetting and slow shading.
+    Luminance is relative to its median, and `DARK` is added before the logarithm. The result, (H, W) float64, does not depend on
+    exposure, white balance, vignetting and slow shading.
     """
     from scipy.ndimage import gaussian_filter
 
-    grey = np.log(0.02 + np.where(usable, np.nan_to_num(np.asarray(image, np.float64)).clip(0).mean(-1), 0.0))
+    grey = np.where(usable, np.nan_to_num(np.asarray(image, np.float64)).clip(0).mean(-1), 0.0)
+    level = float(np.median(grey[usable])) if usable.any() else 0.0
+    if not level > 0:
+        return np.zeros(grey.shape)  # black for the most part: noise is all that there is
+    grey = np.log(DARK + grey / level)
     weight = usable.astype(np.float64)
     sigma = max(2.0, 0.06 * image.shape[1])
     around = gaussian_filter(grey * weight, sigma) / np.maximum(gaussian_filter(weight, sigma), 1e-6)
@@ -135,6 +142,15 @@ def photo_edges(feature: np.ndarray, blur: float) -> np.ndarray:
     dv, du = np.gradient(gaussian_filter(feature, 0.7))
     size = gaussian_filter(np.minimum(np.hypot(du, dv), 1.0), blur)
     return np.clip(size / max(float(np.quantile(size, 0.95)), 1e-9), 0.0, 1.0)
+
+
+def first_step(photos: Sequence[Photo], points: int = 12_000) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the normal equations of the first step of `register`, (6 V + 3, 6 V + 3) and (6 V + 3,), and its solution, for
+    measurements of their arithmetic."""
+    features = [feature_image(p.image, p.usable) for p in photos]
+    maps, start = [_Maps.of(f, BLURS[0]) for f in features], _Cameras.of(photos)
+    normal, right = normal_equations(photos, maps, start, _overlap(photos, features, points), [_edge_points(p) for p in photos])
+    return normal, right, np.linalg.solve(normal, right)
 
 
 def register(photos: Sequence[Photo], points: int = 12_000, intrinsics: bool = True, poses: bool = True) -> Registration:
@@ -406,6 +422,20 @@ def _step(
     free: np.ndarray,
 ) -> np.ndarray:
     """Compute one Gauss-Newton step (6 V + 3,): twists, principal point, log focal length."""
+    views = len(photos)
+    normal, right = normal_equations(photos, maps, state, rows, edges)
+    unknowns = np.flatnonzero(free)
+    step = np.zeros(len(right))
+    if len(unknowns):
+        step[unknowns] = np.linalg.solve(normal[np.ix_(unknowns, unknowns)], right[unknowns])
+    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
+    return np.clip(step, -limit, limit)
+
+
+def normal_equations(
+    photos: Sequence[Photo], maps: Sequence[_Maps], state: _Cameras, rows: _Rows, edges: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix (6 V + 3, 6 V + 3) and the right-hand side of a step, texture values eliminated and prior added."""
     from scipy.sparse import coo_matrix
 
     views = len(photos)
@@ -444,12 +474,7 @@ def _step(
     sum_of_steps = np.r_[state.twist.ravel(), state.principal, np.log(state.focal)]
     normal[np.diag_indices(size)] += precision
     right -= precision * sum_of_steps
-    unknowns = np.flatnonzero(free)
-    step = np.zeros(size)
-    if len(unknowns):
-        step[unknowns] = np.linalg.solve(normal[np.ix_(unknowns, unknowns)], right[unknowns])
-    limit = np.r_[np.tile(np.repeat([0.02, 0.03], 3), views), [0.02, 0.02, 0.02]]
-    return np.clip(step, -limit, limit)
+    return normal, right
 
 
 def _add_edges(

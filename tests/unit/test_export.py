@@ -427,7 +427,9 @@ def test_the_program_beside_the_scene_renders_what_we_render(mi, tmp_path):
     parts, camera = list(parts_of(room(), 0.1, 20000).values()), view()
     folder = written(tmp_path / "out", mitsuba_files(parts, [camera], np.zeros(3))).parent
     programs = [*folder.glob("iif_bsdf/*.py"), folder / "render.py"]
-    assert not any(line.startswith(("from iif_core", "from workflow")) for file in programs for line in file.read_text().splitlines())
+    assert not any(
+        line.startswith(("from iif_core", "from workflow")) for file in programs for line in file.read_text().splitlines()
+    )
     command = [sys.executable, str(folder / "render.py"), "--samples", "512", "--output", str(tmp_path / "room.exr")]
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(command, cwd=tmp_path, env=clean, capture_output=True, text=True, timeout=120)
@@ -445,8 +447,13 @@ def test_slivers_are_no_hole_and_no_nan(mi, tmp_path):
     part = parts_of(scene, 0.1)["walls"]
     first = len(part.vertices)
     thin = np.array([[0.3, 1.0, 1.0], [3.7, 1.0, 1.0], [2.0, 1.0, 1.0004]], np.float32)
-    ends = {name: np.concatenate([getattr(part, name), getattr(part, name)[:3]]) for name in ("albedo", "normals", "roughness", "metallic")}
-    part = replace(part, vertices=np.concatenate([part.vertices, thin]), faces=np.r_[part.faces, [[first, first + 1, first + 2]]], **ends)
+    ends = {
+        name: np.concatenate([getattr(part, name), getattr(part, name)[:3]])
+        for name in ("albedo", "normals", "roughness", "metallic")
+    }
+    part = replace(
+        part, vertices=np.concatenate([part.vertices, thin]), faces=np.r_[part.faces, [[first, first + 1, first + 2]]], **ends
+    )
     files = mitsuba_files([part], [view()], np.zeros(3))
     assert "meshes/walls.slivers.ply" in files and slivers(part).sum() == 1
     loaded = mi.load_file(str(written(tmp_path, files)))

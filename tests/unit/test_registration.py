@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from iif_core.camera.registration import Photo, register
+from iif_core.camera.registration import Photo, feature_image, register
 from iif_core.errors import InputError
 from tests.unit.painted_room import FOCAL, look, off, posed, room, twisted
 
@@ -28,6 +28,15 @@ def test_poses_are_found_again(photos: list[Photo]) -> None:
     # A common drift of half a pixel remains, because texture slides along the surface and only edges prevent it.
     assert np.median(after) < 0.6
     assert found.held_out[1] < 0.5 * found.held_out[0]
+
+
+def test_features_do_not_depend_on_the_unit_of_radiance(photos: list[Photo]) -> None:
+    image, usable = photos[0].image, photos[0].usable
+    usual = feature_image(image, usable)
+    assert usual.std() > 0.1
+    for factor in (1e-30, 1e-6, 1e6, 1e30):
+        np.testing.assert_allclose(feature_image(factor * image, usable), usual, atol=1e-9)
+    assert not feature_image(0 * image, usable).any() and not feature_image(image, usable & False).any()
 
 
 def test_a_common_shift_of_the_principal_point_is_found(photos: list[Photo]) -> None:

@@ -19,8 +19,8 @@ def register() -> None:
 
 
 def plugin() -> type:
-    """Return the class: Cook-Torrance of Eq. R.1 to R.13 on both sides; parameters base_color, roughness and metallic, each a texture
-    or a constant."""
+    """Return the class: Cook-Torrance of Eq. R.1 to R.13 on both sides; parameters base_color, roughness and metallic, each a
+    texture or a constant."""
     import drjit as dr
     import mitsuba as mi
 

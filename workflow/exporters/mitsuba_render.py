@@ -37,7 +37,7 @@ def exact_scene(text: str) -> str:
 
 
 def load(folder: Path, **parameters: str) -> Any:
-    """Load scene.xml of a folder with the plug-in, for the variant that is set; `parameters` are those of the file (spp, resx)."""
+    """Load scene.xml of a folder with the plug-in, for the variant that is set; `parameters` of the file, such as spp."""
     import mitsuba as mi
 
     mitsuba_bsdf.register()

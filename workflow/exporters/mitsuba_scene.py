@@ -107,7 +107,10 @@ def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.
 def exact_files() -> dict[str, bytes]:
     """Return `render.py` and the package `iif_bsdf`: the modules of the reflectance, with their imports made local."""
     modules = {"iif_core.numerics.xp": xp, "iif_core.reflectance.brdf": brdf, "workflow.exporters.mitsuba_bsdf": mitsuba_bsdf}
-    files = {"render.py": mitsuba_render, **{f"iif_bsdf/{name.rpartition('.')[2]}.py": module for name, module in modules.items()}}
+    files = {
+        "render.py": mitsuba_render,
+        **{f"iif_bsdf/{name.rpartition('.')[2]}.py": module for name, module in modules.items()},
+    }
     local = [(f"from {name} import", f"from iif_bsdf.{name.rpartition('.')[2]} import") for name in modules]
     local += [(f"from {name.rpartition('.')[0]} import", "from iif_bsdf import") for name in modules]
     out = {"iif_bsdf/__init__.py": b""}
@@ -129,8 +132,8 @@ def _environment_exr(environment: np.ndarray) -> bytes:
 
 
 def slivers(part: Part) -> NDArray:
-    """Return which faces (F,) are too thin for Mitsuba to interpolate the attributes of their corners: its barycentric coordinates
-    divide by a determinant that cancels in single precision, and the result is NaN."""
+    """Return which faces (F,) are too thin for Mitsuba to interpolate the attributes of their corners: its barycentric
+    coordinates divide by a determinant that cancels in single precision, and the result is NaN."""
     a, b, c = part.vertices[part.faces].astype(np.float64).transpose(1, 0, 2)
     longest = np.max([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))], 0)
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) < THINNEST * longest
@@ -188,8 +191,13 @@ def _shape(part: Part, file: str, place: str = "vertex") -> str:
         if part.opacity < 1:
             lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
         lines += ['\t\t<bsdf type="twosided"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>']
-        lines += [f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", place, "diffuse")}</bsdf>', '\t\t\t<bsdf type="principled">']
-        lines += [f"\t\t\t\t{_attribute(name, place, of)}" for name, of in (("base_color", "specular"), ("roughness", "roughness"))]
+        lines += [
+            f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", place, "diffuse")}</bsdf>',
+            '\t\t\t<bsdf type="principled">',
+        ]
+        lines += [
+            f"\t\t\t\t{_attribute(name, place, of)}" for name, of in (("base_color", "specular"), ("roughness", "roughness"))
+        ]
         lines += ['\t\t\t\t<float name="metallic" value="1"/>', "\t\t\t</bsdf>", "\t\t</bsdf></bsdf>"]
         lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])

@@ -31,7 +31,9 @@ STABILITY_PARTS = (
     "sums",
     "relations",
     "digits",
+    "samplers",
     "renderings",
+    "caches",
     "extremes",
     "sensitivity",
 )

@@ -66,8 +66,8 @@ COMPARED_TILES_ACROSS = 8
 
 
 class SurfacePoints(NamedTuple):
-    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from; and the
-    numbers (n,) uint32 by which they draw."""
+    """Points whose transport is traced, (n, 3) float32 each: metres, unit normals, unit vectors to where they are seen from; and
+    the numbers (n,) uint32 by which they draw."""
 
     points: np.ndarray
     normals: np.ndarray

@@ -310,8 +310,8 @@ class _Capture:
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             what = "are not used" if kind == "black" else "say no more than that their surface is bright"
             self.notes.append(
-                f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}) and {what}: check"
-                " their exposure"
+                f"WARNING {len(names)} of {count} photographs are {kind} all over ({', '.join(names[:5])}{more}) and {what}:"
+                " check their exposure"
             )
 
     def _check_alignment(self, used: list[Frame], views: list[View]) -> None:

@@ -1,8 +1,8 @@
 """Bias of cached light against the number of its paths: diffuse light of the cells, and the power of the emitters.
 
-Stages are run with few and with many paths on one capture, each with several seeds. The difference of the means is the bias, and
-its standard error comes from the seeds. Diffuse light is a mean of paths and must have none; adding paths only where the halves of
-a cell differ could bring one, and is a case of its own. The power comes from least squares whose matrix is noisy.
+Stages are run with few and with many paths on one capture, each with several seeds. The difference of the means is the bias,
+and its standard error comes from the seeds. Diffuse light is a mean of paths and must have none; adding paths only where the
+halves of a cell differ could bring one, and is a case of its own. The power comes from least squares whose matrix is noisy.
 """
 
 from __future__ import annotations

@@ -215,6 +215,7 @@ def _write(capture: Capture, folder: Path) -> None:
 
 def read(capture: Capture, folder: Path) -> Result:
     """Read what the stages wrote to a folder."""
+
     def reader(stage: str) -> StageReader:
         return StageReader(folder / stage, stage, "free")
 

@@ -32,7 +32,9 @@ def tables(frame: pd.DataFrame) -> dict[str, str]:
         "relations": _relations,
         "digits": _digits,
         "flips": _flips,
+        "samplers": _samplers,
         "renderings": _renderings,
+        "caches": _caches,
         "extremes": _extremes,
         "sensitivity": _sensitivity,
     }
@@ -182,6 +184,29 @@ def _renderings(frame: pd.DataFrame) -> list[str]:
         value = rows.set_index("quantity")["value"]
         body.append([str(room), *(_number(value[name]) for name in names)])
     return _markdown(["room", *names], body)
+
+
+def _samplers(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "samplers"]
+    body = []
+    for (sampler, form), rows in own.groupby(["subject", "form"], sort=False):
+        value = {name: part["value"] for name, part in rows.groupby("quantity")}
+        mean, worst = value["statistic / freedom"].mean(), value["threshold / p"].max()
+        count, cells, draws = len(value["draws"]), value["cells"].max(), value["draws"].max()
+        body.append([str(sampler), str(form), str(count), *(_number(x) for x in (draws, cells, mean, worst))])
+    return _markdown(
+        ["what is drawn", "form", "tests", "draws", "cells", "mean statistic / freedom", "largest threshold / p"], body, 2
+    )
+
+
+def _caches(frame: pd.DataFrame) -> list[str]:
+    own = frame[frame["part"] == "caches"]
+    names = list(dict.fromkeys(own["quantity"]))
+    body = []
+    for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
+        value = rows.set_index("quantity")["value"]
+        body.append([str(room), str(form), str(case), *(_number(value[name]) for name in names)])
+    return _markdown(["room", "cache", "paths", *names], body, 3)
 
 
 def _extremes(frame: pd.DataFrame) -> list[str]:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 PICTURE = REPOSITORY / "docs/pictures/sensitivity.png"
-_COLOURS = ("#0072b2", "#d55e00")  # colour-blind safe (Okabe, Ito)
+_COLOURS = ("#0072b2", "#d55e00", "#009e73")  # colour-blind safe (Okabe, Ito)
 
 
 def draw(frame: pd.DataFrame, path: Path, score: str = "albedo") -> None:
@@ -30,7 +30,7 @@ def draw(frame: pd.DataFrame, path: Path, score: str = "albedo") -> None:
 
     rooms = list(dict.fromkeys(frame[frame["part"] == "sensitivity"]["subject"]))
     order = [f"{factor}, {levels}" for factor, levels, *_ in ranked(frame, rooms[-1], score)]
-    figure, axes = plt.subplots(figsize=(9, 0.34 * len(order) + 1), layout="constrained")
+    figure, axes = plt.subplots(figsize=(9, 0.17 * len(rooms) * len(order) + 1), layout="constrained")
     height = 0.8 / len(rooms)
     for number, room in enumerate(reversed(rooms)):
         found = {f"{factor}, {levels}": (size, error) for factor, levels, _, size, error in ranked(frame, room, score)}

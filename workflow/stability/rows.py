@@ -11,11 +11,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from workflow.stability import chain, digits, extremes, relations, sensitivity
+from workflow.stability import caches, chain, digits, extremes, relations, samplers, sensitivity
+from workflow.stability.caches import Bias
 from workflow.stability.digits import Digits, Flips
 from workflow.stability.extremes import Extreme
 from workflow.stability.monte_carlo import SIGMAS, Agreement
 from workflow.stability.relations import Related
+from workflow.stability.samplers import Drawn
 from workflow.stability.scalar import THRESHOLD, Accuracy
 from workflow.stability.sensitivity import Effect
 from workflow.stability.solvers import BACKWARD_LIMIT, Solved
@@ -91,6 +93,28 @@ def of_relations(found: Iterable[Related]) -> Iterator[Row]:
     for one in found:
         for name, value, most in zip(one.found._fields, one.found, one.allowed, strict=True):
             yield _row("relations", one.room, one.yardstick, one.relation, name, value, most, one.explained)
+
+
+def of_samplers(found: Iterable[Drawn]) -> Iterator[Row]:
+    """Rows of the samplers: Pearson's statistic, and the smallest probability that so many tests may show over its own."""
+    found = list(found)
+    least = samplers.threshold(len(found))
+    for one in found:
+        key = ("samplers", one.sampler, one.form, one.case)
+        yield _row(*key, "draws", one.draws, math.nan)
+        yield _row(*key, "cells", one.cells, math.nan)
+        yield _row(*key, "statistic / freedom", one.statistic, math.nan)
+        yield _row(*key, "threshold / p", least / max(one.probability, 1e-300), 1.0)
+
+
+def of_caches(found: Iterable[Bias]) -> Iterator[Row]:
+    """Rows of cached light: its bias, the standard error of that, and the spread of one run."""
+    for one in found:
+        key = ("caches", one.room, one.cache, one.paths)
+        yield _row(*key, "bias / %", 100 * one.bias, math.nan)
+        yield _row(*key, "standard error / %", 100 * one.error, math.nan)
+        yield _row(*key, "bias / standard error", one.sigmas, caches.LIMIT if one.judged else math.nan)
+        yield _row(*key, "spread / %", 100 * one.spread, math.nan)
 
 
 def of_renderings(found: Iterable[Agreement]) -> Iterator[Row]:
@@ -190,6 +214,18 @@ def _renderings() -> Iterator[Row]:
         yield from of_renderings([one])
 
 
+def _samplers() -> Iterator[Row]:
+    return of_samplers(samplers.measure())
+
+
+def _caches() -> Iterator[Row]:
+    log = logging.getLogger("stability")
+    for room in chain.ROOMS:
+        for one in caches.measure(room):
+            log.info("caches: %s: %s, %s", room, one.cache, one.paths)
+            yield from of_caches([one])
+
+
 def _extremes() -> Iterator[Row]:
     log = logging.getLogger("stability")
     for one in extremes.measure():
@@ -198,7 +234,11 @@ def _extremes() -> Iterator[Row]:
 
 
 def _sensitivity() -> Iterator[Row]:
-    for room in chain.ROOMS:
+    there = sensitivity.rooms()
+    for room in sensitivity.ROOMS:
+        if room not in there:
+            logging.getLogger("stability").warning("sensitivity: %s is left out: its files are not there", room)
+            continue
         yield from of_sensitivity(sensitivity.measure(room))
 
 
@@ -208,7 +248,9 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "sums": _sums,
     "relations": _relations,
     "digits": _digits,
+    "samplers": _samplers,
     "renderings": _renderings,
+    "caches": _caches,
     "extremes": _extremes,
     "sensitivity": _sensitivity,
 }

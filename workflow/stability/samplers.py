@@ -168,7 +168,9 @@ def _faces(draws: int) -> Iterator[Drawn]:
     rng = np.random.default_rng(4)
     count = 200
     corners = rng.normal(size=(count, 3, 3)) * np.geomspace(0.01, 3, count)[:, None, None]
-    geometry = build_geometry(corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count).reshape(-1, 3), np.zeros(count, np.int32))
+    geometry = build_geometry(
+        corners.reshape(-1, 3).astype(np.float32), np.arange(3 * count).reshape(-1, 3), np.zeros(count, np.int32)
+    )
     for case, weight in (("by power", None), ("weights 1e-8 to 1", np.geomspace(1e-8, 1, count))):
         emitters = Emitters(geometry, np.ones((count, 3)), sampling_weight=weight)
         u0, u1, u2 = (np.minimum(rng.random(draws), 1 - 2**-24).astype(np.float32) for _ in range(3))
@@ -226,7 +228,9 @@ def _environment(draws: int) -> Iterator[Drawn]:
     d = direction_in(NUMPY, row, column, rng.random(draws), rng.random(draws), 512, 1024)
     # At the pole: 1 - z is uniform in a texel.
     counts = _grid((1 - np.asarray(d[2])) / (1 - np.cos(np.pi / 512)), _turn(d[0], d[1]), 16, 16)
-    yield Drawn("direction in a texel", "numpy float64", "at the pole, 512 x 1024", draws, *chi_squared(counts, np.full(256, 1 / 256)))
+    yield Drawn(
+        "direction in a texel", "numpy float64", "at the pole, 512 x 1024", draws, *chi_squared(counts, np.full(256, 1 / 256))
+    )
 
 
 def measure(draws: int = DRAWS) -> Iterator[Drawn]:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mpmath as mp
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from iif_core.camera.registration import Photo
 
 EPS = float(np.finfo(np.float64).eps)
 SINGLE = float(np.finfo(np.float32).eps)
@@ -418,6 +421,56 @@ def calibration() -> Iterator[Solved]:
         yield Solved("camera response", name, len(params), math.nan, math.nan, error, _lost(curve, found.covariance))
 
 
+def registration() -> Iterator[Solved]:
+    """The first step of the registration: six cameras above a painted floor, whose paint decides what is known of them."""
+    from iif_core.camera.registration import first_step, register
+
+    def waves(x: NDArray, y: NDArray) -> NDArray:
+        return np.exp(0.5 * np.sin(9 * x + 1) * np.sin(7 * y) + 0.3 * np.sin(23 * x - 17 * y))
+
+    cases: dict[str, tuple[Callable[[NDArray, NDArray], NDArray], int, float, float]] = {
+        "painted": (waves, 6, 1.0, 1.0),
+        "stripes along one axis": (lambda x, y: np.exp(0.5 * np.sin(20 * x) + 0 * y), 6, 1.0, 1.0),
+        "one colour": (lambda x, y: 1 + 0 * x, 6, 1.0, 1.0),
+        "black": (lambda x, y: 0 * x, 6, 1.0, 1.0),
+        "one photograph": (waves, 1, 1.0, 1.0),
+        "20 photographs": (waves, 20, 1.0, 1.0),
+        "radiance times 1e-30": (waves, 6, 1e-30, 1.0),
+        "radiance times 1e30": (waves, 6, 1e30, 1.0),
+        "10 times as large": (waves, 6, 1.0, 10.0),
+        "10 times as small": (waves, 6, 1.0, 0.1),
+    }
+    for name, (paint, views, light, metres) in cases.items():
+        photos = [_floor_photo(paint, turn, light, metres) for turn in np.linspace(0, 2 * np.pi, views, endpoint=False)]
+        normal, right, step = first_step(photos, 4000)
+        forward = relative_error(step, exact_solution(normal, right)) if len(right) < 50 else math.nan
+        found = register(photos, 1000) if views == 6 and metres == light == 1.0 else None
+        lost = _lost(step) + (_lost(found.pose, found.principal) if found else 0)
+        says = "no surface is shared: the cameras stay where they are" if not np.abs(step).any() else ""
+        yield Solved(
+            "registration", name, len(step), condition_of(normal), backward_error(normal, step, right), forward, lost, says
+        )
+
+
+def _floor_photo(paint: Callable[[NDArray, NDArray], NDArray], turn: float, light: float, metres: float) -> Photo:
+    """A camera 1.5 m above the floor that looks down at an angle; `metres`: of a unit."""
+    from iif_core.camera.pinhole import look_at, pixel_directions
+    from iif_core.camera.registration import Photo
+
+    width, height, focal = 96, 72, 80.0
+    eye = np.array([np.cos(turn), np.sin(turn), 1.5])
+    pose = look_at(eye, (0.1, -0.1, 0), (0, 0, 1))
+    ray = pixel_directions(focal, focal, width / 2, height / 2, width, height, pose)
+    depth = -eye[2] / ray[..., 2]
+    point = eye + depth[..., None] * ray
+    image = light * np.repeat(0.3 * paint(point[..., 0], point[..., 1])[..., None], 3, -1)
+    normal = np.broadcast_to([0.0, 0.0, 1.0], point.shape).copy()
+    scaled = pose.copy()
+    scaled[:3, 3] *= metres
+    seen = np.ones(depth.shape, bool)
+    return Photo(image, seen, depth * metres, normal, (focal, focal), (width / 2, height / 2), scaled)
+
+
 SOLVERS: tuple[Callable[[], Iterator[Solved]], ...] = (
     affine_maps,
     gains_of_one_channel,
@@ -427,6 +480,7 @@ SOLVERS: tuple[Callable[[], Iterator[Solved]], ...] = (
     camera_gains,
     exposures,
     calibration,
+    registration,
 )
 """All of them, in the order of the table."""
 

@@ -8,7 +8,13 @@ from iif_core.errors import InputError
 from workflow.sources.rooms import bed, kitchen, tiny
 from workflow.sources.rooms.room import Room
 
-ROOMS: dict[str, Callable[[], Room]] = {"kitchen": kitchen.build, "matte": kitchen.build_matte, "tiny": tiny.build, **tiny.EXTREMES, **bed.ROOMS}
+ROOMS: dict[str, Callable[[], Room]] = {
+    "kitchen": kitchen.build,
+    "matte": kitchen.build_matte,
+    "tiny": tiny.build,
+    **tiny.EXTREMES,
+    **bed.ROOMS,
+}
 
 
 def build(name: str, quarterings: int = 0) -> Room:

@@ -32,7 +32,10 @@ class Look(NamedTuple):
     lamp: tuple[float, tuple[float, float, float]] | None = None
 
 
-def build(look: Look = Look()) -> Room:
+USUAL = Look()
+
+
+def build(look: Look = USUAL) -> Room:
     """Build a closed room of 3 x 2.6 x 2.2 m: shell, floor, two boxes, a metal sphere, a rug, two lamps."""
     x, y, z = SIZE
     o = _OVERLAP
