@@ -144,7 +144,7 @@ def test_patch_rows_are_medians_of_even_surface():
     assert 3 not in rows.patch and 11 not in rows.patch and (rows.view == 5).all()
     at = int(np.flatnonzero(rows.patch == 7)[0])
     np.testing.assert_allclose(rows.value[at], 0.1 + 7 / 39, atol=0.01)
-    np.testing.assert_array_equal(rows.facing, np.where(rows.patch % 2 == 0, 5, 2))
+    np.testing.assert_array_equal(rows.facing, np.where(rows.patch % 2 == 0, 4, 3))
     assert rows.clipped[rows.patch == 39].all() and not rows.clipped[rows.value[:, 0] < 0.98].any()
 
 

@@ -404,7 +404,8 @@ def test_deliverable_is_complete_and_verifies(toy):
         "report.html",
         "manifest.json",
     }
-    assert expected <= names and all(n in expected or n.startswith("mitsuba/meshes/") for n in names)
+    program = {"mitsuba/render.py", *(f"mitsuba/iif_bsdf/{name}.py" for name in ("__init__", "xp", "brdf", "mitsuba_bsdf"))}
+    assert expected | program <= names and all(n in expected | program or n.startswith("mitsuba/meshes/") for n in names)
     manifest = json.loads((scene / "manifest.json").read_text())
     assert set(manifest["files"]) == names - {"manifest.json"}
     assert manifest["settings"] == {"seed": 3} and manifest["fingerprints"]["base"] == "print of base"

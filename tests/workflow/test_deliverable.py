@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-FILES = """scene.glb mitsuba/scene.xml objects.parquet emitters.parquet plan.yaml metrics.parquet timings.parquet
+FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet emitters.parquet plan.yaml metrics.parquet timings.parquet
 report.html manifest.json""".split()
 
 
