@@ -103,6 +103,7 @@ class Result:
         base: view name -> base texture (H, W, 5); diffuse: view name -> diffuse light (H, W, 3), mean of both halves.
         power: (3,) radiance times area, summed over the emitters that were kept.
         environment: (3,) mean radiance from outside, 0 if there is none.
+        lamps: names of the objects with faces that shine, as often as they have emitters.
         decisions: component of the plan -> whether it is in; selected: (segments, 3) prediction with the largest weight.
         documents: stage -> its JSON.
     """
@@ -113,6 +114,7 @@ class Result:
     diffuse: Mapping[str, NDArray]
     power: NDArray
     environment: NDArray
+    lamps: tuple[str, ...]
     decisions: Mapping[str, bool]
     selected: NDArray
     documents: Mapping[str, Any]
@@ -244,6 +246,7 @@ def read(capture: Capture, folder: Path) -> Result:
         diffuse,
         (radiance * np.where(kept & area, size, 0)[:, None]).sum(0),
         outside.mean(0) if len(outside) else np.zeros(3),
+        _lamps(capture, emission, np.asarray(emitters["emitter_id"])[kept & area]),
         {item["component"]: bool(item["included"]) for plan in plans for item in plan["plan"]},
         weight.reshape(-1, numbers, 3).argmax(1),
         {
@@ -253,6 +256,14 @@ def read(capture: Capture, folder: Path) -> Result:
             "affines": affines.json("affines.json"),
         },
     )
+
+
+def _lamps(capture: Capture, emission: StageReader, kept: NDArray) -> tuple[str, ...]:
+    """Objects of the emitters that were kept, by the true segmentation."""
+    faces = emission.table("emitter_faces.parquet")
+    first = [int(faces["face_id"][faces["emitter_id"] == number][0]) for number in kept]
+    owner = capture.instance[first] if first else []
+    return tuple(sorted(capture.names[i] if 0 <= i < len(capture.names) else "none" for i in owner))
 
 
 def _materials(channels: dict[str, NDArray]) -> NDArray:

@@ -122,6 +122,9 @@ def measure(room: str, runs: int = RUNS) -> Iterator[Digits | Flips]:
             )
             results = [chain.run(one, folder / "run") for one in captures]
             yield from _digits(room, moved, reference, results, float(by))
+            alike = [result for result in results if result.lamps == reference.lamps]
+            if 1 < len(alike) < len(results):
+                yield from _digits(room, f"{moved}: {len(alike)} runs with the same lamps", reference, alike, float(by))
             yield from _flips(room, moved, reference, results)
 
 
@@ -164,6 +167,7 @@ def _flips(room: str, moved: str, reference: Result, results: Sequence[Result]) 
         count = sum(result.decisions.get(name) != value for result in results)
         if count:
             yield Flips(room, moved, f"plan: {name}", count, len(results))
+    yield Flips(room, moved, "which objects are lamps", sum(one.lamps != reference.lamps for one in results), len(results))
     count = sum(int((result.selected != reference.selected).sum()) for result in results)
     yield Flips(room, moved, "selected predictions", count, reference.selected.size * len(results))
     metal = [_metal(result) for result in results]
