@@ -1,4 +1,4 @@
-"""What is drawn has the density that is reported, by the tests of the study with fewer draws; and those tests find what is wrong."""
+"""What is drawn has the density that is reported, by the tests of the study with fewer draws; they find what is wrong."""
 
 import numpy as np
 import pytest

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet emitters.parquet plan.yaml metrics.parquet timings.parquet
-report.html manifest.json""".split()
+FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet emitters.parquet plan.yaml metrics.parquet
+timings.parquet report.html manifest.json""".split()
 
 
 @pytest.fixture(scope="module")
