@@ -446,7 +446,7 @@ def registration() -> Iterator[Solved]:
         forward = relative_error(step, exact_solution(normal, right)) if len(right) < 50 else math.nan
         found = register(photos, 1000) if views == 6 and metres == light == 1.0 else None
         lost = _lost(step) + (_lost(found.pose, found.principal) if found else 0)
-        says = "no surface is shared: the cameras stay where they are" if not np.abs(step).any() else ""
+        says = "nothing to align: the cameras stay where they are" if not np.abs(step).any() else ""
         yield Solved(
             "registration", name, len(step), condition_of(normal), backward_error(normal, step, right), forward, lost, says
         )
