@@ -107,7 +107,7 @@ def digits_of(values: NDArray) -> NDArray:
 
 
 def measure(room: str, runs: int = RUNS) -> Iterator[Digits | Flips]:
-    """Run one of `chain.ROOMS` with input that is moved, in two series."""
+    """Run one of `chain.ROOMS` with input that is moved, in three series."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         capture = chain.make_capture(folder / "capture", chain.ROOMS[room])
