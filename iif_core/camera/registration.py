@@ -96,16 +96,16 @@ class Registration:
 def feature_image(image: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Compute log luminance less its surroundings (6 % of the width), in units of 0.35, clipped to +-3 (Eq. C.29).
 
-    Luminance is relative to its median, and `DARK` is added before the logarithm. The result, (H, W) float64, does not depend on
-    exposure, white balance, vignetting and slow shading.
+    Luminance is relative to its median over pixels that are not black, and `DARK` is added before the logarithm. The result,
+    (H, W) float64, does not depend on exposure, white balance, vignetting and slow shading; it is 0 if all pixels are black.
     """
     from scipy.ndimage import gaussian_filter
 
     grey = np.where(usable, np.nan_to_num(np.asarray(image, np.float64)).clip(0).mean(-1), 0.0)
-    level = float(np.median(grey[usable])) if usable.any() else 0.0
-    if not level > 0:
-        return np.zeros(grey.shape)  # black for the most part: noise is all that there is
-    grey = np.log(DARK + grey / level)
+    lit = grey[grey > 0]
+    if not len(lit):
+        return np.zeros(grey.shape)
+    grey = np.log(DARK + grey / np.median(lit))
     weight = usable.astype(np.float64)
     sigma = max(2.0, 0.06 * image.shape[1])
     around = gaussian_filter(grey * weight, sigma) / np.maximum(gaussian_filter(weight, sigma), 1e-6)

@@ -134,51 +134,6 @@ def test_reflectance_is_reciprocal():
     np.testing.assert_allclose(fc_there, fc_back, rtol=1e-9)
 
 
-@pytest.mark.parametrize("r", [0.02, 0.2, 1.0])
-def test_half_vectors_follow_ggx(r):
-    """tan^2(theta_h) has the distribution function t / (alpha^2 + t), phi is uniform: chi-squared over 20 x
-    10 cells."""
-    n = 100_000
-    h = brdf.sample_ggx_half(NUMPY, RNG.random(n), RNG.random(n), r)
-    np.testing.assert_allclose(sum(x * x for x in h), 1, rtol=1e-6)
-    tan2 = (h[0] ** 2 + h[1] ** 2) / h[2] ** 2
-    level = np.minimum((20 * tan2 / (r**4 + tan2)).astype(int), 19)
-    sector = ((np.arctan2(h[1], h[0]) / (2 * np.pi) % 1) * 10).astype(int) % 10
-    counts = np.bincount(level * 10 + sector, minlength=200)
-    assert stats.chisquare(counts).pvalue > 1e-3
-
-
-@pytest.mark.parametrize(("r", "NoV"), [(0.25, 0.8), (0.5, 0.3), (1.0, 0.05)])
-def test_directions_follow_mixture_pdf(r, NoV):
-    """Chi-squared test of sampled directions against the integrated density; directions below the surface form one
-    cell."""
-    wo, n = view(NoV), 200_000
-    u0, u1, u2 = RNG.random((3, n))
-    specular = brdf.reflect(wo, brdf.sample_ggx_half(NUMPY, u1, u2, r))
-    cosine = brdf.sample_cosine(NUMPY, u1, u2)
-    wi = [np.where(u0 < 0.5, s, c) for s, c in zip(specular, cosine, strict=True)]
-    rows, columns, fine = 12, 16, 60
-    above = wi[2] > 0
-    cell = (
-        np.minimum((wi[2] * rows).astype(int), rows - 1) * columns
-        + ((np.arctan2(wi[1], wi[0]) / (2 * np.pi) % 1) * columns).astype(int) % columns
-    )
-    counts = np.append(np.bincount(cell[above], minlength=rows * columns), np.count_nonzero(~above))
-
-    z = (np.arange(rows * fine) + 0.5) / (rows * fine)
-    phi = 2 * np.pi * (np.arange(columns * fine) + 0.5) / (columns * fine)
-    z, phi = np.meshgrid(z, phi, indexing="ij")
-    sine = np.sqrt(1 - z * z)
-    NoL, _, NoH, VoH, sin2 = brdf.half_angles(NUMPY, Z, (sine * np.cos(phi), sine * np.sin(phi), z), wo)
-    density = brdf.mixture_pdf(NUMPY, NoL, NoH, VoH, sin2, r)
-    share = density.reshape(rows, fine, columns, fine).mean((1, 3)).ravel() * 2 * np.pi / (rows * columns)
-    expected = n * np.append(share, max(1 - share.sum(), 0))
-    big = expected > 5
-    statistic = np.sum((counts - expected)[big] ** 2 / expected[big])
-    assert stats.chi2.sf(statistic, big.sum() - 1) > 1e-3
-    assert counts[~big].sum() <= expected[~big].sum() + 6 * np.sqrt(expected[~big].sum() + 1)
-
-
 def test_extremes_are_finite_and_one_sided():
     zero, one = np.float32(0), np.float32(1)
     edge = [zero, np.float32(1e-7), np.float32(1e-3), one]

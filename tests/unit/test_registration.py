@@ -36,6 +36,8 @@ def test_features_do_not_depend_on_the_unit_of_radiance(photos: list[Photo]) -> 
     assert usual.std() > 0.1
     for factor in (1e-30, 1e-6, 1e6, 1e30):
         np.testing.assert_allclose(feature_image(factor * image, usable), usual, atol=1e-9)
+    dark = np.where(np.arange(image.shape[1])[None, :, None] < 0.3 * image.shape[1], image, 0)
+    assert feature_image(dark, usable)[:, 5:30].std() > 0.1  # most of the picture is black, the rest is seen
     assert not feature_image(0 * image, usable).any() and not feature_image(image, usable & False).any()
 
 
