@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from iif_core.numerics.xp import NUMPY
 from iif_core.reflectance import brdf
