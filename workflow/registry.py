@@ -88,7 +88,8 @@ STAGES: dict[str, Stage] = {
             on_demand=True,
             shared=("capture", "segmentation"),
         ),
-        Stage("export", ("capture", "segmentation", "base", "emission", "affines"), ("export",)),
+        Stage("unwrap", ("capture", "segmentation", "base", "emission"), ("export.max_faces_glb", "export.texture_size")),
+        Stage("export", ("capture", "segmentation", "base", "emission", "affines", "unwrap"), ("export",)),
         Stage(
             "report",
             ("capture", "plan", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),

@@ -171,6 +171,10 @@ def _export(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
     return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
 
 
+def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", {"faces": size.faces / MILLION, "pixels": size.pixels / MILLION}
+
+
 def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     shown = min(settings["report"]["views"], size.views) * size.pixels / max(size.views, 1) / MILLION
     return "all", {"shown": shown, "pixels": size.pixels / MILLION}
@@ -194,6 +198,7 @@ _STAGES = {
     "render": _render,
     "relight": _relight,
     "metrics": _metrics,
+    "unwrap": _unwrap,
     "export": _export,
     "report": _report,
     "publish": _publish,

@@ -1,7 +1,5 @@
-"""Converts the recovered scene to coloured triangle meshes, one part per object or emitter, which every exporter writes.
-
-Large faces are split, because other programs store colours on vertices; faces are turned towards the photographs.
-"""
+"""Converts the mesh of a scene to the parts that every exporter writes: one mesh per object or emitter, turned towards the
+photographs, cleaned and, where it has too many faces, simplified."""
 
 from __future__ import annotations
 
@@ -13,49 +11,34 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.numerics.arrays import unique_rows
 from iif_core.numerics.graph import component_labels
-from iif_core.reflectance.material import NEUTRAL
-from iif_core.surface.triangles import face_crosses, face_geometry, smooth_groups, subdivide, vertex_normals, weld
+from iif_core.surface.simplify import MIN_AREA, clean, simplify
+from iif_core.surface.triangles import face_crosses, smooth_groups, vertex_normals, weld
 
 Array = np.ndarray
 
-MIN_AREA = 1e-12  # m^2; smaller faces have no normal
 CREASE_COSINE = 0.7660444  # cos 40 degrees; sharper edges get two normals
 TWO_SIDED_SHARE = 0.02  # an object with more of its pixels on the back of faces is a sheet seen from both sides
 
 
 @dataclass(frozen=True)
-class RecoveredScene:
-    """The recovered scene as arrays; lengths in metres, colours linear, ids int32 with -1 = none.
+class SeenSurface:
+    """The mesh of a scene with what was seen of it; lengths in metres, ids int32 with -1 = none.
 
     Attributes:
         vertices, faces: (n, 3) float32, (m, 3) int32.
         object_id: (m,) of each face; object_names: one per object id.
-        cells: (c, 3) float32 centres; cell_object: (c,); cell_values: (c, 5) albedo R G B, roughness, metallic.
-        object_values: (objects, 5), for surface without cells.
-        emitter_id: (m,) of each face, -1 = none; emitter_side: (m,) +1 front, -1 back, 0 both.
-        emitter_radiance: (emitters, 3), one row per emitter id.
-        environment: (3,) or (H, W, 3) radiance outside of the mesh, as in `iif_core.light.environment`.
+        emitter_id: (m,) of each face; emitter_side: (m,) +1 front, -1 back, 0 both.
         seen_front, seen_back: (m,) numbers of pixels that see each side of a face.
-        up: (3,) unit vector.
-        transmittance: (objects,) share of the light that passes straight through each; None = none.
     """
 
     vertices: Array
     faces: Array
     object_id: Array
     object_names: Sequence[str]
-    cells: Array
-    cell_object: Array
-    cell_values: Array
-    object_values: Array
     emitter_id: Array
     emitter_side: Array
-    emitter_radiance: Array
-    environment: Array
     seen_front: Array
     seen_back: Array
-    up: Array
-    transmittance: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -65,76 +48,71 @@ class Part:
     name: str
     object_id: int
     emitter_id: int
-    vertices: Array  # (n, 3) float32
-    normals: Array  # (n, 3) float32
-    faces: Array  # (m, 3) int32
-    albedo: Array  # (n, 3) float32
-    roughness: Array  # (n,) float32
-    metallic: Array  # (n,) float32
-    radiance: Array  # (3,) float32, 0 for what does not emit
+    vertices: Array  # (n, 3) float64
+    normals: Array  # (n, 3) float64
+    faces: Array  # (m, 3) int64
     double_sided: bool
-    opacity: float = 1.0  # share of the light that does not pass straight through
+    simplified: bool = False
 
 
-def build_parts(scene: RecoveredScene, longest_edge: float, max_faces: int) -> list[Part]:
-    """Split, orient and colour the surface: parts in order of object and emitter, with unique names; emitters are black.
+def build_parts(surface: SeenSurface, max_faces: int) -> list[Part]:
+    """Turn, clean and simplify the mesh: parts in order of object and emitter, with unique names.
 
-    Edges longer than `longest_edge` (metres) are halved as long as there are at most `max_faces`; all parts stay equally coarse.
+    Faces without an area and second copies of a face are dropped. With more than `max_faces`, the parts that do not emit are
+    simplified together; an emitter keeps its faces, because its power goes with its area.
 
     Raises:
         InputError: no face with an area.
     """
-    vertices = np.asarray(scene.vertices, np.float64)
-    faces = np.asarray(scene.faces, np.int64)
-    kept = np.flatnonzero(face_geometry(vertices, faces)[1] > MIN_AREA)
-    if not len(kept):
+    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+    turned, double_sided = _orientation(surface)
+    vertices, oriented = weld(vertices, np.where(turned[:, None], faces[:, ::-1], faces))
+    keys, part_of = unique_rows(np.stack([surface.object_id, surface.emitter_id], 1))
+    rows, local = unique_rows(np.stack([oriented.ravel(), np.repeat(part_of, 3)], 1))  # no vertex belongs to two parts
+    vertices, oriented = vertices[rows[:, 0]], local.reshape(-1, 3)
+    kept = clean(oriented, vertices)
+    if not kept.any():
         raise InputError(f"mesh of {len(faces)} faces: none has an area above {MIN_AREA} m^2; nothing can be exported")
-    turned, double_sided = _orientation(scene)
-    oriented = np.where(turned[:, None], faces[:, ::-1], faces)[kept]
-    vertices, oriented = weld(vertices, oriented)
-    vertices, oriented, parent = subdivide(vertices, oriented, longest_edge, max_faces)
-    parent = kept[parent]
-    objects, emitters = scene.object_id[parent], scene.emitter_id[parent]
-    keys, part_of = unique_rows(np.stack([objects, emitters], 1))
+    sides = np.zeros(len(keys), bool)
+    np.logical_or.at(sides, part_of, np.where(surface.emitter_id >= 0, surface.emitter_side == 0, double_sided))
+    vertices, oriented, part_of, simplified = _simplified(vertices, oriented[kept], part_of[kept], keys[:, 1] >= 0, max_faces)
     groups = smooth_groups(vertices, oriented, part_of, CREASE_COSINE)
+    order = np.argsort(part_of, kind="stable")
+    bounds = np.searchsorted(part_of[order], np.arange(len(keys) + 1))
     names, parts = _Names(), []
     for p, (object_id, emitter_id) in enumerate(keys.tolist()):
-        own = np.flatnonzero(part_of == p)
-        corners = np.stack([oriented[own].ravel(), np.repeat(groups[own], 3)], 1)
-        split, local = unique_rows(corners)
+        own = order[bounds[p] : bounds[p + 1]]
+        if not len(own):
+            continue
+        split, local = unique_rows(np.stack([oriented[own].ravel(), np.repeat(groups[own], 3)], 1))
         local = local.reshape(-1, 3)
         xyz = vertices[split[:, 0]]
+        name = surface.object_names[object_id] if 0 <= object_id < len(surface.object_names) else "unlabelled"
+        name = names.unique(name if emitter_id < 0 else f"{name}.emitter{emitter_id}")
         normals = vertex_normals(xyz, local)
-        name = scene.object_names[object_id] if 0 <= object_id < len(scene.object_names) else "unlabelled"
-        radiance = np.zeros(3, np.float32)
-        sides = double_sided[parent[own]].any()
-        if emitter_id >= 0:
-            name = f"{name}.emitter{emitter_id}"
-            radiance = np.asarray(scene.emitter_radiance[emitter_id], np.float32)
-            sides = bool((scene.emitter_side[parent[own]] == 0).any())
-            values = np.tile(np.float32([0, 0, 0, 1, 0]), (len(xyz), 1))
-        else:
-            values = _vertex_values(scene, object_id, xyz, longest_edge)
-        values = np.clip(values, 0, 1).astype(np.float32)
-        sheer = scene.transmittance is not None and object_id >= 0
-        opacity = 1.0 - float(scene.transmittance[object_id]) if sheer else 1.0
-        parts.append(
-            Part(
-                names.unique(name),
-                object_id,
-                emitter_id,
-                xyz.astype(np.float32),
-                normals.astype(np.float32),
-                local.astype(np.int32),
-                values[:, :3],
-                values[:, 3],
-                values[:, 4],
-                radiance,
-                bool(sides) or opacity < 1,
-                opacity,
-            )
-        )
+        parts.append(Part(name, object_id, emitter_id, xyz, normals, local, bool(sides[p]), bool(simplified[p])))
     return parts
+
+
+def _simplified(
+    vertices: Array, faces: Array, part: Array, emits: Array, max_faces: int
+) -> tuple[Array, Array, Array, Array]:
+    """Simplify the parts that do not emit (`emits` (parts,)); a part that would vanish stays as it was.
+
+    Returns:
+        vertices, faces, part of each face, and which parts (parts,) have become simpler.
+    """
+    fixed = emits[part]
+    target = max(max_faces - int(fixed.sum()), 1)
+    if (~fixed).sum() <= target:
+        return vertices, faces, part, np.zeros(len(emits), bool)
+    new_vertices, new_faces, new_part = simplify(vertices, faces[~fixed], part[~fixed], target)
+    gone = np.setdiff1d(part[~fixed], new_part)
+    as_before = fixed | np.isin(part, gone)
+    joined = np.concatenate([faces[as_before], new_faces + len(vertices)])
+    of = np.concatenate([part[as_before], new_part])
+    count = np.bincount(of, minlength=len(emits))
+    return np.concatenate([vertices, new_vertices]), joined, of, count < np.bincount(part, minlength=len(emits))
 
 
 def seen_sides(vertices: Array, faces: Array, face_id: Array, eye: Array) -> tuple[Array, Array]:
@@ -183,61 +161,33 @@ class _Names:
         return candidate
 
 
-def _orientation(scene: RecoveredScene) -> tuple[Array, Array]:
+def _orientation(surface: SeenSurface) -> tuple[Array, Array]:
     """Return which faces to turn (m,), and whether the object of a face was seen from both sides (m,).
 
     A face is turned if most of its pixels see its back; a face that no pixel sees follows the majority of its connected piece.
     Emitters are turned such that they emit to their front.
     """
-    front, back = scene.seen_front.astype(np.int64), scene.seen_back.astype(np.int64)
-    group = _components(scene)
+    front, back = surface.seen_front.astype(np.int64), surface.seen_back.astype(np.int64)
+    group = _components(surface)
     n = int(group.max()) + 1
     group_turned = np.bincount(group, back, n) > np.bincount(group, front, n)
     turned = np.where(front + back > 0, back > front, group_turned[group])
-    objects = np.unique(scene.object_id, return_inverse=True)[1]
+    objects = np.unique(surface.object_id, return_inverse=True)[1]
     minority = np.bincount(objects, np.minimum(front, back))
     total = np.bincount(objects, front + back)
     # If no pixel sees an object, its orientation is unknown and both sides are drawn.
     double = (minority > TWO_SIDED_SHARE * total) | (total == 0)
-    emits = scene.emitter_id >= 0
-    turned = np.where(emits & (scene.emitter_side != 0), scene.emitter_side < 0, turned)
+    emits = surface.emitter_id >= 0
+    turned = np.where(emits & (surface.emitter_side != 0), surface.emitter_side < 0, turned)
     return turned, double[objects]
 
 
-def _components(scene: RecoveredScene) -> Array:
+def _components(surface: SeenSurface) -> Array:
     """Label the connected pieces of each object, (m,); faces are connected if they share a vertex position."""
-    _, weld = unique_rows(scene.vertices)
-    corner = weld[scene.faces]
-    key = np.stack([corner.ravel(), np.repeat(scene.object_id, 3)], 1)
+    _, weld = unique_rows(surface.vertices)
+    corner = weld[surface.faces]
+    key = np.stack([corner.ravel(), np.repeat(surface.object_id, 3)], 1)
     node = unique_rows(key)[1]
-    m, n = len(scene.faces), int(node.max()) + 1
+    m, n = len(surface.faces), int(node.max()) + 1
     face = np.repeat(np.arange(m), 3)
     return component_labels(m + n, face, m + node)[:m]
-
-
-def _vertex_values(scene: RecoveredScene, object_id: int, xyz: Array, reach: float) -> Array:
-    """Return the material (n, 5) of the vertices of one object.
-
-    A vertex takes the mean of the cells to which it is the nearest vertex. Without such cells it takes the nearest cell of the
-    object within four edge lengths, else the mean of the object.
-    """
-    from scipy.spatial import cKDTree
-
-    known = 0 <= object_id < len(scene.object_values)
-    mean = scene.object_values[object_id] if known else np.float32(NEUTRAL)
-    out = np.tile(np.asarray(mean, np.float64), (len(xyz), 1))
-    own = np.flatnonzero(scene.cell_object == object_id)
-    if not len(own):
-        return out
-    centres, values = np.asarray(scene.cells[own], np.float64), scene.cell_values[own]
-    _, nearest = cKDTree(xyz).query(centres)
-    count = np.bincount(nearest, minlength=len(xyz))
-    sums = np.stack([np.bincount(nearest, values[:, i], len(xyz)) for i in range(5)], -1)
-    filled = count > 0
-    out[filled] = sums[filled] / count[filled, None]
-    if not filled.all():
-        distance, cell = cKDTree(centres).query(xyz[~filled], distance_upper_bound=4 * reach)
-        near = np.isfinite(distance)
-        rows = np.flatnonzero(~filled)[near]
-        out[rows] = values[cell[near]]
-    return out

@@ -183,10 +183,23 @@ use rule stage as metrics with:
         "{wildcards.scene}: scores"
 
 
+use rule stage as unwrap with:
+    input:
+        unpack(reads("unwrap", "capture", "segmentation", "base", "emission")),
+    pathvars:
+        stage="unwrap",
+    resources:
+        **needs("unwrap"),
+    params:
+        job=job("unwrap"),
+    message:
+        "{wildcards.scene}: the mesh in parts, with texture coordinates"
+
+
 use rule stage as export with:
     input:
         unpack(
-            reads("export", "capture", "segmentation", "base", "emission", "affines")
+            reads("export", "capture", "segmentation", "base", "emission", "affines", "unwrap")
         ),
     pathvars:
         stage="export",
@@ -293,6 +306,7 @@ descriptions = {
     "affines": "Fit one affine map per object, and the camera response, to the photographs.",
     "render": "Render every view again with the recovered materials and lights.",
     "metrics": "Score the result against ground truth, where there is any, and against the photographs.",
+    "unwrap": "Clean, simplify and unwrap the mesh for the exported files.",
     "export": "Write the result for other programs: glTF, Mitsuba, tables.",
     "report": "Write report.html, and plan.yaml with all decisions settled.",
     "relight": "Render the recovered scene under other light; made on demand.",

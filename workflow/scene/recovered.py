@@ -67,10 +67,7 @@ def read_recovered(job: Job) -> Recovered:
     cell_values = np.stack([fitted[name] for name in CHANNELS], 1).astype(np.float32)
     scale = float(affines.json("affines.json").get("light_scale", 1.0)) if affines.has("affines.json") else 1.0
     light = replace(light, radiance=light.radiance * np.float32(scale), environment=light.environment * np.float32(scale))
-    emitters, faces = emission.table("emitters.parquet"), emission.table("emitter_faces.parquet")
-    shines = light.emits[faces["face_id"]]
-    emitter_id = np.full(len(base.faces), -1, np.int32)
-    emitter_id[faces["face_id"][shines]] = faces["emitter_id"][shines]
+    emitters, emitter_id = emission.table("emitters.parquet"), emitter_of_faces(job, light)
     radiance = np.zeros((int(emitters["emitter_id"].max(initial=-1)) + 1, 3), np.float32)
     radiance[emitter_id[light.emits]] = light.radiance[light.emits]
     return Recovered(
@@ -82,6 +79,15 @@ def read_recovered(job: Job) -> Recovered:
         radiance,
         scale,
     )
+
+
+def emitter_of_faces(job: Job, light: Light) -> np.ndarray:
+    """Return the kept emitter of every face, (m,) int32, -1 = none; the job needs emission upstream."""
+    faces = job.read("emission").table("emitter_faces.parquet")
+    shines = light.emits[faces["face_id"]]
+    emitter_id = np.full(len(light.emits), -1, np.int32)
+    emitter_id[faces["face_id"][shines]] = faces["emitter_id"][shines]
+    return emitter_id
 
 
 def object_names(job: Job, n_objects: int) -> list[str]:

@@ -34,8 +34,12 @@ class Metrics(Section):
 class Export(Section):
     """Files for other programs."""
 
-    max_faces_glb: int = Field(2_000_000, ge=1000)
-    """Largest number of faces of the mesh; a larger one ends stage `export` with an error."""
+    max_faces_glb: int = Field(200_000, ge=1000)
+    """Largest number of faces, about; a larger mesh is simplified."""
+    texture_size: int = Field(2048, ge=128, le=16384)
+    """Largest side of the textures, in texels; smaller where the photographs show less. `export.json` says what it costs."""
+    max_mb: float = Field(40.0, gt=0)
+    """Largest size of `scene.glb` in MB: its textures become JPEG, and then smaller, until it fits."""
 
 
 class Report(Section):

@@ -1,0 +1,173 @@
+"""A texture atlas: charts of a mesh laid out in one square picture by xatlas, and the surface that lies under each texel.
+
+Texture coordinates are those of glTF: (0, 0) is the top left corner of the picture, v grows downwards. Texel (row i, column j)
+of an atlas of S x S has its centre at u = (j + 1/2) / S, v = (i + 1/2) / S.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from iif_core.errors import InputError
+
+PADDING = 4
+"""Texels between two charts: two levels of mip maps do not mix them; beyond, every texel has the value of the nearest chart."""
+FULL = 0.5
+"""Share of an atlas that charts fill, about; the rest is between them."""
+STEP = 128
+"""Sizes of atlases are multiples of this, in texels."""
+SMALLEST = 128
+UNSEEN = 64
+"""Texels along the side of a square for a mesh that no photograph shows, at most; its material is the mean of its object."""
+SEEN_SHARE = 4.0
+"""Texels of a mesh over those of what photographs show of it, at most: a lawn of which a window shows a strip stays small."""
+_ROUNDS = 8
+
+
+@dataclass(frozen=True)
+class Unwrapped:
+    """Texture coordinates of several meshes in one atlas.
+
+    Attributes:
+        source: for each mesh, (n,) int64 vertex of the input from which each new one is copied.
+        uv: for each mesh, (n, 2) float32 in [0, 1].
+        faces: for each mesh, (m, 3) int64 of the new vertices, in the order of the input.
+        size: S, texels.
+        shrunk: factor <= 1 on all densities that made the charts fit.
+        charts: number of charts.
+    """
+
+    source: list[NDArray]
+    uv: list[NDArray]
+    faces: list[NDArray]
+    size: int
+    shrunk: float
+    charts: int
+
+
+def texel_density(area: ArrayLike, seen_area: ArrayLike, footprint: ArrayLike, edge: float) -> NDArray:
+    """Choose texels a metre for meshes: one texel for a pixel of the photographs or a surface cell, whichever is larger.
+
+    Args:
+        area: (n,) of each mesh, m^2, > 0.
+        seen_area: (n,) of it that photographs show, m^2.
+        footprint: (n,) size of a pixel on it where it was seen from near, m; infinite where it was not seen.
+        edge: of the surface cells, m; nothing finer was recovered.
+
+    Returns:
+        (n,) float64 density d, with d^2 area <= UNSEEN^2 + SEEN_SHARE d_0^2 seen_area where d_0 = 1 / max(edge, footprint).
+    """
+    area = np.maximum(np.asarray(area, np.float64), 1e-12)
+    texel = np.maximum(np.asarray(footprint, np.float64), edge)
+    finest = np.where(np.isfinite(texel), 1 / texel, 1 / (8 * edge))
+    most = UNSEEN**2 + SEEN_SHARE * finest**2 * np.asarray(seen_area, np.float64)
+    return np.minimum(finest, np.sqrt(most / area))
+
+
+def wanted_size(texels: float, largest: int) -> int:
+    """Return the side of an atlas for charts of so many texels in all: a multiple of `STEP`, at most `largest`."""
+    side = np.sqrt(max(texels, 1.0) / FULL)
+    return int(min(max(SMALLEST, STEP * np.ceil(side / STEP)), largest))
+
+
+def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, size: int) -> Unwrapped:
+    """Cut meshes into charts and pack them into one atlas of `size` x `size` texels.
+
+    Args:
+        meshes: vertices (n, 3) metres and faces (m, 3), m >= 1, of each.
+        density: texels a metre wanted for each mesh, > 0. All are lowered by one factor where they do not fit.
+        size: S, texels.
+
+    Raises:
+        InputError: the charts do not fit even at a thousandth of the densities.
+    """
+    import xatlas
+
+    density = np.asarray(density, np.float64)
+    scale = 1.0
+    for _ in range(_ROUNDS):
+        atlas = xatlas.Atlas()
+        for (vertices, faces), own in zip(meshes, density, strict=True):
+            middle = vertices.mean(0)  # small numbers lose less in single precision
+            atlas.add_mesh(((vertices - middle) * own * scale).astype(np.float32), faces.astype(np.uint32))
+        options = xatlas.PackOptions()
+        options.padding, options.bilinear = PADDING, True
+        options.texels_per_unit, options.resolution = 1.0, 0
+        atlas.generate(xatlas.ChartOptions(), options, False)
+        width, height = int(atlas.width), int(atlas.height)
+        if max(width, height) <= size and atlas.atlas_count <= 1:
+            break
+        scale *= min(0.97, 0.99 * size / max(width, height))
+        if scale < 1e-3:
+            raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {size} x {size} texels; raise the size")
+    else:
+        raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {size} x {size} texels; raise the size")
+    source, uv, new = [], [], []
+    for number in range(len(meshes)):
+        rows, faces, coordinates = atlas.get_mesh(number)
+        source.append(rows.astype(np.int64))
+        new.append(faces.astype(np.int64))
+        uv.append((coordinates * np.array([width / size, height / size])).astype(np.float32))
+    return Unwrapped(source, uv, new, size, scale, int(atlas.chart_count))
+
+
+def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, NDArray]:
+    """Find the face under the centre of every texel.
+
+    Args:
+        uv: (n, 2) texture coordinates; faces: (m, 3). Charts do not overlap.
+        size: S, which need not be that of the atlas.
+
+    Returns:
+        face (S, S) int32, -1 = none, and barycentric coordinates (S, S, 3) float32 of the centre in it, >= 0, of sum 1.
+    """
+    uv, faces = np.asarray(uv, np.float32), np.asarray(faces)
+    if not len(faces):
+        return np.full((size, size), -1, np.int32), np.zeros((size, size, 3), np.float32)
+    import open3d as o3d
+
+    # The charts lie in the plane z = 0, in units of texels, and a ray comes down through the centre of each texel.
+    plane = np.concatenate([uv * np.float32(size), np.zeros((len(uv), 1), np.float32)], 1)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(plane), o3d.core.Tensor(np.ascontiguousarray(faces, np.uint32)))
+    face, barycentric = np.empty((size, size), np.int32), np.empty((size, size, 3), np.float32)
+    column = np.arange(size, dtype=np.float32) + 0.5
+    rows = max(1, (1 << 20) // size)
+    for first in range(0, size, rows):
+        row = np.arange(first, min(first + rows, size), dtype=np.float32) + 0.5
+        rays = np.zeros((len(row), size, 6), np.float32)
+        rays[..., 0], rays[..., 1] = column[None, :], row[:, None]
+        rays[..., 2], rays[..., 5] = 1, -1
+        hit = scene.cast_rays(o3d.core.Tensor(rays))
+        found = hit["primitive_ids"].numpy()
+        second = np.clip(hit["primitive_uvs"].numpy(), 0, 1)
+        here = slice(first, first + len(row))
+        face[here] = np.where(found == scene.INVALID_ID, -1, found).astype(np.int32)
+        barycentric[here] = np.stack([np.maximum(1 - second.sum(-1), 0), second[..., 0], second[..., 1]], -1)
+    return face, barycentric / np.maximum(barycentric.sum(-1, keepdims=True), np.float32(1e-12))
+
+
+def texel_values(values: ArrayLike, faces: ArrayLike, face: NDArray, barycentric: NDArray) -> NDArray:
+    """Interpolate values (n, C) of the vertices at texels: (t, C) float32, for `face` (t,) >= 0 and `barycentric` (t, 3)."""
+    values = np.asarray(values, np.float32)
+    corner = np.asarray(faces)[face]
+    return sum(values[corner[:, i]] * barycentric[:, i, None] for i in range(3))
+
+
+def nearest_covered(covered: ArrayLike) -> NDArray:
+    """Return the flat index (S, S) int64 of the nearest covered texel of each; its own where nothing is covered.
+
+    A picture that is filled in this way has no background that filters or mip maps could mix into a chart.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    covered = np.asarray(covered, bool)
+    own = np.arange(covered.size).reshape(covered.shape)
+    if not covered.any():
+        return own
+    row, column = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+    return own[row, column]
