@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iif_core.errors import InputError
+from iif_core.surface.triangles import face_geometry
 
 PADDING = 4
 """Texels between two charts: two levels of mip maps do not mix them; beyond, every texel has the value of the nearest chart."""
-FULL = 0.5
-"""Share of an atlas that charts fill, about; the rest is between them."""
-STEP = 128
+FULL = 0.7
+"""Share of an atlas that charts may fill, at most about; the rest is between them."""
+STEP = 64
 """Sizes of atlases are multiples of this, in texels."""
-SMALLEST = 128
 UNSEEN = 64
 """Texels along the side of a square for a mesh that no photograph shows, at most; its material is the mean of its object."""
 SEEN_SHARE = 4.0
 """Texels of a mesh over those of what photographs show of it, at most: a lawn of which a window shows a strip stays small."""
-_ROUNDS = 8
+_ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -68,27 +68,22 @@ def texel_density(area: ArrayLike, seen_area: ArrayLike, footprint: ArrayLike, e
     return np.minimum(finest, np.sqrt(most / area))
 
 
-def wanted_size(texels: float, largest: int) -> int:
-    """Return the side of an atlas for charts of so many texels in all: a multiple of `STEP`, at most `largest`."""
-    side = np.sqrt(max(texels, 1.0) / FULL)
-    return int(min(max(SMALLEST, STEP * np.ceil(side / STEP)), largest))
-
-
-def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, size: int) -> Unwrapped:
-    """Cut meshes into charts and pack them into one atlas of `size` x `size` texels.
+def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, largest: int) -> Unwrapped:
+    """Cut meshes into charts and pack them into one square atlas, which is as small as it can be.
 
     Args:
         meshes: vertices (n, 3) metres and faces (m, 3), m >= 1, of each.
         density: texels a metre wanted for each mesh, > 0. All are lowered by one factor where they do not fit.
-        size: S, texels.
+        largest: side of the atlas in texels, at most.
 
     Raises:
-        InputError: the charts do not fit even at a thousandth of the densities.
+        InputError: the charts do not fit at any density, because there are too many.
     """
     import xatlas
 
     density = np.asarray(density, np.float64)
-    scale = 1.0
+    texels = sum(d * d * face_geometry(*mesh)[1].sum() for mesh, d in zip(meshes, density, strict=True))
+    scale = min(1.0, float(largest * np.sqrt(FULL / max(texels, 1e-12))))
     for _ in range(_ROUNDS):
         atlas = xatlas.Atlas()
         for (vertices, faces), own in zip(meshes, density, strict=True):
@@ -99,13 +94,12 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, size: 
         options.texels_per_unit, options.resolution = 1.0, 0
         atlas.generate(xatlas.ChartOptions(), options, False)
         width, height = int(atlas.width), int(atlas.height)
-        if max(width, height) <= size and atlas.atlas_count <= 1:
+        if max(width, height) <= largest and atlas.atlas_count <= 1:
             break
-        scale *= min(0.97, 0.99 * size / max(width, height))
-        if scale < 1e-3:
-            raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {size} x {size} texels; raise the size")
+        scale *= min(0.97, 0.99 * largest / max(width, height))
     else:
-        raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {size} x {size} texels; raise the size")
+        raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {largest} x {largest} texels; raise it")
+    size = min(STEP * -(-max(width, height) // STEP), largest)
     source, uv, new = [], [], []
     for number in range(len(meshes)):
         rows, faces, coordinates = atlas.get_mesh(number)

@@ -58,6 +58,17 @@ def values_at(
     return out
 
 
+def observed_at(
+    points: ArrayLike, object_id: ArrayLike, edge: float, origin: ArrayLike, ijk: ArrayLike, cell_object: ArrayLike
+) -> Array:
+    """Return (n,) int64 the surface cell at each point, -1 where none was observed; arguments as in `values_at`."""
+    points, object_id = np.asarray(points, np.float32).reshape(-1, 3), np.asarray(object_id, np.int64).reshape(-1)
+    if not len(cell_object):
+        return np.full(len(points), -1, np.int64)
+    table = CellTable.build(pack_keys(np.asarray(ijk).reshape(-1, 3), np.asarray(cell_object)))
+    return _rows(table, voxel_indices(points, edge, origin), object_id).astype(np.int64)
+
+
 def _rows(table: CellTable, ijk: Array, object_id: Array) -> Array:
     """Look up voxels of objects; -1 for those that the table lacks, and for indices that no key can hold."""
     inside = ((ijk >= 0) & (ijk < 1 << 16)).all(1) & (object_id >= -1) & (object_id < (1 << 16) - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from iif_core.surface.atlas import texel_density, unwrap, wanted_size
+from iif_core.surface.atlas import texel_density, unwrap
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.surface import Part, SeenSurface, build_parts, seen_sides
 from workflow.runtime.job import Job
@@ -35,9 +35,8 @@ def run(job: Job) -> None:
     job.log.info("%d parts of %d faces; the mesh has %d", len(parts), count, len(base.faces))
     area = np.array([face_geometry(part.vertices, part.faces)[1].sum() for part in parts])
     density = _densities(parts, area, footprint, np.bincount(base.cell_object, minlength=n_objects), base.cell_edge)
-    size = wanted_size(float((area * density**2).sum()), wanted.texture_size)
-    made = unwrap([(part.vertices, part.faces) for part in parts], density, size)
-    job.log.info("atlas of %d x %d texels, %d charts, densities times %.3f", size, size, made.charts, made.shrunk)
+    made = unwrap([(part.vertices, part.faces) for part in parts], density, wanted.texture_size)
+    job.log.info("atlas of %d x %d texels, %d charts, densities times %.3f", made.size, made.size, made.charts, made.shrunk)
     first = np.cumsum([0, *(len(rows) for rows in made.source)])
     xyz = np.concatenate([part.vertices[rows] for part, rows in zip(parts, made.source, strict=True)])
     normal = np.concatenate([part.normals[rows] for part, rows in zip(parts, made.source, strict=True)])

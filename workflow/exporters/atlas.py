@@ -1,0 +1,204 @@
+"""The recovered scene as textured meshes: parts with texture coordinates, and one atlas of materials for all of them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iif_core.numerics.color import linear_to_srgb, to_uint8
+from iif_core.reflectance.material import BLACK
+from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
+from iif_core.surface.closest import closest_points
+from iif_core.surface.lookup import observed_at, values_at
+from workflow.artifacts.store import StageReader
+from workflow.scene.recovered import Recovered
+
+Array = np.ndarray
+
+UNKNOWN = 1.0
+"""Uncertainty of albedo where no photograph shows the surface: the whole range."""
+
+
+@dataclass(frozen=True)
+class TexturedPart:
+    """One mesh: an object without its emitters, or one emitter of an object. Unit normals point towards the photographs."""
+
+    name: str
+    object_id: int
+    emitter_id: int
+    vertices: Array  # (n, 3) float32, metres
+    normals: Array  # (n, 3) float32
+    uv: Array  # (n, 2) float32 in [0, 1], v downwards
+    faces: Array  # (m, 3) int32
+    radiance: Array  # (3,) float32, 0 for what does not emit
+    double_sided: bool
+    opacity: float = 1.0  # share of the light that does not pass straight through
+    simplified: bool = False
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Materials of all parts in one picture of S x S texels; texels between the charts have the values of the nearest chart.
+
+    Attributes:
+        base_color: (S, S, 3) float32, linear, in [0, 1].
+        roughness, metallic: (S, S) float32 in [0, 1], roughness perceptual.
+        uncertainty: (S, S) float32, standard deviation of albedo; `UNKNOWN` where nothing was observed.
+        seen: (S, S) bool, a photograph shows the surface; elsewhere the values are means of what is around, or of the object.
+        covered: (S, S) bool, the texel belongs to a chart.
+    """
+
+    base_color: Array
+    roughness: Array
+    metallic: Array
+    uncertainty: Array
+    seen: Array
+    covered: Array
+
+    @property
+    def size(self) -> int:
+        return len(self.base_color)
+
+
+def read_parts(unwrapped: StageReader, recovered: Recovered) -> list[TexturedPart]:
+    """Read the parts that stage unwrap wrote, with the light and the transparency of the recovered scene."""
+    vertices, faces, parts = (unwrapped.table(f"{name}.parquet") for name in ("vertices", "faces", "parts"))
+    xyz, normal = (np.stack([vertices[p + c] for c in "xyz"], 1) for p in ("", "n"))
+    uv = np.stack([vertices["u"], vertices["v"]], 1)
+    corners = np.stack([faces[f"v{i}"] for i in range(3)], 1).astype(np.int64)
+    bounds = np.searchsorted(faces["part_id"], np.arange(len(parts["part_id"]) + 1))
+    transmittance = recovered.surface.transmittance
+    out = []
+    for p, (name, object_id, emitter_id) in enumerate(zip(parts["name"], parts["object_id"], parts["emitter_id"], strict=True)):
+        own = corners[bounds[p] : bounds[p + 1]]
+        first, last = int(own.min()), int(own.max()) + 1
+        opacity = 1.0 - float(transmittance[object_id]) if transmittance is not None and object_id >= 0 else 1.0
+        radiance = recovered.emitter_radiance[emitter_id] if emitter_id >= 0 else np.zeros(3)
+        out.append(
+            TexturedPart(
+                str(name),
+                int(object_id),
+                int(emitter_id),
+                xyz[first:last],
+                normal[first:last],
+                uv[first:last],
+                (own - first).astype(np.int32),
+                np.asarray(radiance, np.float32),
+                bool(parts["double_sided"][p]) or opacity < 1,
+                opacity,
+                bool(parts["simplified"][p]),
+            )
+        )
+    return out
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The surface under the texels of an atlas that belong to a chart, in the order of their flat index.
+
+    Attributes:
+        size: S.
+        index: (t,) int64 flat index of each texel.
+        part: (t,) int64 number of its part.
+        face: (t,) int64 face of all parts, counted on.
+        points, normals: (t, 3) float32 of its centre, metres; the normals are those of the vertices, interpolated.
+    """
+
+    size: int
+    index: Array
+    part: Array
+    face: Array
+    points: Array
+    normals: Array
+
+
+def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
+    """Find the surface under the texels of an atlas of `size` x `size`, which may be coarser than that of the materials."""
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
+    face, barycentric = texel_surface(np.concatenate([part.uv for part in parts]), faces, size)
+    index = np.flatnonzero(face >= 0)
+    of, weights = face.ravel()[index], barycentric.reshape(-1, 3)[index]
+    part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])[of]
+    points = texel_values(np.concatenate([part.vertices for part in parts]), faces, of, weights)
+    normals = texel_values(np.concatenate([part.normals for part in parts]), faces, of, weights)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return Texels(size, index, part, of.astype(np.int64), points, normals / np.maximum(length, np.float32(1e-12)))
+
+
+def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array, size: int) -> Atlas:
+    """Read the materials of the recovered scene at the texels of an atlas, as the renderer reads them at the hits of its rays.
+
+    A texel of a simplified part is moved to the nearest point of the mesh that was photographed, because the cells lie there.
+
+    Args:
+        parts: of the scene.
+        recovered: the scene.
+        uncertainty: (cells,) standard deviation of albedo of each surface cell.
+        size: S.
+    """
+    surface = recovered.surface
+    texels = texels_of(parts, size)
+    objects = np.array([part.object_id for part in parts])[texels.part]
+    emits = np.array([part.emitter_id >= 0 for part in parts])[texels.part]
+    points = _on_the_mesh(parts, texels, recovered)
+    grid = surface.cell_edge, surface.cell_origin, surface.cell_ijk, surface.cell_object
+    values = values_at(points, objects, *grid, surface.cell_values, surface.object_values)
+    cell = observed_at(points, objects, *grid)
+    values[emits] = BLACK
+    seen = (cell >= 0) & ~emits
+    spread = np.where(seen, np.asarray(uncertainty)[cell] if len(uncertainty) else UNKNOWN, np.where(emits, 0, UNKNOWN))
+    covered = np.zeros(size * size, bool)
+    covered[texels.index] = True
+    nearest = nearest_covered(covered.reshape(size, size))
+    row = np.zeros(size * size, np.int64)
+    row[texels.index] = np.arange(len(texels.index))
+    row = row[nearest]
+    values = np.clip(values, 0, 1)[row]
+    return Atlas(
+        values[..., :3], values[..., 3], values[..., 4], spread.astype(np.float32)[row], seen[row], covered.reshape(size, size)
+    )
+
+
+def _on_the_mesh(parts: Sequence[TexturedPart], texels: Texels, recovered: Recovered) -> Array:
+    """The points of the texels, those of simplified parts moved to the nearest point of the mesh of the photographs."""
+    points = texels.points.copy()
+    surface = recovered.surface
+    order = np.argsort(texels.part, kind="stable")
+    bounds = np.searchsorted(texels.part[order], np.arange(len(parts) + 1))
+    for number in [number for number, part in enumerate(parts) if part.simplified]:
+        rows = order[bounds[number] : bounds[number + 1]]
+        faces = surface.faces[(surface.object_id == parts[number].object_id) & (recovered.emitter_id < 0)]
+        if len(rows) and len(faces):
+            used, local = np.unique(faces, return_inverse=True)
+            points[rows] = closest_points(surface.vertices[used], local.reshape(-1, 3), points[rows])
+    return points
+
+
+# -------------------------------------------------------------------------------------------------------------- pictures
+
+
+def base_color_picture(atlas: Atlas) -> Array:
+    """Return the base colour as (S, S, 3) uint8, sRGB-encoded."""
+    return to_uint8(linear_to_srgb(atlas.base_color))
+
+
+def surface_picture(atlas: Atlas) -> Array:
+    """Return glTF's metallic-roughness texture, (S, S, 3) uint8: R = 255 (no occlusion), G roughness, B metallic, all linear."""
+    full = np.ones_like(atlas.roughness)
+    return to_uint8(np.stack([full, atlas.roughness, atlas.metallic], -1))
+
+
+def encoded(picture: Array, jpeg: int | None = None) -> bytes:
+    """Encode (S, S, 3) or (S, S) uint8 as PNG, or as JPEG of quality `jpeg` without colour subsampling."""
+    from PIL import Image
+
+    buffer, image = io.BytesIO(), Image.fromarray(np.ascontiguousarray(picture))
+    if jpeg is None:
+        image.save(buffer, "PNG", compress_level=6)
+    else:
+        image.save(buffer, "JPEG", quality=jpeg, subsampling=0)
+    return buffer.getvalue()
