@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.numerics.color import linear_to_srgb, to_uint8
+from iif_core.numerics.color import srgb_from_linear, to_uint8
 from iif_core.reflectance.material import BLACK
 from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
 from iif_core.surface.closest import closest_points
@@ -183,7 +183,7 @@ def _on_the_mesh(parts: Sequence[TexturedPart], texels: Texels, recovered: Recov
 
 def base_color_picture(atlas: Atlas) -> Array:
     """Return the base colour as (S, S, 3) uint8, sRGB-encoded."""
-    return to_uint8(linear_to_srgb(atlas.base_color))
+    return to_uint8(srgb_from_linear(atlas.base_color))
 
 
 def surface_picture(atlas: Atlas) -> Array:

@@ -1,62 +1,111 @@
-"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part, albedo as linear `COLOR_0`.
+"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part, one atlas for all.
 
-trimesh is not used because it stores vertex colours in 8 bits (docs/method/numerics.md#albedo-in-eight-bits).
+trimesh is not used because it does not write `KHR_materials_emissive_strength`.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from workflow.exporters.surface import Part
+from workflow.exporters.atlas import Atlas, TexturedPart, base_color_picture, encoded, surface_picture
+from workflow.scene.normal_form import View
 
-_FLOAT, _USHORT, _UINT = 5126, 5123, 5125
+_FLOAT, _UINT = 5126, 5125
 _VERTEX, _INDEX = 34962, 34963
+_LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP = 9729, 9987, 33071
 _CHUNK_JSON, _CHUNK_BIN = 0x4E4F534A, 0x004E4942
+_NEAR = 0.01  # m
+
+JPEG_QUALITY = 92
+MEGABYTE = 1e6
 
 
-def glb_bytes(parts: Sequence[Part], up: np.ndarray, provenance: dict[str, Any]) -> bytes:
+def glb_bytes(
+    parts: Sequence[TexturedPart],
+    images: dict[str, bytes],
+    up: np.ndarray,
+    provenance: dict[str, Any],
+    views: Sequence[View] = (),
+) -> bytes:
     """Make one binary glTF file of the scene.
 
-    Vertices stay in the world of the photographs (metres); the root node turns `up` (3,) to +y, which glTF requires.
-    Roughness is perceptual, as in glTF. Radiance becomes `emissiveFactor` x `KHR_materials_emissive_strength`. `provenance` is
-    stored in `asset.extras`.
+    Vertices stay in the world of the photographs (metres); the root node turns `up` (3,) to +y, which glTF requires. Roughness is
+    perceptual, as in glTF. Radiance becomes `emissiveFactor` x `KHR_materials_emissive_strength`.
+
+    Args:
+        parts: the meshes.
+        images: `base_color` and `surface` (`atlas.surface_picture`), each a PNG or JPEG file.
+        up: unit vector.
+        provenance: stored in `asset.extras`.
+        views: photographs, which become cameras; glTF has no offset of the principal point, so that it is lost.
     """
     blob = _Blob()
     materials, meshes, nodes = [], [], []
+    textures = {name: number for number, name in enumerate(images)}
     for part in parts:
-        colour = np.full((len(part.vertices), 4), 65535, np.uint16)
-        colour[:, :3] = np.rint(part.albedo * 65535)
-        attributes = {
-            "POSITION": blob.add(part.vertices.astype("<f4"), _FLOAT, "VEC3", _VERTEX, bounds=True),
-            "NORMAL": blob.add(part.normals.astype("<f4"), _FLOAT, "VEC3", _VERTEX),
-            "COLOR_0": blob.add(colour.astype("<u2"), _USHORT, "VEC4", _VERTEX, normalized=True),
-        }
-        indices = blob.add(part.faces.astype("<u4").ravel(), _UINT, "SCALAR", _INDEX)
-        primitive = {"attributes": attributes, "indices": indices, "material": len(materials)}
+        mesh, material = _mesh(blob, part, len(materials)), _material(part, textures)
         extras = {"object_id": part.object_id, "emitter_id": part.emitter_id}
         nodes.append({"name": part.name, "mesh": len(meshes), "extras": extras})
-        meshes.append({"name": part.name, "primitives": [primitive]})
-        materials.append(_material(part))
+        meshes.append(mesh)
+        materials.append(material)
+    cameras = [_camera(view) for view in views]
+    for number, view in enumerate(views):
+        pose = np.asarray(view.world_from_camera, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])  # glTF looks along -z, y up
+        nodes.append({"name": f"view {view.name}", "camera": number, "matrix": [float(v) for v in pose.T.ravel()]})
     root = {"name": "world", "rotation": rotation_to_y(up), "children": list(range(len(nodes)))}
-    if not nodes:
-        del root["children"]
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Intrinsic Image Fusion", "extras": provenance},
         "scene": 0,
         "scenes": [{"nodes": [len(nodes)]}],
         "nodes": [*nodes, root],
+        "meshes": meshes,
+        "materials": materials,
+        "accessors": blob.accessors,
     }
-    if parts:
-        document |= {"meshes": meshes, "materials": materials, "accessors": blob.accessors}
-        document |= {"bufferViews": blob.views, "buffers": [{"byteLength": len(blob.data)}]}
-    if any("extensions" in material for material in materials):
-        document["extensionsUsed"] = ["KHR_materials_emissive_strength"]
+    if cameras:
+        document["cameras"] = cameras
+    if images:
+        document["samplers"] = [{"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAP_LINEAR, "wrapS": _CLAMP, "wrapT": _CLAMP}]
+        document["textures"] = [{"source": number, "sampler": 0} for number in range(len(images))]
+        document["images"] = [_image(blob, name, data) for name, data in images.items()]
+    document |= {"bufferViews": blob.views, "buffers": [{"byteLength": len(blob.data)}]}
+    extensions = sorted({name for material in materials for name in material.get("extensions", {})})
+    if extensions:
+        document["extensionsUsed"] = extensions
     return _container(document, bytes(blob.data))
+
+
+def fitting_glb(
+    parts: Sequence[TexturedPart],
+    atlas: Atlas,
+    up: np.ndarray,
+    provenance: dict[str, Any],
+    views: Sequence[View],
+    max_mb: float,
+) -> tuple[bytes, dict[str, Any]]:
+    """Make the glTF file and keep it below `max_mb`: with PNG textures if they fit, then with JPEG, then with every second texel.
+
+    Returns:
+        The file, and what its textures are: `format`, `size`, `mb`, and `fits`, false if the meshes alone are larger.
+    """
+    colour, surface = base_color_picture(atlas), surface_picture(atlas)
+    every = 1
+    while True:
+        for jpeg in (None, JPEG_QUALITY):
+            images = {name: encoded(p[::every, ::every], jpeg) for name, p in (("base_color", colour), ("surface", surface))}
+            data = glb_bytes(parts, images, up, provenance, views)
+            facts = {"format": "jpeg" if jpeg else "png", "size": len(colour[::every]), "mb": len(data) / MEGABYTE}
+            if len(data) <= max_mb * MEGABYTE:
+                return data, facts | {"fits": True}
+        if len(colour[::every]) <= 256:
+            return data, facts | {"fits": False}
+        every *= 2
 
 
 def rotation_to_y(up: np.ndarray) -> list[float]:
@@ -68,13 +117,30 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
     return [float(v) for v in q / np.linalg.norm(q)]
 
 
-def _material(part: Part) -> dict[str, Any]:
-    surface = {
-        "baseColorFactor": [1.0, 1.0, 1.0, part.opacity],
-        "metallicFactor": _mean(part.metallic, 0.0),
-        "roughnessFactor": _mean(part.roughness, 1.0),
+def _mesh(blob: _Blob, part: TexturedPart, material: int) -> dict[str, Any]:
+    attributes = {
+        "POSITION": blob.add(part.vertices.astype("<f4"), _FLOAT, "VEC3", _VERTEX, bounds=True),
+        "NORMAL": blob.add(part.normals.astype("<f4"), _FLOAT, "VEC3", _VERTEX),
     }
-    material: dict[str, Any] = {"name": part.name, "pbrMetallicRoughness": surface, "doubleSided": part.double_sided}
+    if part.emitter_id < 0:  # emitters have no texture
+        attributes["TEXCOORD_0"] = blob.add(part.uv.astype("<f4"), _FLOAT, "VEC2", _VERTEX)
+    indices = blob.add(part.faces.astype("<u4").ravel(), _UINT, "SCALAR", _INDEX)
+    return {"name": part.name, "primitives": [{"attributes": attributes, "indices": indices, "material": material}]}
+
+
+def _material(part: TexturedPart, textures: dict[str, int]) -> dict[str, Any]:
+    material: dict[str, Any] = {"name": part.name, "doubleSided": part.double_sided}
+    if part.emitter_id >= 0:
+        black = {"baseColorFactor": [0.0, 0.0, 0.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
+        material["pbrMetallicRoughness"] = black
+    else:
+        material["pbrMetallicRoughness"] = {
+            "baseColorFactor": [1.0, 1.0, 1.0, part.opacity],
+            "baseColorTexture": {"index": textures["base_color"]},
+            "metallicFactor": 1.0,
+            "roughnessFactor": 1.0,
+            "metallicRoughnessTexture": {"index": textures["surface"]},
+        }
     if part.opacity < 1:
         material["alphaMode"] = "BLEND"
     strength = float(part.radiance.max(initial=0.0))
@@ -84,29 +150,34 @@ def _material(part: Part) -> dict[str, Any]:
     return material
 
 
-def _mean(values: np.ndarray, default: float) -> float:
-    return round(float(values.mean(dtype=np.float64)), 6) if values.size else default
+def _camera(view: View) -> dict[str, Any]:
+    perspective = {"yfov": 2 * math.atan(0.5 * view.height / view.fy), "aspectRatio": view.width / view.height, "znear": _NEAR}
+    return {"type": "perspective", "name": f"view {view.name}", "perspective": perspective}
+
+
+def _image(blob: _Blob, name: str, data: bytes) -> dict[str, Any]:
+    kind = "image/png" if data.startswith(b"\x89PNG") else "image/jpeg"
+    return {"name": name, "bufferView": blob.bytes(data), "mimeType": kind}
 
 
 class _Blob:
-    """The binary chunk: arrays one after the other, each aligned to four bytes."""
+    """The binary chunk: arrays and files one after the other, each aligned to four bytes."""
 
     def __init__(self) -> None:
         self.data = bytearray()
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
 
-    def add(
-        self, array: np.ndarray, component: int, kind: str, target: int, bounds: bool = False, normalized: bool = False
-    ) -> int:
-        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": array.nbytes, "target": target}
-        self.views.append(view)
-        self.data += array.tobytes()
+    def bytes(self, data: bytes, target: int | None = None) -> int:
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
+        self.views.append(view if target is None else view | {"target": target})
+        self.data += data
         self.data += b"\0" * (-len(self.data) % 4)
-        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(array)}
-        accessor["type"] = kind
-        if normalized:
-            accessor["normalized"] = True
+        return len(self.views) - 1
+
+    def add(self, array: np.ndarray, component: int, kind: str, target: int, bounds: bool = False) -> int:
+        accessor: dict[str, Any] = {"bufferView": self.bytes(array.tobytes(), target), "componentType": component}
+        accessor |= {"count": len(array), "type": kind}
         if bounds:
             accessor["min"] = [float(v) for v in array.min(0)]
             accessor["max"] = [float(v) for v in array.max(0)]
@@ -118,6 +189,5 @@ def _container(document: dict[str, Any], binary: bytes) -> bytes:
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<II", len(text), _CHUNK_JSON) + text
-    if binary:
-        chunks += struct.pack("<II", len(binary), _CHUNK_BIN) + binary
+    chunks += struct.pack("<II", len(binary), _CHUNK_BIN) + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 from workflow.exporters import mitsuba_bsdf
 
 PARAMETERS = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
-"""Parameters of the plug-in, and the attributes of vertices or faces that they are read from."""
+"""Parameters of the plug-in, and the textures that they are read from."""
 
 
 def exact_scene(text: str) -> str:
@@ -26,13 +26,11 @@ def exact_scene(text: str) -> str:
     for bsdf in tree.iter("bsdf"):
         if bsdf.get("type") != "twosided":
             continue
-        place = next(node.get("value", "") for node in bsdf.iter("string")).partition("_")[0]
         for child in list(bsdf):
             bsdf.remove(child)
         bsdf.set("type", mitsuba_bsdf.NAME)
-        for parameter, attribute in PARAMETERS.items():
-            texture = ElementTree.SubElement(bsdf, "texture", type="mesh_attribute", name=parameter)
-            ElementTree.SubElement(texture, "string", name="name", value=f"{place}_{attribute}")
+        for parameter, texture in PARAMETERS.items():
+            ElementTree.SubElement(bsdf, "ref", name=parameter, id=texture)
     return ElementTree.tostring(tree, encoding="unicode")
 
 

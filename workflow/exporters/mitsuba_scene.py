@@ -1,6 +1,6 @@
 """Writes mitsuba/scene.xml, the recovered scene for Mitsuba 3; `mitsuba -m scalar_rgb scene.xml` renders it.
 
-Meshes are PLY files with the material as vertex attributes, in world coordinates and metres; paths are relative.
+Meshes are PLY files in world coordinates and metres, textures linear EXR files; paths are relative.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import math
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -22,8 +21,8 @@ from iif_core.reflectance import brdf
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import split_rgb
 from workflow.exporters import mitsuba_bsdf, mitsuba_render
+from workflow.exporters.atlas import Atlas, TexturedPart
 from workflow.exporters.mitsuba_lobes import blended
-from workflow.exporters.surface import Part
 from workflow.scene.normal_form import View
 
 _NOTE = """
@@ -31,8 +30,8 @@ _NOTE = """
 
   The model of the workflow: k_d = (1 - m) a, k_s = 0.04 (1 - m) + m a, GGX, Schlick, no loss of the diffuse lobe.
   Mitsuba has no such BSDF. Half a `diffuse` of reflectance 2 k_d is its diffuse lobe; half a metal of `principled` is close
-  to its specular lobe, with base colours that reflect as much light in all. `albedo` and `metallic` of the meshes are the
-  recovered ones; `python render.py` beside this file renders them with the exact model.
+  to its specular lobe, with base colours that reflect as much light in all. textures/albedo.exr, roughness.exr and metallic.exr
+  are the recovered ones; `python render.py` beside this file renders them with the exact model.
 
   Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
   samples.
@@ -53,32 +52,31 @@ ENVIRONMENT_ROWS = 256
 
 MASKS = 8
 """Passages through surface that lets light through that a path may have in addition."""
-THINNEST = 1e-3
-"""Height of a face over its longest edge below which it counts as a sliver."""
 BACK_OFFSET = 1e-4  # metres between the two sides of a sheet that emits on both
 
 
-def mitsuba_files(parts: Sequence[Part], views: Sequence[View], environment: np.ndarray, max_depth: int = 9) -> dict[str, bytes]:
+def mitsuba_files(
+    parts: Sequence[TexturedPart], atlas: Atlas, views: Sequence[View], environment: np.ndarray, max_depth: int = 9
+) -> dict[str, bytes]:
     """Make the files of the scene.
 
     Args:
         parts: of the surface.
+        atlas: their materials.
         views: at least one; each becomes a sensor. Mitsuba's cameras have square pixels, so fy is replaced by fx.
         environment: (3,) constant radiance around the scene or (H, W, 3), a map as in `iif_core.light.environment`; 0 = none.
         max_depth: path length; 1 = emitters only.
 
     Returns:
-        Content by relative name: `scene.xml`, `meshes/<part>.ply`, and `render.py` with what it imports.
+        Content by relative name: `scene.xml`, `meshes/<part>.ply`, `textures/<quantity>.exr`, and `render.py`
+        with what it imports.
     """
-    files = exact_files()
-    body = []
+    files = exact_files() | texture_files(atlas)
+    body = [_texture(name) for name in ("albedo", "roughness", "metallic", "diffuse", "specular")]
     for part, stem in zip(parts, _stems(parts), strict=True):
-        thin = slivers(part) & (part.emitter_id < 0)
-        for some, suffix in ((~thin, ""), (thin, ".slivers")):
-            if some.any():
-                name = f"meshes/{stem}{suffix}.ply"
-                files[name] = ply_bytes(replace(part, faces=part.faces[some]), of_faces=bool(suffix))
-                body.append(_shape(part, name, "face" if suffix else "vertex"))
+        name = f"meshes/{stem}.ply"
+        files[name] = ply_bytes(part)
+        body.append(_shape(part, name))
         if part.emitter_id >= 0 and part.double_sided:
             back = f"meshes/{stem}.back.ply"
             files[back] = ply_bytes(part, back=True)
@@ -125,50 +123,48 @@ def exact_files() -> dict[str, bytes]:
 def _environment_exr(environment: np.ndarray) -> bytes:
     repeat = max(1, ENVIRONMENT_ROWS // len(environment))
     image = environment[:, ::-1].repeat(repeat, 0).repeat(repeat, 1)
+    return exr_bytes(split_rgb(np.ascontiguousarray(image, np.float32)))
+
+
+def exr_bytes(channels: dict[str, NDArray]) -> bytes:
+    """Return an EXR file of some channels (H, W) float16 or float32."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "environment.exr"
-        write_exr(path, split_rgb(np.ascontiguousarray(image, np.float32)))
+        path = Path(folder) / "picture.exr"
+        write_exr(path, channels)
         return path.read_bytes()
 
 
-def slivers(part: Part) -> NDArray:
-    """Return which faces (F,) are too thin for Mitsuba to interpolate the attributes of their corners: its barycentric
-    coordinates divide by a determinant that cancels in single precision, and the result is NaN."""
-    a, b, c = part.vertices[part.faces].astype(np.float64).transpose(1, 0, 2)
-    longest = np.max([((p - q) ** 2).sum(1) for p, q in ((a, b), (b, c), (c, a))], 0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) < THINNEST * longest
-
-
-def ply_bytes(part: Part, back: bool = False, of_faces: bool = False) -> bytes:
-    """Return a binary PLY of x y z, nx ny nz; and albedo_0..2, roughness_0, metallic_0, with diffuse_0..2 and specular_0..2 of
-    `mitsuba_lobes.blended`, of the vertices or of the faces. Mitsuba reads them as `vertex_albedo` or `face_albedo` and so on.
+def ply_bytes(part: TexturedPart, back: bool = False) -> bytes:
+    """Return a binary PLY of x y z, nx ny nz and the texture coordinates u v.
 
     With `back` it is the other side of the same sheet, moved by `BACK_OFFSET` so that a ray meets only one of the two.
     """
-    attributes = ["albedo_0", "albedo_1", "albedo_2", "roughness_0", "metallic_0"]
-    attributes += [f"{lobe}_{c}" for lobe in ("diffuse", "specular") for c in range(3)]
-    materials = part.albedo, part.roughness[:, None], part.metallic[:, None]
-    if of_faces:
-        materials = tuple(values[part.faces].mean(1) for values in materials)
-    values = np.concatenate([*materials, *blended(materials[0], materials[1][:, 0], materials[2][:, 0])], 1).astype("<f4")
     normals = -part.normals if back else part.normals
     vertices = part.vertices + BACK_OFFSET * normals if back else part.vertices
-    columns = np.concatenate([vertices, normals] if of_faces else [vertices, normals, values], 1).astype("<f4")
-    own = [(name, "<f4") for name in attributes] if of_faces else []
-    faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3), *own]))
+    uv = part.uv * np.float32([1, -1]) + np.float32([0, 1])  # v grows upwards in Mitsuba
+    columns = np.concatenate([vertices, normals, uv], 1).astype("<f4")
+    faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
     faces["count"] = 3
     faces["corner"] = part.faces[:, ::-1] if back else part.faces
-    for (name, _), column in zip(own, values.T, strict=False):
-        faces[name] = column
-    names = ["x", "y", "z", "nx", "ny", "nz", *([] if of_faces else attributes)]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(part.vertices)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
-    header += [f"property float {name}" for name, _ in own] + ["end_header", ""]
+    header += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz", "u", "v")]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
     return "\n".join(header).encode() + columns.tobytes() + faces.tobytes()
 
 
-def _stems(parts: Sequence[Part]) -> list[str]:
+def texture_files(atlas: Atlas) -> dict[str, bytes]:
+    """Return the textures as EXR files of linear half floats: the materials, and `mitsuba_lobes.blended` of them."""
+    albedo, roughness, metallic = (a.reshape(-1, *a.shape[2:]) for a in (atlas.base_color, atlas.roughness, atlas.metallic))
+    shape = (atlas.size, atlas.size, 3)
+    diffuse, specular = (values.reshape(shape) for values in blended(albedo, roughness, metallic))
+    pictures = {"albedo": atlas.base_color, "diffuse": diffuse, "specular": specular}
+    files = {f"textures/{name}.exr": exr_bytes(split_rgb(picture.astype(np.float16))) for name, picture in pictures.items()}
+    for name in ("roughness", "metallic"):
+        files[f"textures/{name}.exr"] = exr_bytes({"Y": getattr(atlas, name).astype(np.float16)})
+    return files
+
+
+def _stems(parts: Sequence[TexturedPart]) -> list[str]:
     """Return file names that every file system accepts and that differ even where case is ignored."""
     out: list[str] = []
     used: set[str] = set()
@@ -181,7 +177,7 @@ def _stems(parts: Sequence[Part]) -> list[str]:
     return out
 
 
-def _shape(part: Part, file: str, place: str = "vertex") -> str:
+def _shape(part: TexturedPart, file: str) -> str:
     lines = [f'\t<shape type="ply" id={quoteattr(file.removeprefix("meshes/").removesuffix(".ply"))}>']
     lines.append(f'\t\t<string name="filename" value={quoteattr(file)}/>')
     if part.emitter_id >= 0:
@@ -192,20 +188,23 @@ def _shape(part: Part, file: str, place: str = "vertex") -> str:
             lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
         lines += ['\t\t<bsdf type="twosided"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>']
         lines += [
-            f'\t\t\t<bsdf type="diffuse">{_attribute("reflectance", place, "diffuse")}</bsdf>',
+            '\t\t\t<bsdf type="diffuse"><ref name="reflectance" id="diffuse"/></bsdf>',
             '\t\t\t<bsdf type="principled">',
+            '\t\t\t\t<ref name="base_color" id="specular"/>',
+            '\t\t\t\t<ref name="roughness" id="roughness"/>',
+            '\t\t\t\t<float name="metallic" value="1"/>',
+            "\t\t\t</bsdf>",
+            "\t\t</bsdf></bsdf>",
         ]
-        lines += [
-            f"\t\t\t\t{_attribute(name, place, of)}" for name, of in (("base_color", "specular"), ("roughness", "roughness"))
-        ]
-        lines += ['\t\t\t\t<float name="metallic" value="1"/>', "\t\t\t</bsdf>", "\t\t</bsdf></bsdf>"]
         lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])
 
 
-def _attribute(parameter: str, place: str, name: str) -> str:
-    text = f'<string name="name" value="{place}_{name}"/>'
-    return f'<texture type="mesh_attribute" name="{parameter}">{text}</texture>'
+def _texture(name: str) -> str:
+    return (
+        f'\t<texture type="bitmap" id="{name}"><string name="filename" value="textures/{name}.exr"/>'
+        '<boolean name="raw" value="true"/><string name="wrap_mode" value="clamp"/></texture>'
+    )
 
 
 def _sensor(view: View) -> str:

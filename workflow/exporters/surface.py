@@ -94,9 +94,7 @@ def build_parts(surface: SeenSurface, max_faces: int) -> list[Part]:
     return parts
 
 
-def _simplified(
-    vertices: Array, faces: Array, part: Array, emits: Array, max_faces: int
-) -> tuple[Array, Array, Array, Array]:
+def _simplified(vertices: Array, faces: Array, part: Array, emits: Array, max_faces: int) -> tuple[Array, Array, Array, Array]:
     """Simplify the parts that do not emit (`emits` (parts,)); a part that would vanish stays as it was.
 
     Returns:

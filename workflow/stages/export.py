@@ -1,4 +1,4 @@
-"""export: the recovered scene for other programs (glTF, Mitsuba)."""
+"""export: the recovered scene for other programs (glTF, USD, Mitsuba)."""
 
 from __future__ import annotations
 
@@ -6,82 +6,80 @@ from typing import Any
 
 import numpy as np
 
-from iif_core.errors import InputError
 from iif_core.light.environment import as_map, solid_angles
-from workflow.exporters.glb import glb_bytes
+from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, read_parts, surface_picture
+from workflow.exporters.glb import fitting_glb
 from workflow.exporters.mitsuba_scene import mitsuba_files
-from workflow.exporters.surface import RecoveredScene, build_parts, seen_sides, up_axis
+from workflow.exporters.surface import up_axis
+from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered, read_recovered
 
-VERTEX_SPACING = 0.05
-"""Edges are halved until they are this short, m; two cells where cells are larger."""
-
-SPLIT_FACES = 200_000
-"""Largest number of faces that splitting makes; a mesh that has more is exported unchanged."""
-
 MAX_SENSORS = 16
+MASK = "textures/seen.png"
 
 
 def run(job: Job) -> None:
-    """Write scene.glb, mitsuba/, emitters.parquet and export.json."""
+    """Write scene.glb, scene.usdc, textures/, mitsuba/, emitters.parquet and export.json."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
-    if len(recovered.surface.faces) > job.settings.export.max_faces_glb:
-        raise InputError(
-            f"scene {job.scene}: the mesh has {len(recovered.surface.faces)} faces, export.max_faces_glb allows"
-            f" {job.settings.export.max_faces_glb}. Raise it, or decimate the mesh."
-        )
-    scene = _with_observers(capture, recovered)
-    budget = max(len(recovered.surface.faces), min(SPLIT_FACES, job.settings.export.max_faces_glb))
-    parts = build_parts(scene, max(VERTEX_SPACING, 2 * recovered.surface.cell_edge), budget)
+    unwrapped = job.read("unwrap").json("unwrap.json")
+    parts = read_parts(job.read("unwrap"), recovered)
+    atlas = bake(parts, recovered, job.read("affines").table("cells.parquet")["uncertainty"], unwrapped["size"])
+    up = _up(capture)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
-    provenance |= _environment_note(recovered.light.environment)
-    job.writer.bytes("scene.glb", glb_bytes(parts, scene.up, provenance))
-    for name, data in mitsuba_files(parts, capture.views[:MAX_SENSORS], recovered.light.environment).items():
+    environment = recovered.light.environment
+    data, texture = fitting_glb(
+        parts, atlas, up, provenance | _environment_note(environment), capture.views, job.settings.export.max_mb
+    )
+    job.writer.bytes("scene.glb", data)
+    job.log.info("scene.glb: %.1f MB, textures of %d x %d as %s", texture["mb"], *2 * (texture["size"],), texture["format"])
+    if not texture["fits"]:
+        job.log.warning(
+            "scene.glb has %.1f MB, export.max_mb allows %g: the meshes alone are larger; lower export.max_faces_glb",
+            texture["mb"],
+            job.settings.export.max_mb,
+        )
+    job.writer.bytes(BASE_COLOR, encoded(base_color_picture(atlas)))
+    job.writer.bytes(SURFACE, encoded(surface_picture(atlas)))
+    job.writer.bytes(MASK, encoded(np.where(atlas.seen, 255, 0).astype(np.uint8)))
+    job.writer.bytes("scene.usdc", usd_bytes(parts, up, environment, capture.views, provenance))
+    for name, data in mitsuba_files(parts, atlas, capture.views[:MAX_SENSORS], environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
     _emitter_table(job, recovered)
     facts = {
-        "up": scene.up.tolist(),
+        "up": up.tolist(),
         "parts": len(parts),
         "faces": sum(len(part.faces) for part in parts),
         "double_sided": [part.name for part in parts if part.double_sided],
         "light_scale": recovered.light_scale,
+        "texture": texture | _texture_facts(job, parts, atlas.seen & atlas.covered, atlas.covered, texture["size"]),
     }
     job.writer.json("export.json", facts)
 
 
-def _with_observers(capture: CaptureReader, recovered: Recovered) -> RecoveredScene:
-    """Return the scene with the number of pixels that see each side of a face, and the up direction."""
-    front, back = np.zeros((2, len(recovered.surface.faces)), np.int64)
-    vertices = recovered.surface.vertices.astype(np.float64)
-    for view in capture.views:
-        _, face_id = capture.gbuffer(view)
-        sides = seen_sides(vertices, recovered.surface.faces, face_id, view.world_from_camera[:3, 3])
-        front += sides[0]
-        back += sides[1]
+def _up(capture: CaptureReader) -> np.ndarray:
     up = capture.facts.get("up")
-    poses = np.stack([view.world_from_camera for view in capture.views])
-    surface = recovered.surface
-    return RecoveredScene(
-        surface.vertices,
-        surface.faces,
-        surface.object_id,
-        recovered.object_names,
-        recovered.cell_centres,
-        surface.cell_object,
-        surface.cell_values,
-        surface.object_values,
-        recovered.emitter_id,
-        recovered.light.side,
-        recovered.emitter_radiance,
-        recovered.light.environment,
-        front,
-        back,
-        np.asarray(up, np.float64) if up else up_axis(poses),
-        surface.transmittance,
-    )
+    return np.asarray(up, np.float64) if up else up_axis(np.stack([view.world_from_camera for view in capture.views]))
+
+
+def _texture_facts(job: Job, parts: list[TexturedPart], seen: np.ndarray, covered: np.ndarray, size: int) -> dict[str, Any]:
+    """What the textures lost: size of a texel beside that of a surface cell, and how much surface no photograph shows."""
+    unwrapped, table = job.read("unwrap").json("unwrap.json"), job.read("unwrap").table("parts.parquet")
+    shown = [p for p, part in enumerate(parts) if part.emitter_id < 0]
+    density = np.asarray(table["texels_per_m"])[shown]
+    weight = density**2 * np.asarray(table["area_m2"])[shown]
+    order = np.argsort(density)
+    middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum()) if len(shown) else 0
+    texel = 1 / density[order][min(middle, len(shown) - 1)] if len(shown) else 0.0
+    return {
+        "atlas_size": unwrapped["size"],
+        "texel_m": texel,
+        "texel_in_glb_m": texel * unwrapped["size"] / size,
+        "cell_m": unwrapped["cell_edge_m"],
+        "seen_share": float(seen.sum() / max(covered.sum(), 1)),
+    }
 
 
 def _environment_note(environment: np.ndarray) -> dict[str, Any]:
