@@ -141,8 +141,7 @@ def ply_bytes(part: TexturedPart, back: bool = False) -> bytes:
     """
     normals = -part.normals if back else part.normals
     vertices = part.vertices + BACK_OFFSET * normals if back else part.vertices
-    uv = part.uv * np.float32([1, -1]) + np.float32([0, 1])  # v grows upwards in Mitsuba
-    columns = np.concatenate([vertices, normals, uv], 1).astype("<f4")
+    columns = np.concatenate([vertices, normals, part.uv], 1).astype("<f4")
     faces = np.zeros(len(part.faces), np.dtype([("count", "u1"), ("corner", "<i4", 3)]))
     faces["count"] = 3
     faces["corner"] = part.faces[:, ::-1] if back else part.faces
