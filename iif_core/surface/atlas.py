@@ -26,6 +26,8 @@ UNSEEN = 64
 SEEN_SHARE = 4.0
 """Texels of a mesh over those of what photographs show of it, at most: a lawn of which a window shows a strip stays small."""
 _ROUNDS = 12
+_UNIT = 1e-3
+"""Texels per unit of length in xatlas, which ignores faces with an area below 1e-7 squared units."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +90,15 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
         atlas = xatlas.Atlas()
         for (vertices, faces), own in zip(meshes, density, strict=True):
             middle = vertices.mean(0)  # small numbers lose less in single precision
-            atlas.add_mesh(((vertices - middle) * own * scale).astype(np.float32), faces.astype(np.uint32))
+            atlas.add_mesh(((vertices - middle) * (own * scale / _UNIT)).astype(np.float32), faces.astype(np.uint32))
         options = xatlas.PackOptions()
         options.padding, options.bilinear = PADDING, True
-        options.texels_per_unit, options.resolution = 1.0, 0
+        options.texels_per_unit, options.resolution = _UNIT, 0
         atlas.generate(xatlas.ChartOptions(), options, False)
         width, height = int(atlas.width), int(atlas.height)
-        if max(width, height) <= largest and atlas.atlas_count <= 1:
+        if 0 < max(width, height) <= largest and atlas.atlas_count == 1:
             break
-        scale *= min(0.97, 0.99 * largest / max(width, height))
+        scale *= min(0.97, 0.99 * largest / max(width, height, 1))
     else:
         raise InputError(f"texture atlas: {atlas.chart_count} charts do not fit into {largest} x {largest} texels; raise it")
     size = min(STEP * -(-max(width, height) // STEP), largest)
@@ -105,8 +107,22 @@ def unwrap(meshes: Sequence[tuple[NDArray, NDArray]], density: ArrayLike, larges
         rows, faces, coordinates = atlas.get_mesh(number)
         source.append(rows.astype(np.int64))
         new.append(faces.astype(np.int64))
+        charts = np.asarray(atlas.get_mesh_vertex_assignment(number)[1]).astype(np.int32)
+        coordinates = coordinates[_nearest_with(charts >= 0, meshes[number][0][rows])]
         uv.append((coordinates * np.array([width / size, height / size])).astype(np.float32))
     return Unwrapped(source, uv, new, size, scale, int(atlas.chart_count))
+
+
+def _nearest_with(has: NDArray, points: NDArray) -> NDArray:
+    """Return for each point (n,) itself, or the nearest one that `has` (n,): corners of faces without an area are in no chart."""
+    own = np.arange(len(points))
+    if has.all() or not has.any():
+        return own
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero(has)
+    own[~has] = rows[cKDTree(points[rows]).query(points[~has])[1]]
+    return own
 
 
 def texel_surface(uv: ArrayLike, faces: ArrayLike, size: int) -> tuple[NDArray, NDArray]:

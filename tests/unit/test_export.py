@@ -217,13 +217,17 @@ def test_a_mesh_that_is_too_fine_becomes_simpler_and_keeps_its_colours():
     assert walls.simplified
     assert face_geometry(walls.vertices, walls.faces)[1].sum() == pytest.approx(37, rel=0.01)
     np.testing.assert_allclose(np.ptp(walls.vertices, axis=0), [3, 2, 2.5], atol=0.02)
-    made = [replace(p, simplified=True) for p in textured(scene)[0]]  # read on the mesh of the photographs
-    moved = [replace(p, vertices=p.vertices + np.float32([0, 0, 0.02])) for p in made]  # a simplified mesh is not quite there
-    atlas, exact = (
-        bake(moved, fine, np.zeros(len(scene.cell_centres)), 128),
-        bake(made, fine, np.zeros(len(scene.cell_centres)), 128),
-    )
-    assert np.abs(atlas.base_color - exact.base_color).mean() < 0.003
+    # A simplified mesh is not quite where the cells are; its texels are read on the mesh of the photographs.
+    off = [replace(part, vertices=part.vertices + np.float32([0, 0, 0.06])) for part in textured(scene)[0]]
+    texels = texels_of(off, 256)
+    floor = (texels.points[:, 2] < 0.07) & (texels.normals[:, 2] > 0.9) & (np.abs(texels.points[:, 0] - 1.5) < 1.4)
+    floor &= (np.abs(texels.points[:, 0] - 1.5) > 0.1) & (np.abs(texels.points[:, 1] - 1) < 0.9)
+    colour = np.where(texels.points[floor, :1] < 1.5, [0.6, 0.1, 0.1], [0.1, 0.1, 0.6])
+    uncertainty = np.zeros(len(scene.cell_centres))
+    for simplified, most in ((True, 1e-6), (False, np.inf)):
+        atlas = bake([replace(part, simplified=simplified) for part in off], fine, uncertainty, 256)
+        error = np.abs(atlas.base_color.reshape(-1, 3)[texels.index[floor]] - colour)
+        assert error.max() < most and (simplified or error.max() > 0.1)
 
 
 def test_copies_and_faces_without_area_are_dropped():
@@ -419,7 +423,8 @@ def test_glb_comes_back(glb, tmp_path):
     grid = own.cell_edge, own.cell_origin, own.cell_ijk, own.cell_object
     wanted = values_at(hits, objects, *grid, own.cell_values, own.object_values)
     error = np.abs(found - wanted)
-    edge = np.abs(hits[:, 0] - 1.5) < 0.05  # where red meets blue, resampling shifts the border by up to a texel
+    # Where red meets blue, or the floor the walls, resampling shifts the border by up to a texel.
+    edge = (np.abs(hits[:, 0] - 1.5) < 0.05) | (np.minimum(hits, [3, 2, 9] - hits)[:, :2].min(1) < 0.05)
     assert error[~edge].mean() < 1 / 255 and error[~edge].max() < 0.01
     assert error.mean() < 2 / 255
 
