@@ -21,6 +21,20 @@ def values_at(
     values: ArrayLike,
     object_values: ArrayLike,
 ) -> Array:
+    """Read the values of the surface at points, as `cells_at` does, without the cells."""
+    return cells_at(points, object_id, edge, origin, ijk, cell_object, values, object_values)[0]
+
+
+def cells_at(
+    points: ArrayLike,
+    object_id: ArrayLike,
+    edge: float,
+    origin: ArrayLike,
+    ijk: ArrayLike,
+    cell_object: ArrayLike,
+    values: ArrayLike,
+    object_values: ArrayLike,
+) -> tuple[Array, Array]:
     """Read the values of the surface at points: of the cell there; where none was observed, the mean of the coarse cell around,
     then that of the object, and without an object the mean over all objects (docs/method/numerics.md#surface-that-nobody-saw).
 
@@ -33,7 +47,7 @@ def values_at(
         object_values: (objects, C), at least one row.
 
     Returns:
-        (n, C) float32.
+        (n, C) float32, and (n,) int64 the cell at each point, -1 where none was observed.
 
     Raises:
         InputError: points that are not finite, or no row of `object_values`.
@@ -44,8 +58,9 @@ def values_at(
     points, object_id = np.asarray(points, np.float32).reshape(-1, 3), np.asarray(object_id, np.int64).reshape(-1)
     known = (object_id >= 0) & (object_id < len(object_values))
     out = np.where(known[:, None], object_values[np.where(known, object_id, 0)], object_values.mean(axis=0))
+    row = np.full(len(points), -1, np.int64)
     if not len(values):
-        return out
+        return out, row
     around_ijk, around_object, around = coarse_cells(ijk, cell_object, values)
     grids = (
         (COARSE * edge, around_ijk, around_object, around),
@@ -53,20 +68,9 @@ def values_at(
     )
     for size, own_ijk, own_object, own in grids:
         table = CellTable.build(pack_keys(own_ijk, own_object))
-        row = _rows(table, voxel_indices(points, size, origin), object_id)
+        row = _rows(table, voxel_indices(points, size, origin), object_id).astype(np.int64)
         out = np.where((row >= 0)[:, None], own[row], out)
-    return out
-
-
-def observed_at(
-    points: ArrayLike, object_id: ArrayLike, edge: float, origin: ArrayLike, ijk: ArrayLike, cell_object: ArrayLike
-) -> Array:
-    """Return (n,) int64 the surface cell at each point, -1 where none was observed; arguments as in `values_at`."""
-    points, object_id = np.asarray(points, np.float32).reshape(-1, 3), np.asarray(object_id, np.int64).reshape(-1)
-    if not len(cell_object):
-        return np.full(len(points), -1, np.int64)
-    table = CellTable.build(pack_keys(np.asarray(ijk).reshape(-1, 3), np.asarray(cell_object)))
-    return _rows(table, voxel_indices(points, edge, origin), object_id).astype(np.int64)
+    return out, row
 
 
 def _rows(table: CellTable, ijk: Array, object_id: Array) -> Array:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.errors import InputError
@@ -20,6 +21,7 @@ from iif_core.surface.atlas import nearest_covered, unwrap
 from iif_core.surface.cells import voxel_indices
 from iif_core.surface.lookup import values_at
 from iif_core.surface.triangles import face_geometry, subdivide, vertex_normals
+from tests.oracles.exported import maps_of, read_back
 from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
@@ -359,61 +361,15 @@ def test_glb_is_the_same_every_time(glb):
     assert glb == glb_of(room(), [view()])
 
 
-def read_back(path):
-    """What another program reads of the file: geometry, texture coordinates and pictures of each mesh, in the world's axes."""
-    import trimesh
-
-    loaded = trimesh.load(path, process=False)
-    turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], float)  # of the root: z up became y up
-    meshes = {}
-    for node in loaded.graph.nodes_geometry:
-        matrix, name = loaded.graph[node]
-        mesh = loaded.geometry[name]
-        xyz = (np.asarray(mesh.vertices) @ matrix[:3, :3].T + matrix[:3, 3]) @ turn  # back again
-        meshes[name] = (xyz, np.asarray(mesh.faces), mesh.visual)
-    return loaded, meshes
-
-
-def maps_of(meshes, camera):
-    """Base colour (linear), roughness and metallic of each pixel, of meshes that were read from a file; nan = nothing hit."""
-    import open3d as o3d
-
-    rays = pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, camera.world_from_camera)
-    rays = rays.reshape(-1, 3).astype(np.float32)
-    scene, meshes = o3d.t.geometry.RaycastingScene(), list(meshes.values())
-    for xyz, faces, _ in meshes:
-        scene.add_triangles(o3d.core.Tensor(xyz.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
-    eye = np.tile(np.float32(camera.world_from_camera[:3, 3]), (len(rays), 1))
-    hit = scene.cast_rays(o3d.core.Tensor(np.concatenate([eye, rays], 1)))
-    of, face, second = (hit[name].numpy() for name in ("geometry_ids", "primitive_ids", "primitive_uvs"))
-    weights = np.stack([1 - second.sum(1), second[:, 0], second[:, 1]], 1)
-    out = np.full((len(rays), 5), np.nan)
-    for number, (_, faces, visual) in enumerate(meshes):
-        own = np.flatnonzero(of == number)
-        if visual.material.baseColorTexture is None:  # an emitter
-            out[own] = [0, 0, 0, 1, 0]
-            continue
-        uv = np.einsum("nk,nkc->nc", weights[own], np.asarray(visual.uv)[faces[face[own]]])
-        colour, surface = (
-            np.asarray(p, np.float64) / 255 for p in (visual.material.baseColorTexture, visual.material.metallicRoughnessTexture)
-        )
-        size = len(colour)
-        column = np.clip((uv[:, 0] * size).astype(int), 0, size - 1)
-        row = np.clip(((1 - uv[:, 1]) * size).astype(int), 0, size - 1)  # trimesh turns v upwards
-        out[own, :3] = linear_from_srgb(colour[row, column, :3])
-        out[own, 3:] = surface[row, column][:, [1, 2]]
-    hits = eye + hit["t_hit"].numpy()[:, None] * rays
-    return out, hits, of
-
-
 def test_glb_comes_back(glb, tmp_path):
     """trimesh reads the same geometry and, within a quantum of eight bits, the same materials, pixel by pixel."""
     (tmp_path / "scene.glb").write_bytes(glb)
-    loaded, meshes = read_back(tmp_path / "scene.glb")
+    meshes = read_back(tmp_path / "scene.glb", UP)
     scene = room()
     parts = {part.name: part for part in textured(scene)[0]}
     assert set(meshes) == set(parts)
-    np.testing.assert_allclose(loaded.extents, [3, 2.5, 2], atol=1e-5)  # z up became y up
+    extents = trimesh.load(tmp_path / "scene.glb", process=False).extents
+    np.testing.assert_allclose(extents, [3, 2.5, 2], atol=1e-5)  # z up became y up
     for name, (xyz, faces, _) in meshes.items():
         np.testing.assert_allclose(xyz, parts[name].vertices, atol=1e-6)
         np.testing.assert_array_equal(faces, parts[name].faces)

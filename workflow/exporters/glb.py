@@ -94,16 +94,16 @@ def fitting_glb(
     Returns:
         The file, and what its textures are: `format`, `size`, `mb`, and `fits`, false if the meshes alone are larger.
     """
-    colour, surface = base_color_picture(atlas), surface_picture(atlas)
+    pictures = {"base_color": base_color_picture(atlas), "surface": surface_picture(atlas)}
     every = 1
     while True:
         for jpeg in (None, JPEG_QUALITY):
-            images = {name: encoded(p[::every, ::every], jpeg) for name, p in (("base_color", colour), ("surface", surface))}
+            images = {name: encoded(picture[::every, ::every], jpeg) for name, picture in pictures.items()}
             data = glb_bytes(parts, images, up, provenance, views)
-            facts = {"format": "jpeg" if jpeg else "png", "size": len(colour[::every]), "mb": len(data) / MEGABYTE}
+            facts = {"format": "jpeg" if jpeg else "png", "size": -(-atlas.size // every), "mb": len(data) / MEGABYTE}
             if len(data) <= max_mb * MEGABYTE:
                 return data, facts | {"fits": True}
-        if len(colour[::every]) <= 256:
+        if -(-atlas.size // every) <= 256:
             return data, facts | {"fits": False}
         every *= 2
 
