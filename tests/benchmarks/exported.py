@@ -2,10 +2,10 @@
 
     python tests/benchmarks/exported.py kitchen [--quality draft] [--views 3] [--samples 64] [--replicates 12] [--json rows.json]
 
-Run it in a working folder where the scene is finished. Prints, and adds to a JSON file: faults that Khronos' validator finds;
-mean differences of `scene.glb`, read by trimesh, from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact
-reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error,
-and Sidak's test of all pixels.
+Run it in a working folder where the scene is finished. Prints, and adds to a JSON file: faults that Khronos' validator finds; mean
+differences of `scene.glb`, read by trimesh, from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the
+exact reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard
+error, and Sidak's test of all pixels.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def rendered(job: Any, views: list[Any], samples: int, replicates: int) -> dict[
         found = compare(name, theirs, ours, replicates)
         out[name] = found._asdict()
         print(
-            f"{name}: {1 + found.bias:.4f} +- {found.error:.4f} of our radiance, smallest p {found.smallest:.2g} of {found.threshold:.2g}"
+            f"{name}: {1 + found.bias:.4f} +- {found.error:.4f} of our radiance, p {found.smallest:.2g} of {found.threshold:.2g}"
         )
     return out
 

@@ -199,7 +199,15 @@ use rule stage as unwrap with:
 use rule stage as export with:
     input:
         unpack(
-            reads("export", "capture", "segmentation", "base", "emission", "affines", "unwrap")
+            reads(
+                "export",
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "affines",
+                "unwrap",
+            )
         ),
     pathvars:
         stage="export",
