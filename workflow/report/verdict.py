@@ -1,0 +1,364 @@
+"""Judges a result: four lights (geometry, light, materials, scale) with reasons and remedies, from numbers that the stages measured.
+
+Everything here is pure. `workflow/stages/report.py` collects the `Evidence`; `LIMITS` holds every threshold, with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+GREEN, AMBER, RED = "green", "amber", "red"
+ORDER = (GREEN, AMBER, RED)
+WORDS = {GREEN: "good", AMBER: "doubtful", RED: "poor"}
+"""A light in a word, so that no colour is needed to read it."""
+
+
+class Limit(NamedTuple):
+    """Where a number stops to be good.
+
+    Attributes:
+        amber: the last value that is green.
+        red: the last value that is amber.
+        why: reason of both.
+    """
+
+    amber: float
+    red: float
+    why: str
+
+    def level(self, value: float) -> str:
+        """Return the colour of a value. Larger is worse where `red` is larger than `amber`; NaN is red."""
+        sign = 1.0 if self.red >= self.amber else -1.0
+        if sign * value <= sign * self.amber:
+            return GREEN
+        return AMBER if sign * value <= sign * self.red else RED
+
+
+LIMITS: dict[str, Limit] = {
+    "escape": Limit(0.1, 0.4, "windows and doors let 2 to 5 % of the rays out; a room without ceiling two thirds, and its light is a guess"),
+    "depth": Limit(0.02, 0.05, "a share of the distance: 2 % is the noise of depth cameras, 5 % is where the source refuses by default"),
+    "edges": Limit(0.2, 0.05, "correlation of edges in photographs and mesh: a good scan has 0.4; the source warns below 0.05"),
+    "agreement": Limit(0.7, 0.4, "correlation of a photograph with the others: 0.9 is usual; below 0.2 a single one is left out"),
+    "lost": Limit(0.1, 1 / 3, "share of the photographs; beyond a third the fault lies in the whole capture and not in single photographs"),
+    "photographed": Limit(0.6, 0.3, "share of the surface that lights the room; below 0.3 indirect light is not read from photographs"),
+    "stability": Limit(0.7, 0.3, "adjusted Rand index of the objects under small changes; the plan's own limit is 0.7"),
+    "misfit": Limit(0.1, 0.4, "mean squared relative error of the light: six rooms with truth have 0.02 to 0.07; 0.4 is an error of 60 %"),
+    "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
+    "rerendering": Limit(22.0, 16.0, "dB: 22 is an error of 8 % of the sensor's range (a real kitchen has 22), 16 is one of 16 %"),
+    "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
+    "uncertainty": Limit(0.1, 0.2, "claimed standard error of the albedo, median over the surface; rooms with truth have 0.02 to 0.05"),
+    "unfitted": Limit(0.2, 0.6, "share of the pixels on objects that could not be fitted by themselves"),
+    "level_error": Limit(0.25, 0.5, "claimed relative error of the level; rooms with truth have 0.05 to 0.28"),
+    "raised": Limit(1.02, 1.5, "factor on all light without which albedos would exceed 1; 1.5 contradicts every claimed error"),
+    "light_scale": Limit(1.35, 2.0, "factor between the two estimates of the level, in either direction"),
+    "discrepancy": Limit(1.5, 4.0, "mean square of the discrepancy of the two levels of objects over its claimed size; 1 is what is claimed"),
+}  # fmt: skip
+"""Every threshold of the verdict (docs/guide/results.md#the-four-lights)."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known about a result; None where nothing was measured. Shares are of 1, factors of 1, scores in dB.
+
+    Attributes:
+        escape: share of the rays from surface that leave the mesh; escape_camera: that of the rays from cameras.
+        depth: median disagreement of mesh and measured depth.
+        edges: correlation of edges of photographs and mesh; edges_warn: whether the source found it too weak.
+        agreement: median correlation of a photograph with what the others show of the same surface.
+        photographs: number of photographs; lost: how many were left out of those given.
+        photographed: share of the surface met by rays from surface that photographs show.
+        stability: of the objects; None also where objects are given.
+        lamps: emitters that were kept; environment: whether light from outside was found.
+        misfit: of the light; light_spread: of the light against the truth.
+        held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
+        held_out_views: number of held-out photographs.
+        albedo: PSNR against the truth, as it is; has_truth: whether there is truth.
+        prior: kind of the prior.
+        uncertainty: claimed standard error of the albedo.
+        unfitted: share of the pixels on objects that take what others have.
+        level: what fixed the level (`iif_core.fitting.gauge.KINDS`); level_error: its relative standard error.
+        raised: factor by which all light was raised; light_scale: factor between the two estimates of the level.
+        discrepancy: of the levels of objects.
+        warnings: (stage, sentence) of the figures beyond their limits.
+    """
+
+    escape: float | None = None
+    escape_camera: float | None = None
+    depth: float | None = None
+    edges: float | None = None
+    edges_warn: bool = False
+    agreement: float | None = None
+    photographs: int = 0
+    lost: int = 0
+    photographed: float | None = None
+    stability: float | None = None
+    lamps: int = 0
+    environment: bool = False
+    misfit: float | None = None
+    light_spread: float | None = None
+    held_out: float | None = None
+    held_out_views: int = 0
+    used: float | None = None
+    albedo: float | None = None
+    has_truth: bool = False
+    prior: str = ""
+    uncertainty: float | None = None
+    unfitted: float | None = None
+    level: str = ""
+    level_error: float | None = None
+    raised: float = 1.0
+    light_scale: float = 1.0
+    discrepancy: float | None = None
+    warnings: Sequence[tuple[str, str]] = field(default_factory=tuple)
+
+
+class Finding(NamedTuple):
+    """One reason: its colour, a sentence with a number, and what to do about it (empty where it is green)."""
+
+    level: str
+    text: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Light:
+    """One of the four lights: the colour of its worst finding; findings are sorted from worst to best."""
+
+    name: str
+    question: str
+    findings: Sequence[Finding]
+
+    @property
+    def level(self) -> str:
+        return self.findings[0].level if self.findings else GREEN
+
+    @property
+    def word(self) -> str:
+        return WORDS[self.level]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A sentence, its colour, and the four lights."""
+
+    sentence: str
+    level: str
+    lights: Sequence[Light]
+
+
+def judge(e: Evidence) -> Verdict:
+    """Judge a result by its evidence."""
+    lights = [_geometry(e), _light(e), _materials(e), _scale(e)]
+    return Verdict(_sentence(lights), max((light.level for light in lights), key=ORDER.index), lights)
+
+
+def _sentence(lights: Sequence[Light]) -> str:
+    worst = max((light.level for light in lights), key=ORDER.index)
+    named = [light for light in lights if light.level == worst]
+    if worst == GREEN:
+        return "Everything that was checked speaks for this result."
+    names = _joined([light.name for light in named])
+    reason = named[0].findings[0].text
+    reason = reason[0].lower() + reason[1:] if not reason[:2].isupper() else reason
+    if worst == AMBER:
+        return f"Usable with care: {names} {'is' if len(named) == 1 else 'are'} in doubt ({reason})."
+    return f"Do not rely on this result for {names}: {reason}."
+
+
+def _joined(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _made(name: str, question: str, findings: Sequence[Finding | None]) -> Light:
+    found = [finding for finding in findings if finding is not None]
+    ordered = sorted(found, key=lambda finding: -ORDER.index(finding.level))
+    return Light(name, question, ordered or [Finding(AMBER, "Nothing was measured", "Run the stage again")])
+
+
+def _finding(limit: str, value: float | None, text: str, remedy: str, format_: str = "", worst: str = RED) -> Finding | None:
+    """Return the finding about a number, whose place in `text` is `{}`; None where the number is not known.
+
+    `worst` is the worst colour that it may have.
+    """
+    if value is None:
+        return None
+    level = LIMITS[limit].level(value) if np.isfinite(value) else RED
+    level = min(level, worst, key=ORDER.index)
+    return Finding(level, text.format(format(value, format_)), "" if level == GREEN else remedy)
+
+
+def _warned(e: Evidence, stages: Sequence[str]) -> list[Finding]:
+    return [
+        Finding(AMBER, f"Numerical warning of stage {stage}: {sentence}", "See the sentence itself; docs/results/stability.md#guards")
+        for stage, sentence in e.warnings
+        if stage in stages
+    ]
+
+
+def _geometry(e: Evidence) -> Light:
+    lost = e.lost / max(e.photographs + e.lost, 1)
+    edges = None
+    if e.edges is not None:
+        level = max(LIMITS["edges"].level(e.edges), AMBER if e.edges_warn else GREEN, key=ORDER.index)
+        remedy = "Look at the pictures 'alignment' below; check source.axes, source.unit, and that every photograph stands with its own pose"
+        # Measured depth is stronger evidence than edges, which a room without texture hardly has.
+        level = min(level, AMBER, key=ORDER.index) if e.depth is not None else level
+        edges = Finding(level, f"Edges of photographs and mesh correlate by {e.edges:.2f}", "" if level == GREEN else remedy)
+    camera = "" if e.escape_camera is None else f" (of rays from cameras {e.escape_camera:.1%})"
+    return _made(
+        "geometry",
+        "Does the mesh hold the room, and do the photographs lie on it?",
+        [
+            _finding(
+                "escape", e.escape, f"{{}} of the rays from surface leave the mesh{camera}",
+                "Close the mesh: it needs walls, floor and ceiling, because they reflect light and keep light out"
+                " (docs/guide/own-data.md)", ".1%",
+            ),
+            _finding(
+                "depth", e.depth, "Mesh and measured depth differ by {} (median)",
+                "Check unit, axes and frame of the mesh (source.unit, source.axes)", ".1%",
+            ),
+            edges,
+            _finding(
+                "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
+                "Refine the poses where they were made (COLMAP, the phone's app); source.registration: auto moves them by a few pixels",
+                ".2f",
+            ),
+            _finding(
+                "photographed", e.photographed, "Photographs show {} of the surface that lights the rest",
+                "Photograph also what lies behind the camera: every wall, floor and ceiling", ".0%",
+            ),
+            _finding(
+                "lost", lost if e.photographs else None, f"{{}} of the photographs were left out ({e.lost} of {e.photographs + e.lost})",
+                "Take them again, sharper and with poses; the notes say why each was left out", ".0%",
+            ),
+        ],
+    )  # fmt: skip
+
+
+def _light(e: Evidence) -> Light:
+    outside = "light from outside the mesh" if e.environment else ""
+    if e.lamps:
+        lamps = Finding(GREEN, f"{e.lamps} {'lamp' if e.lamps == 1 else 'lamps'} found{' and ' + outside if outside else ''}")
+    elif e.environment and e.escape is not None and LIMITS["escape"].level(e.escape) == GREEN:
+        lamps = Finding(GREEN, f"0 lamps found; {outside} lights the room")
+    elif e.environment:
+        lamps = Finding(
+            AMBER, f"0 lamps found; what shines through the holes of the mesh ({outside}) stands for them",
+            "Photograph every lamp and window, and close the mesh around them",
+        )  # fmt: skip
+    else:
+        lamps = Finding(
+            RED, "0 lamps found and no light from outside: nothing lights the room",
+            "Photograph a lamp or the window, and keep its surface in the mesh",
+        )  # fmt: skip
+    return _made(
+        "light",
+        "Was found what lights the room?",
+        [
+            lamps,
+            _finding(
+                "misfit", e.misfit, "Light explains the surface with a mean squared relative error of {}",
+                "Look for lamps that are missing in the list below; photograph each lamp from several sides", ".3f",
+            ),
+            _finding(
+                "light_spread", e.light_spread, "Against the truth the light's error spreads by {} over objects",
+                "Photograph each lamp from several sides", ".2f",
+            ),
+            *_warned(e, ("emission", "shading")),
+        ],
+    )  # fmt: skip
+
+
+def _materials(e: Evidence) -> Light:
+    if e.held_out is not None:
+        scored = _finding(
+            "rerendering", e.held_out, f"Re-renderings of {e.held_out_views} photographs that were held out have {{}} dB",
+            "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
+        )  # fmt: skip
+    else:
+        scored = _finding(
+            "rerendering", e.used, "Re-renderings of the photographs have {} dB",
+            "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
+        )  # fmt: skip
+    judged = None
+    if not e.has_truth and e.held_out is None:
+        judged = Finding(
+            AMBER, "0 photographs were held out and there is no ground truth: nothing independent judges the materials",
+            "Hold some out: capture: {test_every: 8}",
+        )  # fmt: skip
+    elif not e.has_truth:
+        judged = Finding(GREEN, f"No ground truth: {e.held_out_views} held-out photographs judge the materials")
+    weak = None
+    if e.prior == "retinex":
+        weak = Finding(
+            AMBER, "Prior retinex: 0 learned weights, so roughness and metallic are weak guesses",
+            "Bring the predictions of a learned model (docs/guide/priors.md)",
+        )  # fmt: skip
+    return _made(
+        "materials",
+        "Are base colour, roughness and metallic those of the room?",
+        [
+            scored,
+            _finding(
+                "albedo", e.albedo, "The albedo has {} dB against the truth, as it is",
+                "See which objects are off in the pictures 'albedo error'", ".1f",
+            ),
+            judged,
+            weak,
+            _finding(
+                "uncertainty", e.uncertainty, "The albedo claims a standard error of {} (median)",
+                "More photographs of the surface, at more exposures, from more directions", ".3f",
+            ),
+            _finding(
+                "unfitted", e.unfitted, "{} of the pixels lie on objects that could not be fitted by themselves",
+                "More photographs, or larger objects (segmentation)", ".0%",
+            ),
+            _finding(
+                "stability", e.stability, "Objects depend on the choice of photographs: stability {} of 1",
+                "Judge the pictures 'objects'; give object ids, or change segmentation.scale", ".2f", AMBER,
+            ),
+            *_warned(e, ("base", "affines")),
+        ],
+    )  # fmt: skip
+
+
+FIXED = {"white_patch": "a white patch of known albedo", "lamp": "a lamp of known radiance"}
+CONVENTION = {"prior": "the mean albedo of the prior's predictions", "mean_albedo": "a mean albedo that was set"}
+
+
+def _scale(e: Evidence) -> Light:
+    patch = "Photograph a white patch of known albedo and name it (affines.scale: white_patch), or name a lamp of known radiance"
+    fixed = None
+    if e.level in FIXED:
+        fixed = Finding(GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {e.level_error:.0%})" if e.level_error else ""))
+    elif e.level in CONVENTION:
+        error = "" if e.level_error is None else f"; its error of {e.level_error:.0%} does not contain that of the convention"
+        fixed = Finding(AMBER, f"The level is a convention: {CONVENTION[e.level]}{error}", patch)
+    else:
+        fixed = _finding("level_error", e.level_error, "The level of light and albedo is known within {} (by indirect light)", patch, ".0%")
+        fixed = fixed or Finding(AMBER, "The level of light and albedo is not known: 0 measurements of it", patch)
+    moved = max(e.light_scale, 1 / e.light_scale) if e.light_scale > 0 else float("inf")
+    return _made(
+        "scale",
+        "How bright are albedo and light together?",
+        [
+            fixed,
+            _finding(
+                "raised", e.raised, "All light was raised {} times, so that albedos stay below 1",
+                "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
+            ) if e.raised > 1 else Finding(GREEN, "Light had to be raised 1.00 times: albedos stay below 1 by themselves"),
+            _finding(
+                "light_scale", moved, f"Light found and albedo predicted disagree by a factor of {{}} (the light was multiplied by"
+                f" {e.light_scale:.3g})", patch, ".2f",
+            ) if e.level not in (*FIXED, "mean_albedo") else None,
+            _finding(
+                "discrepancy", e.discrepancy, "Levels of single objects disagree by {} times their claimed variance",
+                "Look at objects whose uncertainty is large; lamps may be missing near them", ".2f",
+            ),
+        ],
+    )  # fmt: skip
