@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 
 from iif_core.light.environment import as_map, solid_angles
+from iif_core.reflectance.material import CHANNELS
 from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, read_parts, surface_picture
 from workflow.exporters.glb import fitting_glb
 from workflow.exporters.mitsuba_scene import mitsuba_files
+from workflow.exporters.object_table import csv_bytes, object_rows
 from workflow.exporters.surface import up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime.job import Job
@@ -21,7 +23,7 @@ MASK = "textures/seen.png"
 
 
 def run(job: Job) -> None:
-    """Write scene.glb, scene.usdc, textures/, mitsuba/, emitters.parquet and export.json."""
+    """Write scene.glb, scene.usdc, textures/, mitsuba/, emitters.parquet, objects.csv and export.json."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     unwrapped = job.read("unwrap").json("unwrap.json")
@@ -48,6 +50,7 @@ def run(job: Job) -> None:
     for name, data in mitsuba_files(parts, atlas, capture.views[:MAX_SENSORS], environment).items():
         job.writer.bytes(f"mitsuba/{name}", data)
     _emitter_table(job, recovered)
+    job.writer.bytes("objects.csv", _object_table(job, recovered))
     facts = {
         "up": up.tolist(),
         "parts": len(parts),
@@ -90,6 +93,18 @@ def _environment_note(environment: np.ndarray) -> dict[str, Any]:
     mean = np.average(radiance, (0, 1), np.repeat(solid_angles(*radiance.shape[:2])[..., None], 3, -1))
     note: dict[str, Any] = {"mean_radiance": [round(float(value), 6) for value in mean]}
     return {"environment": note | ({"map": "mitsuba/environment.exr"} if environment.ndim == 3 else {})}
+
+
+def _object_table(job: Job, recovered: Recovered) -> bytes:
+    """Return objects.csv."""
+    surface, affines, base = recovered.surface, job.read("affines").table("objects.parquet"), job.read("base").table("objects.parquet")
+    before = surface.object_values.astype(np.float64).copy()
+    before[base["object_id"]] = np.stack([base[name] for name in CHANNELS], 1)
+    seen = job.read("segmentation").table("objects.parquet")
+    rows = object_rows(
+        recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, before, affines, seen
+    )
+    return csv_bytes(rows)
 
 
 def _emitter_table(job: Job, recovered: Recovered) -> None:
