@@ -17,7 +17,14 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 AXE = REPOSITORY / ".node/node_modules/axe-core/axe.min.js"
 """Installed by `make validator`, beside the validator of glTF."""
 
-QUIET = ["--no-sandbox", "--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"]
+QUIET = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+]
 SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 """WebGL without a GPU."""
 

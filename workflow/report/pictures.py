@@ -5,6 +5,8 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
+from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +20,8 @@ OBJECT_BORDER = (0.05, 0.05, 0.05)
 DEPTH_EDGE = (0.0, 0.85, 1.0)
 DEPTH_STEP = 0.05  # relative, see `depth_edges`
 _COLOUR_MAPS = {"error": "inferno", "value": "viridis"}
+SCALAR_STEPS = 128
+"""Colours of a scalar map: few enough for a palette, so that the page can read values back from the colours."""
 
 
 def encoded(image: Array) -> Array:
@@ -66,8 +70,26 @@ def scalar(values: Array, low: float = 0.0, high: float = 1.0, scheme: str = "va
     Returns:
         (H, W, 3) uint8.
     """
-    picture = false_colour(values, low, high, scheme)
+    if not high > low:
+        raise InputError(f"colour map range {low} ... {high}: the upper end must be larger")
+    position = np.clip(
+        (np.nan_to_num(np.asarray(values, np.float64), nan=np.nan, posinf=high, neginf=low) - low) / (high - low), 0, 1
+    )
+    picture = false_colour(np.round(position * (SCALAR_STEPS - 1)) / (SCALAR_STEPS - 1), 0.0, 1.0, scheme)
     return color.to_uint8(picture if mask is None else np.where(mask[..., None], picture, 0.35))
+
+
+def palette(scheme: str) -> list[str]:
+    """Return the `SCALAR_STEPS` colours of `scalar`, from `low` to `high`, as `#rrggbb`."""
+    ramp = color.to_uint8(false_colour(np.linspace(0, 1, SCALAR_STEPS), 0.0, 1.0, scheme))
+    return ["#{:02x}{:02x}{:02x}".format(*rgb) for rgb in ramp]
+
+
+def gradient(scheme: str, stops: int = 9) -> str:
+    """Return the colour map as a CSS gradient, dark end first."""
+    colours = palette(scheme)
+    chosen = [colours[round(i * (len(colours) - 1) / (stops - 1))] for i in range(stops)]
+    return f"linear-gradient(to right,{','.join(chosen)})"
 
 
 def grey(values: Array) -> Array:
@@ -153,35 +175,56 @@ def selected_prediction(segment_id: Array, row_segment: Array, row_k: Array, row
     return np.where(segment_id >= 0, best[segment_id], -1)
 
 
-def data_uri(image: Array, lossless: bool = False) -> str:
-    """Encode (H, W, 3) uint8 as a `data:` address: JPEG without colour subsampling, or PNG; deterministic."""
+def data_uri(image: Array, lossless: bool = False, longest: int | None = None) -> str:
+    """Encode (H, W, 3) uint8 as a `data:` address: JPEG without colour subsampling, or PNG; deterministic.
+
+    A picture whose longer side exceeds `longest` is made smaller: by the mean of its pixels, or, if it is to be lossless (ids,
+    scalars in false colours), by the nearest ones. A lossless picture of at most 256 colours gets a palette.
+    """
     from PIL import Image
 
     buffer = io.BytesIO()
     picture = Image.fromarray(np.ascontiguousarray(image))
+    if longest and max(picture.size) > longest:
+        size = tuple(max(1, round(side * longest / max(picture.size))) for side in picture.size)
+        picture = picture.resize(size, Image.Resampling.NEAREST if lossless else Image.Resampling.BOX)
     if lossless:
-        picture.save(buffer, "PNG", optimize=True)
+        _indexed(np.asarray(picture)).save(buffer, "PNG", optimize=True)
     else:
-        picture.save(buffer, "JPEG", quality=90, subsampling=0)
+        picture.save(buffer, "JPEG", quality=90, subsampling=0, optimize=True)
     kind = "png" if lossless else "jpeg"
     return f"data:image/{kind};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def curves_svg(curves: Sequence[tuple[Array, Array, str, bool]], width: int = 300, height: int = 220) -> str:
-    """Draw curves, given as (x, y, colour, dashed), over [0, 1] x [0, 1] as SVG text."""
-    left, bottom, top, right = 34, 28, 8, 8
+def _indexed(image: Array) -> Any:
+    """Return (H, W, 3) uint8 as a Pillow image, with a palette if it has at most 256 colours."""
+    from PIL import Image
+
+    key = (image.astype(np.uint32) << np.array([16, 8, 0], np.uint32)).sum(-1)
+    colours, index = np.unique(key, return_inverse=True)
+    if len(colours) > 256:
+        return Image.fromarray(np.ascontiguousarray(image))
+    out = Image.fromarray(index.reshape(key.shape).astype(np.uint8), "P")
+    out.putpalette(np.stack([colours >> 16 & 255, colours >> 8 & 255, colours & 255], -1).astype(np.uint8).tobytes())
+    return out
+
+
+def curves_svg(curves: Sequence[tuple[Array, Array, str, bool]], title: str, width: int = 340, height: int = 250) -> str:
+    """Draw curves, given as (x, y, name of a CSS class, dashed), over [0, 1] x [0, 1] as SVG text, which `title` describes."""
+    left, bottom, top, right = 44, 34, 8, 8
     w, h = width - left - right, height - top - bottom
-    out = [f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img">']
+    out = [f'<svg viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{escape(title)}">']
     for tick in (0, 0.25, 0.5, 0.75, 1):
         x, y = left + tick * w, top + (1 - tick) * h
-        out.append(f'<path d="M{x:.1f} {top}V{top + h}M{left} {y:.1f}H{left + w}" stroke="#ddd" fill="none"/>')
+        out.append(f'<path d="M{x:.1f} {top}V{top + h}M{left} {y:.1f}H{left + w}" class="grid"/>')
         out.append(f'<text x="{x:.1f}" y="{top + h + 13}" text-anchor="middle">{tick:g}</text>')
         out.append(f'<text x="{left - 4}" y="{y + 3:.1f}" text-anchor="end">{tick:g}</text>')
-    for x, y, colour, dashed in curves:
+    for x, y, name, dashed in curves:
         points = " ".join(
             f"{left + np.clip(a, 0, 1) * w:.1f},{top + (1 - np.clip(b, 0, 1)) * h:.1f}" for a, b in zip(x, y, strict=True)
         )
-        dash = ' stroke-dasharray="5 4"' if dashed else ""
-        out.append(f'<polyline points="{points}" fill="none" stroke="{colour}" stroke-width="1.6"{dash}/>')
-    out.append(f'<text x="{left + w / 2}" y="{height - 2}" text-anchor="middle">exposed radiance</text></svg>')
+        out.append(f'<polyline points="{points}" class="curve {name}{" dashed" if dashed else ""}"/>')
+    out.append(f'<text x="{left + w / 2}" y="{height - 5}" text-anchor="middle">exposed radiance</text>')
+    middle = top + h / 2
+    out.append(f'<text x="11" y="{middle}" text-anchor="middle" transform="rotate(-90 11 {middle})">sensor value</text></svg>')
     return "".join(out)

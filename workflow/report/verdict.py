@@ -193,7 +193,9 @@ def _finding(limit: str, value: float | None, text: str, remedy: str, format_: s
 
 def _warned(e: Evidence, stages: Sequence[str]) -> list[Finding]:
     return [
-        Finding(AMBER, f"Numerical warning of stage {stage}: {sentence}", "See the sentence itself; docs/results/stability.md#guards")
+        Finding(
+            AMBER, f"Numerical warning of stage {stage}: {sentence}", "See the sentence itself; docs/results/stability.md#guards"
+        )
         for stage, sentence in e.warnings
         if stage in stages
     ]
@@ -335,12 +337,16 @@ def _scale(e: Evidence) -> Light:
     patch = "Photograph a white patch of known albedo and name it (affines.scale: white_patch), or name a lamp of known radiance"
     fixed = None
     if e.level in FIXED:
-        fixed = Finding(GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {e.level_error:.0%})" if e.level_error else ""))
+        fixed = Finding(
+            GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {e.level_error:.0%})" if e.level_error else "")
+        )
     elif e.level in CONVENTION:
         error = "" if e.level_error is None else f"; its error of {e.level_error:.0%} does not contain that of the convention"
         fixed = Finding(AMBER, f"The level is a convention: {CONVENTION[e.level]}{error}", patch)
     else:
-        fixed = _finding("level_error", e.level_error, "The level of light and albedo is known within {} (by indirect light)", patch, ".0%")
+        fixed = _finding(
+            "level_error", e.level_error, "The level of light and albedo is known within {} (by indirect light)", patch, ".0%"
+        )
         fixed = fixed or Finding(AMBER, "The level of light and albedo is not known: 0 measurements of it", patch)
     moved = max(e.light_scale, 1 / e.light_scale) if e.light_scale > 0 else float("inf")
     return _made(

@@ -70,6 +70,15 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
     return chosen
 
 
+WRITTEN_HERE = ("manifest.json", "timings.parquet")
+"""Files of the deliverable that this stage writes itself."""
+
+
+def published_names(readers: dict[str, StageReader]) -> list[str]:
+    """Return the names of all files of the deliverable, for pages that link to them."""
+    return sorted({*(name for _, name in deliverables(readers)), *WRITTEN_HERE})
+
+
 def place(source: Path, destination: Path) -> None:
     """Copy a file, so that editing the deliverable does not change results/."""
     destination.parent.mkdir(parents=True, exist_ok=True)

@@ -2,22 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from iif_core.evaluation.catalogue import METRICS
 from iif_core.numerics import color
 from workflow.artifacts.store import ids_from_disk, material_maps, prediction_numbers, rgb
 from workflow.decisions import numerics
 from workflow.decisions.expected import whole, with_expectation
 from workflow.decisions.plan import GAINS, with_override
 from workflow.decisions.record import FORCED, PROVISIONAL, SETTLED, plan_text
+from workflow.exporters.object_table import read_csv
 from workflow.report import pictures as pic
-from workflow.report.page import Page, Picture, Strip, Table, ViewRows, render_page, score_table
+from workflow.report.downloads import commands, downloads
+from workflow.report.page import (
+    Number,
+    Page,
+    Pair,
+    Picture,
+    Strip,
+    Table,
+    ViewRows,
+    explain,
+    explanation_key,
+    render_page,
+    score_table,
+)
+from workflow.report.verdict import Evidence, judge
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
+from workflow.stages import publish
 
 PLAN_KEYS = (
     "component",
@@ -35,7 +54,11 @@ PLAN_KEYS = (
 ERROR_RANGE = 0.25
 COVERAGE_RANGE = 4.0
 UNCERTAINTY_RANGE = 0.2
-CHANNEL_COLOURS = ("#c33", "#292", "#34c")
+CHANNEL_COLOURS = ("red", "green", "blue")
+WIDTH, HERO_WIDTH, PAIR_WIDTH = 512, 768, 288
+"""Longest side of a picture: of the maps, of the first one, and of the pairs of all views."""
+PAIRS = 60
+"""Photographs that are shown beside their re-rendering; of more, so many are taken evenly."""
 
 
 NUMERICS = ("base", "emission", "shading", "affines")
@@ -52,24 +75,117 @@ def run(job: Job) -> None:
     job.writer.bytes("plan.yaml", plan_text(job.scene, job.quality, plan).encode())
     response_svg, response_note = _response(job, capture)
     emission = _document(job, "emission", "emission.json")
+    warned = [(stage, _document(job, stage, f"{stage}.json")) for stage in NUMERICS]
+    tables = _tables(summary)
+    scores = _scores_of_views(job)
+    ranked = _ranked(capture, scores)
+    names = publish.published_names({stage: job.read(stage) for stage in job.stage.upstream})
+    overrides = [(item["component"], item["override"]) for item in plan if item.get("override")]
     page = Page(
         scene=job.scene,
         credit=job.settings.report.credit or str(capture.facts.get("credit", "")),
+        verdict=judge(_evidence(job, capture, recovered, summary)),
+        hero=_pair(job, capture, ranked[len(ranked) // 2], scores, HERO_WIDTH),
+        hero_note=_hero_note(ranked[len(ranked) // 2], scores),
         headline=_headline(summary, capture, recovered),
+        numbers=_numbers(summary),
+        explanations=_explanations(summary),
         facts=_facts(job, capture, recovered),
         notes=[str(note) for note in capture.facts.get("notes", [])] + [str(n) for n in emission.get("notes", [])],
-        warnings=numerics.warnings((stage, _document(job, stage, f"{stage}.json")) for stage in NUMERICS),
+        warnings=numerics.warnings(warned),
         plan=plan,
-        tables=_tables(summary),
-        views=_views(job, capture, recovered),
+        tables=tables,
+        pairs=_pairs(job, capture, ranked, scores),
+        pairs_note=_pairs_note(job, ranked, summary),
+        views=_views(job, capture, recovered, ranked, scores),
+        objects=_objects(job),
         emitters=_emitters(job, recovered),
         emitter_note=_emitter_note(capture, recovered),
         response_svg=response_svg,
         response_note=response_note,
         timings=read_timings(job.scene),
         versions=sorted(job.read("export").manifest.get("versions", {}).items()),
+        downloads=downloads(names),
+        commands=commands(job.scene, job.quality, overrides, names),
+        scene_file=_scene_file(job.scene),
     )
-    job.writer.bytes("report.html", render_page(page).encode())
+    data = render_page(page).encode()
+    job.writer.bytes("report.html", data)
+    job.log.info("report.html: %.1f MB, %d pictures", len(data) / 1e6, data.count(b"data:image/"))
+
+
+# ------------------------------------------------------------------------------------------------------------- evidence
+
+
+def _evidence(job: Job, capture: CaptureReader, recovered: Recovered, summary: dict[str, Any]) -> Evidence:
+    """Collect what the stages measured."""
+    emission, affines = _document(job, "emission", "emission.json"), _document(job, "affines", "affines.json")
+    alignment, registration = capture.facts.get("alignment") or {}, capture.facts.get("registration") or {}
+    agreement = [view["agreement"] for view in registration.get("views", {}).values() if view.get("agreement")]
+    escape, means = emission.get("escape_share") or {}, summary["means"].get("result", {})
+    cache = [
+        d["value"]
+        for d in _document(job, "shading", "shading.json").get("plan", [])
+        if d["component"] == "radiance_cache" and "value" in d
+    ]
+    probed = _document(job, "plan", "plan.json").get("probes", {}).get("photographed_share")
+    emitters = job.read("export").table("emitters.parquet")
+    area = emitters["kept"].astype(bool) & (emitters["kind"] == "area")
+    scale = affines.get("scale") or {}
+    unfitted, uncertainty = _fit_evidence(job)
+
+    def score(quantity: str, metric: str) -> dict[str, Any]:
+        return means.get(quantity, {}).get("raw", {}).get(metric, {})
+
+    return Evidence(
+        escape=escape.get("secondary"),
+        escape_camera=escape.get("primary"),
+        depth=alignment.get("depth_median_disagreement"),
+        edges=alignment.get("edge_correlation"),
+        edges_warn=any("may not be aligned" in str(note) for note in capture.facts.get("notes", [])),
+        agreement=float(np.median(agreement)) if agreement else None,
+        photographs=len(capture.views),
+        lost=len(capture.facts.get("dropped_views") or ()) + len(capture.facts.get("left_out_views") or ()),
+        photographed=float(cache[-1]) if cache else probed,
+        stability=_document(job, "segmentation", "segmentation.json").get("stability"),
+        lamps=int(np.count_nonzero(area)),
+        environment=bool(np.any(recovered.light.environment)),
+        misfit=emission.get("misfit"),
+        light_spread=score("rgb", "light_spread").get("mean"),
+        held_out=score("rgb_held_out", "psnr").get("mean"),
+        held_out_views=int(score("rgb_held_out", "psnr").get("views", 0)),
+        used=score("rgb", "psnr").get("mean"),
+        albedo=score("albedo", "psnr").get("mean"),
+        has_truth=capture.has_truth,
+        prior=str(job.read("prior").manifest.get("settings", {}).get("prior", {}).get("kind", "")),
+        uncertainty=uncertainty,
+        unfitted=unfitted,
+        level=str(scale.get("kind", "")),
+        level_error=scale.get("relative_error"),
+        raised=float(np.exp(emission.get("level_raised") or 0.0)),
+        light_scale=recovered.light_scale,
+        discrepancy=(affines.get("level_errors") or {}).get("normalised_discrepancy"),
+        warnings=[
+            (stage, sentence)
+            for stage in NUMERICS
+            for sentence in numerics.warnings([(stage, _document(job, stage, f"{stage}.json"))])
+        ],
+    )
+
+
+def _fit_evidence(job: Job) -> tuple[float | None, float | None]:
+    """Return the share of pixels on objects that were not fitted by themselves, and the median uncertainty of the albedo."""
+    objects, cells = job.read("affines").table("objects.parquet"), job.read("affines").table("cells.parquet")
+    unfitted = None
+    if "model" in objects and "pixels" in objects and objects["pixels"].sum() > 0:
+        alone = np.array([not str(model).startswith(("population", "identity")) for model in objects["model"]], bool)
+        unfitted = float(objects["pixels"][~alone].sum() / objects["pixels"].sum())
+    return unfitted, float(np.median(cells["uncertainty"])) if len(cells.get("uncertainty", ())) else None
+
+
+def _scene_file(scene: str) -> str:
+    """Return where the settings of the scene stand: its own file, or else the batch table."""
+    return next((path for path in (f"config/scenes/{scene}.yaml", "config/batch.tsv") if Path(path).is_file()), "")
 
 
 # ---------------------------------------------------------------------------------------------------------------- plan
@@ -220,16 +336,109 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
     return [table for table in tables if table]
 
 
+HEADS = (
+    ("held-out photographs", "rgb_held_out", "raw", "psnr"),
+    ("photographs", "rgb", "raw", "psnr"),
+    ("albedo, as it is", "albedo", "raw", "psnr"),
+    ("albedo, up to scale", "albedo", "scaled", "psnr"),
+    ("roughness", "roughness", "raw", "psnr"),
+    ("metallic", "metallic", "raw", "psnr"),
+    ("light left in the albedo", "albedo", "raw", "shading_left"),
+)
+"""Scores at the head of the page: label, quantity, protocol, metric."""
+
+
+def _numbers(summary: dict[str, Any]) -> list[Number]:
+    out = []
+    for label, *column in HEADS:
+        quantity, protocol, metric = column
+        entry = summary["means"].get("result", {}).get(quantity, {}).get(protocol, {}).get(metric)
+        if entry is not None:
+            unit = METRICS[metric].unit
+            text = f"{entry['mean']:.{1 if unit else METRICS[metric].decimals}f}{' ' + unit if unit else ''}"
+            out.append(Number(label, text, explanation_key(*column)))
+    return out
+
+
+def _explanations(summary: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Return the explanation of every score that any variant has."""
+    found = {
+        (quantity, protocol, metric)
+        for quantities in summary["means"].values()
+        for quantity, protocols in quantities.items()
+        for protocol, values in protocols.items()
+        for metric in values
+    }
+    return [explain(*column) for column in sorted(found)]
+
+
 # --------------------------------------------------------------------------------------------------------------- views
 
 
-def _views(job: Job, capture: CaptureReader, recovered: Recovered) -> list[ViewRows]:
-    count = min(job.settings.report.views, len(capture.views))
-    chosen = np.unique(np.linspace(0, len(capture.views) - 1, count).round().astype(int))
+def _scores_of_views(job: Job) -> dict[str, float]:
+    """Return the PSNR of the re-rendering of every view that was scored."""
+    table = job.read("metrics").table("metrics.parquet")
+    rows = np.char.startswith(table["quantity"].astype(str), "rgb") & (table["metric"] == "psnr") & (table["protocol"] == "raw")
+    return {str(view): float(value) for view, value in zip(table["view"][rows], table["value"][rows], strict=True)}
+
+
+def _ranked(capture: CaptureReader, scores: dict[str, float]) -> list[View]:
+    """Return the views from worst to best; those without a score come last."""
+    return sorted(capture.views, key=lambda view: (scores.get(view.name, np.inf), view.view_id))
+
+
+def _spread(views: Sequence[View], count: int) -> list[View]:
+    """Return up to `count` of the views, evenly spread, the first and the last among them."""
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))]
+
+
+def _hero_note(view: View, scores: dict[str, float]) -> str:
+    score = scores.get(view.name)
+    return f"View {view.name}, the middle one of all by its score" + (
+        f" ({score:.1f} dB PSNR, sensor values)" if score is not None else ""
+    )
+
+
+def _pairs_note(job: Job, ranked: Sequence[View], summary: dict[str, Any]) -> str:
+    shown = min(PAIRS, len(ranked))
+    text = "Drag over a picture, or use the arrow keys. The number is the PSNR of sensor values."
+    if summary["views"]["scored"] < summary["views"]["of"]:
+        text += f" {summary['views']['scored']} of {summary['views']['of']} views were scored (metrics.views)."
+    return text + (f" {shown} of {len(ranked)} views, evenly spread from worst to best." if shown < len(ranked) else "")
+
+
+def _pairs(job: Job, capture: CaptureReader, ranked: Sequence[View], scores: dict[str, float]) -> list[Pair]:
+    """Return photograph and re-rendering of all views, small, from worst to best."""
+    return [_pair(job, capture, view, scores, PAIR_WIDTH) for view in _spread(ranked, PAIRS)]
+
+
+def _pair(job: Job, capture: CaptureReader, view: View, scores: dict[str, float], longest: int) -> Pair:
+    photograph, rerendering = _photograph(job, capture, view, longest)[1:]
+    return Pair(view.name, photograph, rerendering, view.width, view.height, scores.get(view.name), view.split == "test")
+
+
+def _photograph(job: Job, capture: CaptureReader, view: View, longest: int) -> tuple[np.ndarray, Picture, Picture]:
+    """Return the photograph in sensor values (H, W, 3), its picture, and that of the re-rendering."""
+    photo, _ = capture.photo(view, held_out=True)
+    rendered = rgb(job.read("render").exr(f"maps/{view.name}.exr"), "ldr")
+    kind, unit = ("srgb", "exposed radiance") if capture.is_hdr else ("sensor", "sensor value")
+    show = pic.linear if capture.is_hdr else pic.encoded
+    sensor = np.clip(view.exposure * photo, 0, 1) if capture.is_hdr else photo
+    pictures = [
+        Picture(title, pic.data_uri(show(image), longest=longest), "", kind, 0.0, 1.0, unit)
+        for title, image in (("photograph", sensor), ("re-rendering", rendered))
+    ]
+    return sensor, pictures[0], pictures[1]
+
+
+def _views(
+    job: Job, capture: CaptureReader, recovered: Recovered, ranked: Sequence[View], scores: dict[str, float]
+) -> list[ViewRows]:
+    chosen = _spread(ranked, job.settings.report.views)
     emission_exposure = _emission_exposure(recovered)
-    exposures, rows = capture.exposures(), []
-    for done, i in enumerate(chosen):
-        rows.append(_view(job, capture, capture.views[i], float(exposures[i]), emission_exposure))
+    rows = []
+    for done, view in enumerate(chosen):
+        rows.append(_view(job, capture, view, emission_exposure, scores))
         job.progress(done + 1, len(chosen), "views drawn")
     return rows
 
@@ -243,31 +452,31 @@ def _emission_exposure(recovered: Recovered) -> float:
     return 0.8 / max(float(peak[order][min(half, len(lit) - 1)]), 1e-6) if len(lit) else 1.0
 
 
-def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emission_exposure: float) -> ViewRows:
+def _view(job: Job, capture: CaptureReader, view: View, emission_exposure: float, scores: dict[str, float]) -> ViewRows:
     file = f"maps/{view.name}.exr"
-    photo, valid = capture.photo(view, held_out=True)
+    _, valid = capture.photo(view, held_out=True)
     depth, face_id = capture.gbuffer(view)
     counted = valid & (face_id >= 0)
     rendered = job.read("render").exr(file)
-    sensor = np.clip(exposure * photo, 0, 1) if capture.is_hdr else photo
-    show = pic.linear if capture.is_hdr else pic.encoded
+    sensor, photograph, rerendering = _photograph(job, capture, view, WIDTH)
     result = material_maps(rendered) if "albedo.R" in rendered else None
     strips = [
         Strip(
             "result",
             [
-                _tile("re-rendering", show(rgb(rendered, "ldr"))),
+                rerendering,
                 *(_materials(result) if result else [None, None, None]),
-                _tile("emission", pic.linear(rgb(rendered, "emission"), emission_exposure)),
-                _tile(
+                _linear("emission", rgb(rendered, "emission"), "radiance", exposure=emission_exposure),
+                _false(
                     "re-rendering error",
                     pic.difference(rgb(rendered, "ldr"), sensor, counted),
-                    f"0 (dark) to {ERROR_RANGE} in sensor units",
+                    "error",
+                    ERROR_RANGE,
+                    "sensor value",
                 ),
             ],
         )
     ]
-    photograph = _tile("photograph", show(sensor))
     if capture.has_truth:
         strips.append(_truth(capture, view, photograph, result, face_id >= 0, emission_exposure))
     predictions = job.read("prior").exr(file) if job.read("prior").has(file) else {}
@@ -276,21 +485,37 @@ def _view(job: Job, capture: CaptureReader, view: View, exposure: float, emissio
     elif not capture.has_truth:
         strips.append(Strip("photograph", [photograph]))
     strips.append(Strip("checks", _checks(job, file, sensor, depth, counted)))
-    captions = [f"{view.width} x {view.height}", f"exposure {exposure:.3g}"]
+    captions = [f"{view.width} x {view.height}", f"exposure {view.exposure:.3g}"]
+    if view.name in scores:
+        captions.insert(0, f"{scores[view.name]:.1f} dB")
     if view.split == "test":
         captions.append("held out: not used in the reconstruction")
-    return ViewRows(view.name, ", ".join(captions), strips)
+    return ViewRows(view.name, ", ".join(captions), strips, file)
 
 
-def _tile(title: str, image: np.ndarray, note: str = "", lossless: bool = False) -> Picture:
-    return Picture(title, pic.data_uri(image, lossless), note)
+def _linear(title: str, image: np.ndarray, unit: str, note: str = "", exposure: float = 1.0) -> Picture:
+    """Return the picture of linear colours, shown times `exposure`."""
+    return Picture(title, pic.data_uri(pic.linear(image, exposure), longest=WIDTH), note, "srgb", 0.0, exposure, unit)
+
+
+def _grey(title: str, values: np.ndarray) -> Picture:
+    return Picture(title, pic.data_uri(pic.grey(values), longest=WIDTH), "", "grey", 0.0, 1.0, title)
+
+
+def _false(title: str, image: np.ndarray, scheme: str, high: float, unit: str, note: str = "") -> Picture:
+    """Return the picture of a scalar in false colours, from 0 to `high`."""
+    return Picture(title, pic.data_uri(image, True, WIDTH), note, scheme, 0.0, high, unit)
+
+
+def _ids(title: str, image: np.ndarray, note: str = "") -> Picture:
+    return Picture(title, pic.data_uri(image, True, WIDTH), note)
 
 
 def _materials(maps: dict[str, np.ndarray]) -> list[Picture | None]:
     return [
-        _tile("albedo", pic.linear(maps["albedo"])),
-        _tile("roughness", pic.grey(maps["roughness"])),
-        _tile("metallic", pic.grey(maps["metallic"])),
+        _linear("albedo", maps["albedo"], "albedo, linear"),
+        _grey("roughness", maps["roughness"]),
+        _grey("metallic", maps["metallic"]),
     ]
 
 
@@ -304,11 +529,11 @@ def _truth(
 ) -> Strip:
     truth = capture.truth(view)
     maps = {"albedo": truth.albedo, "roughness": truth.roughness, "metallic": truth.metallic}
-    emission = _tile("emission", pic.linear(truth.emission, emission_exposure), "same exposure as the result's")
+    emission = _linear("emission", truth.emission, "radiance", "same exposure as the result's", emission_exposure)
     error = None
     if result:
         picture = pic.difference(result["albedo"], truth.albedo, truth.valid & hit & ~(truth.emission > 0).any(-1))
-        error = _tile("albedo error", picture, f"0 to {ERROR_RANGE}, linear")
+        error = _false("albedo error", picture, "error", ERROR_RANGE, "albedo, linear")
     return Strip("truth", [photograph, *_materials(maps), emission, error])
 
 
@@ -317,7 +542,8 @@ def _prediction(channels: dict[str, np.ndarray], photograph: Picture | None) -> 
     numbers = prediction_numbers(channels)
     first = _materials(material_maps(channels, f"prior.{numbers[0]:03d}."))
     spread = np.std([rgb(channels, f"prior.{k:03d}.albedo") for k in numbers], axis=0).mean(-1)
-    apart = _tile("disagreement", pic.scalar(spread, 0, UNCERTAINTY_RANGE), "albedo, over the predictions")
+    shown = pic.scalar(spread, 0, UNCERTAINTY_RANGE)
+    apart = _false("disagreement", shown, "value", UNCERTAINTY_RANGE, "albedo", "standard deviation over the predictions")
     return Strip("raw prediction", [photograph, *first, apart])
 
 
@@ -327,22 +553,46 @@ def _checks(job: Job, file: str, sensor: np.ndarray, depth: np.ndarray, counted:
     if job.read("segmentation").has(file):
         channels = job.read("segmentation").exr(file)
         object_id, segment_id = ids_from_disk(channels["object.id"]), ids_from_disk(channels["segment.id"])
-        out.append(_tile("alignment", pic.alignment(sensor, object_id, depth), lossless=True))
-        out.append(_tile("objects", pic.overlay(sensor, object_id), "one colour for each object, over the photograph"))
+        out.append(_ids("alignment", pic.alignment(sensor, object_id, depth)))
+        objects = pic.data_uri(pic.overlay(sensor, object_id), longest=WIDTH)
+        out.append(Picture("objects", objects, "one colour for each object, over the photograph"))
         table = job.read("base").table("selection.parquet")
         if len(table["k"]):
             k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
-            out.append(_tile("selected prediction", pic.ids(k), "one colour for each number k", lossless=True))
+            out.append(_ids("selected prediction", pic.ids(k), "one colour for each number k"))
     if job.read("affines").has(file):
         uncertainty = job.read("affines").exr(file)["uncertainty"].astype(np.float32)
-        note = f"claimed for the albedo, 0 to {UNCERTAINTY_RANGE}; errors that all predictions share are not in it"
-        out.append(_tile("uncertainty", pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted), note))
+        note = "claimed standard error; errors that all predictions share are not in it"
+        shown = pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted)
+        out.append(_false("uncertainty", shown, "value", UNCERTAINTY_RANGE, "albedo", note))
     if job.read("base").has(file):
         base = job.read("base").exr(file)
-        out.append(_tile("base albedo", pic.linear(rgb(base, "albedo")), "before the fit"))
-        note = f"weighted pixels of the surface cell, 0 (filled in) to {COVERAGE_RANGE:g}"
-        out.append(_tile("coverage", pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted), note))
+        out.append(_linear("base albedo", rgb(base, "albedo"), "albedo, linear", "before the fit"))
+        shown = pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted)
+        out.append(_false("coverage", shown, "value", COVERAGE_RANGE, "pixels", "weighted, of the surface cell; 0: filled in"))
     return out
+
+
+# ------------------------------------------------------------------------------------------------------------ materials
+
+
+def _objects(job: Job) -> list[dict[str, str]]:
+    """Return the rows of the table of materials, from objects.csv of stage export; the surface that most pixels show first."""
+    rows = []
+    for row in read_csv(job.read("export").path("objects.csv").read_bytes()):
+        colour = [float(row[f"base_colour_{c}"]) for c in "rgb"]
+        row["linear"] = ", ".join(f"{v:.3f}" for v in colour)
+        row["luminance"] = f"{color.luminance(np.array(colour)):.5f}"
+        brightest = max("rgb", key=lambda c: float(row[f"base_colour_{c}"]))
+        low, middle = row[f"base_colour_{brightest}_low"], float(row[f"base_colour_{brightest}"])
+        # The interval of the level is a factor, and the same for all channels; its lower end is never cut off.
+        row["level"] = f"(× {float(low) / middle:.2f} to {middle / float(low):.2f})" if low and float(low) > 0 else ""
+        for name in ("roughness", "metallic"):
+            low, high = row[f"{name}_low"], row[f"{name}_high"]
+            row[f"{name}_text"] = f"{float(row[name]):.2f}"
+            row[f"{name}_interval"] = f"({float(low):.2f} to {float(high):.2f})" if low and high else ""
+        rows.append(row)
+    return sorted(rows, key=lambda row: -float(row["pixels"] or 0))
 
 
 # ----------------------------------------------------------------------------------------------- emitters and response
@@ -371,6 +621,8 @@ def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
                 "error": ", ".join(f"{v:.2g}" for v in error[i]),
                 "swatch": "#{:02x}{:02x}{:02x}".format(*swatch),
                 "share": share,
+                "power": f"{power[i]:.6g}",
+                "brightness": f"{radiance[i].sum():.6g}",
                 "observations": int(table["observations"][i]),
                 "kept": bool(kept[i]),
                 "reason": str(table["reason"][i]),
@@ -405,4 +657,4 @@ def _response(job: Job, capture: CaptureReader) -> tuple[str, str]:
         fitted = np.stack([np.interp(grid, x, curve) for curve in curves])
         rms = float(np.sqrt(np.mean((fitted - truth) ** 2)))
         note += f" Dashed: what the camera did; difference {rms:.4f} (root mean square, sensor units)."
-    return pic.curves_svg(drawn), note
+    return pic.curves_svg(drawn, "Response of the camera: sensor value over exposed radiance, in red, green and blue"), note
