@@ -1,4 +1,4 @@
-"""objects.csv: one line for each object, for people and spreadsheets: mean materials with 95 % intervals, and what was seen of it."""
+"""objects.csv: one line for each object, for people and spreadsheets: mean materials, 95 % intervals, what was seen of it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ def object_rows(
     """Return the columns of objects.csv, one entry per object; None where a number is not known.
 
     Intervals hold the errors of the fitted numbers: of the albedo that of its level, a factor exp(+-1.96 sigma); of roughness and
-    metallic those of factor and offset of `T x + t`, taken as independent, sigma^2 = (x sigma_T)^2 + sigma_t^2.
+    metallic those of factor and offset of `T x + t`, taken as independent, sigma^2 = (x sigma_T)^2 + sigma_t^2. Numbers that were
+    not fitted have no error, and no interval is claimed for them.
 
     Args:
         names: one per object id.
@@ -41,7 +42,7 @@ def object_rows(
     mean = np.stack([np.bincount(cell_object, cell_values[:, i].astype(np.float64), n)[:n] for i in range(5)], 1)
     mean = np.where(count[:, None] > 0, mean / np.maximum(count, 1)[:, None], object_values[:n])
     mean = np.clip(mean, 0, 1)
-    level = _by_id(fit, "std_level", n)
+    level = _fitted(_by_id(fit, "std_level", n))
     low, high = mean[:, :3] * np.exp(-NORMAL_95 * level)[:, None], mean[:, :3] * np.exp(NORMAL_95 * level)[:, None]
     columns: dict[str, list] = {
         "object_id": list(range(n)),
@@ -49,11 +50,11 @@ def object_rows(
         "base_colour_hex": [hex_colour(rgb) for rgb in mean[:, :3]],
         **{f"base_colour_{c}": _numbers(mean[:, i]) for i, c in enumerate("rgb")},
         **{f"base_colour_{c}_low": _numbers(low[:, i]) for i, c in enumerate("rgb")},
-        **{f"base_colour_{c}_high": _numbers(np.minimum(high[:, i], 1.0)) for i, c in enumerate("rgb")},
+        **{f"base_colour_{c}_high": _numbers(np.minimum(high[:, i], 1)) for i, c in enumerate("rgb")},
     }
     for channel, name in ((3, "roughness"), (4, "metallic")):
         std = _by_id(fit, f"std_{name}", n, 2)
-        sigma = np.hypot(base_values[:n, channel] * std[:, 0], std[:, 1])
+        sigma = _fitted(np.hypot(base_values[:n, channel] * std[:, 0], std[:, 1]))
         columns[name] = _numbers(mean[:, channel])
         columns[f"{name}_low"] = _numbers(np.maximum(mean[:, channel] - NORMAL_95 * sigma, 0))
         columns[f"{name}_high"] = _numbers(np.minimum(mean[:, channel] + NORMAL_95 * sigma, 1))
@@ -100,6 +101,11 @@ def _by_id(table: Mapping[str, Array], column: str, n: int, width: int = 0) -> A
         known = (ids >= 0) & (ids < n)
         out[ids[known]] = np.asarray(table[column], np.float64)[known]
     return out
+
+
+def _fitted(error: Array) -> Array:
+    """Return errors with NaN in the place of 0, which says that a number was not fitted."""
+    return np.where(error > 0, error, np.nan)
 
 
 def _numbers(values: Array) -> list[float | None]:

@@ -57,8 +57,8 @@ class Picture:
     Attributes:
         title: what it shows; note: more words.
         source: `data:` address.
-        kind: how a colour becomes a number again: `sensor` (value / 255), `srgb` (decoded, over `high`, the exposure), `grey` (value
-            / 255), `error` and `value` (place in the colour map between `low` and `high`), empty: it does not.
+        kind: how a colour becomes a number again: `sensor` (value / 255), `srgb` (decoded, over `high`, the exposure), `grey`
+            (value / 255), `error` and `value` (place in the colour map between `low` and `high`), empty: it does not.
         low, high, unit: of the numbers.
     """
 
@@ -160,7 +160,8 @@ class Page:
 def render_page(page: Page) -> str:
     """Render the page as HTML; all text is escaped."""
     bars = "".join(f".bar-{scheme}{{background:{pic.gradient(scheme)}}}" for scheme in ("error", "value"))
-    style = STYLE.read_text() + bars + "\n"
+    hero = page.hero.width / max(page.hero.height, 1)  # a style of one element would not be allowed by the policy
+    style = f"{STYLE.read_text()}{bars}.large{{max-width:calc(80vh*{hero:.4f})}}\n"
     script = SCRIPT.read_text()
     return template(TEMPLATE).render(
         page=page,

@@ -1,4 +1,4 @@
-"""Judges a result: four lights (geometry, light, materials, scale) with reasons and remedies, from numbers that the stages measured.
+"""Judges a result: four lights (geometry, light, materials, scale) with reasons and remedies, from what the stages measured.
 
 Everything here is pure. `workflow/stages/report.py` collects the `Evidence`; `LIMITS` holds every threshold, with its reason.
 """
@@ -39,23 +39,23 @@ class Limit(NamedTuple):
 
 
 LIMITS: dict[str, Limit] = {
-    "escape": Limit(0.1, 0.4, "windows and doors let 2 to 5 % of the rays out; a room without ceiling two thirds, and its light is a guess"),
-    "depth": Limit(0.02, 0.05, "a share of the distance: 2 % is the noise of depth cameras, 5 % is where the source refuses by default"),
+    "escape": Limit(0.1, 0.4, "windows let 2 to 5 % of the rays out, a missing ceiling two thirds, and its light is a guess"),
+    "depth": Limit(0.02, 0.05, "of the distance: 2 % is the noise of depth cameras; beyond 5 % the source refuses by default"),
     "edges": Limit(0.2, 0.05, "correlation of edges in photographs and mesh: a good scan has 0.4; the source warns below 0.05"),
     "agreement": Limit(0.7, 0.4, "correlation of a photograph with the others: 0.9 is usual; below 0.2 a single one is left out"),
-    "lost": Limit(0.1, 1 / 3, "share of the photographs; beyond a third the fault lies in the whole capture and not in single photographs"),
-    "photographed": Limit(0.6, 0.3, "share of the surface that lights the room; below 0.3 indirect light is not read from photographs"),
+    "lost": Limit(0.1, 1 / 3, "of the photographs; beyond a third the fault lies in the capture, not in single photographs"),
+    "photographed": Limit(0.6, 0.3, "of the surface that lights the rest; below 0.3 indirect light is not read from photographs"),
     "stability": Limit(0.7, 0.3, "adjusted Rand index of the objects under small changes; the plan's own limit is 0.7"),
-    "misfit": Limit(0.1, 0.4, "mean squared relative error of the light: six rooms with truth have 0.02 to 0.07; 0.4 is an error of 60 %"),
+    "misfit": Limit(0.1, 0.4, "mean squared relative error of the light: rooms with truth have 0.02 to 0.07; 0.4 is 60 %"),
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
-    "rerendering": Limit(22.0, 16.0, "dB: 22 is an error of 8 % of the sensor's range (a real kitchen has 22), 16 is one of 16 %"),
+    "rerendering": Limit(22.0, 16.0, "dB: 22 is an error of 8 % of the sensor's range (as in a real kitchen), 16 is one of 16 %"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
-    "uncertainty": Limit(0.1, 0.2, "claimed standard error of the albedo, median over the surface; rooms with truth have 0.02 to 0.05"),
+    "uncertainty": Limit(0.1, 0.2, "claimed standard error of the albedo, median over the surface; rooms have 0.02 to 0.05"),
     "unfitted": Limit(0.2, 0.6, "share of the pixels on objects that could not be fitted by themselves"),
     "level_error": Limit(0.25, 0.5, "claimed relative error of the level; rooms with truth have 0.05 to 0.28"),
     "raised": Limit(1.02, 1.5, "factor on all light without which albedos would exceed 1; 1.5 contradicts every claimed error"),
     "light_scale": Limit(1.35, 2.0, "factor between the two estimates of the level, in either direction"),
-    "discrepancy": Limit(1.5, 4.0, "mean square of the discrepancy of the two levels of objects over its claimed size; 1 is what is claimed"),
+    "discrepancy": Limit(1.5, 4.0, "mean square of the discrepancy of objects' levels over what is claimed; 1 is as claimed"),
 }  # fmt: skip
 """Every threshold of the verdict (docs/guide/results.md#the-four-lights)."""
 
@@ -140,6 +140,15 @@ class Light:
     def word(self) -> str:
         return WORDS[self.level]
 
+    @property
+    def shown(self) -> Sequence[Finding]:
+        """What is not green, or else the first two findings."""
+        return [f for f in self.findings if f.level != GREEN] or self.findings[:2]
+
+    @property
+    def rest(self) -> Sequence[Finding]:
+        return [f for f in self.findings if f not in self.shown]
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -206,7 +215,7 @@ def _geometry(e: Evidence) -> Light:
     edges = None
     if e.edges is not None:
         level = max(LIMITS["edges"].level(e.edges), AMBER if e.edges_warn else GREEN, key=ORDER.index)
-        remedy = "Look at the pictures 'alignment' below; check source.axes, source.unit, and that every photograph stands with its own pose"
+        remedy = "Look at the pictures 'alignment'; check source.axes, source.unit, and that each photograph has its own pose"
         # Measured depth is stronger evidence than edges, which a room without texture hardly has.
         level = min(level, AMBER, key=ORDER.index) if e.depth is not None else level
         edges = Finding(level, f"Edges of photographs and mesh correlate by {e.edges:.2f}", "" if level == GREEN else remedy)
@@ -227,7 +236,7 @@ def _geometry(e: Evidence) -> Light:
             edges,
             _finding(
                 "agreement", e.agreement, "Photographs of the same surface correlate by {} (median)",
-                "Refine the poses where they were made (COLMAP, the phone's app); source.registration: auto moves them by a few pixels",
+                "Refine the poses where they were made (COLMAP, the phone's app); source.registration mends a few pixels",
                 ".2f",
             ),
             _finding(
@@ -235,7 +244,8 @@ def _geometry(e: Evidence) -> Light:
                 "Photograph also what lies behind the camera: every wall, floor and ceiling", ".0%",
             ),
             _finding(
-                "lost", lost if e.photographs else None, f"{{}} of the photographs were left out ({e.lost} of {e.photographs + e.lost})",
+                "lost", lost if e.photographs else None,
+                f"{{}} of the photographs were left out ({e.lost} of {e.photographs + e.lost})",
                 "Take them again, sharper and with poses; the notes say why each was left out", ".0%",
             ),
         ],
@@ -250,7 +260,8 @@ def _light(e: Evidence) -> Light:
         lamps = Finding(GREEN, f"0 lamps found; {outside} lights the room")
     elif e.environment:
         lamps = Finding(
-            AMBER, f"0 lamps found; what shines through the holes of the mesh ({outside}) stands for them",
+            LIMITS["escape"].level(e.escape) if e.escape is not None else AMBER,
+            f"0 lamps found; what shines through the holes of the mesh ({outside}) stands for them",
             "Photograph every lamp and window, and close the mesh around them",
         )  # fmt: skip
     else:
@@ -357,10 +368,10 @@ def _scale(e: Evidence) -> Light:
             _finding(
                 "raised", e.raised, "All light was raised {} times, so that albedos stay below 1",
                 "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
-            ) if e.raised > 1 else Finding(GREEN, "Light had to be raised 1.00 times: albedos stay below 1 by themselves"),
+            ) if not e.raised <= 1 else Finding(GREEN, "Light had to be raised 1.00 times: albedos stay below 1 by themselves"),
             _finding(
-                "light_scale", moved, f"Light found and albedo predicted disagree by a factor of {{}} (the light was multiplied by"
-                f" {e.light_scale:.3g})", patch, ".2f",
+                "light_scale", moved, "Light found and albedo predicted disagree by a factor of {}"
+                f" (the light was multiplied by {e.light_scale:.3g})", patch, ".2f",
             ) if e.level not in (*FIXED, "mean_albedo") else None,
             _finding(
                 "discrepancy", e.discrepancy, "Levels of single objects disagree by {} times their claimed variance",

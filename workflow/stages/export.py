@@ -97,7 +97,11 @@ def _environment_note(environment: np.ndarray) -> dict[str, Any]:
 
 def _object_table(job: Job, recovered: Recovered) -> bytes:
     """Return objects.csv."""
-    surface, affines, base = recovered.surface, job.read("affines").table("objects.parquet"), job.read("base").table("objects.parquet")
+    surface, affines, base = (
+        recovered.surface,
+        job.read("affines").table("objects.parquet"),
+        job.read("base").table("objects.parquet"),
+    )
     before = surface.object_values.astype(np.float64).copy()
     before[base["object_id"]] = np.stack([base[name] for name in CHANNELS], 1)
     seen = job.read("segmentation").table("objects.parquet")

@@ -337,8 +337,8 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
 
 
 HEADS = (
-    ("held-out photographs", "rgb_held_out", "raw", "psnr"),
-    ("photographs", "rgb", "raw", "psnr"),
+    ("re-rendering, held-out photographs", "rgb_held_out", "raw", "psnr"),
+    ("re-rendering of the photographs", "rgb", "raw", "psnr"),
     ("albedo, as it is", "albedo", "raw", "psnr"),
     ("albedo, up to scale", "albedo", "scaled", "psnr"),
     ("roughness", "roughness", "raw", "psnr"),

@@ -1,0 +1,150 @@
+"""The verdict of the report: extremes, thresholds, words."""
+
+import dataclasses
+import math
+from itertools import product
+
+import pytest
+
+from workflow.report.verdict import AMBER, GREEN, LIMITS, ORDER, RED, Evidence, judge
+
+GOOD = Evidence(
+    escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
+    lamps=3, misfit=0.02, held_out=27.0, held_out_views=4, used=28.0, albedo=27.0, has_truth=True, prior="files", uncertainty=0.03,
+    unfitted=0.01, level="found", level_error=0.1, raised=1.0, light_scale=1.03, discrepancy=0.8, light_spread=0.03,
+)  # fmt: skip
+
+
+def levels(evidence):
+    return {light.name: light.level for light in judge(evidence).lights}
+
+
+def changed(**facts):
+    return levels(dataclasses.replace(GOOD, **facts))
+
+
+def test_a_good_result_is_green():
+    verdict = judge(GOOD)
+    assert verdict.level == GREEN and set(levels(GOOD).values()) == {GREEN}
+    assert verdict.sentence == "Everything that was checked speaks for this result."
+    assert all(not finding.remedy for light in verdict.lights for finding in light.findings)
+
+
+def test_a_hopeless_capture_says_so_first():
+    """A scan without a ceiling: no lamp, most rays leave, all light raised (the Red Kitchen at 160 x 120)."""
+    poor = dataclasses.replace(
+        GOOD, escape=0.633, escape_camera=0.046, lamps=0, environment=True, raised=4.7, has_truth=False, albedo=None,
+        light_spread=None, held_out=21.5, prior="retinex", discrepancy=1.94, level_error=0.19,
+    )  # fmt: skip
+    verdict = judge(poor)
+    assert levels(poor) == {"geometry": RED, "light": RED, "materials": AMBER, "scale": RED}
+    assert verdict.sentence.startswith("Do not rely on this result for geometry, light and scale: 63.3% of the rays")
+    said = {light.name: light.findings[0] for light in verdict.lights}
+    assert "Close the mesh" in said["geometry"].remedy and "63.3%" in said["geometry"].text
+    assert said["light"].text.startswith("0 lamps found") and "Photograph every lamp" in said["light"].remedy
+    assert "4.70 times" in said["scale"].text and "white patch" in said["scale"].remedy
+
+
+def test_nothing_that_lights_the_room():
+    assert changed(lamps=0)["light"] == RED
+    finding = judge(dataclasses.replace(GOOD, lamps=0)).lights[1].findings[0]
+    assert "Photograph a lamp" in finding.remedy
+
+
+def test_a_room_that_daylight_alone_lights_is_good():
+    assert changed(lamps=0, environment=True, escape=0.022)["light"] == GREEN
+
+
+def test_nothing_known_is_never_green():
+    """An empty result is not praised for what nobody measured."""
+    verdict = judge(Evidence())
+    assert verdict.level != GREEN
+    assert levels(Evidence()) == {"geometry": AMBER, "light": RED, "materials": AMBER, "scale": AMBER}
+    assert all(light.findings for light in verdict.lights)
+
+
+@pytest.mark.parametrize(
+    ("field", "light", "worst"),
+    [
+        ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED), ("photographed", "geometry", RED),
+        ("misfit", "light", RED), ("light_spread", "light", RED), ("albedo", "materials", RED), ("uncertainty", "materials", RED),
+        ("unfitted", "materials", RED), ("stability", "materials", AMBER), ("level_error", "scale", RED),
+        ("raised", "scale", RED), ("light_scale", "scale", RED), ("discrepancy", "scale", RED),
+    ],
+)  # fmt: skip
+def test_every_number_turns_its_light_at_its_limits(field, light, worst):
+    """Exactly at a limit the better colour holds; a hair beyond it the worse one; NaN is as bad as it gets."""
+    limit = LIMITS[field]
+    beyond = 1e-6 if limit.red > limit.amber else -1e-6
+    for value, expected in (
+        (limit.amber, GREEN), (limit.amber + beyond, AMBER), (limit.red, AMBER), (limit.red + beyond, worst), (math.nan, worst),
+    ):  # fmt: skip
+        found = changed(**{field: value})
+        assert found[light] == expected, (field, value)
+        assert all(level == GREEN for name, level in found.items() if name != light)
+
+
+def test_the_score_of_held_out_photographs_counts_before_that_of_the_others():
+    assert changed(held_out=15.0, used=30.0)["materials"] == RED
+    assert changed(held_out=30.0, used=15.0)["materials"] == GREEN
+    assert changed(held_out=None, used=15.0)["materials"] == RED
+
+
+def test_without_truth_something_must_be_held_out():
+    alone = dict(has_truth=False, albedo=None, held_out=None, light_spread=None)
+    assert changed(**alone)["materials"] == AMBER
+    text = judge(dataclasses.replace(GOOD, **alone)).lights[2].findings[0]
+    assert "test_every" in text.remedy
+    assert changed(**{**alone, "held_out": 27.0})["materials"] == GREEN
+
+
+def test_edges_weigh_less_where_depth_was_measured():
+    assert changed(edges=0.01)["geometry"] == AMBER
+    assert changed(edges=0.01, depth=None)["geometry"] == RED
+    assert changed(edges=0.3, edges_warn=True)["geometry"] == AMBER
+
+
+@pytest.mark.parametrize(
+    ("facts", "level"),
+    [
+        (dict(level="white_patch"), GREEN),
+        (dict(level="lamp", light_scale=5.0), GREEN),  # a known lamp may be far from what was found
+        (dict(level="mean_albedo"), AMBER),
+        (dict(level="prior", level_error=0.3), AMBER),
+        (dict(level="found", level_error=None), AMBER),
+        (dict(light_scale=1 / 3), RED),
+        (dict(light_scale=0.0), RED),
+    ],
+)
+def test_what_fixes_the_level(facts, level):
+    assert changed(**facts)["scale"] == level
+
+
+def test_warnings_turn_the_light_of_their_stage():
+    assert changed(warnings=[("shading", "noise of the light: 0.9")])["light"] == AMBER
+    found = changed(warnings=[("base", "x"), ("affines", "y")])
+    assert found == {"geometry": GREEN, "light": GREEN, "materials": AMBER, "scale": GREEN}
+
+
+def test_lost_photographs():
+    assert changed(lost=2)["geometry"] == GREEN and changed(lost=6)["geometry"] == AMBER and changed(lost=30)["geometry"] == RED
+    assert "6 of 30" in judge(dataclasses.replace(GOOD, lost=6)).lights[0].findings[0].text
+
+
+def test_words_for_every_combination():
+    """Every light that is not green says what to do, with a number; the worst findings come first."""
+    for escape, misfit, used, error in product((0.0, 0.2, 0.9), (0.01, 0.2, 5.0), (30.0, 18.0, 3.0), (0.05, 0.4, 2.0)):
+        verdict = judge(dataclasses.replace(GOOD, escape=escape, misfit=misfit, held_out=None, used=used, level_error=error))
+        assert verdict.sentence.endswith(".") and "{" not in verdict.sentence
+        for light in verdict.lights:
+            ranks = [ORDER.index(finding.level) for finding in light.findings]
+            assert ranks == sorted(ranks, reverse=True)
+            assert set(light.shown) | set(light.rest) == set(light.findings)
+            for finding in light.findings:
+                assert bool(finding.remedy) == (finding.level != GREEN)
+                assert any(c.isdigit() for c in finding.text) and "{" not in finding.text
+
+
+def test_every_limit_has_a_reason_and_an_order():
+    for name, limit in LIMITS.items():
+        assert limit.amber != limit.red and len(limit.why) > 20, name
