@@ -1,103 +1,125 @@
-"""Headless Chromium for the pages that people open, and axe-core for their accessibility.
+"""A headless Chromium for tests of pages, and what it saw: messages, errors, requests.
 
-A test module takes the fixtures by name: `from tests.browser import axe, browser, page_for  # noqa: F401`.
+On continuous integration a missing browser is a failure (`IIF_REQUIRE_BROWSER=1`, set by `.ci/run`); elsewhere the tests skip.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-REPOSITORY = Path(__file__).resolve().parents[1]
-AXE = REPOSITORY / ".node/node_modules/axe-core/axe.min.js"
-"""Installed by `make validator`, beside the validator of glTF."""
-
-QUIET = [
+ROOT = Path(__file__).resolve().parents[1]
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+QUIET = (
     "--no-sandbox",
     "--disable-quic",
     "--disable-background-networking",
     "--disable-component-update",
     "--disable-sync",
     "--no-first-run",
-]
-SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-"""WebGL without a GPU."""
+)
+"""Nothing but what a test asks for."""
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+AXE = ROOT / ".node/node_modules/axe-core/axe.min.js"
+DESKTOP, PHONE = (1280, 800), (390, 844)
 
 
 def missing(what: str) -> None:
-    """Skip the test because `what` is not installed; where IIF_REQUIRE_BROWSER is set (continuous integration), fail instead."""
-    if os.environ.get("IIF_REQUIRE_BROWSER"):
-        pytest.fail(f"{what}, and IIF_REQUIRE_BROWSER is set", pytrace=False)
+    """Skip the test, or fail where a browser is required."""
+    if os.environ.get("IIF_REQUIRE_BROWSER") == "1":
+        pytest.fail(f"{what}, and IIF_REQUIRE_BROWSER=1 asks for it", pytrace=False)
     pytest.skip(what)
 
 
-def chromium() -> str:
-    """Return the path of Chromium or Chrome; skips the test where there is none."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if found is None:
-        missing("no Chromium on the path (Debian: apt-get install chromium)")
-    return str(found)
+def executable() -> str | None:
+    """Return the path of Chromium: $IIF_BROWSER, else the first of `NAMES` on the path."""
+    return os.environ.get("IIF_BROWSER") or next((found for name in NAMES if (found := shutil.which(name))), None)
 
 
-@pytest.fixture(scope="module")
+@dataclass
+class Seen:
+    """What a page said and asked for.
+
+    Attributes:
+        page: of Playwright.
+        messages: (type, text) of its console; errors: exceptions that nothing caught; requests: addresses, that of the page first.
+    """
+
+    page: Any
+    messages: list[tuple[str, str]] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
+
+    @property
+    def complaints(self) -> list[str]:
+        """Errors, and messages of the console of type error, which is how violations of the policy are told."""
+        return self.errors + [text for kind, text in self.messages if kind == "error"]
+
+    @property
+    def outside(self) -> list[str]:
+        """Requests for anything but the page itself and what it made of its own data."""
+        return [address for address in self.requests[1:] if not address.startswith(("blob:", "data:"))]
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """A headless Chromium that Playwright drives."""
+    """Headless Chromium that draws WebGL by software."""
+    found = executable()
+    if found is None:
+        missing(f"no Chromium: none of {', '.join(NAMES)} is installed; name one in IIF_BROWSER")
     from playwright.sync_api import sync_playwright
 
-    path = chromium()
     with sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=path, args=[*QUIET, *SOFTWARE_GL])
-        yield running
-        running.close()
+        chromium = playwright.chromium.launch(executable_path=found, args=[*QUIET, *SOFTWARE_GL])
+        yield chromium
+        chromium.close()
 
 
-@pytest.fixture
-def page_for(browser) -> Iterator[Callable[..., Any]]:
-    """`page_for(path, viewport=(1280, 800), touch=False, **context)`: a page that shows a file, as from a double click.
+@pytest.fixture(scope="session")
+def page_for(browser):
+    """`with page_for(path, viewport=DESKTOP, touch=False, script="", **context) as seen`: open a file, and watch what it does.
 
-    The page has `errors` (messages of the console and exceptions) and `requests` (addresses asked for that are neither the file
-    itself nor `data:` or `blob:`). `context` goes to Playwright's `new_context`, such as `color_scheme` or `java_script_enabled`.
+    `script` runs before those of the page; `context` goes to Playwright's `new_context`, such as color_scheme="dark".
     """
-    contexts = []
 
-    def open_page(path: Path | str, viewport: tuple[int, int] = (1280, 800), touch: bool = False, **context: Any) -> Any:
+    @contextmanager
+    def opened(path: Path, viewport: tuple[int, int] = DESKTOP, touch: bool = False, script: str = "", **options: Any):
         size = {"width": viewport[0], "height": viewport[1]}
-        own = browser.new_context(viewport=size, has_touch=touch, is_mobile=touch, **context)
-        contexts.append(own)
-        page = own.new_page()
-        address = Path(path).resolve().as_uri()
-        page.errors, page.requests = [], []
-        page.on("console", lambda message: page.errors.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: page.errors.append(str(error)))
+        context = browser.new_context(viewport=size, has_touch=touch, is_mobile=touch, **options)
+        try:
+            page = context.new_page()
+            seen = Seen(page)
+            page.on("console", lambda message: seen.messages.append((message.type, message.text)))
+            page.on("pageerror", lambda error: seen.errors.append(str(error)))
+            page.on("request", lambda request: seen.requests.append(request.url))
+            if script:
+                page.add_init_script(script)
+            page.goto(Path(path).resolve().as_uri())
+            yield seen
+        finally:
+            context.close()
 
-        def asked(request: Any) -> None:
-            if not request.url.startswith(("data:", "blob:")) and request.url.split("#")[0].split("?")[0] != address:
-                page.requests.append(request.url)
-
-        page.on("request", asked)
-        page.goto(address)
-        return page
-
-    yield open_page
-    for own in contexts:
-        own.close()
+    return opened
 
 
-def axe(page: Any, **options: Any) -> list[dict[str, Any]]:
-    """Return what axe-core finds: `id`, `impact`, `help` and `nodes` (their HTML) of every violation; skips without axe-core.
+def axe(page: Any) -> list[dict[str, Any]]:
+    """Run axe-core on a page and return its serious and critical findings: id, impact, help and the HTML of each node.
 
-    The content policy of the page forbids foreign scripts, so axe is evaluated by the debugger.
+    The policy of the page does not hold for what the browser's own tools run, so axe-core goes in by them.
     """
     if not AXE.is_file():
-        missing("axe-core is not in .node (make validator)")
-    page.evaluate(AXE.read_text() + "\n;undefined")
-    found = page.evaluate("options => axe.run(document, options)", options)
+        missing(f"{AXE.relative_to(ROOT)} is not there; `make node` installs it")
+    page.evaluate(AXE.read_text(encoding="utf-8") + ";undefined")
+    found = page.evaluate("async () => (await axe.run(document)).violations")
     return [
-        {"id": v["id"], "impact": v["impact"], "help": v["help"], "nodes": [node["html"][:200] for node in v["nodes"]]}
-        for v in found["violations"]
+        {"id": one["id"], "impact": one["impact"], "help": one["help"], "nodes": [node["html"][:200] for node in one["nodes"]]}
+        for one in found
+        if one["impact"] in ("serious", "critical")
     ]

@@ -23,7 +23,8 @@ from workflow.artifacts.verify import damaged
 from workflow.decisions.record import PROVISIONAL, SETTLED, not_probed
 from workflow.registry import STAGES
 from workflow.report import pictures as pic
-from workflow.report.page import number, score_table
+from workflow.report.downloads import commands, downloads
+from workflow.report.page import content_hash, number, score_table
 from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
@@ -403,6 +404,7 @@ def test_deliverable_is_complete_and_verifies(toy):
         "timings.parquet",
         "report.html",
         "manifest.json",
+        "objects.csv",
     }
     program = {"mitsuba/render.py", *(f"mitsuba/iif_bsdf/{name}.py" for name in ("__init__", "xp", "brdf", "mitsuba_bsdf"))}
     assert expected | program <= names and all(n in expected | program or n.startswith("mitsuba/meshes/") for n in names)
@@ -480,24 +482,31 @@ def test_plan_is_collected(toy):
 
 
 class Tags(HTMLParser):
+    """Addresses, ids, text, and the inline style and scripts of a page whose tags close in order."""
+
     def __init__(self):
         super().__init__()
-        self.addresses, self.open, self.text = [], [], []
+        self.addresses, self.open, self.text, self.ids, self.inline = [], [], [], [], []
 
     def handle_starttag(self, tag, attributes):
         self.addresses += [value for name, value in attributes if name in ("src", "href", "action", "srcset")]
-        assert tag not in ("script", "link", "iframe", "object")
-        if tag not in ("meta", "img"):
+        self.ids += [value for name, value in attributes if name == "id"]
+        assert tag not in ("link", "iframe", "object", "base", "form")
+        assert not any(name == "style" or name.startswith("on") for name, _ in attributes)  # the policy would ignore them
+        if tag not in ("meta", "img", "input"):
             self.open.append(tag)
 
     def handle_startendtag(self, tag, attributes):
-        assert tag in ("path", "polyline")
+        assert tag in ("path", "polyline", "rect")
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.text.append(data)
+        if self.open and self.open[-1] in ("script", "style"):
+            self.inline.append((self.open[-1], data))
+        else:
+            self.text.append(data)
 
 
 def parsed(page):
@@ -508,15 +517,104 @@ def parsed(page):
 
 
 def test_page_is_self_contained(toy):
-    page = (toy / "scenes/toy/report.html").read_text()
+    """Pictures are in the page; links lead to its own parts and to files of the deliverable; nothing else is asked for."""
+    folder = toy / "scenes/toy"
+    page = (folder / "report.html").read_text()
     tags = parsed(page)
-    assert tags.addresses and all(a.startswith("data:image/") for a in tags.addresses)
-    assert "default-src 'none'" in page
+    assert len(tags.ids) == len(set(tags.ids))
+    assert sum(a.startswith("data:image/") for a in tags.addresses) > 10
+    links = {a for a in tags.addresses if not a.startswith("data:image/")}
+    assert {a[1:] for a in links if a.startswith("#")} <= set(tags.ids)
+    for address in links:
+        assert address.startswith("#") or (not address.startswith(("/", "..")) and (folder / address).exists()), address
     assert not re.search(r"https?://|@import|url\(", page)
+
+
+def test_every_file_of_the_deliverable_is_linked(toy):
+    folder = toy / "scenes/toy"
+    links = set(parsed((folder / "report.html").read_text()).addresses)
+    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert files - {"report.html"} <= links
+
+
+def test_policy_allows_its_own_style_and_script_alone(toy):
+    page = (toy / "scenes/toy/report.html").read_text()
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]
+    assert "default-src 'none'" in policy and "unsafe" not in policy
+    inline = parsed(page).inline
+    assert [kind for kind, _ in inline] == ["style", "script", "script"]
+    (_, style), (_, palettes), (_, script) = inline
+    assert f"style-src '{content_hash(style)}'" in policy and f"script-src '{content_hash(script)}'" in policy
+    assert set(json.loads(palettes)) == {"error", "value"}  # data, which no policy needs to allow
+
+
+def test_every_explained_number_has_its_explanation(toy):
+    page = (toy / "scenes/toy/report.html").read_text()
+    described = set(re.findall(r'aria-describedby="([^"]*)"', page))
+    assert len(described) > 10 and described <= set(parsed(page).ids)
+
+
+def test_scalars_are_read_back_from_their_colours():
+    """What the script of the page does: the place of a colour in the palette is the value."""
+    values = np.linspace(-0.1, 0.3, 50).reshape(5, 10)
+    for scheme in ("error", "value"):
+        colours = pic.palette(scheme)
+        assert len(set(colours)) == len(colours) == pic.SCALAR_STEPS
+        mask = np.ones(values.shape, bool)
+        mask[0, 0] = False
+        picture = decoded(pic.data_uri(pic.scalar(values, 0, 0.2, scheme, mask), True))
+        found = np.array([[colours.index("#{:02x}{:02x}{:02x}".format(*p)) if p[0] != p[1] or mask[i, j] else -1
+                           for j, p in enumerate(row)] for i, row in enumerate(picture)])  # fmt: skip
+        assert found[0, 0] == -1 and "#595959" not in colours
+        back = found / (pic.SCALAR_STEPS - 1) * 0.2
+        np.testing.assert_allclose(back[mask], np.clip(values, 0, 0.2)[mask], atol=0.51 * 0.2 / (pic.SCALAR_STEPS - 1))
+
+
+def decoded(address):
+    import base64
+    import io
+
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))).convert("RGB"))
+
+
+def test_large_pictures_are_made_smaller():
+    ramp = np.repeat(np.linspace(0, 255, 100).astype(np.uint8)[None, :, None], 3, -1).repeat(40, 0)
+    assert decoded(pic.data_uri(ramp, longest=50)).shape == (20, 50, 3)
+    ids = pic.ids(np.arange(400).reshape(20, 20) // 37)
+    small = decoded(pic.data_uri(ids, True, 10))
+    known = {tuple(c) for c in ids.reshape(-1, 3).tolist()}
+    assert {tuple(c) for c in small.reshape(-1, 3).tolist()} <= known  # no colour in between
+    many = np.arange(3 * 30 * 30).reshape(30, 30, 3).astype(np.uint8)
+    np.testing.assert_array_equal(decoded(pic.data_uri(many, True)), many)  # more colours than a palette holds
+
+
+def test_downloads_are_told_by_their_names():
+    names = ["report.html", "scene.glb", "maps/b.exr", "maps/a.exr", "mitsuba/scene.xml", "mitsuba/meshes/x.ply", "new.thing"]
+    found = downloads(names)
+    assert [d.href for d in found] == ["scene.glb", "mitsuba/scene.xml", "mitsuba/", "maps/", "new.thing"]
+    assert found[3].files == ["maps/a.exr", "maps/b.exr"] and "2 files" in found[3].what
+    assert found[-1].what == "" and all(d.what for d in found[:-1])
+    assert downloads(["report.html"]) == []
+
+
+def test_commands_name_scene_and_quality():
+    words = "override: {components: {specular: off}}"
+    said = {c.text for c in commands("room", "standard", [("specular", words)], ["scene.glb"])}
+    assert "snakemake --cores 2 relight/room --config quality=standard" in said
+    assert {f"snakemake --cores 2 scenes/room --config quality={q}" for q in ("draft", "paper")} <= said
+    assert f"{words}\nsnakemake --cores 2 scenes/room --config quality=standard" in said
+    assert not any("blender" in text or "mitsuba" in text for text in said)  # files that this deliverable lacks
+    more = {c.text for c in commands("room", "draft", [], ["blender_import.py", "mitsuba/render.py"])}
+    assert "blender --python scenes/room/blender_import.py" in more and "python scenes/room/mitsuba/render.py" in more
+    assert "snakemake --cores 2 relight/room" in more
 
 
 def test_page_says_what_matters(toy):
     text = "".join(parsed((toy / "scenes/toy/report.html").read_text()).text)
+    for wanted in ("geometry: good", "1 lamp found", "How do I go on?", "objects.csv", "snakemake --cores 2 relight/toy"):
+        assert wanted in text
     for wanted in (
         "by <nobody> & co",
         "a note with <angle> brackets",
@@ -549,7 +647,8 @@ def test_scene_without_truth(llvm, tmp_path, monkeypatch, dynamic_range):
     page = (tmp_path / "scenes/toy/report.html").read_text()
     text = "".join(parsed(page).text)
     assert "no ground truth" in text and "albedo error" not in text
-    assert page.count(": photograph") == 2  # each view shows what it was made from
+    rows = page[page.index('id="maps"') :]
+    assert rows.count(': photograph" src') == 2  # each view shows what it was made from
     assert (tmp_path / "scenes/toy/camera_response.parquet").exists() == (dynamic_range == "ldr")
     values = dict(zip(zip(table["metric"], table["protocol"], strict=True), table["value"], strict=True))
     assert values["psnr", "raw"] > 27

@@ -10,8 +10,8 @@ from workflow.report.verdict import AMBER, GREEN, LIMITS, ORDER, RED, Evidence, 
 
 GOOD = Evidence(
     escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
-    lamps=3, misfit=0.02, held_out=27.0, held_out_views=4, used=28.0, albedo=27.0, has_truth=True, prior="files", uncertainty=0.03,
-    unfitted=0.01, level="found", level_error=0.1, raised=1.0, light_scale=1.03, discrepancy=0.8, light_spread=0.03,
+    lamps=3, misfit=0.02, held_out=27.0, held_out_views=4, used=28.0, albedo=27.0, has_truth=True, prior="files", level="found",
+    uncertainty=0.03, unfitted=0.01, level_error=0.1, raised=1.0, light_scale=1.03, discrepancy=0.8, light_spread=0.03,
 )  # fmt: skip
 
 
@@ -66,7 +66,8 @@ def test_nothing_known_is_never_green():
 @pytest.mark.parametrize(
     ("field", "light", "worst"),
     [
-        ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED), ("photographed", "geometry", RED),
+        ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED),
+        ("photographed", "geometry", RED),
         ("misfit", "light", RED), ("light_spread", "light", RED), ("albedo", "materials", RED), ("uncertainty", "materials", RED),
         ("unfitted", "materials", RED), ("stability", "materials", AMBER), ("level_error", "scale", RED),
         ("raised", "scale", RED), ("light_scale", "scale", RED), ("discrepancy", "scale", RED),
