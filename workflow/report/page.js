@@ -42,7 +42,11 @@
     tip.textContent = entry.textContent;
     tip.showPopover();
     shown = link;
-    const at = link.getBoundingClientRect(), box = tip.getBoundingClientRect();
+    beside();
+  };
+  const beside = () => {
+    if (!shown) return;
+    const at = shown.getBoundingClientRect(), box = tip.getBoundingClientRect();
     tip.style.left = `${Math.max(8, Math.min(at.left, innerWidth - box.width - 8))}px`;
     tip.style.top = `${at.bottom + box.height + 8 < innerHeight ? at.bottom + 6 : Math.max(8, at.top - box.height - 6)}px`;
   };
@@ -53,7 +57,7 @@
     link.addEventListener("blur", hide);
     link.addEventListener("click", (event) => { event.preventDefault(); show(link); });
   }
-  addEventListener("scroll", hide, { passive: true });
+  addEventListener("scroll", beside, { passive: true, capture: true });  // focus may scroll the number into view
   addEventListener("keydown", (event) => { if (event.key === "Escape") hide(); });
 
   // Tables that sort by a click on their heads, and find rows.
