@@ -57,6 +57,7 @@ onstart:
 
 onsuccess:
     tell_target()
+    tell_pages()
 
 
 onerror:

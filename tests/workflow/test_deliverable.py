@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet emitters.parquet plan.yaml metrics.parquet
+FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml metrics.parquet
 timings.parquet report.html manifest.json""".split()
 
 
@@ -58,3 +58,9 @@ def test_timings_name_every_job(scene):
     table = pq.read_table(scene / "timings.parquet").to_pandas()
     assert {"capture", "prior", "base", "emission", "shading", "affines", "render"} <= set(table["rule"])
     assert (table["seconds"] > 0).all() and (table["threads"] > 0).all()
+
+
+def test_the_last_line_says_where_to_look(workflow):
+    result = workflow.run("scenes/tiny", "--forcerun", "publish")
+    assert result.returncode == 0, result.stderr[-4000:]
+    assert result.stderr.rstrip().endswith(f"Open: {workflow.folder.resolve() / 'scenes/tiny/report.html'}")

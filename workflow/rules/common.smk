@@ -242,6 +242,26 @@ def tell_target():
         print(line, file=sys.stderr)
 
 
+PAGES = ("report.html", "room.html")
+
+
+def tell_pages():
+    """Say where to look, after the last line of Snakemake: the pages of the scenes that were made, or of the batch."""
+    if not workflow.is_main_process:
+        return  # a job on a node of a cluster
+    folders = [
+        path.parent
+        for path in sorted(Path("scenes").glob("*/manifest.json"))
+        if path.stat().st_mtime >= STARTED
+    ]
+    pages = [folder / page for folder in folders for page in PAGES]
+    if batch_asked:
+        pages = [Path("results/batch/report.html")]
+    found = [str(page.resolve()) for page in pages if page.is_file()]
+    if found:
+        atexit.register(print, "\nOpen: " + "\n      ".join(found), file=sys.stderr)
+
+
 def stability_code(wildcards):
     """Digest of everything that the study of stability measures, and measures with."""
     return fingerprints.modules_digest(
