@@ -48,8 +48,10 @@ def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def write_exr(path: Path, channels: dict[str, np.ndarray]) -> dict[str, str]:
+def write_exr(path: Path, channels: dict[str, np.ndarray], attributes: dict[str, Any] | None = None) -> dict[str, str]:
     """Write (H, W) arrays of float16, float32 or uint32 as one EXR, compressed without loss. Returns channel -> dtype.
+
+    `attributes` go into its header: text, numbers, tuples, and (4, 4) float32 matrices for row vectors.
 
     Raises:
         ValueError: shapes that differ, another dtype, or a value that is not finite.
@@ -64,7 +66,7 @@ def write_exr(path: Path, channels: dict[str, np.ndarray]) -> dict[str, str]:
             raise ValueError(f"{path}: channel {name} has dtype {array.dtype}; allowed: {', '.join(_DTYPES)}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{path}: channel {name} holds {np.size(array) - np.isfinite(array).sum()} non-finite values")
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     data = {name: np.ascontiguousarray(array) for name, array in channels.items()}
 
     def write(temporary: Path) -> None:
@@ -81,6 +83,14 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: channel.pixels for name, channel in file.channels().items()}
+
+
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Return the header of a single-part EXR."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return dict(file.header())
 
 
 def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str]) -> dict[str, str]:

@@ -53,20 +53,28 @@ class StageWriter:
         directory.mkdir(parents=True, exist_ok=True)
         (directory / MANIFEST).unlink(missing_ok=True)
 
-    def exr(self, name: str, channels: dict[str, np.ndarray], units: str = "", colour_space: str = "linear") -> None:
+    def exr(
+        self,
+        name: str,
+        channels: dict[str, np.ndarray],
+        units: str = "",
+        colour_space: str = "linear",
+        attributes: dict[str, Any] | None = None,
+    ) -> None:
         """Write one raster.
 
         Args:
             name: file name, ending in `.exr`.
             channels: channel name -> (H, W) float16, float32 or uint32; bool is stored as half.
             units, colour_space: recorded in the manifest.
+            attributes: of the header of the file, as in `write_exr`.
 
         Raises:
             InputError: the name would leave the folder.
             ValueError: shapes that differ, another dtype, or a value that is not finite.
         """
         channels = {k: a.astype(np.float16) if a.dtype == bool else a for k, a in channels.items()}
-        types = io.write_exr(io.inside(self.directory, name), channels)
+        types = io.write_exr(io.inside(self.directory, name), channels, attributes)
         shape = list(next(iter(channels.values())).shape)
         self._record(name, kind="exr", shape=shape, channels=types, units=units, colour_space=colour_space)
 

@@ -8,6 +8,8 @@ import numpy as np
 
 from iif_core.light.environment import as_map, solid_angles
 from iif_core.reflectance.material import CHANNELS
+from workflow.artifacts.store import split_rgb
+from workflow.exporters import camera_files
 from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, read_parts, surface_picture
 from workflow.exporters.glb import fitting_glb
 from workflow.exporters.mitsuba_scene import mitsuba_files
@@ -16,14 +18,15 @@ from workflow.exporters.surface import up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
-from workflow.scene.recovered import Recovered, read_recovered
+from workflow.scene.picture_facts import view_attributes
+from workflow.scene.recovered import Recovered, read_recovered, read_response
 
 MAX_SENSORS = 16
 MASK = "textures/seen.png"
 
 
 def run(job: Job) -> None:
-    """Write scene.glb, scene.usdc, textures/, mitsuba/, emitters.parquet, objects.csv and export.json."""
+    """Write scene.glb, scene.usdc, textures/, mitsuba/, the tables, cameras, photographs and export.json."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     unwrapped = job.read("unwrap").json("unwrap.json")
@@ -51,6 +54,7 @@ def run(job: Job) -> None:
         job.writer.bytes(f"mitsuba/{name}", data)
     _emitter_table(job, recovered)
     job.writer.bytes("objects.csv", _object_table(job, recovered))
+    _camera_files(job, capture, environment, up)
     facts = {
         "up": up.tolist(),
         "parts": len(parts),
@@ -93,6 +97,27 @@ def _environment_note(environment: np.ndarray) -> dict[str, Any]:
     mean = np.average(radiance, (0, 1), np.repeat(solid_angles(*radiance.shape[:2])[..., None], 3, -1))
     note: dict[str, Any] = {"mean_radiance": [round(float(value), 6) for value in mean]}
     return {"environment": note | ({"map": "mitsuba/environment.exr"} if environment.ndim == 3 else {})}
+
+
+def _camera_files(job: Job, capture: CaptureReader, environment: np.ndarray, up: np.ndarray) -> None:
+    """Write cameras.json, photos/, blender_import.py, the table of the response (LDR) and the map of the environment."""
+    names = camera_files.photo_names(capture.views, capture.is_hdr)
+    for view, name in zip(capture.views, names, strict=True):
+        photo, valid = capture.photo(view, held_out=True)  # nothing is fitted to it here
+        if capture.is_hdr:
+            job.writer.exr(name, split_rgb(photo), "relative", attributes=view_attributes(view, 1.0))
+        else:
+            job.writer.bytes(name, camera_files.photograph_png(photo, valid))
+    response = None if capture.is_hdr else "camera_response.cube"
+    if response:
+        job.writer.bytes(response, camera_files.response_cube(read_response(job.read("affines"))))
+    note = _environment_note(environment).get("environment")
+    if note and environment.ndim == 3:
+        note = note | {"map": "environment.exr"}
+        job.writer.exr("environment.exr", split_rgb(camera_files.environment_picture(environment)), "relative")
+    gains = job.read("emission").json("emission.json")["gain"]
+    job.writer.bytes("cameras.json", camera_files.cameras_json(capture.views, names, np.asarray(gains), up, note, response))
+    job.writer.bytes(camera_files.SCRIPT, camera_files.script())
 
 
 def _object_table(job: Job, recovered: Recovered) -> bytes:

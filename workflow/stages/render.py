@@ -17,6 +17,7 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import pixel_gains, read_gains, read_radiance_cache
 from workflow.scene.cached_light import has_lobes
 from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import Recovered, read_recovered, read_response
 
 _SEEDS = 0x72656E  # keeps the random streams of this stage apart from those of others
@@ -71,7 +72,8 @@ def run(job: Job) -> None:
         channels = {**split_rgb(radiance), **split_rgb(np.clip(sensor, 0, 1), "ldr")}
         emission = scene.emission_map(face_id, eye)
         channels |= split_rgb(emission, "emission") | _without_emitters(fitted, emission.any(-1))
-        job.writer.exr(f"maps/{view.name}.exr", channels, "relative")
+        attributes = view_attributes(view, float(factor.mean()))
+        job.writer.exr(f"maps/{view.name}.exr", channels, "relative", attributes=attributes)
     if found:
         rows = np.array(list(found.values()))
         columns = {"view_id": np.array(list(found), np.int32), **{f"gain_{c}": rows[:, i] for i, c in enumerate("rgb")}}
