@@ -49,7 +49,18 @@ if [ -n "${PYTHON:-}" ] && [ "$("$PYTHON" -c "$version" 2>&1)" != "$("$venv/bin/
 installed=no
 if [ "$lock_found $torch_found $folder" = "$lock_wanted $torch_wanted $root" ]; then installed=yes; fi
 
-if [ $installed = yes ] && [ "$checked" = checked ]; then exit 0; fi
+# Every Python of the environment finds its LLVM: also the command mitsuba, and render.py beside an exported scene.
+name_llvm() {
+    local packages
+    for packages in "$venv"/lib/python3*/site-packages; do
+        cmp -s envs/iif_llvm.pth "$packages/iif_llvm.pth" || cp envs/iif_llvm.pth "$packages/"
+    done
+}
+
+if [ $installed = yes ] && [ "$checked" = checked ]; then
+    name_llvm
+    exit 0
+fi
 
 # ---- install --------------------------------------------------------------------------------------------------------
 explain() { # the reason of a failed pip in one line
@@ -117,6 +128,7 @@ if [ $installed = no ]; then
     pip_install "the locked packages" --require-hashes -r envs/requirements.lock
     pip_install "$torch" ${TORCH_INDEX:+--index-url "$TORCH_INDEX"} "$torch"
     "$venv/bin/python" -c pass # the first start makes the links of the LLVM wheel
+    name_llvm
     rm -rf $venv/tmp
     echo "$lock_wanted $torch_wanted $root" >$stamp
     say "installed in $((SECONDS - started)) s"

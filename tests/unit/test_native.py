@@ -5,6 +5,7 @@ ones of this machine are asked at the end.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -212,3 +213,35 @@ def test_old_llvm_of_the_system_is_refused():
         report = native.find_llvm({native.LLVM_VARIABLE: path})
         assert report.path is None and path in report.problem
         assert native._version(path)[1] is not None, "the library itself says that it is older, whatever its name"
+
+
+SCENE = """<scene version="3.0.0"><integrator type="direct"/>
+<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+<shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape><emitter type="constant"/></scene>"""
+
+
+def test_the_command_of_mitsuba_finds_the_llvm_of_this_environment(repository, tmp_path):
+    """`mitsuba -m llvm_ad_rgb` without a variable: what setup.sh puts into the environment names the library at the start of Python.
+    Without it Dr.Jit takes the system's LLVM, and aborts where that is older than 16."""
+    (tmp_path / "scene.xml").write_text(SCENE)
+    (tmp_path / "site").mkdir()
+    shutil.copy(repository / "envs/iif_llvm.pth", tmp_path / "site")
+    code = (
+        "import site, sys, os; site.addsitedir(sys.argv.pop(1)); print(os.environ['DRJIT_LIBLLVM_PATH'])\n"
+        "from mitsuba.cli import _main; sys.exit(_main())"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != native.LLVM_VARIABLE}
+    arguments = [str(tmp_path / "site"), "-m", "llvm_ad_rgb", "-o", str(tmp_path / "out.exr"), str(tmp_path / "scene.xml")]
+    result = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=environment, timeout=120
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert Path(result.stdout.splitlines()[0]).resolve().is_relative_to(Path(sys.prefix).resolve())
+    assert (tmp_path / "out.exr").stat().st_size > 0
+
+
+def test_a_variable_that_is_set_is_kept(repository, tmp_path):
+    code = (repository / "envs/iif_llvm.pth").read_text() + "print(os.environ['DRJIT_LIBLLVM_PATH'])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env={native.LLVM_VARIABLE: "/mine.so"})
+    assert result.stdout.strip() == "/mine.so"
+    assert len((repository / "envs/iif_llvm.pth").read_text().strip().splitlines()) == 1  # Python runs single lines alone
