@@ -221,7 +221,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 
 
 def test_the_command_of_mitsuba_finds_the_llvm_of_this_environment(repository, tmp_path):
-    """`mitsuba -m llvm_ad_rgb` without a variable: what setup.sh puts into the environment names the library at the start of Python.
+    """`mitsuba -m llvm_ad_rgb` without a variable: every Python of the environment names the library.
     Without it Dr.Jit takes the system's LLVM, and aborts where that is older than 16."""
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "site").mkdir()
@@ -232,9 +232,8 @@ def test_the_command_of_mitsuba_finds_the_llvm_of_this_environment(repository, t
     )
     environment = {name: value for name, value in os.environ.items() if name != native.LLVM_VARIABLE}
     arguments = [str(tmp_path / "site"), "-m", "llvm_ad_rgb", "-o", str(tmp_path / "out.exr"), str(tmp_path / "scene.xml")]
-    result = subprocess.run(
-        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=environment, timeout=120
-    )
+    command = [sys.executable, "-c", code, *arguments]
+    result = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=120)
     assert result.returncode == 0, result.stderr[-2000:]
     assert Path(result.stdout.splitlines()[0]).resolve().is_relative_to(Path(sys.prefix).resolve())
     assert (tmp_path / "out.exr").stat().st_size > 0

@@ -29,7 +29,7 @@ from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
 from workflow.scene.recovered import read_recovered, read_response, response_samples
-from workflow.stages import export, metrics, publish, render, report
+from workflow.stages import export, metrics, publish, render, report, unwrap
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
 OUTWARD = np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
@@ -49,7 +49,7 @@ class FakeJob:
         self.stage = SimpleNamespace(name=stage, upstream=STAGES[stage].upstream)
         self.settings = SimpleNamespace(
             render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
-            export=SimpleNamespace(max_faces_glb=100_000),
+            export=SimpleNamespace(max_faces_glb=100_000, texture_size=256, max_mb=40.0),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
             metrics=SimpleNamespace(views="all", lpips_vgg=False),
         )
@@ -252,6 +252,7 @@ def finish(root, upto="publish"):
     for name, stage in (
         ("render", render),
         ("metrics", metrics),
+        ("unwrap", unwrap),
         ("export", export),
         ("report", report),
         ("publish", publish),
@@ -405,9 +406,13 @@ def test_deliverable_is_complete_and_verifies(toy):
         "report.html",
         "manifest.json",
         "objects.csv",
+        *("cameras.json", "photos/v0.png", "photos/v1.png", "camera_response.cube", "blender_import.py"),
+        *("scene.usdc", "textures/base_color.png", "textures/seen.png"),
     }
     program = {"mitsuba/render.py", *(f"mitsuba/iif_bsdf/{name}.py" for name in ("__init__", "xp", "brdf", "mitsuba_bsdf"))}
-    assert expected | program <= names and all(n in expected | program or n.startswith("mitsuba/meshes/") for n in names)
+    assert expected | program <= names and all(
+        n in expected | program or n.startswith(("mitsuba/meshes/", "mitsuba/textures/", "textures/")) for n in names
+    )
     manifest = json.loads((scene / "manifest.json").read_text())
     assert set(manifest["files"]) == names - {"manifest.json"}
     assert manifest["settings"] == {"seed": 3} and manifest["fingerprints"]["base"] == "print of base"

@@ -12,11 +12,11 @@ from iif_core.camera.pinhole import look_at
 from iif_core.light.environment import direction_in, solid_angles
 from iif_core.numerics.xp import NUMPY
 from workflow.artifacts.store import ids_from_disk
-from workflow.stages import affines, emission, export, metrics, render, report, shading
+from workflow.stages import affines, emission, export, metrics, render, report, shading, unwrap
 
 STAGES = {
     **{"emission": emission, "shading": shading, "affines": affines, "render": render},
-    **{"metrics": metrics, "export": export, "report": report},
+    **{"metrics": metrics, "unwrap": unwrap, "export": export, "report": report},
 }
 
 
@@ -29,7 +29,7 @@ def _run(folder, dynamic_range, upto="metrics", pixels="all", **emission_setting
         "affines": {**AFFINES, "iterations": 20, **({} if pixels == "all" else {"pixels": pixels})},
         "render": {"samples": 8, "max_bounces": 8, "denoise": False},
         "metrics": {"views": "all", "lpips_vgg": False},
-        "export": {"max_faces_glb": 100_000},
+        "export": {"max_faces_glb": 100_000, "texture_size": 256, "max_mb": 40.0},
         "report": {"views": 2, "credit": ""},
     }
     for name, module in STAGES.items():
