@@ -216,7 +216,7 @@ def test_old_llvm_of_the_system_is_refused():
 
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
-<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+<sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/></film></sensor>
 <shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape><emitter type="constant"/></scene>"""
 
 

@@ -6,7 +6,7 @@ from itertools import product
 
 import pytest
 
-from workflow.report.verdict import AMBER, GREEN, LIMITS, ORDER, RED, Evidence, judge
+from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, ORDER, RED, Evidence, judge, limits_table
 
 GOOD = Evidence(
     escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
@@ -144,6 +144,11 @@ def test_words_for_every_combination():
             for finding in light.findings:
                 assert bool(finding.remedy) == (finding.level != GREEN)
                 assert any(c.isdigit() for c in finding.text) and "{" not in finding.text
+
+
+def test_the_page_of_the_documentation_holds_the_limits(repository):
+    assert limits_table() in (repository / "docs/guide/results.md").read_text()
+    assert set(LIGHT_OF) == set(LIMITS)
 
 
 def test_every_limit_has_a_reason_and_an_order():

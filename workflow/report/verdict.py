@@ -59,6 +59,14 @@ LIMITS: dict[str, Limit] = {
 }  # fmt: skip
 """Every threshold of the verdict (docs/guide/results.md#the-four-lights)."""
 
+LIGHT_OF = {
+    **dict.fromkeys(("escape", "depth", "edges", "agreement", "lost", "photographed"), "geometry"),
+    **dict.fromkeys(("misfit", "light_spread"), "light"),
+    **dict.fromkeys(("stability", "rerendering", "albedo", "uncertainty", "unfitted"), "materials"),
+    **dict.fromkeys(("level_error", "raised", "light_scale", "discrepancy"), "scale"),
+}
+"""Which light a threshold is of."""
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -379,3 +387,12 @@ def _scale(e: Evidence) -> Light:
             ),
         ],
     )  # fmt: skip
+
+
+def limits_table() -> str:
+    """Return the thresholds as a Markdown table, which docs/guide/results.md holds."""
+    rows = ["| evidence | light | green up to | amber up to | why |", "|---|---|---|---|---|"]
+    for name, limit in LIMITS.items():
+        ends = [f"at least {v:g}" if limit.red < limit.amber else f"{v:.3g}" for v in (limit.amber, limit.red)]
+        rows.append(f"| `{name}` | {LIGHT_OF[name]} | {ends[0]} | {ends[1]} | {limit.why} |")
+    return "\n".join(rows) + "\n"
