@@ -182,7 +182,7 @@ def _sentence(lights: Sequence[Light]) -> str:
     reason = named[0].findings[0].text
     reason = reason[0].lower() + reason[1:] if not reason[:2].isupper() else reason
     if worst == AMBER:
-        return f"Usable with care: {names} {'is' if len(named) == 1 else 'are'} in doubt ({reason})."
+        return f"Usable with care: {names} {'is' if len(named) == 1 and names != 'materials' else 'are'} in doubt ({reason})."
     return f"Do not rely on this result for {names}: {reason}."
 
 

@@ -46,6 +46,6 @@ class Report(Section):
     """The page."""
 
     views: int = Field(6, ge=1)
-    """Number of views shown."""
+    """Number of views shown with all maps, from the worst to the best; each adds up to 2 MB to the page."""
     credit: str = ""
     """Line under the title, such as artist and licence."""

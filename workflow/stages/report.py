@@ -55,8 +55,9 @@ ERROR_RANGE = 0.25
 COVERAGE_RANGE = 4.0
 UNCERTAINTY_RANGE = 0.2
 CHANNEL_COLOURS = ("red", "green", "blue")
-WIDTH, HERO_WIDTH, PAIR_WIDTH = 512, 768, 288
-"""Longest side of a picture: of the maps, of the first one, and of the pairs of all views."""
+WIDTH, HERO_WIDTH, PAIR_WIDTH = 448, 768, 288
+"""Longest side of a picture: of maps, of the first one, and of the pairs of all views. With six views and photographs as noisy
+as those of a phone the page stays below 15 MB."""
 PAIRS = 60
 """Photographs that are shown beside their re-rendering; of more, so many are taken evenly."""
 
