@@ -35,6 +35,7 @@ KINDS = (
     Kind("emitters.parquet", "lamps: area, radiance and standard errors", "pandas, DuckDB"),
     Kind("camera_response.parquet", "response curve of the camera", "pandas, DuckDB"),
     Kind("camera_response.cube", "response curve of the camera as a 1D lookup table", "OCIO, Nuke, Resolve"),
+    Kind("environment.exr", "light from outside, a latitude-longitude map", "any renderer"),
     Kind("cameras.json", "cameras of the photographs (nerfstudio's transforms.json)", "nerfstudio, blender_import.py"),
     Kind("plan.yaml", "what was modelled, what was left out, and why", "a text editor"),
     Kind("metrics.parquet", "scores of every view", "pandas, DuckDB"),
