@@ -1,0 +1,136 @@
+"""Diffuse light that arrives at surface points from every lamp by itself, with all reflections, from one set of paths
+(docs/method/light.md#light-maps)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from iif_core.errors import InputError
+from iif_core.light.transport.arrays import batches, checked_points, on_device, to_numpy
+from iif_core.light.transport.geometry import offset_from
+from iif_core.light.transport.kernels import World, incoming, power_weight, sample_light, to_world, uniform
+from iif_core.light.transport.scene import PathOptions, Scene
+from iif_core.numerics.xp import DRJIT
+from iif_core.reflectance import brdf
+
+Array = np.ndarray
+
+
+class _LampCollector:
+    """Adds emitted radiance times the weight of the path to the row of the lane, in the column of the lamp that emits it.
+
+    Nothing is returned to the path. A lane writes to its own row alone, so plain additions are safe and their order is fixed.
+    """
+
+    def __init__(self, rows: Any, lane: Any, lamps: int, lamp_of_face: Any, environment_lamp: int):
+        self.rows, self.lane, self.lamps = rows, lane, dr.opaque(mi.UInt32, lamps)
+        self.lamp_of_face = lamp_of_face
+        self.environment_lamp = None if environment_lamp < 0 else dr.opaque(mi.UInt32, environment_lamp)
+
+    def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        lamp = dr.gather(mi.Int32, self.lamp_of_face, face, active)
+        return self._add(mi.UInt32(lamp), weight * radiance, active & (lamp >= 0))
+
+    def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
+        if self.environment_lamp is None:
+            return mi.Color3f(0)
+        return self._add(self.environment_lamp, weight * radiance, active)
+
+    def _add(self, lamp: Any, value: Any, active: Any) -> Any:
+        entry = (self.lane * self.lamps + lamp) * 3
+        for channel in range(3):
+            mode = dr.ReduceMode.NoConflicts
+            dr.scatter_reduce(dr.ReduceOp.Add, self.rows, value[channel], entry + channel, active, mode=mode)
+        return mi.Color3f(0)
+
+
+@dr.syntax
+def _trace_points(
+    world: World, rng: Any, point: Any, normal: Any, samples: Any, sample: Any, end: Any, max_bounces: Any
+) -> Any:
+    """Follow the paths of every lane; the collector holds the result, and the returned gain is 0."""
+    nothing = mi.Color3f(0)
+    origin = offset_from(point, normal)
+    while sample < end:
+        if world.emitters.can_be_sampled:
+            light = sample_light(world, rng, origin, normal, mi.Bool(True))
+            cosine = dr.maximum(dr.dot(normal, light.wi), 0) * dr.inv_pi
+            share = dr.select(light.valid, cosine * power_weight(light.pdf, cosine) / light.pdf, 0)
+            light.gain(world, mi.Color3f(share))
+        # The first number of a direction is drawn once in each of as many strata as there are samples.
+        u1 = dr.minimum((mi.Float(sample) + uniform(rng)) / mi.Float(samples), 1 - 2**-24)
+        u2 = uniform(rng)
+        wi = to_world(brdf.sample_cosine(DRJIT, u1, u2), normal)
+        pdf = dr.dot(normal, wi) * dr.inv_pi
+        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, pdf > 0)
+        nothing += gain
+        sample += 1
+    return nothing
+
+
+def light_maps(
+    scene: Scene,
+    points: ArrayLike,
+    normals: ArrayLike,
+    lamp_of_face: ArrayLike,
+    lamps: int,
+    paths: PathOptions,
+    environment_lamp: int = -1,
+    number: Array | None = None,
+) -> Array:
+    """Integrate the diffuse light at points for every lamp by itself: D_l = 1/pi int L_l cos, of the light L_l that lamp l emits
+    and that reaches the point directly or after any reflections (Eq. L.59).
+
+    A diffuse surface of reflectance k_d then has the radiance k_d sum_l D_l, and the sum over all lamps is the diffuse integral
+    of Eq. S.3, because every path adds what it meets to the lamp that emits it and nothing is counted twice or left out.
+
+    Args:
+        scene: what paths meet; of its cache nothing is used, because cached light belongs to no lamp.
+        points: (n, 3) metres.
+        normals: (n, 3) of any length above 0, on the side from which the light arrives.
+        lamp_of_face: (m,) lamp of every face of the scene, -1 = its light is left out.
+        lamps: number of lamps.
+        paths: bounces include the point.
+        environment_lamp: lamp of the environment, -1 = its light is left out.
+        number: (n,) uint32, by which the points draw their random numbers; None = by their order.
+
+    Returns:
+        (n, lamps, 3) float32 radiance, linear.
+
+    Raises:
+        InputError: wrong shapes, non-finite numbers, lamps out of range.
+    """
+    points, normals, _ = checked_points(points, normals, normals)
+    lamp_of_face = np.ascontiguousarray(lamp_of_face, np.int32)
+    faces = len(scene.geometry.faces)
+    if lamp_of_face.shape != (faces,) or max(lamp_of_face.max(initial=-1), environment_lamp) >= lamps:
+        raise InputError(
+            f"lamp_of_face has shape {lamp_of_face.shape} and values up to {lamp_of_face.max(initial=-1)}, the environment is lamp"
+            f" {environment_lamp}; expected ({faces},) and lamps 0 ... {lamps - 1}, -1 = none"
+        )
+    result = np.zeros((len(points), lamps, 3), np.float32)
+    if paths.max_bounces == 0 or lamps == 0 or not len(points):
+        return result
+    scene = scene._replace(cache=None)
+    of_face = on_device(lamp_of_face, mi.Int32)
+    for batch in batches(len(points), paths.samples, 3 * lamps, paths.chunk):
+        rows = dr.zeros(mi.Float, batch.lanes * 3 * lamps)
+        lane = dr.arange(mi.UInt32, batch.lanes)
+        world = World(scene, _LampCollector(rows, lane, lamps, of_face, environment_lamp))
+        gain = _trace_points(
+            world,
+            batch.streams(paths.seed, number),
+            batch.spread(mi.Point3f, points),
+            batch.spread(mi.Vector3f, normals),
+            dr.opaque(mi.UInt32, paths.samples),
+            *batch.samples(paths.samples),
+            dr.opaque(mi.UInt32, paths.max_bounces),
+        )
+        dr.eval(gain, rows)
+        result[batch.part] = to_numpy(rows).reshape(-1, batch.split, lamps, 3).sum(axis=1)
+    return result / np.float32(paths.samples)

@@ -1,0 +1,148 @@
+"""Light maps: closed forms, the sum over lamps, groups, smoothing, half floats."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from iif_core.errors import InputError
+from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, smooth, to_half
+from tests.unit.test_transport import polygon_irradiance
+from tests.unit.transport_rooms import assert_mean, box, lambertian, merge, quad, repeated
+
+
+@pytest.fixture(scope="module")
+def light_maps(T):
+    from iif_core.light.transport.lightmaps import light_maps
+
+    return light_maps
+
+
+def test_two_lamps_have_their_form_factors(T, light_maps):
+    """Two rectangles over a black floor, and light from everywhere below the horizon's complement that they do not cover."""
+    lamps = [quad((-0.2, -0.2, 2), (0, 0.4, 0), (0.4, 0, 0)), quad((0.8, -0.5, 1.2), (0, 1, 0), (1, 0, 0))]
+    vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), *lamps])
+    geometry = T.build_geometry(vertices, faces, ids)
+    radiance = np.float32([[0, 0, 0], [3, 1, 0.5], [0.2, 0.4, 5]])[ids]
+    emitters = T.Emitters(geometry, radiance, np.where(ids > 0, 1, 0), environment=(0.5, 0.25, 0.125))
+    scene = T.Scene(geometry, T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (len(faces), 1))), emitters)
+    n, point = 3000, (0.3, 0, 0)
+    maps = light_maps(scene, repeated(point, n), repeated((0, 0, 3), n), ids - 1, 3, T.PathOptions(32, 1, 5), environment_lamp=2)
+    forms = [polygon_irradiance((0.3, 0, 1e-4), (0, 0, 1), lamp[0]) / np.pi for lamp in lamps]
+    for lamp, number in ((0, 1), (1, 2)):
+        for channel in range(3):
+            assert_mean(maps[:, lamp, channel], radiance[ids == number][0, channel] * forms[lamp], slack=2e-4)
+    assert_mean(maps[:, 2, 0], 0.5 * (1 - sum(forms)), slack=2e-4)
+    # Lamp -1 is left out, and the others do not change by it.
+    alone = light_maps(scene, repeated(point, n), repeated((0, 0, 3), n), np.where(ids == 1, 0, -1), 1, T.PathOptions(32, 1, 5))
+    np.testing.assert_array_equal(alone[:, 0], maps[:, 0])
+
+
+def test_furnace_is_the_geometric_series_of_every_lamp(T, light_maps):
+    """Walls of a closed grey box that all shine with L: D = L / (1 - rho); a lamp that is one third of the radiance has a third."""
+    vertices, faces = box((0, 0, 0), (1, 2, 1.5), inward=True)
+    geometry = T.build_geometry(vertices, faces, np.zeros(12, np.int32))
+    material, rho = lambertian(0.5)
+    emitters = T.Emitters(geometry, np.full((12, 3), 0.7), np.ones(12))
+    n = 4000
+    lamp = np.repeat([0, 1, 2], 4)
+    maps = light_maps(
+        T.Scene(geometry, material, emitters),
+        repeated((0.4, 0.9, 0), n),
+        repeated((0, 0, 1), n),
+        lamp,
+        3,
+        T.PathOptions(16, 64, 1),
+    )
+    whole = maps.sum(1)[:, 0]
+    low, high = 0.7 / (1 - rho), 0.7 / (1 - rho - 0.004)  # the grazing rest of the lobe
+    error = whole.std(ddof=1) / np.sqrt(n)
+    assert low - 3 * error < whole.mean() < high + 3 * error
+
+
+def test_lamps_add_up_to_the_diffuse_light_of_the_shading_caches(T, room, light_maps):
+    """The sum over lamps, and each lamp alone, against the existing integrator with the other lamps dark: Z-tests over blocks."""
+    scene = T.Scene(room.geometry, room.material, room.emitters)
+    paths = T.PathOptions(64, 5, 11)
+    take = slice(None, None, 3)
+    points, normals = room.points[take], room.normals[take]
+    maps = np.stack([light_maps(scene, points, normals, room.group, 2, paths.__class__(64, 5, seed)) for seed in range(8)])
+    for chosen in ((0, 1), (0,), (1,)):
+        on = np.isin(room.group, chosen)
+        emitters = T.Emitters(room.geometry, np.where(on[:, None], room.radiance, 0), room.side)
+        other = T.Scene(room.geometry, room.material, emitters)
+        reference = np.stack(
+            [T.shading_caches(other, points, normals, normals, [], T.PathOptions(64, 5, 100 + seed))[0] for seed in range(8)]
+        )
+        ours = maps[:, :, list(chosen)].sum(2)
+        a, b = ours.mean((1, 2), dtype=np.float64), reference.mean((1, 2), dtype=np.float64)
+        error = np.hypot(a.std(ddof=1), b.std(ddof=1)) / np.sqrt(8)
+        assert abs(a.mean() - b.mean()) < 4 * error
+        assert error < 0.01 * b.mean()
+
+
+def test_lamps_are_independent_of_who_else_is_asked_for(T, room, light_maps):
+    scene = T.Scene(room.geometry, room.material, room.emitters)
+    paths = T.PathOptions(8, 5, 3)
+    both = light_maps(scene, room.points, room.normals, room.group, 2, paths)
+    merged = light_maps(scene, room.points, room.normals, np.minimum(room.group, 0), 1, paths)
+    np.testing.assert_allclose(both.sum(1), merged[:, 0], rtol=2e-5, atol=1e-7)
+    chunked = light_maps(scene, room.points, room.normals, room.group, 2, T.PathOptions(8, 5, 3, chunk=1000))
+    np.testing.assert_array_equal(both, chunked)
+    some = np.arange(5, 400, 7)
+    numbered = light_maps(scene, room.points[some], room.normals[some], room.group, 2, paths, number=some.astype(np.uint32))
+    np.testing.assert_array_equal(numbered, both[some])
+
+
+def test_lamps_out_of_range_are_named(T, room, light_maps):
+    scene = T.Scene(room.geometry, room.material, room.emitters)
+    with pytest.raises(InputError, match="lamp_of_face"):
+        light_maps(scene, room.points, room.normals, room.group, 1, T.PathOptions(1, 1, 0))
+    assert light_maps(scene, room.points[:0], room.normals[:0], room.group, 2, T.PathOptions(1, 1, 0)).shape == (0, 2, 3)
+
+
+def test_the_weakest_lamps_share_a_map():
+    of, count = group_lamps([5, 0, 1, 3, 2, 2], most=3)
+    assert of.tolist() == [0, -1, 2, 1, 2, 2] and count == 3
+    of, count = group_lamps([5, 0, 1, 3], most=3)
+    assert of.tolist() == [0, -1, 1, 2] and count == 3
+    assert group_lamps([])[1] == 0
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(-30, 30), st.integers(0, 2**32 - 1))
+def test_half_floats_neither_overflow_nor_lose_digits(exponent, seed):
+    rng = np.random.default_rng(seed)
+    maps = np.exp(rng.normal(0, 3, (50, 3, 3))) * 10.0**exponent
+    maps[:, 2] = 0
+    halves = to_half(maps)
+    assert halves.value.dtype == np.float16 and np.isfinite(halves.value).all() and halves.value.max() <= HALF_TOP
+    factor = np.array([[0.5, 2, 1], [1, 0, 3], [1, 1, 1]])
+    expected = np.einsum("nlc,lc->nc", maps, factor)
+    np.testing.assert_allclose(recombine(halves, factor), expected, rtol=2.0**-11, atol=1e-11 * maps.max())
+    with pytest.raises(InputError):
+        to_half(-maps)
+
+
+def test_smoothing_lowers_noise_keeps_edges_and_adds_up():
+    """A plane of texels with a shadow edge, noise of 30 % in each half."""
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.arange(60) * 0.02, np.arange(40) * 0.02, indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
+    normals = np.tile([0.0, 0, 1], (len(points), 1))
+    lit = points[:, 0] > 0.6
+    true = np.stack([np.where(lit, 1.0, 0.05), np.full(len(points), 0.2)], 1)[..., None] * np.float32([1, 0.8, 0.5])
+    halves = [(true * rng.gamma(11, 1 / 11, (len(points), 1, 1))).astype(np.float32) for _ in range(2)]
+    out = smooth(points, normals, *halves, reach=0.03)
+    raw = 0.5 * (halves[0] + halves[1])
+    inside = np.abs(points[:, 0] - 0.6) > 0.1
+    assert (out - true)[inside].std() < 0.45 * (raw - true)[inside].std()
+    edge = np.abs(points[:, 0] - 0.6) < 0.03
+    np.testing.assert_allclose(out[edge & lit, 0, 0].mean(), 1.0, atol=0.06)
+    np.testing.assert_allclose(out[edge & ~lit, 0, 0].mean(), 0.05, atol=0.03)
+    assert abs(out.mean() / raw.mean() - 1) < 0.01
+    # The lamps of a map that is their sum are smoothed to their sum.
+    split = [np.concatenate([0.25 * h[:, :1], 0.75 * h[:, :1], h[:, 1:]], 1) for h in halves]
+    again = smooth(points, normals, *split, reach=0.03)
+    np.testing.assert_allclose(again[:, :2].sum(1), out[:, 0], rtol=1e-5)
+    assert smooth(points[:0], normals[:0], halves[0][:0], halves[1][:0], 0.1).shape == (0, 2, 3)
