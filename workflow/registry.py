@@ -91,6 +91,12 @@ STAGES: dict[str, Stage] = {
         Stage("unwrap", ("capture", "segmentation", "base", "emission"), ("export.max_faces_glb", "export.texture_size")),
         Stage("export", ("capture", "segmentation", "base", "emission", "affines", "unwrap"), ("export",)),
         Stage(
+            "room",
+            ("capture", "segmentation", "base", "emission", "affines", "unwrap"),
+            ("room", "report.credit", "seed"),
+            reads_raw=True,
+        ),
+        Stage(
             "report",
             ("capture", "plan", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
             ("report",),
@@ -110,6 +116,7 @@ STAGES: dict[str, Stage] = {
                 "metrics",
                 "export",
                 "report",
+                "room",
             ),
             (),
         ),

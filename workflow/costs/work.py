@@ -175,6 +175,11 @@ def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
     return "all", {"faces": size.faces / MILLION, "pixels": size.pixels / MILLION}
 
 
+def _room(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    texels = settings["room"]["lightmap_size"] ** 2 / MILLION
+    return "all", {"paths": texels * settings["room"]["samples"], "texels": texels, "faces": size.faces / MILLION}
+
+
 def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     shown = min(settings["report"]["views"], size.views) * size.pixels / max(size.views, 1) / MILLION
     return "all", {"shown": shown, "pixels": size.pixels / MILLION}
@@ -200,6 +205,7 @@ _STAGES = {
     "metrics": _metrics,
     "unwrap": _unwrap,
     "export": _export,
+    "room": _room,
     "report": _report,
     "publish": _publish,
 }

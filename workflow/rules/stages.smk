@@ -220,6 +220,29 @@ use rule stage as export with:
         "{wildcards.scene}: glTF, Mitsuba scene and tables"
 
 
+use rule stage as room with:
+    input:
+        unpack(
+            reads(
+                "room",
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "affines",
+                "unwrap",
+            )
+        ),
+    pathvars:
+        stage="room",
+    resources:
+        **needs("room"),
+    params:
+        job=job("room"),
+    message:
+        "{wildcards.scene}: light of every lamp, and the page to walk in"
+
+
 use rule stage as report with:
     input:
         unpack(
@@ -316,6 +339,7 @@ descriptions = {
     "metrics": "Score the result against ground truth, where there is any, and against the photographs.",
     "unwrap": "Clean, simplify and unwrap the mesh for the exported files.",
     "export": "Write the result for other programs: glTF, Mitsuba, tables.",
+    "room": "Write room.html: a page to walk through the room and to switch its lamps.",
     "report": "Write report.html, and plan.yaml with all decisions settled.",
     "relight": "Render the recovered scene under other light; made on demand.",
     "base_scores": "Score the base texture; made on demand by studies.",

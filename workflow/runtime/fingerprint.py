@@ -45,7 +45,7 @@ PLUGINS = {
     "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
 }
 # Stage -> modules that know (and check) further input files.
-FILE_MODULES = {"emission": ("workflow.scene.response_file",)}
+FILE_MODULES = {"emission": ("workflow.scene.response_file",), "room": ("workflow.room.sources",)}
 VGG = Path("results/weights/lpips_vgg.npz")
 
 

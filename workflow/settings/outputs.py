@@ -49,3 +49,20 @@ class Report(Section):
     """Number of views shown with all maps, from the worst to the best; each adds up to 2 MB to the page."""
     credit: str = ""
     """Line under the title, such as artist and licence."""
+
+
+class Room(Section):
+    """The page to walk in."""
+
+    lightmap_size: int = Field(768, ge=32, le=4096)
+    """Largest side of the light maps, in texels; smaller where many lamps would make the page too large. All light maps are of one
+    size, and time and size go with its square."""
+    samples: int = Field(64, ge=2)
+    """Paths for each texel of the light maps, for all lamps together."""
+    max_bounces: int = Field(16, ge=1, le=64)
+    """Longest path, in bounces."""
+    texture_size: int = Field(2048, ge=64, le=8192)
+    """Largest side of the textures in the page, in texels."""
+    max_mb: float = Field(25.0, ge=2)
+    """Largest size of `room.html` in MB: light maps take at most half of it, and photographs become smaller, or are left out,
+    until it fits."""

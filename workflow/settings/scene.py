@@ -10,7 +10,7 @@ from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.limits import Limits
-from workflow.settings.outputs import Export, Metrics, Render, Report
+from workflow.settings.outputs import Export, Metrics, Render, Report, Room
 from workflow.settings.override import Override
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting
@@ -42,6 +42,7 @@ class SceneSettings(Section):
     metrics: Metrics = Metrics()
     export: Export = Export()
     report: Report = Report()
+    room: Room = Room()
     override: Override = Override()
     """Parts of the model that are forced in or out, in the words of plan.yaml."""
     relight: list[Relighting] = Field(default_factory=list)

@@ -8,9 +8,9 @@ trap 'rm -rf "$work"' EXIT
 npm install --prefix "$work" --no-save --no-audit --no-fund --silent three@0.187.0 esbuild@0.28.2
 cat > "$work/parts.js" <<'PARTS'
 export {
-  BackSide, BufferAttribute, BufferGeometry, ClampToEdgeWrapping, Color, DataTexture, DataUtils, DoubleSide, FrontSide, GLSL3, HalfFloatType,
-  LinearFilter, LinearMipmapLinearFilter, LinearSRGBColorSpace, Mesh, NearestFilter, NoColorSpace, PerspectiveCamera, Raycaster,
-  RawShaderMaterial, RepeatWrapping, RGBAFormat, Scene, SphereGeometry, SRGBColorSpace, Texture, Vector2, Vector3, Vector4, WebGLRenderer,
+  BackSide, BufferAttribute, BufferGeometry, DataTexture, DoubleSide, FrontSide, GLSL3, HalfFloatType,
+  LinearFilter, LinearMipmapLinearFilter, LinearSRGBColorSpace, Matrix3, Mesh, NearestFilter, NoColorSpace, PerspectiveCamera, Raycaster,
+  RawShaderMaterial, RGBAFormat, Scene, SphereGeometry, SRGBColorSpace, Texture, Vector2, Vector3, WebGLRenderer,
 } from 'three';
 PARTS
 "$work/node_modules/.bin/esbuild" "$work/parts.js" --bundle --minify --format=iife --global-name=THREE --target=es2020 \

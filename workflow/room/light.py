@@ -1,0 +1,296 @@
+"""The lamps of a room, and the light map of each (docs/method/light.md#light-maps)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from iif_core.light.environment import as_map, solid_angles
+from iif_core.light.light_maps import MOST_LAMPS, group_lamps, smooth
+from iif_core.surface.atlas import texel_surface, texel_values
+from iif_core.surface.triangles import face_geometry
+from workflow.exporters.atlas import TexturedPart
+from workflow.scene.base_scene import BaseScene
+
+if TYPE_CHECKING:
+    from iif_core.light.transport.scene import Scene
+
+Array = np.ndarray
+
+FINER = 3
+"""Points across a texel at which its surface is looked for, so that charts narrower than a texel have light too."""
+EQUAL_SHARE = 0.5
+"""Share of the draws that all lamps have alike; the rest is by power."""
+CHUNK = 1 << 16
+"""Points that are traced between two lines of progress."""
+REACH = 0.75
+"""Standard deviation of the smoothing over distance, in texels."""
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """What one slider moves: an emitter, the environment, or all weak emitters that share a light map.
+
+    Attributes:
+        name: for people.
+        emitters: ids of its emitters; empty = the environment.
+        color: (3,) linear, largest 1: the light is that of the map times this. White where the map has colours of its own,
+            because several emitters or the texels of the environment differ.
+        radiance: (3,) mean radiance of its surface, or of the environment over all directions.
+        power: of all its light, in m^2 sr of radiance; of the environment, as much as enters through surface that is missing is
+            not known, so that it is 0.
+    """
+
+    name: str
+    emitters: tuple[int, ...]
+    color: Array
+    radiance: Array
+    power: float
+
+
+@dataclass(frozen=True)
+class Lamps:
+    """All lamps, and the light of every emitter while its map is traced.
+
+    Attributes:
+        lamps: at most `MOST_LAMPS`.
+        of_emitter: (E,) int32 lamp of each emitter, -1 = none.
+        radiance: (E, 3) float32 radiance of each emitter divided by the colour of its lamp.
+        environment: number of the lamp of the environment, -1 = dark.
+        surroundings: (H, W, 3) float32 radiance of the environment divided by the colour of its lamp.
+    """
+
+    lamps: list[Lamp]
+    of_emitter: Array
+    radiance: Array
+    environment: int
+    surroundings: Array
+
+
+def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Array) -> Lamps:
+    """List the lamps of a scene: one for each emitter, the weakest together beyond `MOST_LAMPS`, the environment last.
+
+    Args:
+        parts: of the surface; the areas of emitters come from them.
+        radiance: (E, 3) of each emitter id.
+        environment: (3,), or (H, W, 3) as in `iif_core.light.environment`.
+    """
+    area, names = np.zeros(len(radiance)), [""] * len(radiance)
+    for part in parts:
+        if part.emitter_id >= 0:
+            sides = 2 if part.double_sided else 1
+            area[part.emitter_id] += sides * face_geometry(part.vertices, part.faces)[1].sum()
+            names[part.emitter_id] = names[part.emitter_id] or part.name
+    radiance = np.asarray(radiance, np.float64).reshape(-1, 3)
+    power = np.pi * area * radiance.mean(1)
+    outside = as_map(environment)
+    shines = bool(outside.any())
+    of_emitter, count = group_lamps(power, MOST_LAMPS - shines)
+    lamps, traced = [], np.zeros_like(radiance)
+    for number in range(count):
+        own = np.flatnonzero(of_emitter == number)
+        total = power[own].sum()
+        mean = (power[own, None] * radiance[own]).sum(0) / total
+        color = _color(radiance[own[0]]) if len(own) == 1 else np.ones(3)
+        traced[own] = radiance[own].max(1, keepdims=True) if len(own) == 1 else radiance[own]
+        name = names[own[0]] if len(own) == 1 else f"{len(own)} weak lamps"
+        lamps.append(Lamp(name, tuple(int(e) for e in own), color, mean, float(total)))
+    if shines:
+        even = outside.shape[:2] == (1, 1)
+        mean = np.average(outside.reshape(-1, 3), 0, solid_angles(*outside.shape[:2]).ravel()).astype(np.float64)
+        lamps.append(Lamp("light from outside", (), _color(mean) if even else np.ones(3), mean, 0.0))
+        outside = np.full_like(outside, outside.max()) if even else outside
+    return Lamps(lamps, of_emitter, traced.astype(np.float32), len(lamps) - 1 if shines else -1, outside)
+
+
+def _color(radiance: Array) -> Array:
+    """(3,) float64 with the largest channel 1."""
+    return np.asarray(radiance, np.float64) / max(float(np.max(radiance)), 1e-30)
+
+
+@dataclass(frozen=True)
+class Texels:
+    """The surface under the texels of a light map, n of them; texels without surface are left out.
+
+    Attributes:
+        size: S, of the map.
+        index: (n,) int64 row x S + column, increasing.
+        points, normals: (n, 3) float64 metres, and unit vectors towards the photographs.
+        part: (n,) int32 part of the surface.
+        edge: size of a texel on each part, (parts,) float64 metres, in the mean over the part.
+    """
+
+    size: int
+    index: Array
+    points: Array
+    normals: Array
+    part: Array
+    edge: Array
+
+
+def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
+    """Find the surface under each texel of a map of S x S.
+
+    It is the surface under the centre of the texel, and where there is none under the point nearest to it out of FINER x FINER.
+    Normals are those of the faces, because a path that starts under the shading normal may start inside of the surface.
+    """
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts]).astype(np.float64)
+    smooth_normals = np.concatenate([part.normals for part in parts])
+    uv = np.concatenate([part.uv for part in parts])
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
+    part_of = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts])
+    index, face, barycentric = _surface_of(uv, faces, size)
+    points = sum(vertices[faces[face, i]] * barycentric[:, i, None] for i in range(3))
+    normal, area = face_geometry(vertices, faces)
+    flat = normal[face]
+    toward = texel_values(smooth_normals, faces, face, barycentric)
+    flat = np.where(np.einsum("ij,ij->i", flat, toward)[:, None] < 0, -flat, flat)
+    corner = uv[faces].astype(np.float64)
+    edges = corner[:, 1:] - corner[:, :1]
+    in_map = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) * size**2
+    sums = [np.bincount(part_of, values, len(parts)) for values in (area, in_map)]
+    edge = np.sqrt(sums[0] / np.maximum(sums[1], 1e-12))
+    return Texels(size, index, points, flat, part_of[face], edge)
+
+
+def _surface_of(uv: Array, faces: Array, size: int) -> tuple[Array, Array, Array]:
+    """Texels (n,) that have surface, the face of each (n,) and barycentric coordinates in it (n, 3)."""
+    face, barycentric = texel_surface(uv, faces, size * FINER)
+    offset = np.arange(FINER) - (FINER - 1) / 2
+    order = np.argsort(np.add.outer(offset**2, offset**2).ravel(), kind="stable")
+
+    def blocks(values: Array) -> Array:
+        """(S * S, FINER^2, ...) the points of every texel, from its centre outwards."""
+        rest = values.shape[2:]
+        values = values.reshape(size, FINER, size, FINER, *rest).swapaxes(1, 2)
+        return values.reshape(size * size, FINER * FINER, *rest)[:, order]
+
+    face, barycentric = blocks(face), blocks(barycentric)
+    index = np.flatnonzero((face >= 0).any(1))
+    first = np.argmax(face[index] >= 0, axis=1)
+    return index, face[index, first], barycentric[index, first]
+
+
+def trace_lamps(
+    parts: Sequence[TexturedPart],
+    texels: Texels,
+    surface: BaseScene,
+    lamps: Lamps,
+    samples: int,
+    max_bounces: int,
+    seed: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Array:
+    """Trace the light maps of all lamps, smoothed, (n, lamps, 3) float32 radiance of a white diffuse surface.
+
+    Paths meet the parts as they are shown, with the materials of the surface cells. A part that is shown from both sides has the
+    light of the side that gets more of it.
+
+    Args:
+        parts: of the surface.
+        texels: where the light is wanted.
+        surface: with the fitted materials.
+        lamps: of the parts.
+        samples: paths for each texel, half of them in each of two independent estimates.
+        max_bounces: longest path, in bounces.
+        seed: of the random numbers.
+        progress: called with numbers of points.
+    """
+    points, normals, number = texels.points, texels.normals, np.arange(len(texels.points), dtype=np.uint32)
+    two_sided = np.array([part.double_sided for part in parts], bool)[texels.part]
+    back = np.flatnonzero(two_sided)
+    points, normals = np.concatenate([points, points[back]]), np.concatenate([normals, -normals[back]])
+    number = np.concatenate([number, np.uint32(len(number)) + number[back]])
+    halves = _trace(parts, points, normals, number, surface, lamps, -(-samples // 2), max_bounces, seed, progress)
+    front, behind = halves[:, : len(texels.points)], halves[:, len(texels.points) :]
+    if len(back):
+        of = texels.part[back]
+        brightness = [np.bincount(of, side.sum((0, 2, 3)), len(parts)) for side in (front[:, back], behind)]
+        turned = (brightness[1] > brightness[0])[of]
+        front[:, back[turned]] = behind[:, turned]
+        normals = normals[: len(texels.points)].copy()
+        normals[back[turned]] *= -1
+    out = np.empty(front.shape[1:], np.float32)
+    order = np.argsort(texels.part, kind="stable")
+    for own in np.split(order, np.cumsum(np.bincount(texels.part, minlength=len(parts)))[:-1]):
+        if len(own):
+            reach = REACH * texels.edge[texels.part[own[0]]]
+            out[own] = smooth(texels.points[own], normals[own], front[0, own], front[1, own], reach)
+    return out
+
+
+def _trace(
+    parts: Sequence[TexturedPart],
+    points: Array,
+    normals: Array,
+    number: Array,
+    surface: BaseScene,
+    lamps: Lamps,
+    samples: int,
+    max_bounces: int,
+    seed: int,
+    progress: Callable[[int, int], None],
+) -> Array:
+    """(2, n, lamps, 3) float32 two independent estimates."""
+    scene, lamp_of_face = lit_scene(parts, surface, lamps)
+    from iif_core.light.transport.lightmaps import light_maps
+    from iif_core.light.transport.scene import PathOptions
+
+    out = np.zeros((2, len(points), len(lamps.lamps), 3), np.float32)
+    total = 2 * len(points)
+    for half in range(2):
+        paths = PathOptions(samples, max_bounces, 2 * seed + half)
+        for first in range(0, len(points), CHUNK):
+            progress(half * len(points) + first, total)
+            some = slice(first, first + CHUNK)
+            light = light_maps(
+                scene, points[some], normals[some], lamp_of_face, len(lamps.lamps), paths, lamps.environment, number[some]
+            )
+            out[half, some] = light
+    progress(total, total)
+    return out
+
+
+def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -> tuple[Scene, Array]:
+    """Build the parts on the device with their lamps, and return the scene and the lamp (m,) of each of its faces."""
+    black = surface.n_objects  # of `BaseScene.materials`
+    material = surface.materials()
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.geometry import build_geometry
+    from iif_core.light.transport.scene import Scene
+
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
+
+    def of_face(values: list) -> Array:
+        return np.repeat(np.asarray(values), [len(part.faces) for part in parts], axis=0)
+
+    emitter = of_face([part.emitter_id for part in parts])
+    object_id = np.where(emitter >= 0, black, of_face([part.object_id for part in parts])).astype(np.int32)
+    passes = of_face([1.0 - part.opacity for part in parts]).astype(np.float32)
+    geometry = build_geometry(vertices, faces, object_id, passes)
+    radiance = np.concatenate([lamps.radiance, np.zeros((1, 3), np.float32)])[emitter]  # the last for -1
+    side = np.where(of_face([part.double_sided for part in parts]), 0, 1).astype(np.int8)
+    lamp = np.append(lamps.of_emitter, np.int32(-1))[emitter].astype(np.int32)
+    weight = _draws(geometry.areas * radiance.mean(1), lamp, len(lamps.lamps))
+    environment = lamps.surroundings if lamps.environment >= 0 else np.zeros(3, np.float32)
+    emitters = Emitters(geometry, radiance, side, environment, sampling_weight=weight)
+    return Scene(geometry, material, emitters), lamp
+
+
+def _draws(power: Array, lamp: Array, lamps: int) -> Array:
+    """(m,) how often each face is drawn: `EQUAL_SHARE` of the draws alike for all lamps, so that the light of weak ones is not
+    noisier than that of strong ones, and the rest by power."""
+    own = lamp >= 0
+    total = np.bincount(lamp[own], power[own], lamps)
+    lit = int((total > 0).sum())
+    if not lit:
+        return power
+    share = np.zeros_like(power)
+    share[own] = power[own] / np.maximum(total, 1e-300)[lamp[own]] / lit
+    return EQUAL_SHARE * share + (1 - EQUAL_SHARE) * power / power.sum()
