@@ -49,9 +49,7 @@ class Seen:
 
     Attributes:
         page: of Playwright.
-        messages: (type, text) of its console.
-        errors: exceptions that nothing caught.
-        requests: addresses, that of the page first.
+        messages: (type, text) of its console; errors: exceptions that nothing caught; requests: addresses, that of the page first.
     """
 
     page: Any

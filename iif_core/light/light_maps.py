@@ -1,4 +1,4 @@
-"""Light maps: which emitters share a map, smoothing that keeps the maps additive, and their storage as half floats
+"""Light maps: which emitters share a map, the mean of denoised maps, and their storage as half floats
 (docs/method/light.md#light-maps).
 
 Tracing them is in `iif_core.light.transport.lightmaps`.
@@ -18,14 +18,10 @@ Array = np.ndarray
 MOST_LAMPS = 16
 """Light maps at most; the weakest emitters beyond share the last."""
 
-NEIGHBOURS = 24
-"""Texels over which `smooth` averages, the texel itself among them."""
+TEXELS_TRUSTED = 256
+"""Texels of a part whose mean counts as much as the mean over all parts in `with_mean_of`."""
 
-NORMAL_REACH = 0.35
-"""Difference of unit normals that counts as much as one `reach` of distance (20 degrees)."""
-
-CONTRAST = 2.0
-"""Standard errors by which the light of a neighbour may differ before its weight falls to e^-1/2."""
+GAIN_LIMITS = (0.5, 2.0)
 
 HALF_TOP = 16384.0
 """Largest stored value; the largest half float is 65504, and interpolation needs room."""
@@ -53,49 +49,33 @@ def group_lamps(power: ArrayLike, most: int = MOST_LAMPS) -> tuple[Array, int]:
     return of_emitter, min(len(shining), most)
 
 
-def smooth(points: ArrayLike, normals: ArrayLike, first: Array, second: Array, reach: float) -> Array:
-    """Average light over neighbours on the same surface, with the same weights for all lamps (Eq. L.60).
+def with_mean_of(traced: Array, denoised: Array, part: ArrayLike, area: ArrayLike) -> Array:
+    """Scale denoised light maps so that the light of every part is what was traced (Eq. L.60).
 
-    Neighbours are near in space and not in the map, so charts do not matter and seams disappear. Both halves are averaged, each
-    with the weights that follow from the other, so that noise does not choose what it is averaged with. A neighbour counts less
-    the further it is, the more its normal differs, and the more the sum of its lamps differs, compared with the noise.
+    A denoiser takes rare bright texels for noise, and with them the light that they stand for. The factor of lamp and part is the
+    ratio R_p of the sums of traced and denoised light on the part, drawn to the ratio R over all parts where the part has few
+    texels: (n R_p + TEXELS_TRUSTED R) / (n + TEXELS_TRUSTED), limited to GAIN_LIMITS.
 
     Args:
-        points, normals: (n, 3) metres, and unit vectors.
-        first, second: (n, lamps, 3) two independent estimates.
-        reach: standard deviation of the weights over distance, metres.
+        traced, denoised: (n, lamps, 3), >= 0.
+        part: (n,) int part of each texel, >= 0.
+        area: (n,) of each texel.
 
     Returns:
-        (n, lamps, 3) float32, linear in the lamps for given sums over them.
+        (n, lamps, 3) float32.
     """
-    from scipy.spatial import cKDTree
-
-    place = np.concatenate([np.asarray(points, np.float64) / reach, np.asarray(normals, np.float64) / NORMAL_REACH], 1)
-    if not len(place):
-        return np.zeros(first.shape, np.float32)
-    count = min(NEIGHBOURS, len(place))
-    distance, near = cKDTree(place).query(place, k=count)
-    distance, near = distance.reshape(len(place), count), near.reshape(len(place), count)
-    closeness = np.exp(-0.5 * distance**2)
-    halves = [np.asarray(half, np.float32) for half in (first, second)]
-    level = [half.sum(1, dtype=np.float64).mean(-1) for half in halves]
-
-    def mean(values: Array, weight: Array) -> Array:
-        return np.einsum("nk,nk->n", weight, values[near]) / weight.sum(1)
-
-    # Guides are smoothed by closeness alone; their noise is that of the halves, over as many neighbours as count.
-    guide = [mean(one, closeness) for one in level]
-    noise = np.sqrt(np.maximum(mean((level[0] - level[1]) ** 2, closeness), 0) / 2)
-    effective = closeness.sum(1) ** 2 / (closeness**2).sum(1)
-    error = CONTRAST * np.sqrt(2.0) * noise / np.sqrt(effective) + 1e-3 * np.abs(guide[0] + guide[1]) / 2 + 1e-30
-    out = np.zeros(halves[0].shape, np.float64)
-    for half, other in ((halves[0], guide[1]), (halves[1], guide[0])):
-        apart = (other[near] - other[:, None]) / np.maximum(error[:, None], error[near])
-        weight = closeness * np.exp(-0.5 * np.minimum(apart**2, 60.0))
-        weight /= weight.sum(1, keepdims=True)
-        for k in range(count):  # one neighbour at a time, which keeps the memory at the size of the maps
-            out += weight[:, k, None, None] * half[near[:, k]]
-    return (0.5 * out).astype(np.float32)
+    part, area = np.asarray(part), np.asarray(area, np.float64)
+    if not len(part):
+        return np.zeros(denoised.shape, np.float32)
+    count = np.bincount(part)
+    out = np.empty(denoised.shape, np.float32)
+    for lamp in range(traced.shape[1]):
+        sums = [np.bincount(part, area * maps[:, lamp].sum(1, dtype=np.float64)) for maps in (traced, denoised)]
+        whole = sums[0].sum() / sums[1].sum() if sums[1].sum() > 0 else 1.0
+        own = np.divide(sums[0], sums[1], out=np.full(len(count), whole), where=sums[1] > 0)
+        gain = np.clip((count * own + TEXELS_TRUSTED * whole) / (count + TEXELS_TRUSTED), *GAIN_LIMITS)
+        out[:, lamp] = denoised[:, lamp] * gain[part, None]
+    return out
 
 
 class Halves(NamedTuple):

@@ -1,4 +1,4 @@
-"""Light maps: closed forms, the sum over lamps, groups, smoothing, half floats."""
+"""Light maps: closed forms, the sum over lamps, groups, means of denoised maps, half floats."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.errors import InputError
-from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, smooth, to_half
+from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, to_half, with_mean_of
 from tests.unit.test_transport import polygon_irradiance
 from tests.unit.transport_rooms import assert_mean, box, lambertian, merge, quad, repeated
 
@@ -38,8 +38,8 @@ def test_two_lamps_have_their_form_factors(T, light_maps):
     np.testing.assert_array_equal(alone[:, 0], maps[:, 0])
 
 
-def test_furnace_is_the_geometric_series_of_every_lamp(T, light_maps):
-    """Walls of a closed grey box that all shine with L: D = L / (1 - rho); a lamp that is one third of the radiance has a third."""
+def test_lamps_of_a_furnace_add_up_to_the_geometric_series(T, light_maps):
+    """Walls of a closed grey box that all shine with L: the lamps, two walls each, add up to D = L / (1 - rho)."""
     vertices, faces = box((0, 0, 0), (1, 2, 1.5), inward=True)
     geometry = T.build_geometry(vertices, faces, np.zeros(12, np.int32))
     material, rho = lambertian(0.5)
@@ -63,10 +63,9 @@ def test_furnace_is_the_geometric_series_of_every_lamp(T, light_maps):
 def test_lamps_add_up_to_the_diffuse_light_of_the_shading_caches(T, room, light_maps):
     """The sum over lamps, and each lamp alone, against the existing integrator with the other lamps dark: Z-tests over blocks."""
     scene = T.Scene(room.geometry, room.material, room.emitters)
-    paths = T.PathOptions(64, 5, 11)
     take = slice(None, None, 3)
     points, normals = room.points[take], room.normals[take]
-    maps = np.stack([light_maps(scene, points, normals, room.group, 2, paths.__class__(64, 5, seed)) for seed in range(8)])
+    maps = np.stack([light_maps(scene, points, normals, room.group, 2, T.PathOptions(64, 5, seed)) for seed in range(8)])
     for chosen in ((0, 1), (0,), (1,)):
         on = np.isin(room.group, chosen)
         emitters = T.Emitters(room.geometry, np.where(on[:, None], room.radiance, 0), room.side)
@@ -124,25 +123,19 @@ def test_half_floats_neither_overflow_nor_lose_digits(exponent, seed):
         to_half(-maps)
 
 
-def test_smoothing_lowers_noise_keeps_edges_and_adds_up():
-    """A plane of texels with a shadow edge, noise of 30 % in each half."""
-    rng = np.random.default_rng(1)
-    x, y = np.meshgrid(np.arange(60) * 0.02, np.arange(40) * 0.02, indexing="ij")
-    points = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
-    normals = np.tile([0.0, 0, 1], (len(points), 1))
-    lit = points[:, 0] > 0.6
-    true = np.stack([np.where(lit, 1.0, 0.05), np.full(len(points), 0.2)], 1)[..., None] * np.float32([1, 0.8, 0.5])
-    halves = [(true * rng.gamma(11, 1 / 11, (len(points), 1, 1))).astype(np.float32) for _ in range(2)]
-    out = smooth(points, normals, *halves, reach=0.03)
-    raw = 0.5 * (halves[0] + halves[1])
-    inside = np.abs(points[:, 0] - 0.6) > 0.1
-    assert (out - true)[inside].std() < 0.45 * (raw - true)[inside].std()
-    edge = np.abs(points[:, 0] - 0.6) < 0.03
-    np.testing.assert_allclose(out[edge & lit, 0, 0].mean(), 1.0, atol=0.06)
-    np.testing.assert_allclose(out[edge & ~lit, 0, 0].mean(), 0.05, atol=0.03)
-    assert abs(out.mean() / raw.mean() - 1) < 0.01
-    # The lamps of a map that is their sum are smoothed to their sum.
-    split = [np.concatenate([0.25 * h[:, :1], 0.75 * h[:, :1], h[:, 1:]], 1) for h in halves]
-    again = smooth(points, normals, *split, reach=0.03)
-    np.testing.assert_allclose(again[:, :2].sum(1), out[:, 0], rtol=1e-5)
-    assert smooth(points[:0], normals[:0], halves[0][:0], halves[1][:0], 0.1).shape == (0, 2, 3)
+def test_denoised_maps_keep_the_light_of_every_part():
+    rng = np.random.default_rng(3)
+    part = np.repeat([0, 1, 2], [5000, 4000, 20])
+    area = np.repeat([1e-4, 4e-4, 1e-4], [5000, 4000, 20])
+    truth = np.ones((len(part), 2, 3)) * np.float32([1, 0.5, 0.25])
+    traced = truth * rng.gamma(2, 0.5, (len(part), 2, 1))
+    lost = np.array([0.9, 0.8, 0.1])[part][:, None, None]  # of a small part the mean over all is believed more
+    out = with_mean_of(traced, truth * lost, part, area)
+    for p, tolerance in ((0, 0.02), (1, 0.02)):
+        own = part == p
+        np.testing.assert_allclose(out[own].mean(0), traced[own].mean(0), rtol=tolerance)
+    whole = (area[:, None] * traced[:, 0]).sum() / (area[:, None] * (truth * lost)[:, 0]).sum()
+    few = (20 * traced[-20:, 0].sum() / (truth * lost)[-20:, 0].sum() + 256 * whole) / 276
+    np.testing.assert_allclose(out[-20:, 0], (truth * lost)[-20:, 0] * min(few, 2.0), rtol=1e-5)
+    assert with_mean_of(traced[:0], truth[:0], part[:0], area[:0]).shape == (0, 2, 3)
+    assert not with_mean_of(0 * traced, 0 * truth, part, area).any()

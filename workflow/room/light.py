@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from iif_core.light.environment import as_map, solid_angles
-from iif_core.light.light_maps import MOST_LAMPS, group_lamps, smooth
-from iif_core.surface.atlas import texel_surface, texel_values
+from iif_core.light.light_maps import MOST_LAMPS, group_lamps, with_mean_of
+from iif_core.numerics.color import id_colours
+from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import TexturedPart
+from workflow.models.denoise import denoise
 from workflow.scene.base_scene import BaseScene
 
 if TYPE_CHECKING:
+    from iif_core.light.transport.geometry import Geometry
     from iif_core.light.transport.scene import Scene
 
 Array = np.ndarray
@@ -26,8 +29,10 @@ EQUAL_SHARE = 0.5
 """Share of the draws that all lamps have alike; the rest is by power."""
 CHUNK = 1 << 16
 """Points that are traced between two lines of progress."""
-REACH = 0.75
-"""Standard deviation of the smoothing over distance, in texels."""
+PROBES = 16
+"""Rays from each texel that find out whether it is inside of a solid."""
+INSIDE = 0.25
+"""Share of the rays that meet surface from behind, above which it is."""
 
 
 @dataclass(frozen=True)
@@ -183,76 +188,122 @@ def trace_lamps(
     samples: int,
     max_bounces: int,
     seed: int,
+    denoised: bool = True,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Array:
-    """Trace the light maps of all lamps, smoothed, (n, lamps, 3) float32 radiance of a white diffuse surface.
+    """Trace the light maps of all lamps, (n, lamps, 3) float32 radiance of a white diffuse surface.
 
     Paths meet the parts as they are shown, with the materials of the surface cells. A part that is shown from both sides has the
-    light of the side that gets more of it.
+    light of the side that gets more of it. A texel inside of a solid has the light of the nearest texel of its part that is not.
 
     Args:
         parts: of the surface.
         texels: where the light is wanted.
         surface: with the fitted materials.
         lamps: of the parts.
-        samples: paths for each texel, half of them in each of two independent estimates.
+        samples: paths for each texel.
         max_bounces: longest path, in bounces.
         seed: of the random numbers.
+        denoised: denoise the map of each lamp by itself, and keep its mean (`with_mean_of`).
         progress: called with numbers of points.
     """
-    points, normals, number = texels.points, texels.normals, np.arange(len(texels.points), dtype=np.uint32)
-    two_sided = np.array([part.double_sided for part in parts], bool)[texels.part]
-    back = np.flatnonzero(two_sided)
-    points, normals = np.concatenate([points, points[back]]), np.concatenate([normals, -normals[back]])
-    number = np.concatenate([number, np.uint32(len(number)) + number[back]])
-    halves = _trace(parts, points, normals, number, surface, lamps, -(-samples // 2), max_bounces, seed, progress)
-    front, behind = halves[:, : len(texels.points)], halves[:, len(texels.points) :]
+    scene, lamp_of_face = lit_scene(parts, surface, lamps)
+    two_sided = np.array([part.double_sided for part in parts], bool)
+    inside = _inside(scene.geometry, texels, np.repeat(two_sided, [len(part.faces) for part in parts]), seed)
+    inside &= ~two_sided[texels.part]
+    open_ = np.flatnonzero(~inside)
+    back = np.flatnonzero(two_sided[texels.part])
+    points = np.concatenate([texels.points[open_], texels.points[back]])
+    normals = np.concatenate([texels.normals[open_], -texels.normals[back]])
+    number = np.concatenate([open_, len(texels.index) + back]).astype(np.uint32)
+    traced = _trace(scene, points, normals, number, lamp_of_face, lamps, PathCount(samples, max_bounces, seed), progress)
+    light = np.zeros((len(texels.index), len(lamps.lamps), 3), np.float32)
+    light[open_] = traced[: len(open_)]
     if len(back):
-        of = texels.part[back]
-        brightness = [np.bincount(of, side.sum((0, 2, 3)), len(parts)) for side in (front[:, back], behind)]
-        turned = (brightness[1] > brightness[0])[of]
-        front[:, back[turned]] = behind[:, turned]
-        normals = normals[: len(texels.points)].copy()
-        normals[back[turned]] *= -1
-    out = np.empty(front.shape[1:], np.float32)
-    order = np.argsort(texels.part, kind="stable")
-    for own in np.split(order, np.cumsum(np.bincount(texels.part, minlength=len(parts)))[:-1]):
-        if len(own):
-            reach = REACH * texels.edge[texels.part[own[0]]]
-            out[own] = smooth(texels.points[own], normals[own], front[0, own], front[1, own], reach)
-    return out
+        of, behind = texels.part[back], traced[len(open_) :]
+        front_sum, back_sum = (np.bincount(of, side.sum((1, 2)), len(parts)) for side in (light[back], behind))
+        turned = (back_sum > front_sum)[of]
+        light[back[turned]] = behind[turned]
+    light = light[_nearest_open(texels, inside)]
+    return _denoised(light, texels, len(parts)) if denoised and len(texels.index) else light
+
+
+class PathCount(NamedTuple):
+    """How many paths start at each point, how long they are, and the seed of their random numbers."""
+
+    samples: int
+    max_bounces: int
+    seed: int
 
 
 def _trace(
-    parts: Sequence[TexturedPart],
+    scene: Scene,
     points: Array,
     normals: Array,
     number: Array,
-    surface: BaseScene,
+    lamp_of_face: Array,
     lamps: Lamps,
-    samples: int,
-    max_bounces: int,
-    seed: int,
+    count: PathCount,
     progress: Callable[[int, int], None],
 ) -> Array:
-    """(2, n, lamps, 3) float32 two independent estimates."""
-    scene, lamp_of_face = lit_scene(parts, surface, lamps)
+    """(n, lamps, 3) float32."""
     from iif_core.light.transport.lightmaps import light_maps
     from iif_core.light.transport.scene import PathOptions
 
-    out = np.zeros((2, len(points), len(lamps.lamps), 3), np.float32)
-    total = 2 * len(points)
-    for half in range(2):
-        paths = PathOptions(samples, max_bounces, 2 * seed + half)
-        for first in range(0, len(points), CHUNK):
-            progress(half * len(points) + first, total)
-            some = slice(first, first + CHUNK)
-            light = light_maps(
-                scene, points[some], normals[some], lamp_of_face, len(lamps.lamps), paths, lamps.environment, number[some]
-            )
-            out[half, some] = light
-    progress(total, total)
+    paths, total = PathOptions(*count), len(lamps.lamps)
+    out = np.zeros((len(points), total, 3), np.float32)
+    for first in range(0, len(points), CHUNK):
+        progress(first, len(points))
+        some = slice(first, first + CHUNK)
+        out[some] = light_maps(scene, points[some], normals[some], lamp_of_face, total, paths, lamps.environment, number[some])
+    progress(len(points), len(points))
     return out
+
+
+def _inside(geometry: Geometry, texels: Texels, two_sided: Array, seed: int) -> Array:
+    """(n,) bool: more than INSIDE of the rays from a texel meet a face, which is not shown from both sides, from behind."""
+    from iif_core.light.transport.geometry import cosine_directions, trace
+
+    rng = np.random.default_rng(seed)
+    behind = np.zeros(len(texels.index))
+    start = texels.points + 1e-4 * texels.normals
+    for _ in range(PROBES):
+        way = cosine_directions(texels.normals, rng)
+        face, _ = trace(geometry, start, way)
+        hit = np.flatnonzero((face >= 0) & ~two_sided[face])
+        behind[hit] += np.einsum("ij,ij->i", geometry.normals[face[hit]], way[hit]) > 0
+    return behind > INSIDE * PROBES
+
+
+def _nearest_open(texels: Texels, inside: Array) -> Array:
+    """(n,) row of the nearest texel of the same part that is not inside; its own where the part has none."""
+    from scipy.spatial import cKDTree
+
+    row = np.arange(len(texels.index))
+    for part in np.unique(texels.part[inside]):
+        own = np.flatnonzero(texels.part == part)
+        hidden, free = own[inside[own]], own[~inside[own]]
+        if len(free):
+            place = np.concatenate([texels.points, texels.edge[part] * texels.normals], 1)
+            row[hidden] = free[cKDTree(place[free]).query(place[hidden])[1]]
+    return row
+
+
+def _denoised(light: Array, texels: Texels, parts: int) -> Array:
+    """Denoise the picture of each lamp by itself. Guides are the normals, and a colour for each part in place of the albedo,
+    which the light does not contain; what lies between charts is filled from the nearest, so that charts have no dark rims."""
+    size = texels.size
+    row = np.zeros(size * size, np.int64)
+    row[texels.index] = np.arange(len(texels.index))
+    has = np.zeros(size * size, bool)
+    has[texels.index] = True
+    source = row[nearest_covered(has.reshape(size, size))]
+    colour = id_colours(np.arange(parts))[texels.part].astype(np.float32)
+    guides = colour[source], texels.normals.astype(np.float32)[source]
+    out = np.empty_like(light)
+    for lamp in range(light.shape[1]):
+        out[:, lamp] = denoise(light[:, lamp][source], *guides).reshape(-1, 3)[texels.index]
+    return with_mean_of(light, out, texels.part, texels.edge[texels.part] ** 2)
 
 
 def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -> tuple[Scene, Array]:

@@ -167,7 +167,7 @@
       else if (mode == 4) shown = encoded(emissionExposure * emission);
       else shown = texture(colours, vec2(clamp(surface.r * uncertaintyRange, 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0, 0.5)).rgb;
       float stripe = step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 12.0));
-      shown = mix(shown, mix(vec3(1.0, 0.75, 0.1), vec3(0.1, 0.25, 0.9), stripe), 0.3 * chosen);
+      shown = mix(shown, mix(vec3(1.0, 0.75, 0.1), vec3(0.1, 0.25, 0.9), stripe), 0.2 * chosen);
       colour = vec4(shown, opacity);
     }`;
 
@@ -380,9 +380,9 @@
     const extent = Math.hypot(...[0, 1, 2].map((i) => far[i] - near[i]));
     const pose = {
       view: 'walk', eye: new THREE.Vector3().fromArray(data.start.eye), yaw: data.start.yaw, pitch: data.start.pitch, photograph: -1,
-      azimuth: -Math.PI / 2, elevation: 1.05, distance: 0.95 * extent, target: new THREE.Vector3().fromArray(middle),
+      azimuth: -Math.PI / 2, elevation: 1.05, distance: 0.85 * extent, target: new THREE.Vector3().fromArray(middle),
     };
-    pose.target.z = data.floor;
+    pose.target.z = data.floor + 0.3 * (far[2] - data.floor);
 
     const clamp = (x, a, b) => Math.min(Math.max(x, a), b);
     function keepInside() {

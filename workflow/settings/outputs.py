@@ -57,10 +57,12 @@ class Room(Section):
     lightmap_size: int = Field(768, ge=32, le=4096)
     """Largest side of the light maps, in texels; smaller where many lamps would make the page too large. All light maps are of one
     size, and time and size go with its square."""
-    samples: int = Field(64, ge=2)
+    samples: int = Field(64, ge=1)
     """Paths for each texel of the light maps, for all lamps together."""
     max_bounces: int = Field(16, ge=1, le=64)
     """Longest path, in bounces."""
+    denoise: bool = True
+    """Denoise the light map of each lamp by itself, and keep the mean light on every part."""
     texture_size: int = Field(2048, ge=64, le=8192)
     """Largest side of the textures in the page, in texels."""
     max_mb: float = Field(25.0, ge=2)

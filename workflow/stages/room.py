@@ -11,6 +11,7 @@ from iif_core.light.light_maps import to_half
 from iif_core.numerics import color
 from workflow.exporters.atlas import read_atlas
 from workflow.exporters.surface import up_axis
+from workflow.models.denoise import require_denoiser
 from workflow.report import pictures
 from workflow.room import build
 from workflow.room.light import Lamps, find_lamps, texels_of, trace_lamps
@@ -29,6 +30,8 @@ def run(job: Job) -> None:
     """Write room.html and room.json."""
     capture, recovered = CaptureReader(job.read("capture")), read_recovered(job)
     wanted = job.settings.room
+    if wanted.denoise:
+        require_denoiser()
     with job.timed("textures"):
         atlas = read_atlas(job, recovered)
         lamps = find_lamps(atlas.parts, recovered.emitter_radiance, recovered.light.environment)
@@ -37,8 +40,10 @@ def run(job: Job) -> None:
     job.log.info("%d lamps, light maps of %d x %d, %d texels with surface", len(lamps.lamps), size, size, len(texels.index))
     with job.timed("light"):
         seed = (job.seed << 32) | _SEEDS
-        progress = lambda done, total: job.progress(done, total, "points of the light maps")  # noqa: E731
-        light = trace_lamps(atlas.parts, texels, recovered.surface, lamps, wanted.samples, wanted.max_bounces, seed, progress)
+        paths = (wanted.samples, wanted.max_bounces, seed, wanted.denoise)
+        light = trace_lamps(
+            atlas.parts, texels, recovered.surface, lamps, *paths, lambda done, total: job.progress(done, total, "points lit")
+        )
     halves = to_half(light)
     poses = np.stack([view.world_from_camera for view in capture.views])
     up = np.asarray(capture.facts.get("up") or up_axis(poses), np.float64)
