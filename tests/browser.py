@@ -49,7 +49,9 @@ class Seen:
 
     Attributes:
         page: of Playwright.
-        messages: (type, text) of its console; errors: exceptions that nothing caught; requests: addresses, that of the page first.
+        messages: (type, text) of its console.
+        errors: exceptions that nothing caught.
+        requests: addresses, that of the page first.
     """
 
     page: Any

@@ -1,4 +1,4 @@
-"""Light maps: which emitters share a map, the mean of denoised maps, and their storage as half floats
+"""Light maps: which emitters share a map, smoothing, the mean of denoised maps, and their storage as half floats
 (docs/method/light.md#light-maps).
 
 Tracing them is in `iif_core.light.transport.lightmaps`.
@@ -17,6 +17,15 @@ Array = np.ndarray
 
 MOST_LAMPS = 16
 """Light maps at most; the weakest emitters beyond share the last."""
+
+NEIGHBOURS = 32
+"""Texels over which `smooth` averages, the texel itself among them."""
+
+NORMAL_REACH = 0.35
+"""Difference of unit normals that counts as much as one `reach` of distance (20 degrees)."""
+
+CONTRAST = 0.3
+"""Relative difference of the light of a neighbour at which its weight is e^-1/2."""
 
 TEXELS_TRUSTED = 256
 """Texels of a part whose mean counts as much as the mean over all parts in `with_mean_of`."""
@@ -49,8 +58,40 @@ def group_lamps(power: ArrayLike, most: int = MOST_LAMPS) -> tuple[Array, int]:
     return of_emitter, min(len(shining), most)
 
 
+def smooth(points: ArrayLike, normals: ArrayLike, light: Array, reach: float) -> Array:
+    """Average light over neighbours on the same surface, with the same weights for all lamps (Eq. L.60).
+
+    Neighbours are near in space and not in the map, so that seams between charts disappear. One counts less the further it is, the
+    more its normal differs, and the more the sum of its lamps differs.
+
+    Args:
+        points, normals: (n, 3) metres, and unit vectors.
+        light: (n, lamps, 3), >= 0.
+        reach: standard deviation of the weights over distance, metres.
+
+    Returns:
+        (n, lamps, 3) float32.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(light):
+        return np.zeros(light.shape, np.float32)
+    place = np.concatenate([np.asarray(points, np.float64) / reach, np.asarray(normals, np.float64) / NORMAL_REACH], 1)
+    count = min(NEIGHBOURS, len(place))
+    distance, near = (found.reshape(len(place), count) for found in cKDTree(place).query(place, k=count))
+    level = light.sum((1, 2), dtype=np.float64)
+    width = CONTRAST * (level[near] + level[:, None]) / 2
+    apart = (level[near] - level[:, None]) / np.maximum(width, 1e-300)
+    weight = np.exp(-0.5 * (distance**2 + apart**2))
+    weight /= weight.sum(1, keepdims=True)
+    out = np.zeros(light.shape, np.float64)
+    for k in range(count):  # one neighbour at a time, which keeps the memory at the size of the maps
+        out += weight[:, k, None, None] * light[near[:, k]]
+    return out.astype(np.float32)
+
+
 def with_mean_of(traced: Array, denoised: Array, part: ArrayLike, area: ArrayLike) -> Array:
-    """Scale denoised light maps so that the light of every part is what was traced (Eq. L.60).
+    """Scale denoised light maps so that the light of every part is what was traced (Eq. L.61).
 
     A denoiser takes rare bright texels for noise, and with them the light that they stand for. The factor of lamp and part is the
     ratio R_p of the sums of traced and denoised light on the part, drawn to the ratio R over all parts where the part has few

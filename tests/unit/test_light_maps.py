@@ -1,4 +1,4 @@
-"""Light maps: closed forms, the sum over lamps, groups, means of denoised maps, half floats."""
+"""Light maps: closed forms, the sum over lamps, groups, smoothing, means of denoised maps, half floats."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from iif_core.errors import InputError
-from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, to_half, with_mean_of
+from iif_core.light.light_maps import HALF_TOP, group_lamps, recombine, smooth, to_half, with_mean_of
 from tests.unit.test_transport import polygon_irradiance
 from tests.unit.transport_rooms import assert_mean, box, lambertian, merge, quad, repeated
 
@@ -139,3 +139,23 @@ def test_denoised_maps_keep_the_light_of_every_part():
     np.testing.assert_allclose(out[-20:, 0], (truth * lost)[-20:, 0] * min(few, 2.0), rtol=1e-5)
     assert with_mean_of(traced[:0], truth[:0], part[:0], area[:0]).shape == (0, 2, 3)
     assert not with_mean_of(0 * traced, 0 * truth, part, area).any()
+
+
+def test_smoothing_lowers_noise_and_keeps_shadows():
+    """A plane with the edge of a shadow and noise of 10 %, and a plane behind it that has other light."""
+    rng = np.random.default_rng(1)
+    x, y = np.meshgrid(np.arange(60) * 0.02, np.arange(40) * 0.02, indexing="ij")
+    plane = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1)
+    points, normals = np.concatenate([plane, plane - [0, 0, 0.01]]), np.repeat([[0.0, 0, 1], [0, 0, -1]], len(plane), 0)
+    lit, front = points[:, 0] > 0.59, np.arange(len(points)) < len(plane)
+    true = np.stack([np.where(lit, 1.0, 0.05) * np.where(front, 1, 3), np.full(len(points), 0.05)], 1)
+    true = (true[..., None] * np.float32([1, 0.8, 0.5])).astype(np.float32)
+    noisy = (true * rng.gamma(100, 0.01, (len(points), 1, 1))).astype(np.float32)
+    out = smooth(points, normals, noisy, reach=0.03)
+    assert (out / true - 1).std() < 0.35 * (noisy / true - 1).std()
+    edge = np.abs(points[:, 0] - 0.59) < 0.02
+    for side in (lit, ~lit):
+        np.testing.assert_allclose(out[edge & side & front, 0].mean(0), true[edge & side & front, 0].mean(0), rtol=0.05)
+    parted = smooth(points, normals, np.concatenate([0.25 * noisy[:, :1], 0.75 * noisy[:, :1], noisy[:, 1:]], 1), reach=0.03)
+    np.testing.assert_allclose(parted[:, :2].sum(1), out[:, 0], rtol=1e-5)
+    assert smooth(points[:0], normals[:0], noisy[:0], 0.1).shape == (0, 2, 3)

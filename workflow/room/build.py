@@ -12,11 +12,11 @@ from iif_core.light.light_maps import Halves
 from iif_core.light.relighting import axes_of_map
 from iif_core.numerics import color
 from iif_core.reflectance.brdf import R_MIN, kd_ks
-from iif_core.reflectance.directional_albedo import COSINES, directional_albedo
+from iif_core.reflectance.directional_albedo import directional_albedo
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart
 from workflow.report.pictures import false_colour
-from workflow.room.light import Lamps, Texels
+from workflow.room.light import Lamps, LitTexels
 from workflow.room.pack import Blob, array_blob, normals_to_bytes, picture_blob, quantized
 from workflow.scene.normal_form import View
 
@@ -55,7 +55,7 @@ class Frame:
     high: Array
 
 
-def frame_of(parts: Sequence[TexturedPart], texels: Texels, up: Array, cameras: Array) -> Frame:
+def frame_of(parts: Sequence[TexturedPart], texels: LitTexels, up: Array, cameras: Array) -> Frame:
     """Find the floor and the extent of the room.
 
     The floor is the height below the middle camera at which most surface faces up.
@@ -126,7 +126,7 @@ def _smaller(picture: Array, largest: int) -> Array:
     return np.asarray(picture, np.float32)
 
 
-def light_blobs(halves: Halves, texels: Texels) -> dict[str, Blob]:
+def light_blobs(halves: Halves, texels: LitTexels) -> dict[str, Blob]:
     """Return the light maps and the texels at which they are stored: those with surface and their eight neighbours, which have
     the light of the nearest one, so that interpolation finds light wherever there is surface."""
     stored, source = bordered(texels)
@@ -134,7 +134,7 @@ def light_blobs(halves: Halves, texels: Texels) -> dict[str, Blob]:
     return {"light": array_blob(value.view(np.uint16)), "texels": array_blob(stored.astype(np.uint32)[:, None])}
 
 
-def bordered(texels: Texels) -> tuple[Array, Array]:
+def bordered(texels: LitTexels) -> tuple[Array, Array]:
     """Return the stored texels (t,) as row x S + column, increasing, and the row (t,) of `texels` whose light each has."""
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
@@ -171,7 +171,7 @@ def colour_blob() -> Blob:
     return array_blob(color.to_uint8(false_colour(np.linspace(0, 1, 256), scheme="value")))
 
 
-def base_exposure(atlas: Atlas, texels: Texels, light: Array, lamps: Lamps) -> float:
+def base_exposure(atlas: Atlas, texels: LitTexels, light: Array, lamps: Lamps) -> float:
     """Choose the factor from radiance to the screen: 95 % of the lit surface becomes no brighter than BRIGHT.
 
     light: (n, lamps, 3), before the colours of the lamps.

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from iif_core.light.environment import as_map, solid_angles
-from iif_core.light.light_maps import MOST_LAMPS, group_lamps, with_mean_of
+from iif_core.light.light_maps import MOST_LAMPS, group_lamps, smooth, with_mean_of
 from iif_core.numerics.color import id_colours
-from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
+from iif_core.surface.atlas import nearest_covered
 from iif_core.surface.triangles import face_geometry
-from workflow.exporters.atlas import TexturedPart
+from workflow.exporters.atlas import TexturedPart, texels_of
 from workflow.models.denoise import denoise
 from workflow.scene.base_scene import BaseScene
 
@@ -29,6 +29,8 @@ EQUAL_SHARE = 0.5
 """Share of the draws that all lamps have alike; the rest is by power."""
 CHUNK = 1 << 16
 """Points that are traced between two lines of progress."""
+REACH = 1.5
+"""Standard deviation of the smoothing over distance, in texels."""
 PROBES = 16
 """Rays from each texel that find out whether it is inside of a solid."""
 INSIDE = 0.25
@@ -88,7 +90,7 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         if part.emitter_id >= 0:
             sides = 2 if part.double_sided else 1
             area[part.emitter_id] += sides * face_geometry(part.vertices, part.faces)[1].sum()
-            names[part.emitter_id] = names[part.emitter_id] or part.name
+            names[part.emitter_id] = names[part.emitter_id] or part.name.replace(".emitter", ", emitter ")
     radiance = np.asarray(radiance, np.float64).reshape(-1, 3)
     power = np.pi * area * radiance.mean(1)
     outside = as_map(environment)
@@ -101,7 +103,7 @@ def find_lamps(parts: Sequence[TexturedPart], radiance: Array, environment: Arra
         mean = (power[own, None] * radiance[own]).sum(0) / total
         color = _color(radiance[own[0]]) if len(own) == 1 else np.ones(3)
         traced[own] = radiance[own].max(1, keepdims=True) if len(own) == 1 else radiance[own]
-        name = names[own[0]] if len(own) == 1 else f"{len(own)} weak lamps"
+        name = names[own[0]] if len(own) == 1 else f"{len(own)} weak emitters together"
         lamps.append(Lamp(name, tuple(int(e) for e in own), color, mean, float(total)))
     if shines:
         even = outside.shape[:2] == (1, 1)
@@ -117,14 +119,14 @@ def _color(radiance: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Texels:
+class LitTexels:
     """The surface under the texels of a light map, n of them; texels without surface are left out.
 
     Attributes:
         size: S, of the map.
         index: (n,) int64 row x S + column, increasing.
-        points, normals: (n, 3) float64 metres, and unit vectors towards the photographs.
-        part: (n,) int32 part of the surface.
+        points, normals: (n, 3) float64 metres, and unit normals of the faces, on the side of the photographs.
+        part: (n,) int64 part of the surface.
         edge: size of a texel on each part, (parts,) float64 metres, in the mean over the part.
     """
 
@@ -136,53 +138,35 @@ class Texels:
     edge: Array
 
 
-def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
-    """Find the surface under each texel of a map of S x S.
+def lit_texels(parts: Sequence[TexturedPart], size: int) -> LitTexels:
+    """Find the surface under each texel of a light map of S x S.
 
-    It is the surface under the centre of the texel, and where there is none under the point nearest to it out of FINER x FINER.
+    It is the surface under the centre of the texel, and where there is none under the nearest of FINER x FINER points in it.
     Normals are those of the faces, because a path that starts under the shading normal may start inside of the surface.
     """
-    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = np.concatenate([part.vertices for part in parts]).astype(np.float64)
-    smooth_normals = np.concatenate([part.normals for part in parts])
-    uv = np.concatenate([part.uv for part in parts])
-    faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
-    part_of = np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts])
-    index, face, barycentric = _surface_of(uv, faces, size)
-    points = sum(vertices[faces[face, i]] * barycentric[:, i, None] for i in range(3))
-    normal, area = face_geometry(vertices, faces)
-    flat = normal[face]
-    toward = texel_values(smooth_normals, faces, face, barycentric)
-    flat = np.where(np.einsum("ij,ij->i", flat, toward)[:, None] < 0, -flat, flat)
-    corner = uv[faces].astype(np.float64)
-    edges = corner[:, 1:] - corner[:, :1]
-    in_map = 0.5 * np.abs(edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]) * size**2
-    sums = [np.bincount(part_of, values, len(parts)) for values in (area, in_map)]
-    edge = np.sqrt(sums[0] / np.maximum(sums[1], 1e-12))
-    return Texels(size, index, points, flat, part_of[face], edge)
-
-
-def _surface_of(uv: Array, faces: Array, size: int) -> tuple[Array, Array, Array]:
-    """Texels (n,) that have surface, the face of each (n,) and barycentric coordinates in it (n, 3)."""
-    face, barycentric = texel_surface(uv, faces, size * FINER)
-    offset = np.arange(FINER) - (FINER - 1) / 2
-    order = np.argsort(np.add.outer(offset**2, offset**2).ravel(), kind="stable")
-
-    def blocks(values: Array) -> Array:
-        """(S * S, FINER^2, ...) the points of every texel, from its centre outwards."""
-        rest = values.shape[2:]
-        values = values.reshape(size, FINER, size, FINER, *rest).swapaxes(1, 2)
-        return values.reshape(size * size, FINER * FINER, *rest)[:, order]
-
-    face, barycentric = blocks(face), blocks(barycentric)
-    index = np.flatnonzero((face >= 0).any(1))
-    first = np.argmax(face[index] >= 0, axis=1)
-    return index, face[index, first], barycentric[index, first]
+    fine = texels_of(parts, size * FINER)
+    row, column = np.divmod(fine.index, size * FINER)
+    texel = row // FINER * size + column // FINER
+    from_centre = [axis % FINER - (FINER - 1) / 2 for axis in (row, column)]
+    order = np.lexsort((fine.index, from_centre[0] ** 2 + from_centre[1] ** 2, texel))
+    index, first = np.unique(texel[order], return_index=True)
+    chosen = order[first]
+    geometry = [face_geometry(part.vertices.astype(np.float64), part.faces) for part in parts]
+    flat = np.concatenate([normal for normal, _ in geometry])[fine.face[chosen]]
+    away = np.einsum("ij,ij->i", flat, fine.normals[chosen]) < 0
+    edge = np.empty(len(parts))
+    for number, part in enumerate(parts):
+        corner = part.uv[part.faces].astype(np.float64) * size
+        across, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        in_map = 0.5 * np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]).sum()
+        edge[number] = np.sqrt(geometry[number][1].sum() / max(in_map, 1e-12))
+    points = fine.points[chosen].astype(np.float64)
+    return LitTexels(size, index, points, np.where(away[:, None], -flat, flat), fine.part[chosen], edge)
 
 
 def trace_lamps(
     parts: Sequence[TexturedPart],
-    texels: Texels,
+    texels: LitTexels,
     surface: BaseScene,
     lamps: Lamps,
     samples: int,
@@ -224,8 +208,9 @@ def trace_lamps(
         front_sum, back_sum = (np.bincount(of, side.sum((1, 2)), len(parts)) for side in (light[back], behind))
         turned = (back_sum > front_sum)[of]
         light[back[turned]] = behind[turned]
-    light = light[_nearest_open(texels, inside)]
-    return _denoised(light, texels, len(parts)) if denoised and len(texels.index) else light
+    if denoised and not inside.all():
+        light = _denoised(light, texels, inside, len(parts))
+    return light[_nearest_open(texels, inside)]
 
 
 class PathCount(NamedTuple):
@@ -260,7 +245,7 @@ def _trace(
     return out
 
 
-def _inside(geometry: Geometry, texels: Texels, two_sided: Array, seed: int) -> Array:
+def _inside(geometry: Geometry, texels: LitTexels, two_sided: Array, seed: int) -> Array:
     """(n,) bool: more than INSIDE of the rays from a texel meet a face, which is not shown from both sides, from behind."""
     from iif_core.light.transport.geometry import cosine_directions, trace
 
@@ -275,7 +260,7 @@ def _inside(geometry: Geometry, texels: Texels, two_sided: Array, seed: int) -> 
     return behind > INSIDE * PROBES
 
 
-def _nearest_open(texels: Texels, inside: Array) -> Array:
+def _nearest_open(texels: LitTexels, inside: Array) -> Array:
     """(n,) row of the nearest texel of the same part that is not inside; its own where the part has none."""
     from scipy.spatial import cKDTree
 
@@ -289,21 +274,27 @@ def _nearest_open(texels: Texels, inside: Array) -> Array:
     return row
 
 
-def _denoised(light: Array, texels: Texels, parts: int) -> Array:
-    """Denoise the picture of each lamp by itself. Guides are the normals, and a colour for each part in place of the albedo,
-    which the light does not contain; what lies between charts is filled from the nearest, so that charts have no dark rims."""
+def _denoised(light: Array, texels: LitTexels, inside: Array, parts: int) -> Array:
+    """Denoise the picture of each lamp by itself, smooth over the borders of charts, and keep the mean light of each part.
+
+    Guides are the normals, and a colour for each part in place of the albedo,
+    which the light does not contain. What lies between charts or inside of solids is filled from the nearest texel that does
+    not, so that charts have no dark rims."""
     size = texels.size
     row = np.zeros(size * size, np.int64)
     row[texels.index] = np.arange(len(texels.index))
     has = np.zeros(size * size, bool)
-    has[texels.index] = True
+    has[texels.index[~inside]] = True
     source = row[nearest_covered(has.reshape(size, size))]
     colour = id_colours(np.arange(parts))[texels.part].astype(np.float32)
     guides = colour[source], texels.normals.astype(np.float32)[source]
     out = np.empty_like(light)
     for lamp in range(light.shape[1]):
         out[:, lamp] = denoise(light[:, lamp][source], *guides).reshape(-1, 3)[texels.index]
-    return with_mean_of(light, out, texels.part, texels.edge[texels.part] ** 2)
+    for part in range(parts):
+        own = np.flatnonzero((texels.part == part) & ~inside)
+        out[own] = smooth(texels.points[own], texels.normals[own], out[own], REACH * texels.edge[part])
+    return with_mean_of(light, out, texels.part, np.where(inside, 0, texels.edge[texels.part] ** 2))
 
 
 def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -> tuple[Scene, Array]:

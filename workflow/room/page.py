@@ -1,4 +1,4 @@
-"""room.html: one file with everything in it, under a policy that lets only its own two scripts run and forbids all connections."""
+"""room.html: one file with everything in it, under a policy that lets its own two scripts run and forbids all connections."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from workflow.room.pack import Blob
 from workflow.room.sources import LIBRARY, STYLE, TEMPLATE, VENDORED, VIEWER
 
 NOTES = {
-    "lit": "Diffuse light of every lamp, path-traced with all reflections, times the surface, and its gloss as if the light at the point came"
-    " evenly from everywhere: mirrors show the brightness of the light and no images.",
+    "lit": "Diffuse light of every lamp, path-traced with all reflections, times the surface, and its gloss as if the light at the"
+    " point came evenly from everywhere: mirrors show the brightness of the light and no images.",
     "albedo": "Base colour, as fitted.",
     "roughness": "0 (black) to 1 (white), as fitted.",
     "metallic": "0 (black) to 1 (white), as fitted.",
     "emission": "What shines, with its strength and colour; all else is black.",
-    "uncertainty": "Standard deviation of the albedo that the fit claims; errors that all predictions share are not in it.",
+    "uncertainty": "Standard deviation of the albedo that the fit claims; errors that all predictions share are not in it."
+    " Grey: no photograph shows it.",
 }
 """What the modes show, in the order of the buttons; MODES of viewer.js has the same names."""
 

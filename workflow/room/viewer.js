@@ -18,7 +18,8 @@
  *   hit(x, y)                    what lies under a point of the canvas (CSS pixels): part, object, uv, point, normal; or null
  *   pixels()                     {width, height, data}: RGBA bytes of the picture now, bottom row first
  *   light()                      Float32Array, light map of all lamps as it is on the screen, RGB of each stored texel
- *   camera()                     {eye, direction, fov}
+ *   camera()                     {eye, direction, fov, view}
+ *   cost()                       milliseconds that a picture with all pixels takes
  */
 (() => {
   const $ = (id) => document.getElementById(id);
@@ -165,6 +166,7 @@
       else if (mode == 2) shown = vec3(roughness);
       else if (mode == 3) shown = vec3(metallic);
       else if (mode == 4) shown = encoded(emissionExposure * emission);
+      else if (surface.r > 0.99) shown = vec3(0.35); // no photograph shows it
       else shown = texture(colours, vec2(clamp(surface.r * uncertaintyRange, 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0, 0.5)).rgb;
       float stripe = step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 12.0));
       shown = mix(shown, mix(vec3(1.0, 0.75, 0.1), vec3(0.1, 0.25, 0.9), stripe), 0.2 * chosen);
@@ -211,7 +213,7 @@
     }
     const data = JSON.parse($('scene').textContent);
     const canvas = $('view');
-    const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: false, powerPreference: 'high-performance' });
+    const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: false, preserveDrawingBuffer: true, powerPreference: 'high-performance' });
     renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader encodes
     renderer.setClearColor(0x595959, 1);
     const scene = new THREE.Scene();
@@ -499,28 +501,43 @@
 
     // ------------------------------------------------------------------------------------------------------- the picture
 
+    // Where a picture takes long, those that follow one another have fewer pixels, and the last is drawn again with all of them.
+    const SMOOTH = 50; // ms that a picture of a movement may take
+    const REST = 250; // ms without a change after which it is drawn again
     let lightDirty = true;
     let waiting = false;
+    let cost = 0; // ms for a picture with all pixels
+    let resting = 0;
+    let coarseness = 1;
     function draw() {
       if (waiting) return;
       waiting = true;
       requestAnimationFrame(() => {
         waiting = false;
-        render();
+        coarseness = cost > SMOOTH ? Math.max(Math.sqrt(SMOOTH / cost), 0.25) : 1;
+        render(coarseness);
+        clearTimeout(resting);
+        if (coarseness < 1) resting = setTimeout(() => render(1), REST);
       });
     }
 
-    function render() {
-      if (lightDirty) combineLight();
-      const ratio = Math.min(window.devicePixelRatio || 1, 2);
+    const onePixel = new Uint8Array(4);
+    function render(share) {
       const [width, height] = [canvas.clientWidth, canvas.clientHeight];
       if (!width || !height) return;
+      if (lightDirty) combineLight();
+      const ratio = share * Math.min(window.devicePixelRatio || 1, 2);
       if (canvas.width !== Math.floor(width * ratio) || canvas.height !== Math.floor(height * ratio)) {
         renderer.setPixelRatio(ratio);
         renderer.setSize(width, height, false);
       }
       placeCamera();
+      const begun = performance.now();
       renderer.render(scene, camera);
+      const gl = renderer.getContext();
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, onePixel); // waits until it is drawn
+      const taken = (performance.now() - begun) / (share * share);
+      cost = cost ? 0.5 * cost + 0.5 * taken : 0.1 * taken; // the first picture has to compile and to upload
     }
 
     // --------------------------------------------------------------------------------------------------------- clicking
@@ -858,13 +875,14 @@
         draw();
       },
       pixels() {
-        render();
+        render(1);
         const gl = renderer.getContext();
         const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
         const out = new Uint8Array(4 * width * height);
         gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, out);
         return { width, height, data: out };
       },
+      cost: () => cost,
       light() {
         if (lightDirty) combineLight();
         return sum;
@@ -881,7 +899,7 @@
     setView('walk');
     select(-1);
     say('');
-    render();
+    render(1);
     document.body.classList.add('ready');
   }
 

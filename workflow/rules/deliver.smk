@@ -18,6 +18,7 @@ rule publish:
                 "metrics",
                 "export",
                 "report",
+                "room",
             )
         ),
     output:

@@ -9,12 +9,12 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.light.light_maps import to_half
 from iif_core.numerics import color
-from workflow.exporters.atlas import read_atlas
+from workflow.exporters.atlas import bake, read_parts
 from workflow.exporters.surface import up_axis
 from workflow.models.denoise import require_denoiser
 from workflow.report import pictures
 from workflow.room import build
-from workflow.room.light import Lamps, find_lamps, texels_of, trace_lamps
+from workflow.room.light import Lamps, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import Blob, array_blob
 from workflow.room.page import NOTES, Page, render_page
 from workflow.runtime.job import Job
@@ -33,22 +33,24 @@ def run(job: Job) -> None:
     if wanted.denoise:
         require_denoiser()
     with job.timed("textures"):
-        atlas = read_atlas(job, recovered)
-        lamps = find_lamps(atlas.parts, recovered.emitter_radiance, recovered.light.environment)
+        parts = read_parts(job.read("unwrap"), recovered)
+        uncertainty = job.read("affines").table("cells.parquet")["uncertainty"]
+        atlas = bake(parts, recovered, uncertainty, job.read("unwrap").json("unwrap.json")["size"])
+        lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment)
         size = build.lightmap_size(wanted.lightmap_size, len(lamps.lamps), FILL, wanted.max_mb)
-        texels = texels_of(atlas.parts, size)
+        texels = lit_texels(parts, size)
     job.log.info("%d lamps, light maps of %d x %d, %d texels with surface", len(lamps.lamps), size, size, len(texels.index))
     with job.timed("light"):
         seed = (job.seed << 32) | _SEEDS
         paths = (wanted.samples, wanted.max_bounces, seed, wanted.denoise)
         light = trace_lamps(
-            atlas.parts, texels, recovered.surface, lamps, *paths, lambda done, total: job.progress(done, total, "points lit")
+            parts, texels, recovered.surface, lamps, *paths, lambda done, total: job.progress(done, total, "points lit")
         )
     halves = to_half(light)
     poses = np.stack([view.world_from_camera for view in capture.views])
     up = np.asarray(capture.facts.get("up") or up_axis(poses), np.float64)
-    frame = build.frame_of(atlas.parts, texels, up, poses[:, :3, 3])
-    geometry, places, bounds = build.geometry_blobs(atlas.parts, frame)
+    frame = build.frame_of(parts, texels, up, poses[:, :3, 3])
+    geometry, places, bounds = build.geometry_blobs(parts, frame)
     blobs = geometry | build.light_blobs(halves, texels) | {"lobes": build.lobe_blob(), "colours": build.colour_blob()}
     blobs |= build.picture_blobs(atlas, wanted.texture_size)
     exposure = build.base_exposure(atlas, texels, light, lamps)
@@ -61,7 +63,7 @@ def run(job: Job) -> None:
         "cut": float(frame.floor + 0.85 * max(frame.high[2] - frame.floor, 0.1)),
         "worldFromRoom": frame.turn.ravel().tolist(),  # columns of the inverse, as WebGL stores matrices
         "exposure": exposure,
-        "brightest": _brightest(atlas.parts, lamps),
+        "brightest": _brightest(parts, lamps),
         "light": {"size": size},
         "lobes": {"cosines": 33, "roughnesses": build.ROUGHNESSES},
         "uncertainty": {"top": build.UNCERTAINTY_TOP, "shown": build.UNCERTAINTY_SHOWN},
@@ -76,7 +78,7 @@ def run(job: Job) -> None:
             }
             for lamp, scale in zip(lamps.lamps, halves.scale, strict=True)
         ],
-        "parts": [_part(part, place, lamps, emission) for part, place in zip(atlas.parts, places, strict=True)],
+        "parts": [_part(part, place, lamps, emission) for part, place in zip(parts, places, strict=True)],
         "objects": _objects(job, recovered),
         "environment": None,
     }
@@ -116,7 +118,8 @@ def _fitting(
         if shown and shown == previous:
             continue
         previous = shown
-        pictures_in = {f"photograph-{i}": build.photograph_blob(picture, width) for i, picture in enumerate(sharp)} if width else {}
+        kept = sharp if width else []
+        pictures_in = {f"photograph-{i}": build.photograph_blob(picture, width) for i, picture in enumerate(kept)}
         for facts in document["photographs"]:
             facts["picture"] = bool(width)
         page = render_page(Page(job.scene, credit, _about(job), document, blobs | pictures_in)).encode()
@@ -138,8 +141,9 @@ def _about(job: Job) -> list[str]:
     samples = job.settings.room.samples
     return [
         "Materials and lamps were recovered from photographs. The light of each lamp was traced once, with all reflections"
-        f" ({samples} paths for each texel), and stored; the page adds the lamps up, so that strengths and colours are exact for diffuse light.",
-        "Intervals are those of the fit (95 %): of albedo that of its brightness. What an object gives to others stays as it was traced.",
+        f" ({samples} paths for each texel), and stored; the page adds the lamps up, so that strengths and colours are exact for"
+        " diffuse light.",
+        "Intervals are those of the fit (95 %); that of albedo is that of its brightness.",
     ]
 
 
@@ -173,7 +177,7 @@ def _emission(job: Job, recovered: Recovered) -> dict[int, list[dict[str, Any]]]
     out = {}
     for row, emitter in enumerate(table["emitter_id"]):
         out[int(emitter)] = [
-            build.interval(f"radiance, {name}", scale * float(table[f"radiance_{c}"][row]), scale * float(table[f"error_{c}"][row]))
+            build.interval(f"radiance, {name}", *(scale * float(table[f"{kind}_{c}"][row]) for kind in ("radiance", "error")))
             for c, name in zip("rgb", ("red", "green", "blue"), strict=True)
         ]
     return out

@@ -50,9 +50,7 @@ class _LampCollector:
 
 
 @dr.syntax
-def _trace_points(
-    world: World, rng: Any, point: Any, normal: Any, samples: Any, sample: Any, end: Any, max_bounces: Any
-) -> Any:
+def _trace_points(world: World, rng: Any, point: Any, normal: Any, samples: Any, sample: Any, end: Any, max_bounces: Any) -> Any:
     """Follow the paths of every lane; the collector holds the result, and the returned gain is 0."""
     nothing = mi.Color3f(0)
     origin = offset_from(point, normal)
