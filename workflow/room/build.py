@@ -27,8 +27,11 @@ QUALITY = 92
 PHOTOGRAPH_QUALITY = 80
 PHOTOGRAPH_WIDTHS = (640, 480, 320, 0)
 """Widths of photographs in the page, in pixels, of which the first that fits is taken; 0 = without photographs."""
-UNCERTAINTY_TOP, UNCERTAINTY_SHOWN = 0.5, 0.2
-"""Largest uncertainty that the texture holds, and the one that is shown lightest."""
+UNCERTAINTY_MOST, UNCERTAINTY_TOP, UNCERTAINTY_SHOWN = 0.5, 0.625, 0.2
+"""Largest uncertainty, the value that 255 in the texture would mean if it did not stand for surface that was not seen, and the
+uncertainty that is shown lightest."""
+HOLES = 3
+"""Texels across which surface between observed cells has the uncertainty of the nearest of them."""
 ROUGHNESSES = 17
 EYE_HEIGHT = 1.6
 """Metres above the floor."""
@@ -112,9 +115,20 @@ def geometry_blobs(parts: Sequence[TexturedPart], frame: Frame) -> tuple[dict[st
 
 
 def picture_blobs(atlas: Atlas, largest: int) -> dict[str, Blob]:
-    """Return base colour (sRGB) and, as red, green and blue of one picture, uncertainty / UNCERTAINTY_TOP, roughness, metallic."""
+    """Return the base colour (sRGB), and as red, green and blue of one picture the uncertainty, roughness and metallic.
+
+    Red is the uncertainty over UNCERTAINTY_TOP, and 1 where no photograph shows the surface.
+    """
+    from scipy.ndimage import distance_transform_edt
+
     base = color.to_uint8(color.srgb_from_linear(np.clip(_smaller(atlas.base_color, largest), 0, 1)))
-    rest = np.stack([atlas.uncertainty / UNCERTAINTY_TOP, atlas.roughness, atlas.metallic], -1)
+    known = atlas.seen | (atlas.uncertainty == 0)  # emitters are known to be black
+    uncertainty = np.ones(known.shape, np.float32)
+    if known.any():
+        distance, (row, column) = distance_transform_edt(~known, return_indices=True)
+        nearest = np.minimum(atlas.uncertainty, UNCERTAINTY_MOST)[row, column] / UNCERTAINTY_TOP
+        uncertainty = np.where(distance <= HOLES, nearest, uncertainty)
+    rest = np.stack([uncertainty, atlas.roughness, atlas.metallic], -1)
     return {"base": picture_blob(base, QUALITY), "surface": picture_blob(color.to_uint8(_smaller(rest, largest)), None)}
 
 
