@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from iif_core.errors import InputError
+from tests.browser import browser, page_for  # noqa: F401  fixtures
 from workflow.runtime import native
 
 REPOSITORY = Path(__file__).resolve().parents[1]

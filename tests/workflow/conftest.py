@@ -14,7 +14,7 @@ shading: {samples: 8, levels: 6}
 affines: {pixels: 8000, iterations: 5}
 render: {samples: 8}
 report: {views: 2}
-room: {lightmap_size: 128, samples: 64}
+room: {lightmap_size: 128, samples: 256}
 """
 
 

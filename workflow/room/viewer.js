@@ -663,7 +663,6 @@
       slider.setAttribute('aria-label', `strength of ${lamp.name}`);
       exact.setAttribute('aria-label', `strength of ${lamp.name}, as a number`);
       color.setAttribute('aria-label', `colour of ${lamp.name}`);
-      off.setAttribute('aria-label', `switch ${lamp.name}`);
       slider.addEventListener('input', () => setLamp(l, Number(slider.value)));
       exact.addEventListener('input', () => {
         if (exact.value !== '' && Number(exact.value) >= 0) setLamp(l, Number(exact.value), undefined, true);
@@ -684,6 +683,7 @@
       if (!typing) control.exact.value = String(Number(lamp.strength.toFixed(3)));
       control.color.value = hexOf(lamp.tint);
       control.off.textContent = lamp.strength > 0 ? 'off' : 'on';
+      control.off.setAttribute('aria-label', `${control.off.textContent}: ${lamp.name}`);
       lightDirty = true;
       draw();
     }
