@@ -11,7 +11,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all validator doctor lint format lock docs clean always plan relight bench results \
+.PHONY: help setup scenes verify test test-all node doctor lint format lock docs clean always plan relight bench results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -69,18 +69,20 @@ always:
 # A file's tests stay in one process, because they share what its fixtures made.
 IN_PARALLEL := -n 2 --dist loadfile --no-loadscope-reorder
 # All tests but those marked `long`, which test-all adds; times are in docs/development/testing.md.
-test: setup validator
+test: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -m "not long" $(PYTEST_ARGS)
 
-test-all: setup validator
+test-all: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) $(PYTEST_ARGS)
 
-# Khronos' validator of glTF, for the tests of scene.glb; machines without npm test the file's structure alone.
-GLTF_VALIDATOR := .node/node_modules/gltf-validator
-validator:
-	@if [ ! -d $(GLTF_VALIDATOR) ] && command -v npm >/dev/null; then \
-	  npm install --fetch-retries=1 --fetch-timeout=60000 --no-save --no-audit --no-fund --silent --prefix .node gltf-validator@2.0.0-dev.3.10 \
-	    || echo 'validator: npm could not install gltf-validator; its test will be skipped' >&2; fi
+# What tests take from npm: Khronos' validator of glTF, and axe-core, which looks for what hinders people with disabilities. Machines
+# without npm test the structure of the files alone. Pages need Chromium as well, which comes with the machine.
+NODE_PACKAGES := gltf-validator@2.0.0-dev.3.10 axe-core@4.14.1
+NODE_FOLDERS := $(addprefix .node/node_modules/,gltf-validator axe-core)
+node:
+	@if [ $$(ls -d $(NODE_FOLDERS) 2>/dev/null | wc -l) -lt 2 ] && command -v npm >/dev/null; then \
+	  npm install --fetch-retries=1 --fetch-timeout=60000 --no-save --no-audit --no-fund --silent --prefix .node $(NODE_PACKAGES) \
+	    || echo 'node: npm could not install $(NODE_PACKAGES); their tests will be skipped' >&2; fi
 
 # Needs nothing installed: it tells what is missing.
 doctor:

@@ -61,8 +61,8 @@ def group_lamps(power: ArrayLike, most: int = MOST_LAMPS) -> tuple[Array, int]:
 def smooth(points: ArrayLike, normals: ArrayLike, light: Array, reach: float) -> Array:
     """Average light over neighbours on the same surface, with the same weights for all lamps (Eq. L.60).
 
-    Neighbours are near in space and not in the map, so that seams between charts disappear. One counts less the further it is, the
-    more its normal differs, and the more the sum of its lamps differs.
+    Neighbours are near in space and not in the map, so that seams between charts disappear. One counts less the further it is,
+    the more its normal differs, and the more the sum of its lamps differs.
 
     Args:
         points, normals: (n, 3) metres, and unit vectors.

@@ -435,7 +435,7 @@ v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(r => cons
 def test_khronos_validator(glb, tmp_path):
     if not (shutil.which("node") and VALIDATOR.is_dir()):
         assert not os.environ.get("CI"), f"continuous integration has node and npm; {VALIDATOR} is missing"
-        pytest.skip("needs node and the npm package gltf-validator: make validator")
+        pytest.skip("needs node and the npm package gltf-validator: make node")
     (tmp_path / "scene.glb").write_bytes(glb)
     command = ["node", "-e", VALIDATE, str(VALIDATOR.resolve()), str(tmp_path / "scene.glb")]
     issues = json.loads(subprocess.run(command, capture_output=True, text=True).stdout)

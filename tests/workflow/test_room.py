@@ -154,19 +154,19 @@ def test_a_lamp_adds_what_paths_find(room, stored, finished, monkeypatch, llvm):
         kd = diffuse_reflectance(stored, facts["uv"])
         points, normals = (facts[name] @ turn for name in ("point", "normal"))
         eye = np.array(room.evaluate("room.camera().eye")) @ turn
-        for l, lamp in enumerate(stored.document["lamps"]):
+        for number_of_lamp, lamp in enumerate(stored.document["lamps"]):
             pictures, paths = [], []
             for on in (1, 0):
-                room.evaluate("([l, on]) => room.setLamp(l, on)", [l, on])
+                room.evaluate("([number, on]) => room.setLamp(number, on)", [number_of_lamp, on])
                 pictures.append(shown() * 4 / stored.document["exposure"])
                 dark = np.isin(scene.emitter_id, lamp["emitters"]) & (on == 0)
                 light = replace(scene.light, radiance=np.where(dark[:, None], np.float32(0), scene.light.radiance))
                 world = Scene(geometry, material, light.emitters(geometry))
                 options = PathOptions(512, 16, 9 + number)
                 paths.append(shading_caches(world, points, normals, eye - points, [], options)[0])
-            room.evaluate("l => room.setLamp(l, 1)", l)
-            found[l].append(pictures[0] - pictures[1])
-            traced[l].append(kd * (paths[0] - paths[1]))
+            room.evaluate("l => room.setLamp(l, 1)", number_of_lamp)
+            found[number_of_lamp].append(pictures[0] - pictures[1])
+            traced[number_of_lamp].append(kd * (paths[0] - paths[1]))
     for change, expected in ((np.concatenate(f), np.concatenate(t)) for f, t in zip(found, traced, strict=True)):
         assert change.mean() == pytest.approx(expected.mean(), rel=0.03)
         assert np.median(np.abs(change - expected).mean(1)) < 0.15 * expected.mean()
@@ -184,10 +184,10 @@ def test_the_camera_of_a_photograph_sees_what_it_saw(room, stored, finished):
         room.wait_for_function("!document.getElementById('photograph').hidden")
         v, u = (axis[::37] for axis in np.nonzero(interior & (ids < 1 << 31)))
         hits = room.evaluate(
-            """([u, v]) => { room.camera(); const s = document.getElementById('photograph').style, p = room.data.photographs[0];
-            const scale = parseFloat(s.width) / p.width;
-            return u.map((x, i) => { const hit = room.hit(parseFloat(s.left) + (x + 0.5) * scale, parseFloat(s.top) + (v[i] + 0.5) * scale);
-            return hit ? hit.object : -1; }); }""",
+            """([u, v]) => { room.camera();
+            const s = document.getElementById('photograph').style, p = room.data.photographs[0];
+            const scale = parseFloat(s.width) / p.width, at = (start, x) => parseFloat(start) + (x + 0.5) * scale;
+            return u.map((x, i) => { const hit = room.hit(at(s.left, x), at(s.top, v[i])); return hit ? hit.object : -1; }); }""",
             [u.tolist(), v.tolist()],
         )
         same += int((np.array(hits) == ids[v, u]).sum())
@@ -365,7 +365,8 @@ def test_nothing_hinders_people_with_disabilities(page_for, path, scheme):
 
 def test_a_browser_without_webgl_gets_one_sentence(page_for, path):
     without = """const own = HTMLCanvasElement.prototype.getContext;
-    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) { return kind === 'webgl2' ? null : own.call(this, kind, ...rest); };"""
+    HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
+      return kind === 'webgl2' ? null : own.call(this, kind, ...rest); };"""
     with page_for(path, script=without) as seen:
         seen.page.wait_for_selector("#message:visible")
         sentence = seen.page.inner_text("#message")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from iif_core.reflectance.brdf import R_MIN, kd_ks
 from iif_core.reflectance.directional_albedo import directional_albedo
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart
+from workflow.exporters.object_table import NORMAL_95
 from workflow.report.pictures import false_colour
 from workflow.room.light import Lamps, LitTexels
 from workflow.room.pack import Blob, array_blob, normals_to_bytes, picture_blob, quantized
@@ -37,7 +38,6 @@ EYE_HEIGHT = 1.6
 """Metres above the floor."""
 BRIGHT = 0.8
 """Linear value, on the screen, of the light that 95 % of the surface do not exceed."""
-TWO_SIGMA = 1.96
 MARGIN = 0.15
 """Metres that the eye keeps from the ends of the room."""
 
@@ -86,7 +86,7 @@ def frame_of(parts: Sequence[TexturedPart], texels: LitTexels, up: Array, camera
         bins = np.floor((height - height.min()) / 0.1).astype(np.int64)
         total = np.bincount(bins, area)
         best = bins == np.argmax(total)
-        floor = float(np.average(height[best], weights=area[best]))
+        floor = _quantile(height[best], area[best], 0.5)
     return Frame(turn, float(floor), np.minimum(low, high - 0.1), high)
 
 
@@ -144,7 +144,7 @@ def light_blobs(halves: Halves, texels: LitTexels) -> dict[str, Blob]:
     """Return the light maps and the texels at which they are stored: those with surface and their eight neighbours, which have
     the light of the nearest one, so that interpolation finds light wherever there is surface."""
     stored, source = bordered(texels)
-    value = halves.value[source].reshape(len(stored), -1)
+    value = halves.value[source].reshape(len(stored), 3 * len(halves.scale))
     return {"light": array_blob(value.view(np.uint16)), "texels": array_blob(stored.astype(np.uint32)[:, None])}
 
 
@@ -245,55 +245,31 @@ def walkable(frame: Frame) -> tuple[Array, Array]:
     return low, high
 
 
-def interval(name: str, value: float, error: float, top: float = np.inf) -> dict[str, Any]:
-    """Return a number with its 95 % interval, value +- 1.96 error, limited to [0, top]."""
-    low, high = max(value - TWO_SIGMA * error, 0.0), min(value + TWO_SIGMA * error, top)
+def interval(name: str, value: float, error: float) -> dict[str, Any]:
+    """Return a number >= 0 with its 95 % interval."""
+    low, high = max(value - NORMAL_95 * error, 0.0), value + NORMAL_95 * error
     return {"name": name, "value": round(value, 6), "low": round(low, 6), "high": round(high, 6)}
 
 
-def relative_interval(name: str, value: float, error: float, top: float = np.inf) -> dict[str, Any]:
-    """Return a number with its 95 % interval where `error` is that of its logarithm."""
-    low, high = value * np.exp(-TWO_SIGMA * error), min(value * np.exp(TWO_SIGMA * error), top)
-    return {"name": name, "value": round(value, 6), "low": round(float(low), 6), "high": round(float(high), 6)}
-
-
-def object_facts(
-    names: Sequence[str], values: Array, base: Array, fit: dict[str, Array], segmentation: dict[str, Array]
-) -> list[dict[str, Any]]:
-    """Return what a click on an object says.
-
-    Args:
-        names: (O,) of the objects.
-        values: (O, 5) mean fitted material; base: (O, 5) before the fit, at which the errors of gains count.
-        fit: columns of affines/objects.parquet; segmentation: of segmentation/objects.parquet.
-    """
-    fitted = {int(i): row for row, i in enumerate(fit["object_id"])}
-    seen = {int(i): row for row, i in enumerate(segmentation["object_id"])}
+def object_facts(columns: Mapping[str, Sequence]) -> list[dict[str, Any]]:
+    """Return what a click on each object says, from the columns of `object_table.object_rows`."""
+    labels = {f"base_colour_{c}": f"albedo, {name}" for c, name in zip("rgb", ("red", "green", "blue"), strict=True)}
+    labels |= {"roughness": "roughness", "metallic": "metallic"}
     out = []
-    for i, name in enumerate(names):
-        rgb, numbers, model = values[i, :3].astype(float), [], "not fitted"
-        if i in fitted:
-            row = fitted[i]
-            model = str(fit["model"][row])
-            level = float(fit["std_level"][row])
-            numbers += [relative_interval(f"albedo, {c}", rgb[k], level, 1.0) for k, c in enumerate(("red", "green", "blue"))]
-            for column, key in ((3, "roughness"), (4, "metallic")):
-                gain, bias = (float(v) for v in fit[f"std_{key}"][row])
-                error = float(np.hypot(gain * base[i, column], bias))  # their correlation is not stored
-                numbers.append(interval(key, float(values[i, column]), error, 1.0))
-        else:
-            numbers += [{"name": f"albedo, {c}", "value": round(rgb[k], 6)} for k, c in enumerate(("red", "green", "blue"))]
-            numbers += [{"name": key, "value": round(float(values[i, c]), 6)} for c, key in ((3, "roughness"), (4, "metallic"))]
-        row = seen.get(i)
+    for row, number in enumerate(columns["object_id"]):
+        numbers = [
+            {"name": label, "value": columns[key][row], "low": columns[f"{key}_low"][row], "high": columns[f"{key}_high"][row]}
+            for key, label in labels.items()
+        ]
         out.append(
             {
-                "id": i,
-                "name": name,
-                "model": model,
-                "views": int(segmentation["views"][row]) if row is not None else 0,
-                "pixels": int(segmentation["pixels"][row]) if row is not None else 0,
-                "area": round(float(segmentation["area_m2"][row]), 4) if row is not None else None,
-                "albedo": [round(float(v), 5) for v in rgb],
+                "id": number,
+                "name": columns["name"][row],
+                "model": columns["model"][row] or "not fitted",
+                "views": columns["photographs"][row] or 0,
+                "pixels": columns["pixels"][row] or 0,
+                "area": columns["area_m2"][row],
+                "color": columns["base_colour_hex"][row],
                 "numbers": numbers,
             }
         )

@@ -191,6 +191,8 @@ def trace_lamps(
         denoised: denoise the map of each lamp by itself, and keep its mean (`with_mean_of`).
         progress: called with numbers of points.
     """
+    if not lamps.lamps or not len(texels.index):
+        return np.zeros((len(texels.index), len(lamps.lamps), 3), np.float32)
     scene, lamp_of_face = lit_scene(parts, surface, lamps)
     two_sided = np.array([part.double_sided for part in parts], bool)
     inside = _inside(scene.geometry, texels, np.repeat(two_sided, [len(part.faces) for part in parts]), seed)

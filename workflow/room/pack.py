@@ -37,9 +37,9 @@ def array_blob(values: Array) -> Blob:
     """Compress unsigned integers (items, components): differences along the items of each component, modulo the range of the
     type, then all lowest bytes, all second bytes and so on, then deflate. Neighbours are alike, so most bytes become small.
     """
-    values = np.ascontiguousarray(values.reshape(len(values), -1).T)
+    values = np.ascontiguousarray(values.reshape(len(values), int(np.prod(values.shape[1:]))).T)
     steps = np.diff(values, axis=1, prepend=np.zeros((len(values), 1), values.dtype))  # wraps around
-    planes = steps.astype(values.dtype).ravel().view(np.uint8).reshape(-1, values.itemsize).T
+    planes = steps.astype(values.dtype).ravel().view(np.uint8).reshape(values.size, values.itemsize).T
     packed = zlib.compress(np.ascontiguousarray(planes).tobytes(), 9)
     return Blob(base64.b64encode(packed).decode(), "array", _NAMES[values.dtype], *values.shape)
 

@@ -15,8 +15,8 @@ from workflow.room.pack import Blob
 from workflow.room.sources import LIBRARY, STYLE, TEMPLATE, VENDORED, VIEWER
 
 NOTES = {
-    "lit": "Diffuse light of every lamp, path-traced with all reflections, times the surface, and its gloss as if the light at the"
-    " point came evenly from everywhere: mirrors show the brightness of the light and no images.",
+    "lit": "Diffuse light of every lamp, path-traced with all reflections, times the surface, and its gloss as if the light at"
+    " the point came evenly from everywhere: mirrors show the brightness of the light and no images.",
     "albedo": "Base colour, as fitted.",
     "roughness": "0 (black) to 1 (white), as fitted.",
     "metallic": "0 (black) to 1 (white), as fitted.",

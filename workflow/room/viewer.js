@@ -611,7 +611,7 @@
         row(table, 'seen by', `${object.views} photograph${object.views === 1 ? '' : 's'}, ${object.pixels} pixels`);
         if (object.area !== null) row(table, 'area', `${number(object.area)} m²`);
         object.numbers.forEach((one) => row(table, one.name, number(one.value), between(one)));
-        $('swatch').style.background = hexOf(object.albedo);
+        $('swatch').style.background = object.color;
         $('swatch').hidden = false;
       }
       if (part && part.emitter >= 0) {

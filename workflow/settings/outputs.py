@@ -55,8 +55,8 @@ class Room(Section):
     """The page to walk in."""
 
     lightmap_size: int = Field(768, ge=32, le=4096)
-    """Largest side of the light maps, in texels; smaller where many lamps would make the page too large. Time and size go with its
-    square."""
+    """Largest side of the light maps, in texels; smaller where many lamps would make the page too large. Time and size go with
+    its square."""
     samples: int = Field(64, ge=1)
     """Paths for each texel of the light maps, for all lamps together."""
     max_bounces: int = Field(16, ge=1, le=64)

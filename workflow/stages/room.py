@@ -10,6 +10,7 @@ from iif_core.errors import InputError
 from iif_core.light.light_maps import to_half
 from iif_core.numerics import color
 from workflow.exporters.atlas import bake, read_parts
+from workflow.exporters.object_table import object_rows
 from workflow.exporters.surface import up_axis
 from workflow.models.denoise import require_denoiser
 from workflow.report import pictures
@@ -18,6 +19,7 @@ from workflow.room.light import Lamps, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import Blob, array_blob
 from workflow.room.page import NOTES, Page, render_page
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_base_scene
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered, read_recovered
 
@@ -184,8 +186,9 @@ def _emission(job: Job, recovered: Recovered) -> dict[int, list[dict[str, Any]]]
 
 
 def _objects(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
-    names, base = recovered.object_names, np.zeros((len(recovered.object_names), 5))
-    means = job.read("base").table("objects.parquet")
-    base[means["object_id"]] = np.stack([means[c] for c in ("albedo_r", "albedo_g", "albedo_b", "roughness", "metallic")], 1)
+    surface, base = recovered.surface, read_base_scene(job)
     fit, seen = job.read("affines").table("objects.parquet"), job.read("segmentation").table("objects.parquet")
-    return build.object_facts(names, recovered.surface.object_values, base, fit, seen)
+    columns = object_rows(
+        recovered.object_names, surface.cell_object, surface.cell_values, surface.object_values, base.object_values, fit, seen
+    )
+    return build.object_facts(columns)

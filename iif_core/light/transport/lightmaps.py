@@ -108,8 +108,8 @@ def light_maps(
     faces = len(scene.geometry.faces)
     if lamp_of_face.shape != (faces,) or max(lamp_of_face.max(initial=-1), environment_lamp) >= lamps:
         raise InputError(
-            f"lamp_of_face has shape {lamp_of_face.shape} and values up to {lamp_of_face.max(initial=-1)}, the environment is lamp"
-            f" {environment_lamp}; expected ({faces},) and lamps 0 ... {lamps - 1}, -1 = none"
+            f"lamp_of_face has shape {lamp_of_face.shape} and values up to {lamp_of_face.max(initial=-1)}, the environment is"
+            f" lamp {environment_lamp}; expected ({faces},) and lamps 0 ... {lamps - 1}, -1 = none"
         )
     result = np.zeros((len(points), lamps, 3), np.float32)
     if paths.max_bounces == 0 or lamps == 0 or not len(points):

@@ -1,0 +1,236 @@
+"""room.html without a browser: lamps, texels, packing, and what the vendored program is."""
+
+import hashlib
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from iif_core.light.light_maps import to_half
+from tests.unit.transport_rooms import box, quad
+from workflow.exporters.atlas import TexturedPart
+from workflow.room import build
+from workflow.room.light import find_lamps, lit_texels, trace_lamps
+from workflow.room.pack import array_blob, normals_to_bytes, quantized
+from workflow.room.page import NOTES, Page, policy, render_page, three_version
+from workflow.room.sources import LIBRARY, VENDORED, VIEWER
+from workflow.scene.base_scene import BaseScene
+
+
+def part(mesh, column, columns, name, object_id, emitter_id=-1, radiance=(0, 0, 0), double_sided=False):
+    """A mesh of quads whose charts lie below one another in a column of the atlas, with a margin between them."""
+    vertices, faces = mesh
+    corners = vertices[faces].reshape(-1, 2, 3, 3)
+    count = len(corners)
+    split, uv, new = [], [], []
+    for number, (first, second) in enumerate(corners):
+        four = np.stack([first[0], first[1], first[2], second[2]])
+        low = np.array([(column + 0.05) / columns, (number + 0.05) / count])
+        size = np.array([0.9 / columns, 0.9 / count])
+        uv.append(low + size * np.array([[0, 0], [1, 0], [1, 1], [0, 1]]))
+        new.append(np.array([[0, 1, 2], [0, 2, 3]]) + 4 * number)
+        split.append(four)
+    split = np.concatenate(split)
+    normals = np.repeat(np.cross(corners[:, 0, 1] - corners[:, 0, 0], corners[:, 0, 2] - corners[:, 0, 0]), 4, 0)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    arrays = [a.astype(np.float32) for a in (split, normals, np.concatenate(uv))]
+    faces = np.concatenate(new).astype(np.int32)
+    return TexturedPart(name, object_id, emitter_id, *arrays, faces, np.float32(radiance), double_sided)
+
+
+@pytest.fixture
+def parts():
+    """A room of 3 x 2 x 2.5 m with a block that stands on the floor, and a lamp under the ceiling."""
+    return [
+        part(box((0, 0, 0), (3, 2, 2.5), inward=True), 0, 3, "shell", 0),
+        part(box((1, 0.7, -0.1), (1.6, 1.3, 0.8), inward=False), 1, 3, "block", 1),
+        part(quad((1.2, 0.8, 2.4), (0, 0.5, 0), (0.5, 0, 0)), 2, 3, "lamp.emitter0", 2, 0, (8, 4, 2)),
+    ]
+
+
+@pytest.fixture
+def surface(parts):
+    values = np.float32([[0.6, 0.6, 0.6, 0.9, 0], [0.4, 0.1, 0.1, 0.5, 0], [0, 0, 0, 1, 0]])
+    empty = np.zeros((0, 3), np.int32)
+    faces = sum(len(one.faces) for one in parts)
+    return BaseScene(
+        np.zeros((0, 3)), empty, np.zeros(0), np.zeros((0, 3)), np.zeros(faces), 3, 0.05, np.zeros(3), empty, np.zeros(0, np.int32),
+        np.zeros((0, 5), np.float32), values,
+    )  # fmt: skip
+
+
+def test_every_emitter_is_a_lamp_up_to_sixteen():
+    lamp = quad((0, 0, 2), (0, 1, 0), (1, 0, 0))
+    many = [part(lamp, i, 20, f"lamp.emitter{i}", i, i) for i in range(20)]
+    radiance = np.linspace(1, 20, 20)[:, None] * np.float32([1, 0.5, 0.25])
+    few = find_lamps(many[:3], radiance[:3], np.float32([0.1, 0.2, 0.4]))
+    assert [one.name for one in few.lamps] == ["lamp, emitter 0", "lamp, emitter 1", "lamp, emitter 2", "light from outside"]
+    np.testing.assert_allclose([one.color for one in few.lamps], [[1, 0.5, 0.25]] * 3 + [[0.25, 0.5, 1]])
+    np.testing.assert_allclose(few.radiance, radiance[:3, :1].repeat(3, 1))  # white while it is traced
+    assert few.environment == 3 and few.surroundings.ravel().tolist() == pytest.approx([0.4] * 3)
+    sun = np.float32([[[1, 2, 3], [0, 0, 0]], [[0, 0, 0], [0, 0, 9]]])
+    all_of_them = find_lamps(many, radiance, sun)
+    assert len(all_of_them.lamps) == 16 and all_of_them.environment == 15
+    shared = all_of_them.lamps[14]
+    assert shared.emitters == tuple(range(6)) and shared.color.tolist() == [1, 1, 1]
+    np.testing.assert_allclose(all_of_them.radiance[:6], radiance[:6])  # with their own colours
+    np.testing.assert_array_equal(all_of_them.surroundings, sun)
+    assert find_lamps([], np.zeros((0, 3)), np.zeros(3)).lamps == []
+
+
+def test_texels_lie_on_the_surface(parts):
+    texels = lit_texels(parts, 64)
+    assert (np.diff(texels.index) > 0).all() and set(texels.part) == {0, 1, 2}
+    shell = texels.points[texels.part == 0]
+    away = np.minimum(np.abs(shell), np.abs(shell - [3, 2, 2.5])).min(1)
+    np.testing.assert_allclose(away, 0, atol=1e-5)
+    middle = np.array([1.5, 1, 1.25])
+    assert (np.einsum("ij,ij->i", texels.normals[texels.part == 0], middle - shell) > 0).all()
+    area = 2 * (3 * 2 + 3 * 2.5 + 2 * 2.5)
+    assert texels.edge[0] ** 2 * (64 * 64 * 0.81 / 3) == pytest.approx(area, rel=1e-3)
+
+
+def test_stored_texels_have_a_border_of_the_nearest_light(parts):
+    texels = lit_texels(parts, 64)
+    stored, source = build.bordered(texels)
+    has = np.zeros(64 * 64, bool)
+    has[stored] = True
+    for row, column in np.ndindex(3, 3):
+        r, c = texels.index // 64 + row - 1, texels.index % 64 + column - 1
+        inside = (r >= 0) & (r < 64) & (c >= 0) & (c < 64)
+        assert has[(64 * r + c)[inside]].all()
+    own = np.isin(stored, texels.index)
+    np.testing.assert_array_equal(texels.index[source[own]], stored[own])
+    distance = np.hypot(*(np.array(np.divmod(stored, 64)) - np.divmod(texels.index[source], 64)))
+    assert distance.max() < 1.5
+
+
+def test_a_lamp_of_a_million_is_stored_and_solids_cast_no_rims(llvm, parts, surface):
+    """Light maps are linear in the radiance to the digits of half floats; the floor under the block has the light around it."""
+    texels = lit_texels(parts, 64)
+    maps = {}
+    for strength in (1.0, 1e6 / 8):
+        lamp = replace(parts[2], radiance=np.float32([8, 4, 2]) * np.float32(strength))
+        lamps = find_lamps([*parts[:2], lamp], lamp.radiance[None], np.zeros(3))
+        light = trace_lamps([*parts[:2], lamp], texels, surface, lamps, 32, 8, 1, denoised=False)
+        halves = to_half(light)
+        assert np.isfinite(halves.value).all()
+        maps[strength] = halves.value.astype(np.float64) * halves.scale[:, None] / strength
+    np.testing.assert_allclose(maps[1.0], maps[1e6 / 8], rtol=2e-3, atol=1e-3 * maps[1.0].mean())
+    x, y, z = texels.points.T
+    below = (texels.part == 0) & (z < 0.01) & (x > 1.05) & (x < 1.55) & (y > 0.75) & (y < 1.25)
+    around = (texels.part == 0) & (z < 0.01) & ~((x > 0.95) & (x < 1.65) & (y > 0.65) & (y < 1.35))
+    assert below.sum() > 5 and maps[1.0][below].mean() > 0.2 * maps[1.0][around].mean()
+
+
+def test_no_lamp_is_a_dark_page(parts, surface):
+    texels = lit_texels(parts, 32)
+    lamps = find_lamps(parts[:2], np.zeros((0, 3)), np.zeros(3))
+    light = trace_lamps(parts, texels, surface, lamps, 8, 4, 1)
+    assert light.shape == (len(texels.index), 0, 3)
+    blobs = build.light_blobs(to_half(light), texels)
+    assert blobs["light"].components == 0 and blobs["texels"].items >= len(texels.index)
+
+
+def test_arrays_come_back(tmp_path):
+    """Of several types and widths, empty ones too, through a page and the reader of the tests, which shares no code with it."""
+    from tests.room_page import read_room
+
+    rng = np.random.default_rng(2)
+    arrays = {
+        "a": rng.integers(0, 1 << 16, (100, 3)).astype(np.uint16),
+        "b": rng.integers(0, 1 << 32, (57, 1)).astype(np.uint32),
+        "c": rng.integers(0, 256, (9, 4)).astype(np.uint8),
+        "d": np.zeros((5, 0), np.uint16),
+    }
+    text = render_page(
+        Page(
+            "<b>",
+            "",
+            ["</script>"],
+            {"lamps": [], "x": "</script><script>alert(1)"},
+            {n: array_blob(v) for n, v in arrays.items()},
+        )
+    )
+    (tmp_path / "page.html").write_text(text)
+    page = read_room(tmp_path / "page.html")
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(page.arrays[name].reshape(values.shape), values)
+    assert page.document["x"] == "</script><script>alert(1)" and "alert(1)" not in re.sub("\\\\u003cscript>alert", "", text)
+    assert "<b>" not in text and text.count("</script>") == len(re.findall("<script", text))
+
+
+def test_positions_and_normals_keep_their_digits():
+    rng = np.random.default_rng(4)
+    values = rng.uniform(-3, 7, (1000, 3))
+    low, high = values.min(0), values.max(0)
+    back = low + quantized(values, low, high) / 65535 * (high - low)
+    np.testing.assert_allclose(back, values, atol=0.51 * 10 / 65535)
+    normals = values / np.linalg.norm(values, axis=1, keepdims=True)
+    np.testing.assert_allclose((normals_to_bytes(normals).astype(float) - 128) / 127, normals, atol=0.5 / 127 + 1e-9)
+
+
+def test_light_maps_shrink_with_the_number_of_lamps():
+    sizes = [build.lightmap_size(768, lamps, 0.6, 25) for lamps in (1, 4, 8, 16)]
+    assert sizes == sorted(sizes, reverse=True) and sizes[0] == 768 and sizes[-1] < 768
+    for lamps, size in zip((1, 4, 8, 16), sizes, strict=True):
+        assert 0.6 * size**2 * lamps * 6 * 0.8 * 4 / 3 <= 12.5e6
+    assert build.lightmap_size(64, 1, 0.6, 25) == 64 and build.lightmap_size(768, 16, 0.6, 0.01) == 32
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 1, 0), (0, 0.6, -0.8)])
+def test_the_floor_is_found_and_z_is_up(parts, up):
+    turn = np.linalg.qr(np.column_stack([up, np.eye(3)[:, :2]]))[0]
+    turn *= np.sign(turn[:, 0] @ up)
+    axes = np.stack([turn[:, 1], np.cross(up, turn[:, 1]), np.asarray(up, float)])  # world from room, as rows
+    turned = [
+        replace(one, vertices=(one.vertices @ axes).astype(np.float32), normals=(one.normals @ axes).astype(np.float32))
+        for one in parts
+    ]
+    cameras = np.array([[0.5, 0.5, 1.5], [2.5, 1.5, 1.4]]) @ axes
+    frame = build.frame_of(turned, lit_texels(turned, 64), np.asarray(up, float), cameras)
+    np.testing.assert_allclose(frame.turn @ up, [0, 0, 1], atol=1e-6)
+    assert frame.floor == pytest.approx(0, abs=1e-4)
+    assert frame.high[2] == pytest.approx(2.5, abs=0.1)
+    start = build.start_of([], frame)
+    assert start["eye"][2] == pytest.approx(build.EYE_HEIGHT, abs=1e-3)
+
+
+def test_what_a_click_tells():
+    columns = {
+        "object_id": [0, 1], "name": ["door", "wall"], "model": ["gain", ""], "photographs": [3, None], "pixels": [10, None],
+        "area_m2": [1.5, None], "base_colour_hex": ["#102030", "#ffffff"], **{f"base_colour_{c}": [0.2, 0.5] for c in "rgb"},
+        **{f"base_colour_{c}_{end}": [v, None] for c in "rgb" for end, v in (("low", 0.1), ("high", 0.3))},
+        **{f"{name}{end}": [0.4, None] for name in ("roughness", "metallic") for end in ("", "_low", "_high")},
+    }  # fmt: skip
+    door, wall = build.object_facts(columns)
+    assert door["views"] == 3 and door["model"] == "gain" and len(door["numbers"]) == 5
+    assert door["numbers"][0] == {"name": "albedo, red", "value": 0.2, "low": 0.1, "high": 0.3}
+    assert wall["model"] == "not fitted" and wall["views"] == 0 and wall["numbers"][0]["low"] is None
+    assert build.interval("radiance", 1.0, 2.0) == {
+        "name": "radiance",
+        "value": 1.0,
+        "low": 0.0,
+        "high": pytest.approx(4.92, abs=0.01),
+    }
+
+
+def test_three_is_the_file_that_its_readme_names():
+    readme, library = VENDORED.read_text(), LIBRARY.read_bytes()
+    assert hashlib.sha256(library).hexdigest() in readme
+    assert re.fullmatch(r"\d+\.\d+\.\d+", three_version())
+    assert (
+        "MIT" in (VENDORED.parent / "LICENSE").read_text()
+        or "Permission is hereby granted" in (VENDORED.parent / "LICENSE").read_text()
+    )
+    assert f"three@{three_version()}" in (VENDORED.parent / "bundle.sh").read_text()
+    for text in (library.decode(), VIEWER.read_text()):
+        assert "</script" not in text and "eval(" not in text and "new Function" not in text
+
+
+def test_the_policy_has_no_hole():
+    text = policy("body {}", ["first", "second"])
+    assert "unsafe" not in text and "*" not in text and "http" not in text and text.count("sha256-") == 3
+    modes = re.search(r"const MODES = \[(.*?)\]", VIEWER.read_text())[1]
+    assert re.findall(r"'(\w+)'", modes) == list(NOTES)
