@@ -126,6 +126,7 @@ def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) 
 def _run_stage(arguments: argparse.Namespace) -> int:
     from workflow.runtime.job import run_stage
     from workflow.runtime.job_state import JobState
+    from workflow.scene.named import check_overrides
     from workflow.settings import scene_origin
 
     stage, scene = arguments.command, arguments.scene
@@ -134,11 +135,12 @@ def _run_stage(arguments: argparse.Namespace) -> int:
     note = Path("results") / scene / "benchmarks" / f"{stage}.threads"
     note.parent.mkdir(parents=True, exist_ok=True)
     note.write_text(f"{arguments.threads}\n")
-    return _guarded(
-        f"{stage} of {scene}",
-        lambda: run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint),
-        JobState(scene, stage, arguments.fingerprint),
-    )
+
+    def run() -> None:
+        check_overrides(stage, scene, arguments.quality)
+        run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint)
+
+    return _guarded(f"{stage} of {scene}", run, JobState(scene, stage, arguments.fingerprint))
 
 
 def _batch(arguments: argparse.Namespace) -> int:

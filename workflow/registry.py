@@ -65,7 +65,15 @@ STAGES: dict[str, Stage] = {
         Stage(
             "affines",
             ("capture", "prior", "segmentation", "base", "emission", "shading"),
-            ("affines", "capture.dynamic_range", "emission.saturation", "override.components.metallic", "prior.kind", "seed"),
+            (
+                "affines",
+                "capture.dynamic_range",
+                "emission.saturation",
+                "override.components.metallic",
+                "overrides",
+                "prior.kind",
+                "seed",
+            ),
         ),
         Stage("render", ("capture", "segmentation", "base", "emission", "shading", "affines"), ("render", "seed")),
         Stage(

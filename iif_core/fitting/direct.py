@@ -46,7 +46,7 @@ from iif_core.fitting.selection import (
 )
 from iif_core.fitting.tone import Tone
 from iif_core.reflectance.brdf import R_MIN
-from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, NUMBERS
+from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, METALLIC, NUMBERS, ROUGHNESS
 
 SELECTION_PIXELS = 3000
 """Pixels of an object in the selection. With few pixels in each cluster, the errors that its pixels share would go unseen."""
@@ -76,6 +76,7 @@ class FitProgress:
         profiled: roughness from the profile, once it was made.
         response_weight: (O,) weight q of each object's pixels (Eq. M.25); None: 1.
         levels: both estimates of the level of each object, once they were compared.
+        given: (O, 2) roughness and metallic that are known and stay, NaN = fitted; None: all are fitted.
     """
 
     state: DescentState
@@ -85,6 +86,7 @@ class FitProgress:
     profiled: ProfiledRoughness | None = None
     response_weight: np.ndarray | None = None
     levels: ObjectLevels | None = None
+    given: np.ndarray | None = None
 
 
 def fit_affines(problem: FitProblem, response: Response, options: FitOptions | None = None) -> FitResult:
@@ -99,11 +101,12 @@ def fit_affines(problem: FitProblem, response: Response, options: FitOptions | N
     members = np.flatnonzero(texture_of_all.enough)
     px, texture = everything.only(members), texture_of_all.only(members)
     start_params = response.params.ravel().astype(np.float64) if tone.size else np.zeros(0)
-    fit = _start(px, texture, start_params, opt)
+    given = None if problem.given is None else problem.given[members]
+    fit = _start(px, texture, start_params, opt, given)
     if len(members):
         scatter = np.full(problem.n_objects, UNKNOWN_SCATTER) if problem.scatter is None else problem.scatter
         fit = _descend_all(px, fit, tone, texture, opt, start_params, scatter[members])
-    return result_of(px, fit, tone, texture, opt, start_params, members, everything.usable)
+    return result_of(px, fit, tone, texture, opt, start_params, members, everything.usable, problem.given)
 
 
 def _descend_all(
@@ -180,8 +183,22 @@ def weigh_by_halves(
     px.target = np.ascontiguousarray(np.where(px.saturated, measured - 3.0 * apart, measured + bias), measured.dtype)
 
 
-def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) -> FitProgress:
-    """Start at the mean of the first population, a rough dielectric, or without one at the identity."""
+def hold_given(affine: np.ndarray, free: np.ndarray, metallic: np.ndarray, given: np.ndarray | None) -> None:
+    """Put known roughness and metallic (O, 2), NaN = not known, into the numbers (O, 16), which are then not free, and into the
+    gain and bias of the metallic (O, 2); all in place."""
+    if given is None:
+        return
+    for column, (numbers, value) in enumerate(zip((ROUGHNESS, METALLIC), given.T, strict=True)):
+        known = ~np.isnan(value)
+        held = np.stack([np.zeros(known.sum()), value[known]], 1)
+        affine[np.ix_(known, numbers)] = held
+        free[np.ix_(known, numbers)] = False
+        if column == 1:
+            metallic[known] = held
+
+
+def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions, given: np.ndarray | None = None) -> FitProgress:
+    """Start at the mean of the first population, a rough dielectric, or without one at the identity; known values stay."""
     n = px.n_objects
     free = texture.albedo_numbers()
     if opt.select or opt.population:
@@ -204,7 +221,9 @@ def _start(px: Pixels, texture: Texture, params: np.ndarray, opt: FitOptions) ->
     if not opt.lobes:
         affine[:, 12:], free[:, 12:] = 0.0, False
         affine[:, 13] = np.maximum(texture.mean[:, 3], MATTE_ROUGHNESS)
-    return FitProgress(DescentState(affine, free, params.copy(), np.full(n, 1e-2)), prior, population, metallic)
+    hold_given(affine, free, metallic, given)
+    state = DescentState(affine, free, params.copy(), np.full(n, 1e-2))
+    return FitProgress(state, prior, population, metallic, given=given)
 
 
 def _select_kinds(
@@ -220,14 +239,15 @@ def _select_kinds(
     noise = row_variance(terms, few, state.free)
     prior = population_prior(initial_population(), noise, texture.mean[:, 3], fit.metallic)
     found = profile_roughness(few, state, prior, tone.at(state.params), opt, state.free, measured & texture.mixed)
-    choice = choose_kinds(found, measured, texture.mean, px.usable)
-    metallic = KINDS[choice.kind]
+    choice = choose_kinds(found, measured, texture.mean, px.usable, fit.given)
+    metallic = KINDS[choice.kind].copy()
     affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
     affine[:, 12:] = np.concatenate([np.zeros((px.n_objects, 1)), choice.roughness[:, None], metallic], 1)
     affine = np.where(measured[:, None], affine, state.affine)
     free = state.free.copy()
     free[:, 13] = measured
     free[:, 12] = measured & texture.varied[:, 0]
+    hold_given(affine, free, metallic, fit.given)
     state = DescentState(affine, free, state.params, np.full(px.n_objects, 1e-3))
     profiled = _profile_errors(few, state, prior, tone, opt, found.noise, choice)
     weight = np.maximum(choice.allowed_share, LEAST_RESPONSE_WEIGHT)
@@ -292,6 +312,7 @@ def result_of(
     start_params: np.ndarray,
     members: np.ndarray,
     counts: np.ndarray,
+    given: np.ndarray | None = None,
 ) -> FitResult:
     """Collect the result of all objects, with covariances.
 
@@ -299,10 +320,11 @@ def result_of(
         px: pixels of the fitted objects; fit: where the fit ended; tone: curve at the start; texture: of the fitted objects.
         opt: options; start_params: (P,) response at the start.
         members: indices of the fitted objects; counts: (O,) usable pixels of every object.
+        given: (O, 2) roughness and metallic that are known, NaN = not known; None: nothing is.
 
     Returns:
-        Numbers of all objects. Those that were not fitted have the mean of the population, or the identity without one; their
-        albedo is that of the base at the level that the others have relative to it.
+        Numbers of all objects; known ones have no variance. Those that were not fitted have the mean of the population, or the
+        identity without one; their albedo is that of the base at the level that the others have relative to it.
     """
     state, n_objects = fit.state, len(counts)
     affine, free = np.tile(IDENTITY, (n_objects, 1)), np.zeros((n_objects, NUMBERS), bool)
@@ -340,13 +362,15 @@ def result_of(
     facts = {**_facts(fit), "numerics": _numerics(px, fit, spectrum)} if len(members) else {}
     rank = np.zeros(n_objects, np.int64)
     rank[members] = texture.rank
+    models = describe_models(rank, free, affine, counts, given)
+    hold_given(affine, free, np.zeros((n_objects, 2)), given)
     return FitResult(
         affine,
         covariance,
         free,
         counts.astype(np.int64),
         residual,
-        describe_models(rank, free, affine, counts),
+        models,
         final.response,
         1.0,
         list(state.history) or [0.0],

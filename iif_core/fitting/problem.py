@@ -31,6 +31,8 @@ class FitProblem:
             pixels of an object in their given order.
         scatter: (O,) of the logarithm of the brightness of each object over its predictions
             (`object_levels.prediction_scatter`); None: not known.
+        given: (O, 2) roughness and metallic of objects that are known and not fitted, NaN = fitted; None: all are fitted. Only
+            the direct solver knows them.
     """
 
     object_id: np.ndarray
@@ -45,10 +47,13 @@ class FitProblem:
     saturated: np.ndarray
     cluster: np.ndarray | None = None
     scatter: np.ndarray | None = None
+    given: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         n, j = len(self.object_id), len(self.levels)
         shapes = {"base": (n, 5), "value": (n, 3), "exposure": (n,), "saturated": (n, 3)}
+        if self.given is not None:
+            shapes["given"] = (self.n_objects, 2)
         if self.cluster is not None:
             shapes["cluster"] = (n,)
         for name, shape in shapes.items():
@@ -66,7 +71,7 @@ class FitProblem:
         """Return some of the pixels."""
         changed: dict[str, Any] = {}
         for name, value in self.__dict__.items():
-            if name in ("n_objects", "levels", "scatter") or value is None:
+            if name in ("n_objects", "levels", "scatter", "given") or value is None:
                 continue
             changed[name] = tuple(part[index] for part in value) if isinstance(value, tuple) else value[index]
         return replace(self, **changed)

@@ -226,7 +226,9 @@ class Choice:
     allowed_share: np.ndarray
 
 
-def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixels: np.ndarray) -> Choice:
+def choose_kinds(
+    found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixels: np.ndarray, given: np.ndarray | None = None
+) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
     Which of two objects has the rougher base counts as an observation of their roughness. A metal must be as bright as its base
@@ -235,12 +237,15 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixe
     Args:
         found: the evidence; counts: (O,) bool, objects that enter the histogram.
         mean_base: (O, 5) mean base material; pixels: (O,) usable pixels.
+        given: (O, 2) roughness and metallic that are known, NaN = chosen here; None: all are chosen.
     """
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
     everything = np.exp(np.maximum((cost.min((1, 2), keepdims=True) - cost) / scale, -700.0)) * _PRIOR_OF_KINDS
     cost[ROUGHNESS_GRID[cost[:, 1].argmin(1)] > ROUGHEST_METAL, 1] = np.inf
     cost[:, 1, ROUGHNESS_GRID > ROUGHEST_METAL] = np.inf
+    if given is not None:
+        cost = _within_given(cost, found.cost, given)
     allowed_share = np.where(np.isfinite(cost), everything, 0.0).sum((1, 2)) / everything.sum((1, 2))
     log_likelihood = (cost.min((1, 2), keepdims=True) - cost) / scale
     likelihood = np.where(counts[:, None, None], np.exp(np.maximum(log_likelihood, -700.0)), 1.0)
@@ -266,6 +271,23 @@ def choose_kinds(found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixe
     level = float(prior.sum(0) @ ROUGHNESS_GRID)
     width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
     return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
+
+
+def _within_given(cost: np.ndarray, tried: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """Leave only what agrees with the known values (O, 2) of each object: the nearest roughness of the grid, and the kind whose
+    metallic is nearest. What is known holds against `ROUGHEST_METAL` too, and where nothing that agrees was tried."""
+    roughness, metallic = given.T
+    nearest = np.abs(ROUGHNESS_GRID - np.where(np.isnan(roughness), 0.0, roughness)[:, None]).argmin(1)
+    at = np.isnan(roughness)[:, None] | (np.arange(len(ROUGHNESS_GRID)) == nearest[:, None])
+    metal = np.where(np.isnan(metallic), 0.0, metallic) >= 0.5
+    kind = np.isnan(metallic)[:, None] | (np.arange(len(KINDS)) == metal[:, None])
+    agrees = kind[:, :, None] & at[:, None, :]
+    known = ~np.isnan(given).all(1)
+    left = np.where(agrees, np.where(np.isnan(metallic)[:, None, None], cost, tried), np.inf)
+    barren = ~np.isfinite(left).any((1, 2), keepdims=True)
+    left = np.where(barren & agrees & np.isfinite(tried), tried, left)
+    left = np.where(~np.isfinite(left).any((1, 2), keepdims=True) & agrees, 0.0, left)
+    return np.where(known[:, None, None], left, cost)
 
 
 def _smoothed(histogram: np.ndarray) -> np.ndarray:
@@ -319,31 +341,37 @@ def _agreement_with_base(posterior: np.ndarray, brightness: np.ndarray, counts: 
     return np.where(counts[:, None], np.minimum(agreement / agreement[:, :1], 1.0), 1.0)
 
 
-def describe_models(rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray) -> list[str]:
+def describe_models(
+    rank: np.ndarray, free: np.ndarray, affine: np.ndarray, pixels: np.ndarray, given: np.ndarray | None = None
+) -> list[str]:
     """Describe in words what was fitted for each object.
 
     Args:
         rank: (O,) directions of colour; free: (O, 16) bool; affine: (O, 16); pixels: (O,) usable pixels.
+        given: (O, 2) known roughness and metallic, NaN = not known; None: nothing is.
 
     Returns:
         E.g. `full, roughness, metal`, or `population (12 pixels)` where nothing was free.
     """
     out = []
+    known = np.zeros((len(pixels), 2), bool) if given is None else ~np.isnan(given)
     for o in range(len(pixels)):
+        told = [f"{name} given" for name, is_known in zip(("roughness", "metallic"), known[o], strict=True) if is_known]
         if not free[o].any():
             out.append(
                 f"population ({int(pixels[o])} pixels)"
                 if np.any(affine[o] != IDENTITY)
                 else f"identity ({int(pixels[o])} pixels)"
             )
+            out[-1] = ", ".join([out[-1], *told])
             continue
         parts = [("gain", "gain+bias", "full", "full")[int(rank[o])]]
         if free[o, ROUGHNESS].any():
             parts.append("roughness")
         if free[o, METALLIC].any():
             parts.append("metallic")
-        else:
+        elif not known[o, 1]:
             g, h = affine[o, METALLIC]
             parts += ["metal"] if h == 1 else ["metallic as predicted"] if g else []
-        out.append(", ".join(parts))
+        out.append(", ".join([*parts, *told]))
     return out

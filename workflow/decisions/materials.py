@@ -25,6 +25,20 @@ def metallic(free: np.ndarray, prior_median: np.ndarray, setting: str = "auto") 
     return decision("metallic", count > 0, "largest median predicted metalness", value, METALLIC_PRIOR, reason)
 
 
+def given_words(objects: int, given: np.ndarray | None) -> list[str]:
+    """Return in words what was given by hand of each object, e.g. `roughness, metallic`, from values (O, 2), NaN = fitted."""
+    known = np.zeros((objects, 2), bool) if given is None else ~np.isnan(given)
+    return [", ".join(name for name, told in zip(("roughness", "metallic"), row, strict=True) if told) for row in known]
+
+
+def given_by_hand(names: list[str], given: np.ndarray) -> Decision:
+    """Describe which materials were given by hand (`overrides`) and thus not fitted."""
+    words = given_words(len(names), given)
+    told = [f"{name} ({what})" for name, what in zip(names, words, strict=True) if what]
+    reason = f"given by hand, not fitted: {'; '.join(told)}"
+    return decision("given_materials", True, "objects with values given by hand", len(told), 0.0, reason, FORCED)
+
+
 def affine_size(models: list[str]) -> Decision:
     """Describe the sizes of the albedo maps, which follow the texture of each object (Eq. M.19)."""
     kinds = [m.split(",")[0].split(" (")[0] for m in models]

@@ -17,6 +17,7 @@ from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
+from workflow.scene.named import check_overrides
 from workflow.settings import SCENE_NAME, require_relighting, scene_file
 from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table
@@ -119,6 +120,7 @@ def reads(stage, *names):
     def inputs(wildcards):
         quality = quality_of(wildcards.scene)
         or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
+        or_stop(check_overrides, stage, wildcards.scene, quality)
         common = study_files.shared_scene(wildcards.scene)
         found = {name: manifest(name, wildcards.scene) for name in own}
         return found | {f"{SHARED}{name}": manifest(name, common) for name in shared}

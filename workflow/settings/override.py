@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
 
 from workflow.settings.section import ON_OFF, Section
 
@@ -30,3 +32,39 @@ class Override(Section):
 
     components: Components = Components()
     """Component of plan.yaml -> `on`, `off` or `auto`."""
+
+
+class GivenMaterial(Section):
+    """What is known of the material of an object. It is not fitted, and the fit of everything else goes on with it
+    (docs/guide/relighting.md#corrections-by-hand)."""
+
+    roughness: float | None = Field(None, ge=0.02, le=1)
+    """Perceptual roughness, the same all over the object; by default fitted."""
+    metallic: float | None = Field(None, ge=0, le=1)
+    """Metallic, the same all over the object; by default chosen by the fit."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_albedo(cls, value: Any) -> Any:
+        if isinstance(value, dict) and "albedo" in value:
+            raise ValueError(
+                "albedo is not given by hand here, because its level is one with that of the light: use"
+                " `affines: {scale: {white_patch: {object: ..., albedo: ...}}}`, or paint the object in a relighting"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _something(self) -> GivenMaterial:
+        if self.roughness is None and self.metallic is None:
+            raise ValueError("nothing is given; write `roughness`, `metallic` or both")
+        return self
+
+
+def _words(value: Any) -> Any:
+    """Keys of a mapping as text: YAML reads the id of an object as a number."""
+    return {str(key): entry for key, entry in value.items()} if isinstance(value, dict) else value
+
+
+TEXT_KEYS = BeforeValidator(_words)
+"""For mappings whose keys are names or ids."""
+ByObject = Annotated[dict[str, GivenMaterial], TEXT_KEYS]

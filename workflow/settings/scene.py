@@ -10,8 +10,13 @@ from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.limits import Limits
+<<<<<<< HEAD
 from workflow.settings.outputs import Export, Metrics, Render, Report, Room
-from workflow.settings.override import Override
+from workflow.settings.override import ByObject, Override
+=======
+from workflow.settings.outputs import Export, Metrics, Render, Report
+from workflow.settings.override import ByObject, Override
+>>>>>>> c977113 (Corrections by hand: roughness and metallic of an object that are given stay fixed while the rest is fitted)
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting
 from workflow.settings.section import Section
@@ -45,6 +50,9 @@ class SceneSettings(Section):
     room: Room = Room()
     override: Override = Override()
     """Parts of the model that are forced in or out, in the words of plan.yaml."""
+    overrides: ByObject = Field(default_factory=dict)
+    """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
+    (docs/guide/relighting.md#corrections-by-hand)."""
     relight: list[Relighting] = Field(default_factory=list)
     """Pictures under other light and from other positions, made on demand."""
     seed: int = Field(0, ge=0, lt=2**31)
@@ -94,6 +102,8 @@ class SceneSettings(Section):
         for component in ("specular", "metallic"):
             if forced.get(component) == "off" and not fits_both:
                 raise ValueError(f"`override: components: {component}: off`: needs `affines: {{model: objects, solver: direct}}`")
+        if self.overrides and not (fits_both and self.preset == "ours"):
+            raise ValueError("`overrides`: materials given by hand need `affines: {model: objects, solver: direct}`; remove them")
         own = {
             "environment": ("emission", "environment", {"on": "on", "off": "off"}),
             "radiance_cache": ("shading", "indirect", {"on": "cache", "off": "path"}),

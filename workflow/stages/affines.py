@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,6 +38,7 @@ from workflow.scene.base_scene import (
     view_pixels,
 )
 from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
+from workflow.scene.named import object_number
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names, write_response
 from workflow.settings.affines import KnownLamp
@@ -49,16 +50,17 @@ def run(job: Job) -> None:
         return baselines.run(job)
     capture, (scene, light) = CaptureReader(job.read("capture")), read_lit_scene(job)
     names = object_names(job, scene.n_objects)
-    find_gauge = _gauge(job, capture, names)  # wrong settings stop the stage before any work
+    find_gauge, given = _gauge(job, capture, names), _given(job, names)  # wrong settings stop the stage before any work
     mixed = light.emits | scene.is_sheer
     problem, places = _problem(job, capture, scene, mixed, read_gains(job))
+    problem = replace(problem, given=given)
     start, prior, calibration = _starting_response(job)
     job.log.info("%d pixels of %d objects", len(problem.object_id), len(np.unique(problem.object_id)))
     textures = CellTextures.of(job, capture, scene, mixed)
     fit, free = _fitted(job, problem, start, prior, places, find_gauge)
     for o in range(scene.n_objects):
         job.log.debug("%s: %s, residual %.4f", names[o], fit.model[o], fit.residual[o])
-    _write_objects(job, names, fit)
+    _write_objects(job, names, fit, given)
     if not capture.is_hdr:
         write_response(job, fit.response)
     albedo = textures.albedo(fit) if textures is not None else None
@@ -66,6 +68,8 @@ def run(job: Job) -> None:
     _write_maps(job, capture, fit, albedo)
     metals = job.settings.override.components.metallic
     plan = _plan(problem, fit, calibration, capture.facts["dynamic_range"], metals)
+    if given is not None:
+        plan.append(materials.given_by_hand(names, given))
     loss = reference_loss(problem, free.affine, free.response)
     _write_facts(job, fit, loss.__dict__, plan)
 
@@ -207,6 +211,29 @@ def _lamp_gauge(job: Job, lamp: KnownLamp) -> Callable[[FitProblem, _Places], Ga
     return lambda problem, places: Gauge("lamp", factor=float(np.mean(lamp.radiance)) / max(found, 1e-30))
 
 
+def _given(job: Job, names: list[str]) -> np.ndarray | None:
+    """Return roughness and metallic (O, 2) that `overrides` gives, NaN = fitted; None if it gives nothing.
+
+    Raises:
+        InputError: no object has this name or id, two entries mean the same object, or the model has no specular lobes.
+    """
+    wanted: dict[str, Any] = vars(job.settings.overrides)
+    if not wanted:
+        return None
+    if not has_lobes(job):
+        raise InputError(
+            "overrides: found materials given by hand, but this scene is fitted without specular lobes, so they would change"
+            " nothing; set `override: {components: {specular: on}}`, or remove them"
+        )
+    given = np.full((len(names), 2), np.nan)
+    for key, entry in wanted.items():
+        number = object_number(key, names, "overrides")
+        if not np.isnan(given[number]).all():
+            raise InputError(f"overrides.{key}: object {names[number]!r} is there twice, by its name and by its id; remove one")
+        given[number] = [np.nan if value is None else value for value in (entry.roughness, entry.metallic)]
+    return given
+
+
 # -------------------------------------------------------------------------------------------------------------- input
 
 
@@ -299,7 +326,7 @@ def _scatter(job: Job, n_objects: int) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------------- output
 
 
-def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
+def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray | None) -> None:
     """Write objects.parquet: numbers, standard deviations and model of every object."""
     spread = np.sqrt(np.clip(np.diagonal(fit.covariance, axis1=1, axis2=2), 0.0, None))
     columns: dict[str, Any] = {
@@ -317,6 +344,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult) -> None:
         "residual": fit.residual,
         "light_gain": np.ones(len(names)) if fit.light_gain is None else fit.light_gain,
         "model": np.array(fit.model, dtype=str),
+        "given": np.array(materials.given_words(len(names), given), dtype=str),
     }
     job.writer.table("objects.parquet", columns, {"residual": "sensor value"})
 

@@ -1,0 +1,70 @@
+"""What the settings call by name: objects of the segmentation."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from pathlib import Path
+
+from iif_core.errors import InputError
+from workflow.artifacts import StageReader
+from workflow.registry import upstream_of
+from workflow.runtime import fingerprint as fp
+from workflow.settings.names import did_you_mean
+
+
+def object_number(key: object, names: list[str], where: str) -> int:
+    """Return the id of the object that a key of the settings means: its name, or else its id.
+
+    Raises:
+        InputError: there is no such object, or several have this name; `where` is the setting, for the message.
+    """
+    text = str(key)
+    found = [i for i, name in enumerate(names) if name == text]
+    if len(found) == 1:
+        return found[0]
+    if len(found) > 1:
+        raise InputError(f"{where}: {text!r} is the name of {len(found)} objects; name it by its id, one of {found}")
+    if text.isdigit() and int(text) < len(names):
+        return int(text)
+    hint = did_you_mean(text, names, "{!r}")
+    listed = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    raise InputError(f"{where}: there is no object {text!r}.{hint} Allowed: a name or an id of objects.parquet, such as {listed}")
+
+
+@lru_cache(None)
+def check_overrides(stage: str, scene: str, quality: str) -> None:
+    """Check the objects that `overrides` names, once the segmentation is known: before the work of any stage after it, not before
+    that of stage `affines`, which is the first to use them.
+
+    Raises:
+        InputError: as `object_number`.
+    """
+    wanted = json.loads(fp.resolved(scene, quality))["overrides"]
+    if not wanted or "segmentation" not in upstream_of(stage):
+        return
+    reader = finished("segmentation", scene, quality)
+    if reader is not None:
+        names = names_of(reader)
+        for key in wanted:
+            object_number(key, names, "overrides")
+
+
+def names_of(segmentation: StageReader) -> list[str]:
+    """Return the name of every object id; `object<id>` where it has none."""
+    table = segmentation.table("objects.parquet")
+    names = [f"object{i}" for i in range(int(table["object_id"].max(initial=-1)) + 1)]
+    for i, name in zip(table["object_id"], table["name"], strict=True):
+        names[int(i)] = str(name)
+    return names
+
+
+def finished(stage: str, scene: str, quality: str) -> StageReader | None:
+    """Return the reader of a stage if it is finished under these settings and this code; None otherwise."""
+    home = fp.home(stage, scene, quality)
+    folder = Path("results") / home / stage
+    try:
+        reader = StageReader(folder, stage, home)
+    except InputError:
+        return None
+    return reader if reader.fingerprint == fp.fingerprint(stage, scene, quality) else None
