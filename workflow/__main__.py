@@ -3,6 +3,7 @@
 `python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
 workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
 design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
+`python -m workflow relit <scene>` copies pictures of relightings to relight/,
 `python -m workflow bench <scene>` shows what three of them did in a room, `python -m workflow planned <scene>` what a room was
 found to require, `python -m workflow claims` takes from the study `regret` what is expected of that, and `python -m workflow
 lpips_vgg` fetches weights.
@@ -55,6 +56,11 @@ def _arguments() -> argparse.Namespace:
     planned.add_argument("scene")
     planned.add_argument("--quality", default="draft")
     planned.add_argument("--log", type=Path)
+    relit = commands.add_parser("relit")
+    relit.add_argument("scene")
+    relit.add_argument("--plan", default="", help="of config/relight/; without it, the relightings of the scene itself")
+    relit.add_argument("--quality", default="draft")
+    relit.add_argument("--log", type=Path)
     bench = commands.add_parser("bench")
     bench.add_argument("scene")
     bench.add_argument("--log", type=Path)
@@ -212,6 +218,10 @@ def main() -> int:
         return _guarded("claims", lambda: write_claims(load_study("regret"), TABLE, SHIPPED))
     if arguments.command == "planned":
         return _guarded("planned", partial(_planned, arguments.scene, arguments.quality))
+    if arguments.command == "relit":
+        from workflow.studies.relit import deliver
+
+        return _guarded("relit", partial(deliver, arguments.scene, arguments.plan, arguments.quality))
     if arguments.command == "bench":
         from workflow.trade.bench import write_bench
 

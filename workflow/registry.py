@@ -77,8 +77,15 @@ STAGES: dict[str, Stage] = {
         ),
         Stage("render", ("capture", "segmentation", "base", "emission", "shading", "affines"), ("render", "seed")),
         Stage(
-            "relight",
+            "lamp_images",
             ("capture", "segmentation", "base", "emission", "affines"),
+            ("lamp_images", "seed"),
+            reads_raw=True,
+            on_demand=True,
+        ),
+        Stage(
+            "relight",
+            ("capture", "segmentation", "base", "emission", "affines", "lamp_images"),
             ("relight", "seed"),
             reads_raw=True,
             on_demand=True,

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.errors import InputError
+from iif_core.numerics.color import luminance
 
 Array = np.ndarray
 
@@ -84,6 +85,43 @@ def exposure_for(radiance: ArrayLike, quantile: float = 0.95, level: float = 0.8
     """Return the factor that brings the `quantile` of the largest channel to `level`, 1 for black pictures (Eq. L.54)."""
     brightest = float(np.quantile(np.asarray(radiance, np.float64).max(-1), quantile))
     return level / brightest if brightest > 0 else 1.0
+
+
+def coloured(radiance: ArrayLike, factor: float, colour: ArrayLike | None = None) -> Array:
+    """Return the radiance (3,) of a lamp of radiance `radiance` (3,) that is dimmed by `factor` and has another colour.
+
+    With a colour c (3,), linear, the radiance is factor x Y(radiance) / Y(c) x c: the luminance Y stays (Eq. L.61).
+
+    >>> coloured([1.0, 1.0, 1.0], 0.5).tolist()
+    [0.5, 0.5, 0.5]
+
+    Raises:
+        InputError: a colour without light.
+    """
+    found = np.asarray(radiance, np.float64)
+    if colour is None:
+        return factor * found
+    wanted = np.asarray(colour, np.float64)
+    if not luminance(wanted) > 0:
+        raise InputError(f"colour of a lamp: found {wanted.tolist()}; one of the three numbers must be above 0")
+    return factor * wanted * (luminance(found) / luminance(wanted))
+
+
+def sum_of_lamps(pictures: ArrayLike, weights: ArrayLike) -> Array:
+    """Return the picture under other light: sum over l of weights_l pictures_l (Eq. L.60).
+
+    Args:
+        pictures: (L, ..., 3) radiance that each lamp gives by itself; weights: (L, 3) factors on the light of each.
+
+    Returns:
+        (..., 3) float32.
+    """
+    pictures, weights = np.asarray(pictures), np.asarray(weights, np.float64)
+    total = np.zeros(pictures.shape[1:], np.float64)
+    for picture, weight in zip(pictures, weights, strict=True):
+        if weight.any():
+            total += picture * weight
+    return total.astype(np.float32)
 
 
 def axes_of_map(up: ArrayLike, turn: float) -> Array:

@@ -1,5 +1,8 @@
 """Relighting: camera paths, the inserted lamp, and the stage against the renderer and the superposition of light."""
 
+import json
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -10,8 +13,9 @@ from iif_core.light.relighting import axes_of_map, camera_path, ease, exposure_f
 from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.settings.relight import Relighting
-from workflow.stages import relight
+from workflow.relighting.world import read_environment
+from workflow.settings.relight import Relighting, lamp_bases
+from workflow.stages import lamp_images, relight
 
 
 def test_ease_starts_and_stops_gently():
@@ -83,16 +87,16 @@ def test_environment_files_keep_up_and_turn_clockwise(tmp_path):
     picture[0] = (9, 0, 0)  # top row = up
     picture[4, 4] = (0, 5, 0)  # a quarter to the right of the left edge = a quarter turn clockwise, seen from above
     write_exr(tmp_path / "sky.exr", split_rgb(picture))
-    found = relight._read_environment(tmp_path / "sky.exr", np.array([0.0, 0, 1]), 0.0)
+    found = read_environment(tmp_path / "sky.exr", np.array([0.0, 0, 1]), 0.0)
     assert (found[0, :, 0] > 8).all() and not found[2:, :, 0].any()
     assert found[4, 11].tolist() == [0, 5, 0]  # our columns run counter-clockwise
-    turned = relight._read_environment(tmp_path / "sky.exr", np.array([0.0, 0, 1]), 45.0)
+    turned = read_environment(tmp_path / "sky.exr", np.array([0.0, 0, 1]), 45.0)
     np.testing.assert_allclose(turned, np.roll(found, 2, 1), atol=1e-5)
-    y_up = relight._read_environment(tmp_path / "sky.exr", np.array([0.0, 1, 0]), 0.0)
+    y_up = read_environment(tmp_path / "sky.exr", np.array([0.0, 1, 0]), 0.0)
     np.testing.assert_allclose(y_up, resample(picture[:, ::-1], axes_of_map((0, 1, 0), 0), 8, 16, 2))
     write_exr(tmp_path / "grey.exr", {"Y": picture[..., 0]})
     with pytest.raises(InputError, match="channels Y"):
-        relight._read_environment(tmp_path / "grey.exr", np.array([0.0, 0, 1]), 0.0)
+        read_environment(tmp_path / "grey.exr", np.array([0.0, 0, 1]), 0.0)
 
 
 BALL = {"center": [1.0, 1.0, 1.4], "radius": 0.15, "radiance": [8.0, 4.0, 2.0]}
@@ -105,12 +109,19 @@ def toy(llvm, tmp_path_factory):
     return root
 
 
-def lit(root, *wanted):
-    job = FakeJob("relight", root)
+def lit(root, *wanted, run=None):
+    """Run both stages on a room; returns the first frames, and the folder of the pictures. `run` collects the jobs."""
     common = {"samples": 256, "max_bounces": 4, "denoise": False}
-    job.settings.relight = [Relighting(**{**common, **entry}).model_dump(mode="json") for entry in wanted]
-    relight.run(job)
-    job.writer.finish()
+    entries = [Relighting(**{**common, **entry}).model_dump(mode="json") for entry in wanted]
+    for stage, module in (("lamp_images", lamp_images), ("relight", relight)):
+        job = FakeJob(stage, root)
+        job.timed = lambda name: nullcontext()
+        job.document["relight"] = job.settings.relight = entries
+        job.settings.lamp_images = lamp_bases(entries)
+        module.run(job)
+        job.writer.finish()
+        if run is not None:
+            run.append(job)
     folder = root / "results/toy/relight"
     return [rgb(read_exr(folder / f"{entry['name']}/frame_0000.exr")) for entry in wanted], folder
 
@@ -134,7 +145,8 @@ def test_as_found_is_the_truth_and_light_adds_up(toy):
     from PIL import Image
 
     assert Image.open(folder / "found/frame_0000.png").size == (40, 32)
-    assert Image.open(folder / "contact_sheet.png").size == (48, 4 * (relight.CAPTION + 36) + 4)
+    facts = json.loads((folder / "relight.json").read_text())["relightings"]
+    assert [entry["method"] for entry in facts] == ["recombined", "recombined", "path traced", "path traced"]
 
 
 def test_flight_denoised_and_lamp_that_moves(toy):
@@ -167,6 +179,9 @@ def test_what_is_asked_for_must_be_there(toy):
 def test_missing_environment_file_is_named():
     from workflow.settings import relight_files
 
-    assert relight_files({"relight": [{"environment": "keep"}, {"environment": [1, 2, 3]}]}) == []
+    def entry(**more):
+        return Relighting(name="a", **more).model_dump(mode="json")
+
+    assert relight_files([entry(), entry(environment=[1, 2, 3]), entry(environment=0.5)]) == []
     with pytest.raises(InputError, match="'nowhere.exr', which is no EXR file here"):
-        relight_files({"relight": [{"environment": "nowhere.exr"}]})
+        relight_files([entry(environment="nowhere.exr")])

@@ -50,7 +50,10 @@ class StageWriter:
         self.directory = directory
         self.provenance = provenance
         self.files: dict[str, dict[str, Any]] = {}
+        self.parts: dict[str, Any] = {}
         directory.mkdir(parents=True, exist_ok=True)
+        for part, note in _parts_of(directory / MANIFEST).items():
+            io.write_json(io.inside(directory, f"{UNFINISHED}/{part}.json"), note)
         (directory / MANIFEST).unlink(missing_ok=True)
 
     def exr(
@@ -95,37 +98,43 @@ class StageWriter:
         io.write_atomically(io.inside(self.directory, name), lambda temporary: _write_bytes(temporary, data))
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
-    def part_done(self, part: str, names: list[str], facts: dict[str, Any]) -> None:
+    def part_done(self, part: str, names: list[str], facts: dict[str, Any], by: str = "") -> None:
         """Note that a part of the stage is finished, so that a job that is killed need not repeat it; `finish` removes the note.
 
         Args:
             part: name of the part, such as that of a view.
             names: the files that were written for it.
             facts: small document that `part_kept` gives back.
+            by: digest of all that the part depends on, if that is less than the stage does; the note is then kept in the
+                manifest, and the next job of the stage takes the part over although something else has changed.
         """
         files = {name: self.files[name] for name in names}
-        document = {"by": self.provenance["fingerprint"], "files": files, "facts": facts}
+        document = {"by": by or self.provenance["fingerprint"], "files": files, "facts": facts}
         io.write_json(io.inside(self.directory, f"{UNFINISHED}/{part}.json"), document)
+        if by:
+            self.parts[part] = document
 
-    def part_kept(self, part: str) -> dict[str, Any] | None:
-        """Take over the files of a part that an earlier run of the same job finished.
+    def part_kept(self, part: str, by: str = "") -> dict[str, Any] | None:
+        """Take over the files of a part that an earlier run of the same job finished, or any earlier job if `by` is given.
 
         Returns:
-            What `part_done` noted; None if the part is to be made, because it was not finished, or under another fingerprint, or
-            a file is gone or has changed.
+            What `part_done` noted; None if the part is to be made, because it was not finished, or under another fingerprint or
+            digest `by`, or a file is gone or has changed.
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
             done = json.loads(note.read_text())
         except (OSError, ValueError):
             return None
-        if done["by"] != self.provenance["fingerprint"]:
+        if done["by"] != (by or self.provenance["fingerprint"]):
             return None
         for name, facts in done["files"].items():
             path = io.inside(self.directory, name)
             if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
                 return None
         self.files |= done["files"]
+        if by:
+            self.parts[part] = done
         return done["facts"]
 
     def keep_state(self, name: str, arrays: Mapping[str, np.ndarray], facts: Any) -> None:
@@ -174,7 +183,17 @@ class StageWriter:
                     path.rmdir()
             elif str(path.relative_to(self.directory)) not in kept:
                 path.unlink()
-        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
+        parts = {"parts": self.parts} if self.parts else {}
+        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files, **parts})
+
+
+def _parts_of(manifest: Path) -> dict[str, Any]:
+    """Return the notes that a manifest keeps of parts of its stage; none if there is no such manifest, or it cannot be read."""
+    try:
+        parts = json.loads(manifest.read_text()).get("parts", {})
+        return parts if isinstance(parts, dict) else {}
+    except (OSError, ValueError, AttributeError):
+        return {}
 
 
 def _write_bytes(path: Path, data: bytes) -> None:

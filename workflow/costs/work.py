@@ -153,10 +153,25 @@ def _render(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
     return "all", {"paths": pixels * settings["render"]["samples"], "pixels": pixels, "faces": size.faces / MILLION}
 
 
+def _lamp_images(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    pixels = sum(_pixels_of(basis["camera"], size) for basis in settings["lamp_images"])
+    paths = sum(_pixels_of(basis["camera"], size) * basis["samples"] for basis in settings["lamp_images"])
+    return "all", {"paths": paths, "pixels": pixels, "faces": size.faces / MILLION}
+
+
 def _relight(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    a_view = size.pixels / max(size.views, 1) / MILLION
-    pictures = sum(max(one["camera"].get("frames") or 1, len(one["camera"].get("views") or [0])) for one in settings["relight"])
-    return "all", {"pixels": pictures * a_view, "faces": size.faces / MILLION}
+    entries = settings["relight"]
+    traced = [one for one in entries if one["name"] not in settings["recombined"]]
+    paths = sum(_pixels_of(one["camera"], size) * one["samples"] for one in traced)
+    pixels = sum(_pixels_of(one["camera"], size) for one in entries)
+    return "all", {"paths": paths, "pixels": pixels, "faces": size.faces / MILLION}
+
+
+def _pixels_of(camera: dict[str, Any], size: SceneSize) -> float:
+    """Pixels of all frames of a relighting, in millions."""
+    a_view = size.pixels / max(size.views, 1)
+    shape = (camera["width"] or a_view**0.5) * (camera["height"] or a_view**0.5)
+    return camera["frames"] * shape / MILLION
 
 
 def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -201,6 +216,7 @@ _STAGES = {
     "shading": _shading,
     "affines": _affines,
     "render": _render,
+    "lamp_images": _lamp_images,
     "relight": _relight,
     "metrics": _metrics,
     "unwrap": _unwrap,

@@ -18,9 +18,11 @@ from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
 from workflow.scene.named import check_overrides
-from workflow.settings import SCENE_NAME, require_relighting, scene_file
+from workflow.relighting.inventory import check_relightings
+from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table
+from workflow.studies import relit
 from workflow.trade import bench, choose
 
 STARTED = time.time()
@@ -101,6 +103,7 @@ wildcard_constraints:
     study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){study_files.STUDY}",
     benchmark=KERNEL_BENCHMARKS,
     part="|".join(STABILITY_PARTS),
+    plan=SCENE_NAME,
 
 
 # ---------------------------------------------------------------------------------------------------------- stages
@@ -193,10 +196,18 @@ def publish_inputs(*names):
 
 
 def relit_inputs(wildcards):
-    """The relightings of a scene; those of which a picture is gone are copied again."""
-    source = f"results/{wildcards.scene}/relight/manifest.json"
-    folder_or_stop(f"relight/{wildcards.scene}")
-    again_without(f"relight/{wildcards.scene}", source)
+    """The relightings of a scene, or one plan of them; those of which a picture is gone are copied again."""
+    scene, plan = wildcards.scene, wildcards.get("plan", "")
+    folder = f"relight/{scene}/{plan}" if plan else f"relight/{scene}"
+    asked = [name for name in workflow.dag_settings.targets if Path(name).parts[:2] == ("relight", scene)]
+    if len({len(Path(name).parts) for name in asked}) > 1:
+        stop(
+            f"relight/{scene} holds the plans that were asked for, and Snakemake makes a folder and what lies in it only one after"
+            f" the other. Ask twice: first `relight/{scene}`, then {' '.join(name for name in asked if name.count('/') > 1)}."
+        )
+    source = f"results/{or_stop(relit.source, scene, plan, quality_of(scene))}/relight/manifest.json"
+    folder_or_stop(folder)
+    again_without(folder, source)
     return {"manifest": source}
 
 
@@ -272,12 +283,12 @@ def stability_code(wildcards):
 
 
 def relight_inputs(*names):
-    """What is relit; a scene without relightings stops here, before any job."""
+    """What is relit; a scene without relightings, or one of which something does not exist, stops here, before any job."""
     inputs_of = reads("relight", *names)
 
     def inputs(wildcards):
-        found = inputs_of(wildcards)
-        or_stop(require_relighting, resolved(wildcards.scene), wildcards.scene)
+        found, scene = inputs_of(wildcards), wildcards.scene
+        or_stop(check_relightings, resolved(scene), scene, quality_of(scene))
         return found
 
     return inputs

@@ -58,7 +58,7 @@ rule planned:
 
 
 rule relit:
-    """Copy the relit pictures to relight/<scene>/, without the workflow's own files."""
+    """Copy the relit pictures of a scene to relight/<scene>/, and again those of its plans that are finished."""
     input:
         unpack(relit_inputs),
     output:
@@ -72,11 +72,35 @@ rule relit:
     log:
         "results/{scene}/logs/relit.log",
     localrule: True
+    params:
+        quality=lambda wildcards: quality_of(wildcards.scene),
     message:
         "{wildcards.scene}: pictures in relight/{wildcards.scene}"
     shell:
-        "mkdir -p {output.pictures:q} && cp -r results/{wildcards.scene}/relight/. {output.pictures:q}"
-        " && rm {output.pictures:q}/manifest.json > {log:q} 2>&1"
+        "python3 -m workflow relit {wildcards.scene} --quality {params.quality} --log {log:q}"
+
+
+rule relit_plan:
+    """Copy the pictures of a scene under a plan of config/relight/ to relight/<scene>/<plan>/."""
+    input:
+        unpack(relit_inputs),
+    output:
+        pictures=report(
+            directory("relight/{scene}/{plan}"),
+            patterns=["{picture}.png"],
+            caption="../report/captions/relighting.rst",
+            category="Relighting",
+            subcategory="{scene}",
+        ),
+    log:
+        "results/{scene}/logs/relit-{plan}.log",
+    localrule: True
+    params:
+        quality=lambda wildcards: quality_of(wildcards.scene),
+    message:
+        "{wildcards.scene}: pictures in relight/{wildcards.scene}/{wildcards.plan}"
+    shell:
+        "python3 -m workflow relit {wildcards.scene} --plan {wildcards.plan} --quality {params.quality} --log {log:q}"
 
 
 rule bench:

@@ -272,10 +272,27 @@ use rule stage as report with:
         "{wildcards.scene}: the page"
 
 
-# On demand: `relight:` in config/scenes/<scene>.yaml (docs/guide/relighting.md).
+# On demand: `relight:` in config/scenes/<scene>.yaml, or a plan of config/relight/ (docs/guide/relighting.md).
+use rule stage as lamp_images with:
+    input:
+        unpack(reads("lamp_images", "capture", "segmentation", "base", "emission", "affines")),
+    pathvars:
+        stage="lamp_images",
+    resources:
+        **needs("lamp_images"),
+    params:
+        job=job("lamp_images"),
+    message:
+        "{wildcards.scene}: the light of every lamp by itself"
+
+
 use rule stage as relight with:
     input:
-        unpack(relight_inputs("capture", "segmentation", "base", "emission", "affines")),
+        unpack(
+            relight_inputs(
+                "capture", "segmentation", "base", "emission", "affines", "lamp_images"
+            )
+        ),
     pathvars:
         stage="relight",
     resources:
@@ -341,7 +358,8 @@ descriptions = {
     "export": "Write the result for other programs: glTF, Mitsuba, tables.",
     "room": "Write room.html: a page to walk through the room and to switch its lamps.",
     "report": "Write report.html, and plan.yaml with all decisions settled.",
-    "relight": "Render the recovered scene under other light; made on demand.",
+    "lamp_images": "Render the recovered scene with every lamp by itself; made on demand by relight.",
+    "relight": "Render the recovered scene under other light, edited; made on demand.",
     "base_scores": "Score the base texture; made on demand by studies.",
     "common_scores": "Score the result at views that all variants of a study share; made on demand by studies.",
 }

@@ -24,6 +24,7 @@ from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
 from workflow.settings import study_files
+from workflow.settings.relight import recombines
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 PACKAGES = ("iif_core", "workflow")  # their __init__ hold nothing but a docstring
@@ -205,8 +206,9 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     """
     wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
     out = [VGG] if wants_vgg and VGG.is_file() else []
-    if stage == "relight":
-        out.extend(settings_module.relight_files(document))
+    if stage in ("relight", "lamp_images"):
+        entries = document["relight"] if stage == "relight" else [entry for entry in document["relight"] if recombines(entry)]
+        out.extend(settings_module.relight_files(entries))
     for section, key, pattern in PLUGINS.get(stage, ()):
         module = importlib.import_module(pattern.format(document[section][key]))
         if hasattr(module, "raw_inputs"):

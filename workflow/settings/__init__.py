@@ -8,10 +8,11 @@ these files are those of the working folder and when those of the repository. No
 no hidden files.
 """
 
-from workflow.settings.document import reference_markdown, schema_json
+from workflow.settings.document import plan_schema_json, reference_markdown, schema_json
 from workflow.settings.loading import load, scene_file, scene_origin
 from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.relight import relight_files, require_relighting
+from workflow.settings.relight_plans import active_plan, plan_names
 from workflow.settings.scene import UNIONS, SceneSettings, dump, select
 from workflow.settings.section import Section
 from workflow.settings.targets import refuse_target
@@ -22,11 +23,14 @@ __all__ = [
     "RESERVED",
     "SCENE_NAME",
     "UNIONS",
+    "active_plan",
     "SceneSettings",
     "Section",
     "dump",
     "load",
+    "plan_names",
     "read_yaml",
+    "plan_schema_json",
     "reference_markdown",
     "refuse_target",
     "relight_files",

@@ -5,13 +5,23 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from workflow.settings.relight import RelightPlan
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
 
 
 def schema_json() -> str:
     """Return the JSON schema of a scene file, for editors (`config/scene.schema.json`)."""
-    schema = SceneSettings.model_json_schema()
+    return _schema(SceneSettings)
+
+
+def plan_schema_json() -> str:
+    """Return the JSON schema of a plan of relightings, for editors (`config/relight.schema.json`)."""
+    return _schema(RelightPlan)
+
+
+def _schema(model: type[Section]) -> str:
+    schema = model.model_json_schema()
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
 

@@ -115,7 +115,10 @@ def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch
     of_bench = parts is not None and parts.study == study_files.BENCH
     if parts and of_bench:
         scene, quality = parts.scene, parts.variant
-    of_study = parts is not None and not of_bench
+    of_study = parts is not None and parts.study not in study_files.OWN
+    plan = parts if parts is not None and parts.study == study_files.RELIGHT else None
+    if plan:
+        scene = plan.scene
     # What a study compares must not move with what `draft` is.
     settings = {} if of_study and quality == DEFAULT else _quality(quality, root)
     line = batch_table.find(scene, root)
@@ -127,6 +130,8 @@ def _layers(scene: str, quality: str, root: Path) -> tuple[Layers, Layers, batch
         above = [(str(shown), read_yaml(path))] if path != study_files.scenes_path(root) else []
         if parts and of_study:
             above += study_files.layers(parts, root)
+    if plan:
+        above = [*above, *study_files.layers(plan, root)]
     limits = _merged(above).get("limits")
     if isinstance(limits, dict):
         settings = limited(settings, limits)

@@ -18,7 +18,7 @@ from workflow.settings.outputs import Export, Metrics, Render, Report
 from workflow.settings.override import ByObject, Override
 >>>>>>> c977113 (Corrections by hand: roughness and metallic of an object that are given stay fixed while the rest is fitted)
 from workflow.settings.prior import Prior
-from workflow.settings.relight import Relighting
+from workflow.settings.relight import Relighting, lamp_bases, recombines
 from workflow.settings.section import Section
 from workflow.settings.segmentation import GivenSegmentation, Segmentation
 from workflow.settings.source import Capture, Source
@@ -54,7 +54,8 @@ class SceneSettings(Section):
     """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
     (docs/guide/relighting.md#corrections-by-hand)."""
     relight: list[Relighting] = Field(default_factory=list)
-    """Pictures under other light and from other positions, made on demand."""
+    """Pictures under other light, edited, and from other positions, made on demand; where there are none,
+    `config/relight/<scene>.yaml` or `config/relight/example.yaml` stands for them."""
     seed: int = Field(0, ge=0, lt=2**31)
     """Seed of all random numbers."""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
@@ -164,8 +165,11 @@ def section_in(annotation: Any) -> Any:
 
 
 def dump(settings: SceneSettings) -> dict[str, Any]:
-    """Return the settings as plain JSON values."""
-    return settings.model_dump(mode="json")
+    """Return the settings as plain JSON values, and what stage `lamp_images` traces for the relightings among them, with the
+    names of those that are summed from it."""
+    document = settings.model_dump(mode="json")
+    summed = [entry["name"] for entry in document["relight"] if recombines(entry)]
+    return {**document, "lamp_images": lamp_bases(document["relight"]), "recombined": summed}
 
 
 def select(document: dict[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pydantic import Field, PositiveFloat, ValidationError
 from iif_core.errors import InputError
 from iif_core.evaluation import catalogue
 from workflow.registry import STAGES
+from workflow.settings import relight_plans
 from workflow.settings.names import configuration, did_you_mean, scene_names, scene_path
 from workflow.settings.section import Section
 from workflow.settings.yaml_file import read_yaml
@@ -36,6 +37,10 @@ SHARED_VARIANT = "shared"
 """Name of the derived scene at whose views all variants of a study are scored."""
 BENCH = "bench"
 """The variants of this study are points of the front, of any scene: `<scene>--bench-p03-s0` (workflow/trade/bench.py)."""
+RELIGHT = "relight"
+"""The variants of this study are plans of relightings, of any scene: `<scene>--relight-evening-s0`."""
+OWN = {BENCH: "the points of the front", RELIGHT: "plans of relightings"}
+"""Studies without a file, and what their variants are."""
 BENCH_HELD_OUT = {"capture": {"test_every": 8}}
 """Set where the scene holds no photograph out."""
 
@@ -187,8 +192,8 @@ def load_study(name: str, root: Path = Path(".")) -> Study:
     """
     path = FOLDER / f"{name}.yaml"
     names = study_names(root)
-    if name == BENCH:
-        raise InputError(f"{path}: a study cannot be called {BENCH}, which stands for the points of the front; rename it")
+    if name in OWN:
+        raise InputError(f"{path}: a study cannot be called {name}, which stands for {OWN[name]}; rename it")
     if name not in names:
         raise InputError(
             f"{path}: not found.{did_you_mean(name, names)} Known studies: {', '.join(names) or 'none'}; benchmarks"
@@ -369,6 +374,8 @@ def layers(parts: Derived, root: Path = Path(".")) -> list[tuple[str, dict[str, 
     """Return (place, settings) of the layers that a derived scene puts over the file of its scene, in order."""
     if parts.study == BENCH:
         return []
+    if parts.study == RELIGHT:
+        return [relight_plans.plan_layer(parts.variant, root)]
     shared = scene_overrides(root)
     if parts.scene not in shared:
         raise InputError(f"{SCENES}: {parts.scene} is not listed. Known there: {', '.join(shared) or 'none'}.")
@@ -399,6 +406,8 @@ def bases(name: str, root: Path = Path(".")) -> list[str]:
     parts = derived(name, root)
     if parts is None or parts.study == BENCH:
         return []
+    if parts.study == RELIGHT:
+        return [parts.scene]
     candidates = [f"{parts.scene}--s0", f"{parts.scene}--s{parts.seed}"]
     if parts.study:
         study = load_study(parts.study, root)
@@ -419,7 +428,7 @@ def shared_scene(name: str, root: Path = Path(".")) -> str:
     parts = derived(name, root)
     if parts is None:
         return name
-    study = load_study(parts.study, root) if parts.study and parts.study != BENCH else None
+    study = load_study(parts.study, root) if parts.study and parts.study not in OWN else None
     return scene_of(parts.study, parts.scene, SHARED_VARIANT, 0) if study and study.shared else f"{parts.scene}--s0"
 
 

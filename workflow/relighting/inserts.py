@@ -1,0 +1,161 @@
+"""Meshes that are put into a room: geometry and metallic-roughness materials of GLB, glTF, PLY and OBJ files."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iif_core.errors import InputError
+from iif_core.numerics.color import linear_from_srgb
+from workflow.settings.mesh_files import files_of_mesh
+
+Array = np.ndarray
+LARGEST_TEXTURE = 1024
+"""Pixels along the longer side to which textures are reduced."""
+PLAIN = np.array([0.5, 0.5, 0.5, 0.5, 0.0], np.float32)
+"""Material of surface whose file has none."""
+
+
+@dataclass(frozen=True)
+class InsertedMesh:
+    """A mesh as its file has it.
+
+    Attributes:
+        corners: (k, 3, 3) float64 of its faces, in the units and axes of the file.
+        uv: (k, 3, 2) texture coordinates, v counted downwards.
+        texture: (k,) int, which of `textures` a face has.
+        textures: (h, w, 5) float32 each: linear albedo R, G, B, roughness, metallic.
+        is_y_up: by the rules of its format.
+    """
+
+    corners: Array
+    uv: Array
+    texture: Array
+    textures: list[Array]
+    is_y_up: bool
+
+
+def load_insert(path: Path) -> InsertedMesh:
+    """Read a mesh with its materials.
+
+    Raises:
+        InputError: the file cannot be read, has no surface, or numbers that are not finite.
+    """
+    files_of_mesh(path)
+    import trimesh
+
+    try:
+        loaded = trimesh.load_scene(str(path), process=False)
+        parts = list(_parts(loaded))
+    except InputError:
+        raise
+    except Exception as error:  # whatever trimesh makes of a broken file
+        raise InputError(f"{path}: not readable as a mesh ({type(error).__name__}: {error}); export it again") from None
+    if not parts:
+        raise InputError(f"{path}: has no triangles; export a mesh with surface")
+    corners = np.concatenate([part[0] for part in parts])
+    uv = np.concatenate([part[1] for part in parts])
+    if not (np.isfinite(corners).all() and np.isfinite(uv).all()):
+        raise InputError(f"{path}: has corners or texture coordinates that are not finite; export the mesh again")
+    number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    return InsertedMesh(corners, uv, number, [part[2] for part in parts], path.suffix.lower() in (".glb", ".gltf"))
+
+
+def _parts(scene: Any) -> Iterator[tuple[Array, Array, Array]]:
+    """(corners, uv, texture) of every mesh of a trimesh scene, in world axes of the file."""
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not len(getattr(mesh, "faces", ())):
+            continue
+        vertices = np.asarray(mesh.vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
+        yield vertices[mesh.faces], *_material(mesh)
+
+
+def _material(mesh: Any) -> tuple[Array, Array]:
+    """Texture coordinates (k, 3, 2) and texture (h, w, 5) of a mesh."""
+    faces, visual = mesh.faces, mesh.visual
+    uv = getattr(visual, "uv", None)
+    if visual.kind == "texture":
+        texture = _texture(visual.material)
+        if uv is None or texture.shape[:2] == (1, 1):
+            return np.zeros((len(faces), 3, 2)), texture
+        flipped = np.asarray(uv, np.float64) * [1, -1] + [0, 1]  # trimesh counts v upwards
+        return flipped[faces], texture
+    if visual.kind in ("vertex", "face"):
+        colours = visual.vertex_colors[faces].mean(1) if visual.kind == "vertex" else visual.face_colors
+        texture = np.tile(PLAIN, (1, len(faces), 1))
+        texture[0, :, :3] = linear_from_srgb(np.asarray(colours)[:, :3] / 255.0)
+        # One texel for each face, read in its middle.
+        middle = (np.arange(len(faces)) + 0.5) / len(faces)
+        return np.repeat(np.stack([middle, np.full(len(faces), 0.5)], 1)[:, None], 3, 1), texture
+    return np.zeros((len(faces), 3, 2)), PLAIN[None, None].copy()
+
+
+def _texture(material: Any) -> Array:
+    """Factors times pictures of a material of trimesh, as (h, w, 5)."""
+    if not hasattr(material, "baseColorFactor"):  # of OBJ files: a colour or a picture, and nothing of gloss
+        if not hasattr(material, "diffuse"):
+            return PLAIN[None, None].copy()
+        picture = _pixels(getattr(material, "image", None))
+        colour = linear_from_srgb(np.asarray(material.diffuse, np.float64)[:3] / 255.0) if picture is None else np.ones(3)
+        albedo = np.ones((1, 1, 3)) if picture is None else linear_from_srgb(picture / 255.0)
+        return _stacked(albedo * colour, PLAIN[3:])
+    factor = material.baseColorFactor
+    colour = np.ones(3) if factor is None else np.asarray(factor, np.float64)[:3] / 255.0
+    picture, gloss = _pixels(material.baseColorTexture), _pixels(material.metallicRoughnessTexture)
+    albedo = np.ones((1, 1, 3)) if picture is None else linear_from_srgb(picture / 255.0)
+    rough, metal = (1.0 if value is None else float(value) for value in (material.roughnessFactor, material.metallicFactor))
+    if gloss is None:
+        return _stacked(albedo * colour, np.array([rough, metal]))
+    if picture is None:
+        albedo = np.ones((*gloss.shape[:2], 3))
+    elif gloss.shape[:2] != albedo.shape[:2]:
+        gloss = _resized(gloss, albedo.shape[:2])
+    return _stacked(albedo * colour, gloss[..., 1:] / 255.0 * [rough, metal])  # G is roughness, B metallic
+
+
+def _stacked(albedo: Array, gloss: Array) -> Array:
+    return np.concatenate([albedo, np.broadcast_to(gloss, (*albedo.shape[:2], 2))], -1).astype(np.float32)
+
+
+def _pixels(picture: Any) -> Array | None:
+    """(h, w, 3) 0 ... 255 of a picture of PIL, reduced to `LARGEST_TEXTURE`; None without one."""
+    if picture is None:
+        return None
+    picture = picture.convert("RGB")
+    picture.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE))
+    return np.asarray(picture, np.float64)
+
+
+def _resized(pixels: Array, shape: tuple[int, int]) -> Array:
+    from PIL import Image
+
+    picture = Image.fromarray(pixels.astype(np.uint8)).resize(shape[::-1], Image.Resampling.BILINEAR)
+    return np.asarray(picture, np.float64)
+
+
+def placed(mesh: InsertedMesh, insert: dict[str, Any], up: Array) -> Array:
+    """Return the corners (k, 3, 3) float64 of a mesh where a dumped `insert` puts it, in metres and world axes.
+
+    The y axis of glTF is turned to `up` by the shortest turn; then come scale and rotation, and then the middle of the lowest
+    side is moved to `position`.
+    """
+    from scipy.spatial.transform import Rotation
+
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    corners = mesh.corners.reshape(-1, 3) * float(insert["scale"])
+    if mesh.is_y_up:
+        turn = np.cross([0.0, 1.0, 0.0], up)
+        sine, cosine = np.linalg.norm(turn), up[1]
+        axis = turn / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])
+        corners = corners @ Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix().T
+    corners = corners @ Rotation.from_euler("xyz", insert["rotation"], degrees=True).as_matrix().T
+    height = corners @ up
+    middle = 0.5 * (corners.min(0) + corners.max(0))
+    foot = middle + up * (height.min() - middle @ up)
+    return (corners - foot + np.asarray(insert["position"], np.float64)).reshape(-1, 3, 3)

@@ -1,0 +1,65 @@
+"""Flights as MP4 files."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterable
+
+import numpy as np
+
+from iif_core.errors import InputError
+
+ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
+OPTIONS = {"av1": {"preset": "8", "crf": "30"}, "h264": {"preset": "medium", "crf": "20"}}
+"""Settings of the encoders: good quality, at a speed that is small beside rendering."""
+KEYFRAMES = 2
+"""Seconds between frames that a player can jump to."""
+
+
+def require_codec(codec: str, name: str) -> None:
+    """Check that a codec can be written.
+
+    Raises:
+        InputError: the encoder is not there; `name` is that of the relighting.
+    """
+    import av
+
+    if codec in ENCODERS and ENCODERS[codec] in av.codecs_available:
+        return
+    there = [other for other, encoder in ENCODERS.items() if encoder in av.codecs_available]
+    raise InputError(
+        f"relight.video.codec of {name}: found {codec!r}, whose encoder {ENCODERS.get(codec, codec)} is not in this installation"
+        f" of PyAV; allowed here: {', '.join(there) or 'none'}. Set another codec, or `video: off`"
+    )
+
+
+def encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
+    """Return an MP4 file.
+
+    Args:
+        pictures: (H, W, 3) uint8 each, sRGB; an odd height or width is made even by doubling the last row or column.
+        fps: frames per second.
+        codec: key of `ENCODERS`.
+    """
+    os.environ.setdefault("SVT_LOG", "1")  # errors alone
+    import av
+
+    buffer = io.BytesIO()
+    with av.open(buffer, "w", format="mp4") as container:
+        stream = container.add_stream(ENCODERS[codec], rate=fps, options=OPTIONS[codec])
+        stream.pix_fmt, height, width = "yuv420p", 0, 0
+        context = stream.codec_context
+        context.gop_size = KEYFRAMES * fps
+        context.color_primaries = context.color_trc = context.colorspace = 1  # BT.709, as sRGB is shown
+        context.color_range = 1  # of video
+        for picture in pictures:
+            if not height:
+                height, width = (-(-size // 2) * 2 for size in picture.shape[:2])
+                stream.width, stream.height = width, height
+            even = np.pad(picture, [(0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0)], "edge")
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return buffer.getvalue()
