@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
-from workflow.relighting.inserts import load_insert
-from workflow.scene.named import finished, names_of, object_number
+from workflow.scene.named import names_of, object_number
 from workflow.settings.names import did_you_mean
-from workflow.settings.relight import name_of, require_relighting
 
 
 @dataclass(frozen=True)
@@ -94,58 +91,3 @@ def check_views(entry: dict[str, Any], names: Iterable[str]) -> None:
                 f"`relight.camera.views` of {entry['name']}: found {name}; the views are"
                 f" {', '.join(known[:8])}{' ...' if len(known) > 8 else ''}.{did_you_mean(name, known)}"
             )
-
-
-def check_relightings(document: dict[str, Any], scene: str, quality: str) -> None:
-    """Check everything that relightings name as far as it is known before their jobs run, so that a mistake stops at once.
-
-    Args:
-        document: dumped settings of the scene.
-        scene: whose finished stages are looked at; quality: of its settings.
-
-    Raises:
-        InputError: a lamp, an object or a view does not exist, a mesh cannot be read, or a codec is not there.
-    """
-    from workflow.relighting.video import require_codec
-
-    entries = require_relighting(document, scene)
-    capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
-    for entry in entries:
-        if entry["video"] and entry["camera"]["frames"] > 1:
-            require_codec(entry["video"]["codec"], entry["name"])
-        for insert in entry["insert"]:
-            load_insert(Path(insert["file"]))
-        if capture is not None:
-            check_views(entry, map(str, capture.table("cameras.parquet")["name"]))
-        if segmentation is not None and emission is not None:
-            Inventory.read(segmentation, emission).check(entry)
-
-
-def described(entry: dict[str, Any], default: str = "as found") -> str:
-    """Return what a dumped relighting changes, in words, for captions."""
-    parts = []
-    if entry["emitters"] != 1:
-        parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}")
-    for key, lamp in entry["lamps"].items():
-        told = [_factor(lamp["factor"])] if lamp["factor"] != 1 or not (lamp["colour"] or lamp["move"]) else []
-        told += [f"colour {_numbers(lamp['colour'])}"] if lamp["colour"] else []
-        told += [f"moved {_numbers(lamp['move'])} m"] if lamp["move"] else []
-        parts.append(f"{key if not key.isdigit() else f'lamp {key}'} {', '.join(told)}")
-    light = entry["environment"]
-    if light != "keep":
-        is_file = isinstance(light, str) and light != "off"
-        shown = f"of {Path(light).name}" if is_file else _numbers(light) if isinstance(light, list) else _factor(light)
-        parts.append(f"light from outside {shown}")
-    if entry["sphere"]:
-        parts.append("a luminous sphere" + (" that moves" if entry["sphere"]["path_to"] else ""))
-    parts += [f"{name_of(insert)} put in" for insert in entry["insert"]]
-    parts += [f"{key} painted" for key in entry["materials"]]
-    return "; ".join(parts) or default
-
-
-def _factor(value: float | str) -> str:
-    return {0: "off", 1: "on", "off": "off"}.get(value, f"x {value:g}" if not isinstance(value, str) else value)
-
-
-def _numbers(values: list[float]) -> str:
-    return " ".join(f"{value:g}" for value in values)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from workflow.settings.relight import name_of
+
 Array = np.ndarray
-GAP, TITLE, CAPTION, LARGEST = 6, 22, 18, 384
-"""Pixels between pictures, of a title, of a caption, and of the longer side of a picture."""
+GAP, TITLE, CAPTION, LARGEST, LEAST_WIDTH = 6, 20, 18, 384, 320
+"""Pixels between pictures, of a line of a title, of a caption, of the longer side of a picture, and of a relighting at least."""
 PAIRS = 3
 """Frames of a flight that are shown."""
 
@@ -44,36 +47,49 @@ def png(picture: Array) -> bytes:
 
 
 def contact_sheet(rows: list[Row]) -> Array:
-    """Draw one row for each relighting: its title, then pairs of pictures with captions. (H, W, 3) uint8."""
+    """Draw the relightings in the order of reading, (H, W, 3) uint8: each with its title, then pairs of pictures with captions.
+    Those that fit beside one another stand on one line."""
+    from PIL import Image
+
+    blocks = [_block(row) for row in rows]
+    widest = max(block.width for block in blocks)
+    if len(blocks) > 1:
+        widest = max(widest, PAIRS * min(block.width for block in blocks))
+    placed: list[tuple[int, int, Any]] = []
+    x, y, deepest = 0, 0, 0
+    for block in blocks:
+        if x and x + block.width > widest:
+            x, y, deepest = 0, y + deepest, 0
+        placed.append((x, y, block))
+        x, deepest = x + block.width, max(deepest, block.height)
+    sheet = Image.new("RGB", (widest, y + deepest), "white")
+    for left, top, block in placed:
+        sheet.paste(block, (left, top))
+    return np.asarray(sheet)
+
+
+def _block(row: Row) -> Any:
+    """One relighting as a picture of PIL."""
     from PIL import Image, ImageDraw, ImageFont
 
     title, caption = ImageFont.load_default(15), ImageFont.load_default(12)
     ruler = ImageDraw.Draw(Image.new("RGB", (1, 1)))
-    laid: list[tuple[int, int, Any]] = []
-    y, width = GAP, 0
-    for row in rows:
-        pictures = [_small(picture) for pair in row.pairs for picture in (pair.before, pair.after)]
-        told = [text for pair in row.pairs for text in ("before", f"after, {pair.caption}" if pair.caption else "after")]
-        room = sum(picture.width + GAP for picture in pictures)
-        lines = _wrapped(row.title, title, max(room, 320), ruler)
-        for line in lines:
-            laid.append((GAP, y, (line, title)))
-            width = max(width, GAP + int(ruler.textlength(line, font=title)))
-            y += TITLE
-        x, deepest = GAP, 0
-        for picture, text in zip(pictures, told, strict=True):
-            laid += [(x, y, picture), (x, y + picture.height + 1, (text, caption))]
-            x += picture.width + GAP
-            deepest = max(deepest, picture.height)
-        width, y = max(width, x), y + deepest + CAPTION + GAP
-    sheet = Image.new("RGB", (width + GAP, y), "white")
-    draw = ImageDraw.Draw(sheet)
-    for x, y, what in laid:
-        if isinstance(what, tuple):
-            draw.text((x, y), what[0], fill="black", font=what[1])
-        else:
-            sheet.paste(what, (x, y))
-    return np.asarray(sheet)
+    pictures = [_small(picture) for pair in row.pairs for picture in (pair.before, pair.after)]
+    told = [text for pair in row.pairs for text in ("before", f"after, {pair.caption}" if pair.caption else "after")]
+    width = max(sum(picture.width + GAP for picture in pictures), LEAST_WIDTH) + 2 * GAP
+    lines = _wrapped(row.title, title, width - 2 * GAP, ruler)
+    top = GAP + TITLE * len(lines)
+    height = top + max(picture.height for picture in pictures) + CAPTION + GAP
+    block = Image.new("RGB", (width, height), "white")
+    draw = ImageDraw.Draw(block)
+    for number, line in enumerate(lines):
+        draw.text((GAP, GAP + TITLE * number), line, fill="black", font=title)
+    x = GAP
+    for picture, text in zip(pictures, told, strict=True):
+        block.paste(picture, (x, top))
+        draw.text((x, top + picture.height + 1), text, fill="black", font=caption)
+        x += picture.width + GAP
+    return block
 
 
 def _small(picture: Array) -> Any:
@@ -94,3 +110,33 @@ def _wrapped(text: str, font: Any, width: int, ruler: Any) -> list[str]:
         else:
             lines[-1] = longer
     return lines
+
+
+def described(entry: dict[str, Any], default: str = "as found") -> str:
+    """Return what a dumped relighting changes, in words, for captions."""
+    parts = []
+    if entry["emitters"] != 1:
+        parts.append(f"{'all' if not entry['lamps'] else 'other'} lamps {_factor(entry['emitters'])}")
+    for key, lamp in entry["lamps"].items():
+        told = [_factor(lamp["factor"])] if lamp["factor"] != 1 or not (lamp["colour"] or lamp["move"]) else []
+        told += [f"colour {_numbers(lamp['colour'])}"] if lamp["colour"] else []
+        told += [f"moved {_numbers(lamp['move'])} m"] if lamp["move"] else []
+        parts.append(f"{key if not key.isdigit() else f'lamp {key}'} {', '.join(told)}")
+    light = entry["environment"]
+    if light != "keep":
+        is_file = isinstance(light, str) and light != "off"
+        shown = f"of {Path(light).name}" if is_file else _numbers(light) if isinstance(light, list) else _factor(light)
+        parts.append(f"light from outside {shown}")
+    if entry["sphere"]:
+        parts.append("a luminous sphere" + (" that moves" if entry["sphere"]["path_to"] else ""))
+    parts += [f"{name_of(insert)} put in" for insert in entry["insert"]]
+    parts += [f"{key} painted" for key in entry["materials"]]
+    return "; ".join(parts) or default
+
+
+def _factor(value: float | str) -> str:
+    return {0: "off", 1: "on", "off": "off"}.get(value, f"x {value:g}" if not isinstance(value, str) else value)
+
+
+def _numbers(values: list[float]) -> str:
+    return " ".join(f"{value:g}" for value in values)

@@ -11,7 +11,7 @@ import numpy as np
 from iif_core.errors import InputError
 
 ENCODERS = {"av1": "libsvtav1", "h264": "libx264"}
-OPTIONS = {"av1": {"preset": "8", "crf": "30"}, "h264": {"preset": "medium", "crf": "20"}}
+OPTIONS = {"av1": {"preset": "8", "crf": "24"}, "h264": {"preset": "medium", "crf": "20"}}
 """Settings of the encoders: good quality, at a speed that is small beside rendering."""
 KEYFRAMES = 2
 """Seconds between frames that a player can jump to."""

@@ -18,7 +18,7 @@ from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
 from workflow.runtime.job_state import reasons
 from workflow.scene.named import check_overrides
-from workflow.relighting.inventory import check_relightings
+from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings import refuse_target, study_files
 from workflow.studies import table as study_table

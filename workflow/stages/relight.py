@@ -16,7 +16,6 @@ from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import require_denoiser
 from workflow.relighting import sheet
 from workflow.relighting.camera import Flight, photograph_exposure
-from workflow.relighting.inventory import described
 from workflow.relighting.tracing import Studio, trace_picture
 from workflow.relighting.video import encoded, require_codec
 from workflow.relighting.world import AS_FOUND, World, lamp_weights
@@ -149,7 +148,7 @@ def _relight(one: _Prepared, curve: Response) -> tuple[dict[str, Any], sheet.Row
     job.progress(frames, frames, f"frames of {name}")
     facts = {
         "name": name,
-        "changes": described(entry),
+        "changes": sheet.described(entry),
         "frames": frames,
         "method": "recombined" if one.basis else "path traced",
         "exposure": float(np.exp(np.mean(np.log(display.factor)))),
@@ -160,7 +159,7 @@ def _relight(one: _Prepared, curve: Response) -> tuple[dict[str, Any], sheet.Row
     if is_dark:
         facts["note"] = "black: no light is on, or none reaches the room"
         job.log.warning("relighting %s is %s", name, facts["note"])
-    return facts, sheet.Row(f"{name}: {described(entry)} (exposure {display.source})", pairs)
+    return facts, sheet.Row(f"{name}: {sheet.described(entry)} (exposure {display.source})", pairs)
 
 
 def _write(job: Job, name: str, radiance: Array, picture: Array) -> None:

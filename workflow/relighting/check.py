@@ -1,0 +1,35 @@
+"""What can be wrong with relightings, told before any job where the stages that know it are finished."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from workflow.relighting.inserts import load_insert
+from workflow.relighting.inventory import Inventory, check_views
+from workflow.relighting.video import require_codec
+from workflow.scene.named import finished
+from workflow.settings.relight import require_relighting
+
+
+def check_relightings(document: dict[str, Any], scene: str, quality: str) -> None:
+    """Check everything that relightings name as far as it is known before their jobs run, so that a mistake stops at once.
+
+    Args:
+        document: dumped settings of the scene.
+        scene: whose finished stages are looked at; quality: of its settings.
+
+    Raises:
+        InputError: a lamp, an object or a view does not exist, a mesh cannot be read, or a codec is not there.
+    """
+    entries = require_relighting(document, scene)
+    capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
+    for entry in entries:
+        if entry["video"] and entry["camera"]["frames"] > 1:
+            require_codec(entry["video"]["codec"], entry["name"])
+        for insert in entry["insert"]:
+            load_insert(Path(insert["file"]))
+        if capture is not None:
+            check_views(entry, map(str, capture.table("cameras.parquet")["name"]))
+        if segmentation is not None and emission is not None:
+            Inventory.read(segmentation, emission).check(entry)
