@@ -109,7 +109,7 @@ def check_way(flight: Flight, geometry: Geometry, object_id: Array, names: list[
     owner = int(object_id[face[first]])
     what = f"{names[owner]!r}" if owner >= 0 else "surface of no object"
     after = int(np.clip(np.searchsorted(flight.times, times[goes[first] + 1] - 1e-12), 1, frames - 1))
-    where = ", ".join(f"{x:.2f}" for x in at)
+    where = ", ".join(f"{x:.2f}" for x in np.round(at, 2) + 0.0)
     raise InputError(
         f"relight.camera of {entry['name']}: the way of the camera leads through {what} at [{where}] m,"
         f" between frames {after - 1} and {after}; add a view or a pose that leads around it, or set `through_surface: true`"

@@ -1,0 +1,575 @@
+"""Lamps by themselves, edits of the room, camera ways, videos, and what is said of everything that cannot be."""
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from iif_core.errors import InputError
+from iif_core.light.relighting import coloured, sum_of_lamps
+from iif_core.numerics.color import linear_from_srgb, luminance
+from tests.unit.test_relighting import lit
+from tests.unit.test_report import FakeJob, make_scene
+from workflow.artifacts import StageReader, StageWriter
+from workflow.artifacts.files import read_exr, write_exr
+from workflow.artifacts.store import rgb, split_rgb
+from workflow.relighting import sheet, video, world
+from workflow.relighting.inserts import load_insert, placed
+from workflow.relighting.inventory import Inventory, Lamp
+from workflow.relighting.tracing import Studio
+from workflow.settings import relight_files, relight_plans
+from workflow.settings.relight import Relighting, key_of, lamp_bases, lamp_basis, recombines
+from workflow.stages import relight
+
+
+def entry(**more):
+    return Relighting(**{"name": "a", **more}).model_dump(mode="json")
+
+
+# ------------------------------------------------------------------------------------------------- light of single lamps
+
+
+def test_lamps_add_up_to_the_picture(T, room):
+    """Both are estimates from independent paths, so that their differences over the noise have variance 1; weights too."""
+    from iif_core.light.transport.lamps import render_lamps
+
+    scene = T.Scene(room.geometry, room.material, room.emitters)
+    jitter = (np.zeros(3), np.zeros(3))
+    weights = np.array([[1.0, 1.0, 1.0], [0.2, 3.0, 0.0]])
+    dimmed = T.Emitters(room.geometry, room.radiance * np.append(weights, [[0, 0, 0]], 0)[room.group], room.side)
+    for factors, emitters in ((np.ones((2, 3)), room.emitters), (weights, dimmed)):
+        traced = np.stack(
+            [
+                T.render(scene._replace(emitters=emitters), room.origin, room.directions, T.PathOptions(16, 6, seed))
+                for seed in range(8)
+            ]
+        )
+        parts = [
+            render_lamps(scene, room.group, 2, room.origin, room.directions, T.PathOptions(16, 6, 100 + seed), jitter)
+            for seed in range(8)
+        ]
+        summed = np.stack([sum_of_lamps(part.transpose(1, 0, 2), factors) for part in parts])
+        away = (summed.mean(0) - traced.mean(0)).mean(0)
+        error = np.sqrt((summed.mean(1).var(0, ddof=1) + traced.mean(1).var(0, ddof=1)) / 8)
+        assert (np.abs(away) < 4.5 * np.maximum(error, 1e-9)).all(), away / error
+        assert (error < 0.03 * traced.mean()).all()
+    part = parts[0].transpose(1, 0, 2)
+    assert (sum_of_lamps(part, 2 * weights) == 2 * sum_of_lamps(part, weights)).all()  # exactly linear
+    alone = [sum_of_lamps(part, np.where(np.arange(2)[:, None] == lamp, weights, 0)) for lamp in range(2)]
+    np.testing.assert_allclose(alone[0] + alone[1], sum_of_lamps(part, weights), rtol=1e-6)
+
+
+def test_light_from_outside_is_a_lamp(T):
+    from iif_core.light.transport.lamps import render_lamps
+
+    geometry = T.build_geometry([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]], [0])
+    scene = T.Scene(
+        geometry, T.FaceMaterials(np.float32([[0.5, 0.5, 0.5, 1, 0]])), T.Emitters(geometry, np.zeros((1, 3)), None, (1, 2, 3))
+    )
+    rays = (np.float32([0.2, 0.2, 1]), np.float32([[0, 0, 1], [0, 0, -1]]))
+    step = (np.zeros(3), np.zeros(3))
+    found = render_lamps(scene, [-1], 1, *rays, T.PathOptions(64, 2, 0), step, environment_lamp=0)
+    assert found[0, 0].tolist() == [1, 2, 3] and 0.3 < found[1, 0, 0] < 0.7
+    assert not render_lamps(scene, [-1], 1, *rays, T.PathOptions(4, 2, 0), step).any()  # nobody asked for its light
+    with pytest.raises(InputError, match="lamp_of_face has shape"):
+        render_lamps(scene, [0, 0], 1, *rays, T.PathOptions(4, 2, 0), step)
+    with pytest.raises(InputError, match="expected"):
+        render_lamps(scene, [1], 1, *rays, T.PathOptions(4, 2, 0), step)
+
+
+def test_a_colour_keeps_the_luminance():
+    found = np.array([8.0, 4.0, 1.0])
+    blue = coloured(found, 0.5, [0.0, 0.2, 1.0])
+    assert luminance(blue) == pytest.approx(0.5 * luminance(found)) and blue[0] == 0 and blue[2] == 5 * blue[1]
+    with pytest.raises(InputError, match="above 0"):
+        coloured(found, 1.0, [0, 0, 0])
+
+
+def test_factors_and_colours_are_no_part_of_what_is_traced():
+    one = entry(name="a", emitters=0.3, lamps={"bulb": {"factor": 2, "colour": [1, 0, 0]}}, environment="off", exposure=2)
+    other = entry(name="b", lamps={3: "off"}, video=False)
+    assert recombines(one) and recombines(other) and lamp_basis(one) == lamp_basis(other)
+    assert len(lamp_bases([one, other])) == 1
+    for edit in (
+        {"lamps": {"bulb": {"move": [0, 0, 1]}}},
+        {"insert": [{"file": "x.glb", "position": [0, 0, 0]}]},
+        {"materials": {"wall": {"albedo": [1, 0, 0]}}},
+        {"sphere": {"center": [0, 0, 0]}},
+        {"environment": [1, 1, 1]},
+    ):
+        assert not recombines(entry(**edit)) and recombines(entry(**edit, method="recombine"))
+        assert key_of(lamp_basis(entry(**edit))) != key_of(lamp_basis(one))
+    assert not recombines(entry(method="path")) and key_of(lamp_basis(entry(samples=8))) != key_of(lamp_basis(one))
+
+
+def test_settings_of_lamps_and_paint():
+    lamps = entry(lamps={"a": "off", "b": False, 3: 0.5, "c": {"factor": True}})["lamps"]
+    assert {key: lamp["factor"] for key, lamp in lamps.items()} == {"a": 0, "b": 0, "3": 0.5, "c": 1}
+    for bad, words in (
+        ({"lamps": {"a": -1}}, "greater than or equal"),
+        ({"lamps": {"a": {"colour": [0, 0, 0]}}}, "one of them above"),
+        ({"materials": {"a": {}}}, "nothing is edited"),
+        ({"materials": {"a": {"albedo": [0, 0, 0], "tint": [1, 1, 1]}}}, "remove one of the two"),
+        ({"materials": {"a": {"albedo": [2, 0, 0]}}}, "less than or equal"),
+        ({"camera": {"views": ["a"], "poses": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}}, "both given"),
+        ({"video": {"codec": "hevc"}}, "'av1' or 'h264'"),
+        ({"method": "recombine", "sphere": {"center": [0, 0, 0], "path_to": [1, 0, 0]}}, "moves"),
+    ):
+        with pytest.raises(ValidationError, match=words):
+            entry(**bad)
+    assert entry(video="off")["video"] is None and entry()["video"] == {"fps": 24, "codec": "av1"}
+
+
+# ------------------------------------------------------------------------------------------------------------- the room
+
+
+@pytest.fixture(scope="module")
+def toy(llvm, tmp_path_factory):
+    root = tmp_path_factory.mktemp("edited")
+    make_scene(root)
+    return root
+
+
+@pytest.fixture(scope="module")
+def studio(toy):
+    return Studio.open(FakeJob("lamp_images", toy))
+
+
+def plate(path, colour=(200, 30, 30), size=(0.8, 0.02, 0.8)):
+    """A plate in GLB, y up, of one colour."""
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+
+    box = trimesh.creation.box(size)
+    box.visual = trimesh.visual.TextureVisuals(
+        material=PBRMaterial(baseColorFactor=[*colour, 255], roughnessFactor=0.9, metallicFactor=0.0)
+    )
+    path.write_bytes(trimesh.Scene({"plate": box}).export(file_type="glb"))
+    return path
+
+
+def seen(studio, state, origin, direction, samples=2048, weights=None):
+    """Radiance (3,) along one ray."""
+    from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions
+
+    made = studio.world(lamp_basis(state))
+    weights = world.lamp_weights(state, studio.inventory, made.columns, made.level, made.found)
+    return render(made.scene(weights), np.float32(origin), np.float32([direction]), PathOptions(samples, 4, 1))[0]
+
+
+def test_what_is_put_in_casts_a_shadow_and_is_reflected(studio, tmp_path):
+    put = {"insert": [{"file": str(plate(tmp_path / "plate.glb")), "position": [1.5, 1.0, 1.2]}]}
+    floor = ([1.5, 1.0, 1.0], [0, 0, -1])
+    bare, shaded = (seen(studio, entry(**more), *floor) for more in ({}, put))
+    assert (shaded < 0.5 * bare).all() and (shaded > 0).all()
+    from_above = seen(studio, entry(**put), [1.5, 1.0, 2.0], [0, 0, -1])
+    np.testing.assert_allclose(
+        from_above / from_above[0], linear_from_srgb(np.array([200, 30, 30]) / 255) / linear_from_srgb(200 / 255), atol=0.15
+    )
+    mirror = {"walls": {"albedo": [1, 1, 1], "metallic": 1, "roughness": 0.02}}
+    green = {**put["insert"][0], "radiance": [0, 5, 0]}
+    image = seen(studio, entry(emitters="off", materials=mirror, insert=[green]), *floor, samples=64)
+    assert image[1] > 3 and image[0] == image[2] == 0
+
+
+def test_recombined_with_something_put_in(toy, tmp_path):
+    """The same picture, summed and traced, of a room that was edited."""
+    edits = {"insert": [{"file": str(plate(tmp_path / "plate.glb")), "position": [1.5, 1.0, 1.2], "radiance": [0, 0, 3]}]}
+    more = {**edits, "lamps": {"lamp": {"factor": 0.4, "colour": [1, 0.2, 0.1]}}}
+    (summed, traced), _ = lit(toy, {"name": "sum", "method": "recombine", **more}, {"name": "path", **more})
+    away = summed - traced
+    error = away.std((0, 1)) / np.sqrt(away[..., 0].size)
+    assert (np.abs(away.mean((0, 1))) < 4.5 * error).all() and (error < 0.05 * traced.mean((0, 1))).all()
+
+
+def test_dimmed_is_darker_by_the_factor(toy):
+    """Also as a picture: the exposure is that of the photograph and not chosen anew."""
+    from PIL import Image
+
+    (found, dimmed, path), folder = lit(
+        toy, {"name": "found"}, {"name": "dimmed", "emitters": 0.3}, {"name": "path", "emitters": 0.3, "method": "path"}
+    )
+    np.testing.assert_allclose(dimmed, 0.3 * found, rtol=1e-5, atol=1e-6)
+    assert path.mean() == pytest.approx(dimmed.mean(), rel=0.03)
+    facts = json.loads((folder / "relight.json").read_text())["relightings"]
+    assert [one["exposure"] for one in facts] == [0.5] * 3 and facts[1]["exposure_of"] == "of photograph v0"
+    assert facts[1]["changes"] == "all lamps x 0.3" and facts[0]["method"] == "recombined"
+    level = [np.asarray(Image.open(folder / f"{name}/frame_0000.png")).mean() for name in ("found", "dimmed")]
+    assert level[1] < 0.7 * level[0]
+    before = np.asarray(Image.open(folder / "dimmed/before_0000.png"))
+    assert (before == np.asarray(Image.open(folder / "found/frame_0000.png"))).all()
+    _, folder = lit(
+        toy, {"name": "auto", "emitters": 0.3, "exposure": "auto"}, {"name": "plain", "exposure": 2, "response": "srgb"}
+    )
+    auto, plain = json.loads((folder / "relight.json").read_text())["relightings"]
+    assert auto["exposure"] > 1 and auto["exposure_of"] == "by the first frame" and plain["exposure"] == 2
+
+
+def test_paint_changes_one_object_alone(studio):
+    surface, paint = (
+        studio.room.surface,
+        entry(materials={"box": {"tint": [0.5, 1, 2], "roughness": 0.3}, 0: {"albedo": [1, 0, 0]}}),
+    )
+    made = world.painted(surface, studio.inventory, paint["materials"])
+    box, walls = surface.cell_object == 1, surface.cell_object == 0
+    np.testing.assert_allclose(made.cell_values[box, :3], np.minimum(surface.cell_values[box, :3] * np.float32([0.5, 1, 2]), 1))
+    assert (made.cell_values[box, 3] == np.float32(0.3)).all() and (made.cell_values[box, 4] == surface.cell_values[box, 4]).all()
+    assert (made.cell_values[walls, :3] == [1, 0, 0]).all() and (made.object_values[0, :3] == [1, 0, 0]).all()
+    rest = ~(box | walls)
+    assert rest.any() and (made.cell_values[rest] == surface.cell_values[rest]).all()
+    assert (made.object_values[2] == surface.object_values[2]).all()
+
+
+def test_a_lamp_that_is_moved_takes_its_material_along(studio):
+    made = studio.world(lamp_basis(entry(lamps={"lamp": {"move": [0.5, 0, -1.0]}})))
+    lit_faces = made.lamp_of_face == 0
+    corners = made.geometry.vertices[made.geometry.faces[lit_faces]]
+    was = studio.room.surface.vertices[studio.room.surface.faces[lit_faces[: len(studio.room.surface.faces)]]]
+    np.testing.assert_allclose(corners, was + np.float32([0.5, 0, -1.0]), atol=1e-6)
+    bright, dark = (
+        seen(studio, entry(lamps={"lamp": {"move": move}}), [1.5, 1.0, 0.5], [0, 0, -1])[0] for move in ([0, 0, -1.0], [0, 0, 0])
+    )
+    assert bright > 1.2 * dark
+
+
+def test_materials_of_moved_and_textured_faces(T):
+    """A moved face has the material of where it was; textures repeat, and are interpolated between texels."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from iif_core.light.transport.edits import EditedMaterials, Textures, uv_maps
+
+    def by_place(point, face, object_id, active):
+        return mi.Color3f(point.x, point.y, point.z), mi.Float(0.5), mi.Float(0.0)
+
+    corners = np.array([[[0, 0, 0], [2, 0, 0], [0, 2, 0]], [[1, 1, 1], [1, 3, 1], [1, 1, 4.0]]])
+    uv = np.array([[[0, 0], [2, 0], [0, 2.0]], [[0.5, 0.5]] * 3])
+    texels = np.random.default_rng(0).uniform(0.1, 0.9, (12, 5)).astype(np.float32)
+    textures = Textures(texels, np.array([0, 0]), np.array([4, 4]), np.array([3, 3]), uv_maps(corners, uv))
+    shift = np.zeros((4, 3), np.float32)
+    shift[1] = 1, 2, 3
+    made = EditedMaterials(by_place, 4, shift, textures)
+    points = np.float32([[5, 5, 5], [5, 5, 5], [0.25, 1.7, 0], [1.9, 0.05, 0], [1, 2, 2]])
+    faces = np.uint32([0, 1, 2, 2, 3])
+    colour, roughness, metallic = made(mi.Point3f(points.T), mi.UInt32(faces), mi.Int32(0), mi.Bool(True))
+    found = np.column_stack([np.array(colour).T, np.array(roughness), np.zeros(5) + np.array(metallic)])
+    assert found[0].tolist()[:3] == [5, 5, 5] and found[1].tolist()[:3] == [4, 3, 2]
+    image = texels.reshape(3, 4, 5)
+    for row, (u, v) in zip(found[2:], ((0.25, 1.7), (1.9, 0.05), (0.5, 0.5)), strict=True):
+        x, y = u % 1 * 4 - 0.5, v % 1 * 3 - 0.5
+        i, j = int(np.floor(x)), int(np.floor(y))
+        expected = sum(
+            (1 - abs(x - i - a)) * (1 - abs(y - j - b)) * image[(j + b) % 3, (i + a) % 4] for a in (0, 1) for b in (0, 1)
+        )
+        np.testing.assert_allclose(row, expected, atol=2e-5)
+    with pytest.raises(InputError, match="textures of 2 faces"):
+        EditedMaterials(by_place, 4, None, textures._replace(width=np.array([4, 40])))
+    dr.eval(colour)
+
+
+# ------------------------------------------------------------------------------------------------------- files of meshes
+
+
+def test_meshes_come_with_their_materials(tmp_path):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
+
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    colours = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+    gloss = np.zeros((2, 2, 3), np.uint8)
+    gloss[..., 1], gloss[..., 2] = 128, 255
+    material = PBRMaterial(
+        baseColorTexture=Image.fromarray(colours),
+        metallicRoughnessTexture=Image.fromarray(gloss),
+        roughnessFactor=0.5,
+        metallicFactor=0.8,
+    )
+    textured = square.copy()
+    textured.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
+    (tmp_path / "a.glb").write_bytes(trimesh.Scene({"a": textured}).export(file_type="glb"))
+    mesh = load_insert(tmp_path / "a.glb")
+    assert mesh.is_y_up and len(mesh.corners) == 2 and mesh.textures[0].shape == (2, 2, 5)
+    assert mesh.textures[0][0, 0, :3].tolist() == [1, 0, 0] and mesh.textures[0][1, 0, :3].tolist() == [0, 0, 1]
+    np.testing.assert_allclose(mesh.textures[0][..., 3:].reshape(-1, 2), [[0.5 * 128 / 255, 0.8]] * 4, atol=1e-3)
+    lower_left = mesh.corners.reshape(-1, 3).sum(1).argmin()
+    np.testing.assert_allclose(mesh.uv.reshape(-1, 2)[lower_left], [0, 1], atol=1e-6)  # v counts downwards
+    plain = square.copy()
+    plain.visual.vertex_colors = np.tile(np.uint8([188, 0, 0, 255]), (4, 1))
+    plain.export(tmp_path / "b.ply")
+    mesh = load_insert(tmp_path / "b.ply")
+    assert not mesh.is_y_up
+    np.testing.assert_allclose(mesh.textures[0][0, :, 0], linear_from_srgb(188 / 255), atol=1e-6)
+    square.export(tmp_path / "c.obj")
+    assert load_insert(tmp_path / "c.obj").textures[0].shape == (1, 1, 5)
+
+
+def test_meshes_stand_where_they_are_put(tmp_path):
+    mesh = load_insert(plate(tmp_path / "plate.glb", size=(0.8, 0.1, 0.4)))
+    put = {"position": [1, 2, 3], "rotation": [0, 0, 90], "scale": 2.0}
+    corners = placed(mesh, put, np.array([0.0, 0, 1])).reshape(-1, 3)
+    np.testing.assert_allclose(corners.min(0), [1 - 0.4, 2 - 0.8, 3], atol=1e-9)
+    np.testing.assert_allclose(corners.max(0), [1 + 0.4, 2 + 0.8, 3.2], atol=1e-9)
+    for up in ([0, 1, 0], [0, -1, 0], [1, 0, 0]):
+        corners = placed(mesh, {**put, "rotation": [0, 0, 0]}, np.float64(up)).reshape(-1, 3)
+        assert (corners @ np.float64(up)).min() == pytest.approx(np.float64(up) @ [1, 2, 3])
+        assert np.ptp(corners @ np.float64(up)) == pytest.approx(0.2)
+
+
+def test_broken_meshes_are_refused(tmp_path):
+    def said(path):
+        with pytest.raises(InputError) as error:
+            relight_files([entry(insert=[{"file": str(path), "position": [0, 0, 0]}])])
+            load_insert(path)
+        message = str(error.value)
+        assert message.count("\n") == 0 and path.name in message
+        return message
+
+    whole = plate(tmp_path / "plate.glb").read_bytes()
+    (tmp_path / "short.glb").write_bytes(whole[:-40])
+    assert "cut short" in said(tmp_path / "short.glb")
+    (tmp_path / "text.glb").write_text("not a mesh, and longer than its header")
+    assert "does not begin with `glTF`" in said(tmp_path / "text.glb")
+    spoilt = bytearray(whole)
+    spoilt[24:30] = b"??????"
+    (tmp_path / "spoilt.glb").write_bytes(spoilt)
+    assert "not readable as glTF" in said(tmp_path / "spoilt.glb")
+    document = {"asset": {"version": "2.0"}, "images": [{"uri": "wodo.png"}]}
+    (tmp_path / "wood.png").touch()
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    assert "texture" in said(tmp_path / "a.gltf") and "Did you mean" in said(tmp_path / "a.gltf")
+    (tmp_path / "b.gltf").write_text(json.dumps({"asset": {}, "extensionsRequired": ["KHR_draco_mesh_compression"]}))
+    assert "KHR_draco_mesh_compression" in said(tmp_path / "b.gltf")
+    (tmp_path / "c.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
+    assert "no triangles" in said(tmp_path / "c.gltf") or "not readable as a mesh" in said(tmp_path / "c.gltf")
+    (tmp_path / "d.ply").write_text("plyers")
+    assert "export it again" in said(tmp_path / "d.ply") or "no triangles" in said(tmp_path / "d.ply")
+    (tmp_path / "e.obj").write_text("mtllib nothing.mtl\nv 0 0 0\n")
+    assert "file of materials" in said(tmp_path / "e.obj")
+    assert "not found" in said(tmp_path / "plat.glb") and "Did you mean" in said(tmp_path / "plat.glb")
+    assert "allowed: a mesh that ends in .glb" in said(tmp_path / "mesh.fbx")
+
+
+# --------------------------------------------------------------------------------------------------- what does not exist
+
+
+@pytest.fixture
+def things():
+    return Inventory(["wall", "window", "bulb", "bulb"], [Lamp(0, (1,)), Lamp(4, (2,)), Lamp(5, (3,))])
+
+
+def test_lamps_are_called_by_object_or_id(things):
+    assert things.lamps_called("window", "x") == [0] and things.lamps_called("4", "x") == [1]
+    assert things.lamps_called("bulb", "x") == [1, 2]
+    for key, words in (
+        ("windw", r"no lamp 'windw'\. Did you mean 'window'\? Lamps of this room: 0 \(window\), 4 \(bulb\)"),
+        ("7", "no lamp '7'"),
+        ("wall", "object 'wall' does not shine"),
+    ):
+        with pytest.raises(InputError, match=words):
+            things.check(entry(lamps={key: "off"}))
+    with pytest.raises(InputError, match="are the same lamp, 4"):
+        things.check(entry(lamps={"bulb": 1, 4: 2}))
+    with pytest.raises(InputError, match=r"relight.materials of a: there is no object 'wal'\. Did you mean 'wall'"):
+        things.check(entry(materials={"wal": {"metallic": 0}}))
+
+
+def test_a_way_through_a_wall_is_named(toy):
+    camera = {
+        "poses": [{"position": [0.3, 0.3, 1.6], "look_at": [2, 1, 1]}, {"position": [0.3, -1.0, 1.6], "look_at": [2, 1, 1]}]
+    }
+    camera |= {"frames": 5, "width": 16, "height": 16}
+    wanted = {"name": "out", "camera": camera, "samples": 1, "video": False}
+    with pytest.raises(
+        InputError, match=r"way of the camera leads through 'walls' at \[0.30, 0.00, 1.60\] m, between frames 1 and 2"
+    ):
+        lit(toy, wanted)
+    with pytest.raises(InputError, match="leads through 'walls'"):
+        lit(toy, {**wanted, "method": "path"})
+    _, folder = lit(toy, {**wanted, "camera": {**camera, "through_surface": True}})
+    assert (folder / "out/frame_0004.png").is_file() and not (folder / "out/video.mp4").exists()
+    with pytest.raises(InputError, match="give two different points"):
+        lit(toy, {"name": "a", "camera": {"poses": [{"position": [1, 1, 1], "look_at": [1, 1, 1]}]}})
+
+
+def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
+    monkeypatch.setattr(relight, "trace_picture", lambda *_: pytest.fail("rendered although the second relighting is wrong"))
+    with pytest.raises(InputError, match="no lamp 'lmap'"):
+        lit(toy, {"name": "a", "method": "path"}, {"name": "b", "lamps": {"lmap": 0}, "method": "path"})
+
+
+# ----------------------------------------------------------------------------------------------- only what an edit touches
+
+
+def test_frames_that_an_edit_does_not_touch_are_taken_over(toy, monkeypatch):
+    traced = []
+    trace = relight.trace_picture
+    monkeypatch.setattr(
+        relight, "trace_picture", lambda *arguments: traced.append(arguments[4]["materials"]) or trace(*arguments)
+    )
+    first = {"name": "first", "materials": {"box": {"albedo": [1, 0, 0]}}, "samples": 2}
+    second = {"name": "second", "materials": {"box": {"albedo": [0, 1, 0]}}, "samples": 2}
+    pictures, folder = lit(toy, first, second)
+    assert len(traced) == 4  # and what was before, of either
+    traced.clear()
+    again, _ = lit(toy, {**second, "materials": {"box": {"albedo": [0, 0, 1]}}}, {**first, "exposure": 3.0})
+    assert traced == [{"box": {"albedo": [0.0, 0.0, 1.0], "tint": None, "roughness": None, "metallic": None}}]
+    assert (again[1] == pictures[0]).all() and (again[0] != pictures[1]).any()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert set(manifest["parts"]) == {"first.frame_0000", "first.before_0000", "second.frame_0000", "second.before_0000"}
+    traced.clear()
+    (folder / "first/frame_0000.exr").write_bytes(b"damaged")
+    lit(toy, {**first, "exposure": 3.0})
+    assert len(traced) == 1
+
+
+def test_parts_outlive_other_changes_of_their_stage(tmp_path):
+    def job(fingerprint):
+        return StageWriter(tmp_path / "stage", {"stage": "stage", "fingerprint": fingerprint})
+
+    writer = job("one")
+    writer.bytes("a.bin", b"a")
+    writer.part_done("a", ["a.bin"], {"n": 1}, by="digest")
+    writer.bytes("b.bin", b"b")
+    writer.part_done("b", ["b.bin"], {})
+    writer.finish()
+    writer = job("two")
+    assert writer.part_kept("a", by="other") is None and writer.part_kept("b") is None
+    assert writer.part_kept("a", by="digest") == {"n": 1}
+    writer.finish()
+    assert StageReader(tmp_path / "stage", "stage", "x").manifest["files"].keys() == {"a.bin"}
+    assert not (tmp_path / "stage/unfinished").exists() and not (tmp_path / "stage/b.bin").exists()
+    writer = job("three")  # killed before it looked at anything
+    assert job("four").part_kept("a", by="digest") == {"n": 1}
+
+
+# ------------------------------------------------------------------------------------------------------ sheet and video
+
+
+@pytest.mark.parametrize("codec", ["av1", "h264"])
+@pytest.mark.parametrize("size", [(64, 96), (65, 97)])
+def test_videos_play(codec, size):
+    import av
+
+    ramp = np.linspace(40, 200, size[1])[None, :, None] * np.ones((size[0], 1, 3))
+    pictures = [np.uint8(np.clip(ramp * [1, 0.6, 0.3] + 10 * number, 0, 255)) for number in range(5)]
+    with av.open(io.BytesIO(video.encoded(pictures, 12, codec))) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(stream)]
+        assert stream.average_rate == 12 and float(stream.duration * stream.time_base) == pytest.approx(5 / 12)
+    assert len(frames) == 5 and all(frame.shape == (-(-size[0] // 2) * 2, -(-size[1] // 2) * 2, 3) for frame in frames)
+    for frame, picture in zip(frames, pictures, strict=True):
+        assert np.abs(frame[: size[0], : size[1]].astype(int) - picture).mean() < 5
+
+
+def test_a_codec_that_is_not_there_is_named(monkeypatch):
+    monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
+    with pytest.raises(InputError, match="codec of flight: found 'av1', whose encoder libnothing .* allowed here: h264"):
+        video.require_codec("av1", "flight")
+    video.require_codec("h264", "flight")
+
+
+def test_flights_have_a_video_and_the_sheet_shows_what_was_before(toy):
+    from PIL import Image
+
+    camera = {"views": ["v0", "v1"], "frames": 4, "width": 48, "height": 40, "through_surface": True}
+    _, folder = lit(
+        toy, {"name": "flight", "lamps": {"lamp": 0.5}, "camera": camera, "samples": 4, "video": {"fps": 8, "codec": "h264"}}
+    )
+    assert (folder / "flight/video.mp4").stat().st_size > 500
+    shown = sheet.shown_frames(4)
+    assert shown == [0, 2, 3] and sheet.shown_frames(1) == [0] and sheet.shown_frames(2) == [0, 1]
+    for frame in shown:
+        before, after = (rgb(read_exr(folder / f"flight/{name}_{frame:04d}.exr")) for name in ("before", "frame"))
+        np.testing.assert_allclose(after, 0.5 * before, rtol=2e-3, atol=1e-5)
+    width, height = Image.open(folder / "contact_sheet.png").size
+    assert width >= 6 * 48 and height > 40 + sheet.TITLE + sheet.CAPTION
+    one = sheet.Row("a short title", [sheet.Pair(np.zeros((40, 200, 3), np.uint8), np.full((40, 200, 3), 255, np.uint8), "")])
+    drawn = sheet.contact_sheet([one] * 4)
+    assert drawn.shape[1] == 3 * 424 and drawn.shape[0] == 2 * (sheet.GAP + sheet.TITLE + 40 + sheet.CAPTION + sheet.GAP)
+    assert (drawn[sheet.GAP + sheet.TITLE + 20, 20] == 0).all()
+
+
+def test_captions_say_what_changes():
+    told = sheet.described(
+        entry(
+            emitters=0.5,
+            lamps={"bulb": "off", 3: {"colour": [1, 0, 0], "factor": 2}, "x": {"move": [0, 0, 1]}},
+            environment=[1, 1, 1],
+            insert=[{"file": "a/vase.glb", "position": [0, 0, 0]}],
+            materials={"wall": {"metallic": 0}},
+        )
+    )
+    lamps, rest = told.split("; light from ")
+    assert lamps == "other lamps x 0.5; bulb off; lamp 3 x 2, colour 1 0 0; x moved 0 0 1 m"
+    assert rest == "outside 1 1 1; vase put in; wall painted"
+    assert sheet.described(entry()) == "as found"
+
+
+# ----------------------------------------------------------------------------------------------------------------- plans
+
+
+def test_plans_are_found_and_checked(tmp_path):
+    folder = tmp_path / "config/relight"
+    folder.mkdir(parents=True)
+    (tmp_path / "config/scenes").mkdir()
+    (folder / "night.yaml").write_text(
+        "relight:\n- {name: a, emitters: off}\n- {name: b, insert: [{file: plate.glb, position: [0, 0, 0]}]}\n"
+    )
+    plate(folder / "plate.glb")
+    place, layer = relight_plans.plan_layer("night", tmp_path)
+    assert place == "config/relight/night.yaml" and layer["relight"][1]["insert"][0]["file"] == str(folder / "plate.glb")
+    assert relight_plans.active_plan("night", tmp_path) == "night" and relight_plans.active_plan("x", tmp_path) == "example"
+    for text, words in (("relight: []\n", "needed a list"), ("relihgt: []\n", "unknown key. Did you mean `relight`")):
+        (folder / "bad.yaml").write_text(text)
+        with pytest.raises(InputError, match=words):
+            relight_plans.plan_layer("bad", tmp_path)
+    with pytest.raises(InputError, match=r"config/relight/nihgt.yaml: not found. Did you mean night\? Known plans .*bad, night"):
+        relight_plans.plan_layer("nihgt", tmp_path)
+
+
+def test_mistakes_in_a_plan_are_blamed_on_it(tmp_path, repository):
+    from workflow import settings
+
+    for part in ("relight", "scenes"):
+        (tmp_path / f"config/{part}").mkdir(parents=True)
+    shutil.copy(repository / "config/scenes/kitchen.yaml", tmp_path / "config/scenes/room.yaml")
+    (tmp_path / "config/relight/night.yaml").write_text("relight: [{name: a, lamsp: {bulb: off}}]\n")
+    with pytest.raises(InputError, match=r"config/relight/night.yaml: `relight.0.lamsp`: unknown key. Did you mean `lamps`"):
+        settings.load("room--relight-night-s0", "draft", tmp_path)
+    (tmp_path / "config/relight/night.yaml").write_text("relight: [{name: a, lamps: {bulb: off}}]\n")
+    found = settings.dump(settings.load("room--relight-night-s0", "draft", tmp_path))
+    plain = settings.dump(settings.load("room", "draft", tmp_path))
+    assert found["recombined"] == ["a"] and not plain["relight"]
+    different = {key for key in found if found[key] != plain[key]}
+    assert different == {"relight", "lamp_images", "recombined"}
+
+
+def test_shipped_plans_are_good(repository):
+    from workflow import settings
+
+    names = relight_plans.plan_names(repository)
+    assert {"example", "kitchen"} <= set(names)
+    for name in names:
+        document = settings.dump(settings.load(f"kitchen--relight-{name}-s0", "draft", repository))
+        assert document["relight"] and settings.require_relighting(document, "kitchen")
+
+
+def test_environment_map_as_a_lamp(toy, tmp_path):
+    """A map takes the place of what was found, for sums as well; a factor dims what was found."""
+    write_exr(tmp_path / "sky.exr", split_rgb(np.full((8, 16, 3), 0.5, np.float32)))
+    camera = {"poses": [{"position": [0.3, -1.0, 1.6], "look_at": [2, -3, 1]}]}
+    more = {"environment": str(tmp_path / "sky.exr"), "camera": camera, "samples": 4}
+    (summed, traced, none), _ = lit(
+        toy,
+        {"name": "a", "method": "recombine", **more},
+        {"name": "b", **more},
+        {"name": "c", "environment": 0.5, "camera": camera, "samples": 4},
+    )
+    np.testing.assert_allclose(summed[8], 0.5, rtol=2e-3)
+    np.testing.assert_allclose(traced[8], 0.5, rtol=1e-5)
+    assert not none[8].any()
