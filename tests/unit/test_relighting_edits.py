@@ -419,8 +419,12 @@ def test_frames_that_an_edit_does_not_touch_are_taken_over(toy, monkeypatch):
     again, _ = lit(toy, {**second, "materials": {"box": {"albedo": [0, 0, 1]}}}, {**first, "exposure": 3.0})
     assert traced == [{"box": {"albedo": [0.0, 0.0, 1.0], "tint": None, "roughness": None, "metallic": None}}]
     assert (again[1] == pictures[0]).all() and (again[0] != pictures[1]).any()
-    manifest = json.loads((folder / "manifest.json").read_text())
-    assert set(manifest["parts"]) == {"first.frame_0000", "first.before_0000", "second.frame_0000", "second.before_0000"}
+    assert set(json.loads((folder / "parts.json").read_text())) == {
+        "first.frame_0000",
+        "first.before_0000",
+        "second.frame_0000",
+        "second.before_0000",
+    }
     traced.clear()
     (folder / "first/frame_0000.exr").write_bytes(b"damaged")
     lit(toy, {**first, "exposure": 3.0})
@@ -437,6 +441,7 @@ def test_parts_outlive_other_changes_of_their_stage(tmp_path):
     writer.bytes("b.bin", b"b")
     writer.part_done("b", ["b.bin"], {})
     writer.finish()
+    (tmp_path / "stage/manifest.json").unlink()  # as Snakemake does
     writer = job("two")
     assert writer.part_kept("a", by="other") is None and writer.part_kept("b") is None
     assert writer.part_kept("a", by="digest") == {"n": 1}
@@ -573,3 +578,24 @@ def test_environment_map_as_a_lamp(toy, tmp_path):
     np.testing.assert_allclose(summed[8], 0.5, rtol=2e-3)
     np.testing.assert_allclose(traced[8], 0.5, rtol=1e-5)
     assert not none[8].any()
+
+
+def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
+    """The check that runs while Snakemake plans: it reads finished stages alone."""
+    from workflow.relighting import check
+
+    monkeypatch.setattr(check, "finished", lambda stage, *_: StageReader(toy / "results/toy" / stage, stage, "toy"))
+
+    def told(**more):
+        with pytest.raises(InputError) as error:
+            check.check_relightings({"relight": [entry(**more)]}, "toy", "draft")
+        return str(error.value)
+
+    check.check_relightings({"relight": [entry(lamps={"lamp": 0}, materials={"walls": {"metallic": 0}})]}, "toy", "draft")
+    assert "there is no object 'wals'" in told(materials={"wals": {"metallic": 0}})
+    assert "there is no lamp 'lmap'. Did you mean 'lamp'" in told(lamps={"lmap": 0})
+    assert "found v7; the views are v0, v1" in told(camera={"views": ["v7"]})
+    monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
+    assert "libnothing" in told(camera={"frames": 2})
+    monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused
+    check.check_relightings({"relight": [entry(lamps={"lmap": 0})]}, "toy", "draft")

@@ -15,6 +15,7 @@ from workflow.artifacts import files as io
 SCHEMA = "iif.stage/1"
 MANIFEST = "manifest.json"
 UNFINISHED = "unfinished"
+PARTS = "parts.json"
 
 
 def command(scene: str, stage: str, quality: str | None) -> str:
@@ -52,7 +53,7 @@ class StageWriter:
         self.files: dict[str, dict[str, Any]] = {}
         self.parts: dict[str, Any] = {}
         directory.mkdir(parents=True, exist_ok=True)
-        for part, note in _parts_of(directory / MANIFEST).items():
+        for part, note in _noted_parts(directory).items():
             io.write_json(io.inside(directory, f"{UNFINISHED}/{part}.json"), note)
         (directory / MANIFEST).unlink(missing_ok=True)
 
@@ -105,8 +106,8 @@ class StageWriter:
             part: name of the part, such as that of a view.
             names: the files that were written for it.
             facts: small document that `part_kept` gives back.
-            by: digest of all that the part depends on, if that is less than the stage does; the note is then kept in the
-                manifest, and the next job of the stage takes the part over although something else has changed.
+            by: digest of all that the part depends on, if that is less than the stage does; the note then stays in parts.json,
+                and the next job of the stage takes the part over although something else has changed.
         """
         files = {name: self.files[name] for name in names}
         document = {"by": by or self.provenance["fingerprint"], "files": files, "facts": facts}
@@ -176,23 +177,25 @@ class StageWriter:
 
     def finish(self) -> None:
         """Remove the files that an earlier run left, then write the manifest."""
-        kept = set(self.files) | {MANIFEST}
+        if self.parts:
+            io.write_json(self.directory / PARTS, self.parts)
+        kept = set(self.files) | {MANIFEST} | ({PARTS} if self.parts else set())
         for path in sorted(self.directory.rglob("*"), reverse=True):
             if path.is_dir():
                 if not any(path.iterdir()):
                     path.rmdir()
             elif str(path.relative_to(self.directory)) not in kept:
                 path.unlink()
-        parts = {"parts": self.parts} if self.parts else {}
-        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files, **parts})
+        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
 
 
-def _parts_of(manifest: Path) -> dict[str, Any]:
-    """Return the notes that a manifest keeps of parts of its stage; none if there is no such manifest, or it cannot be read."""
+def _noted_parts(directory: Path) -> dict[str, Any]:
+    """Return the notes that a finished job left of parts of its stage; none if there are none, or they cannot be read. They are
+    not in the manifest, which Snakemake removes before it starts a job."""
     try:
-        parts = json.loads(manifest.read_text()).get("parts", {})
+        parts = json.loads((directory / PARTS).read_text())
         return parts if isinstance(parts, dict) else {}
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError):
         return {}
 
 

@@ -15,6 +15,7 @@ from workflow.artifacts.files import read_exr
 from workflow.artifacts.store import rgb
 from workflow.relighting.inserts import load_insert, placed
 from workflow.relighting.inventory import Inventory
+from workflow.runtime import device
 from workflow.scene.base_scene import BaseScene
 from workflow.scene.named import object_number
 from workflow.scene.recovered import Recovered
@@ -95,6 +96,7 @@ def build_world(room: Recovered, inventory: Inventory, state: dict[str, Any], up
         up: (3,) unit vector.
         time: in [0, 1], for a sphere that moves.
     """
+    device.mitsuba()
     from iif_core.light.transport.edits import EditedMaterials
     from iif_core.light.transport.geometry import build_geometry
 

@@ -199,12 +199,18 @@ def relit_inputs(wildcards):
     """The relightings of a scene, or one plan of them; those of which a picture is gone are copied again."""
     scene, plan = wildcards.scene, wildcards.get("plan", "")
     folder = f"relight/{scene}/{plan}" if plan else f"relight/{scene}"
-    asked = [name for name in workflow.dag_settings.targets if Path(name).parts[:2] == ("relight", scene)]
+    asked = [
+        name
+        for name in workflow.dag_settings.targets
+        if Path(name).parts[:2] == ("relight", scene)
+    ]
     if len({len(Path(name).parts) for name in asked}) > 1:
         stop(
             f"relight/{scene} holds the plans that were asked for, and Snakemake makes a folder and what lies in it only one after"
             f" the other. Ask twice: first `relight/{scene}`, then {' '.join(name for name in asked if name.count('/') > 1)}."
         )
+    if os.path.isdir(folder) and not os.path.isfile(f"{folder}/contact_sheet.png"):
+        workflow.dag.forcefiles.add(folder)  # it holds plans alone
     source = f"results/{or_stop(relit.source, scene, plan, quality_of(scene))}/relight/manifest.json"
     folder_or_stop(folder)
     again_without(folder, source)

@@ -275,7 +275,11 @@ use rule stage as report with:
 # On demand: `relight:` in config/scenes/<scene>.yaml, or a plan of config/relight/ (docs/guide/relighting.md).
 use rule stage as lamp_images with:
     input:
-        unpack(reads("lamp_images", "capture", "segmentation", "base", "emission", "affines")),
+        unpack(
+            reads(
+                "lamp_images", "capture", "segmentation", "base", "emission", "affines"
+            )
+        ),
     pathvars:
         stage="lamp_images",
     resources:

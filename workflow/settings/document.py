@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import Any, get_origin
 
 from workflow.settings.relight import RelightPlan
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
@@ -33,6 +33,11 @@ def _bound(rule: Any) -> str:
     return ", ".join(f"{words} {getattr(rule, name)}" for name, words in _BOUNDS.items() if hasattr(rule, name))
 
 
+def _of_many(annotation: Any) -> str:
+    """Return what stands after a key whose value is a list of sections, or maps names to them; nothing after any other."""
+    return {list: "[]", dict: ".<name>"}.get(get_origin(annotation), "")
+
+
 def reference_markdown() -> str:
     """Return the settings as a page: key, default, allowed values, meaning (docs/reference/settings.md)."""
     lines = ["# Settings", "", "Made from `workflow/settings/` by `python -m workflow.settings`; do not edit.", ""]
@@ -46,7 +51,7 @@ def reference_markdown() -> str:
             section = section_in(field.annotation)
             nested = isinstance(section, type) and issubclass(section, Section)
             if nested:
-                nested_rows.append((f"{prefix}{name}.", section))
+                nested_rows.append((f"{prefix}{name}{_of_many(field.annotation)}.", section))
                 default = "none" if field.get_default() is None else "see below"
             else:
                 default = "required" if field.is_required() else f"`{field.get_default(call_default_factory=True)}`"
@@ -66,9 +71,10 @@ def reference_markdown() -> str:
                 lines.extend([f"## `{name}: {{kind: {kind}}}`", "", " ".join((model.__doc__ or "").split()), ""])
                 rows(model, f"{name}.")
         elif isinstance(section := section_in(field.annotation), type) and issubclass(section, Section):
-            many = section is not field.annotation
-            lines.extend([f"## `{name}`" + (" (a list)" if many else ""), "", " ".join((section.__doc__ or "").split()), ""])
-            rows(section, f"{name}[]." if many else f"{name}.")
+            many = _of_many(field.annotation)
+            what = {"[]": " (a list)", ".<name>": " (by name)"}.get(many, "")
+            lines.extend([f"## `{name}`{what}", "", " ".join((section.__doc__ or "").split()), ""])
+            rows(section, f"{name}{many}.")
         else:
             lines.extend([f"## `{name}`", "", f"Default `{field.get_default()}`. {field.description or ''}", ""])
     return "\n".join(lines)
