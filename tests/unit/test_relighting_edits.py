@@ -599,3 +599,23 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     assert "libnothing" in told(camera={"frames": 2})
     monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused
     check.check_relightings({"relight": [entry(lamps={"lmap": 0})]}, "toy", "draft")
+
+
+def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):
+    from dataclasses import replace
+    from types import SimpleNamespace
+
+    from workflow.relighting.camera import photograph_exposure, plan_flight
+
+    views = [replace(view, split="test" if view.name == "v1" else "train") for view in studio.capture.views]
+    capture = SimpleNamespace(views=views, used=views[:1], facts={"exposure_estimated": True}, is_hdr=False)
+    for estimated, name in ((True, "v0"), (False, "v1")):
+        capture.facts["exposure_estimated"] = estimated
+        flight = plan_flight(capture, entry(camera={"views": ["v1"]}), studio.up)
+        assert flight.view.name == name and (flight.poses[0] == views[1].world_from_camera).all()
+    gains = SimpleNamespace(gain=np.array([[0.5, 0.5, 0.5], [1.0, 1.2, 0.8]]))
+    assert photograph_exposure(capture, gains, flight.view).tolist() == [1.0, 1.2, 0.8]
+    capture.is_hdr = True
+    assert photograph_exposure(capture, gains, flight.view) is None
+    near = plan_flight(capture, entry(camera={"poses": [{"position": [0.4, 0.4, 1.6], "look_at": [2.2, 1.3, 0.8]}]}), studio.up)
+    assert near.view.name == "v0"

@@ -220,8 +220,10 @@ def test_shipped_scenes_and_studies_load_at_every_quality(repository):
 
 
 def test_the_kitchen_can_be_relit_as_it_is_shipped(repository):
-    document = settings.dump(settings.load("kitchen", "draft", repository))
-    assert [entry["name"] for entry in settings.require_relighting(document, "kitchen")] == ["dimmed", "lamp"]
+    plan = settings.active_plan("kitchen", repository)
+    document = settings.dump(settings.load(f"kitchen--relight-{plan}-s0", "draft", repository))
+    names = [entry["name"] for entry in settings.require_relighting(document, "kitchen")]
+    assert plan == "kitchen" and {"dimmed", "evening", "vase", "lamp"} <= set(names)
 
 
 def test_generated_files_are_current(repository):

@@ -68,7 +68,9 @@ def plan_flight(capture: CaptureReader, entry: dict[str, Any], up: Array) -> Fli
         fx = fy = 0.5 * width / np.tan(np.radians(camera["fov"]) / 2)
         cx, cy = width / 2, height / 2
     times = frame_times(camera["frames"])
-    return Flight(camera_path(keys, times), times, keys, fx, fy, cx, cy, width, height, first)
+    # The exposure of a photograph that is held out is not known where exposures are estimated.
+    told = _nearest(capture.used, keys[0]) if first.split == "test" and capture.facts.get("exposure_estimated") else first
+    return Flight(camera_path(keys, times), times, keys, fx, fy, cx, cy, width, height, told)
 
 
 def _nearest(views: list[View], pose: Array) -> View:
