@@ -619,3 +619,9 @@ def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):
     assert photograph_exposure(capture, gains, flight.view) is None
     near = plan_flight(capture, entry(camera={"poses": [{"position": [0.4, 0.4, 1.6], "look_at": [2.2, 1.3, 0.8]}]}), studio.up)
     assert near.view.name == "v0"
+
+
+def test_frames_that_an_encoder_refuses_are_told(monkeypatch):
+    monkeypatch.setitem(video.OPTIONS, "h264", {"preset": "no such preset"})
+    with pytest.raises(InputError, match="h264 refuses these frames .* or `video: off`"):
+        video.encoded([np.zeros((16, 16, 3), np.uint8)], 24, "h264")

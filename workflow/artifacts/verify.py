@@ -9,7 +9,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
-from workflow.artifacts.store import MANIFEST, StageReader, chosen, command
+from workflow.artifacts.store import MANIFEST, PARTS, StageReader, chosen, command
 
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
@@ -31,7 +31,7 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
             except InputError as error:
                 upstream.add(scene)
                 yield str(error)
-        listed = set(reader.names()) | {MANIFEST}
+        listed = set(reader.names()) | {MANIFEST, PARTS}
         for path in sorted(manifest.parent.rglob("*")):
             if path.is_file() and str(path.relative_to(manifest.parent)) not in listed:
                 yield f"{path}: not written by rule {stage} (not in its manifest); remove it"
@@ -71,8 +71,11 @@ def _gone(root: Path, scene: str) -> Iterator[str]:
         return
     for stage, (made, quality) in sorted(needed.items()):
         path = own / stage / MANIFEST
-        if path.is_file() or any(root.glob(f"results/{scene.split('--')[0]}--*/{stage}/{MANIFEST}") if "--" in scene else ()):
-            continue  # derived scenes of studies share equal results
+        # Derived scenes of studies share equal results, and pictures of a scene may come from a plan of relightings.
+        base = scene.split("--")[0]
+        shared = [base, f"{base}--*"] if "--" in scene else [f"{scene}--relight-*"] if stage == "relight" else []
+        if path.is_file() or any(any(root.glob(f"results/{name}/{stage}/{MANIFEST}")) for name in shared):
+            continue
         again = f"snakemake --cores 2 results/{scene}/{stage}/{MANIFEST}{chosen(quality)}"
         again = command(scene, stage, quality) if stage == "publish" else again
         yield f"{path}: missing, although {made} was made from it; rebuild with: {again}"

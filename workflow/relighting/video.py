@@ -41,8 +41,23 @@ def encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
         pictures: (H, W, 3) uint8 each, sRGB; an odd height or width is made even by doubling the last row or column.
         fps: frames per second.
         codec: key of `ENCODERS`.
+
+    Raises:
+        InputError: the encoder refuses the frames, such as frames that are too large for it.
     """
     os.environ.setdefault("SVT_LOG", "1")  # errors alone
+    import av
+
+    try:
+        return _encoded(pictures, fps, codec)
+    except av.error.FFmpegError as error:
+        raise InputError(
+            f"relight.video: {codec} refuses these frames ({error}); set another `codec` or size, or `video: off`. The frames that were"
+            " rendered are kept"
+        ) from None
+
+
+def _encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
     import av
 
     buffer = io.BytesIO()
