@@ -52,8 +52,8 @@ def encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
         return _encoded(pictures, fps, codec)
     except av.error.FFmpegError as error:
         raise InputError(
-            f"relight.video: {codec} refuses these frames ({error}); set another `codec` or size, or `video: off`. The frames that were"
-            " rendered are kept"
+            f"relight.video: {codec} refuses these frames ({error}); set another `codec` or size, or `video: off`. The frames"
+            " that were rendered are kept"
         ) from None
 
 

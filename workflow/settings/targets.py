@@ -26,7 +26,8 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
     hint = _meant(target, list(dict.fromkeys(scenes)), list(rules), root)
     raise InputError(
         f"{target}: no rule makes this.{hint} Targets are scenes/<name>, plan/<name>, bench/<name> and relight/<name> with the"
-        " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/, results/<name>/<stage>/manifest.json, results/studies/<study>.parquet,"
+        " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/,"
+        " results/<name>/<stage>/manifest.json, results/studies/<study>.parquet,"
         " `scenes` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
     )
 
