@@ -43,7 +43,7 @@ def test_commands_that_run_nothing_know_the_default_target(fresh):
 def test_a_folder_without_scenes_knows_those_of_the_repository(repository, tmp_path):
     elsewhere = Workflow(repository, tmp_path)
     assert "publishing scenes/kitchen" in succeeded(elsewhere.run("scenes/kitchen", "-n"))
-    assert "kitchen: relighting" in succeeded(elsewhere.run("relight/kitchen", "-n"))
+    assert "relight-kitchen-s0: relighting" in succeeded(elsewhere.run("relight/kitchen", "-n"))
     misspelt = elsewhere.run("scenes/kichen", "-n")
     assert misspelt.returncode == 1 and "Did you mean scenes/kitchen?" in misspelt.stderr.strip().splitlines()[-1]
 
