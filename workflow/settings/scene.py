@@ -10,13 +10,8 @@ from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.limits import Limits
-<<<<<<< HEAD
 from workflow.settings.outputs import Export, Metrics, Render, Report, Room
 from workflow.settings.override import ByObject, Override
-=======
-from workflow.settings.outputs import Export, Metrics, Render, Report
-from workflow.settings.override import ByObject, Override
->>>>>>> c977113 (Corrections by hand: roughness and metallic of an object that are given stay fixed while the rest is fitted)
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting, lamp_bases, recombines
 from workflow.settings.section import Section
