@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-ProtocolName = Literal["raw", "scaled", "oracle_affine"]
+ProtocolName = Literal["raw", "gain", "scaled", "oracle_affine"]
 
 
 class Protocol(NamedTuple):
@@ -17,6 +17,7 @@ class Protocol(NamedTuple):
 
 PROTOCOLS: dict[ProtocolName, Protocol] = {
     "raw": Protocol("raw", "as it is", "as it is"),
+    "gain": Protocol("gain", "one gain per image", "after one gain per image, the same for its channels"),
     "scaled": Protocol(
         "scaled", "one gain per image and channel", "after one gain per image and channel, which 8-bit photographs leave open"
     ),
@@ -33,6 +34,9 @@ PROTOCOLS_OF: dict[str, tuple[ProtocolName, ...]] = {
     "emission": ("raw", "scaled"),
     "rgb": ("raw",),
 }
+RELIT_PROTOCOLS: tuple[ProtocolName, ...] = ("raw", "gain", "scaled")
+RELIT = ("relit_lamp", "relit_moved", "relit_environment", "relit_sphere")
+"""Pictures under new light: a lamp alone, a moved lamp, an environment, a glowing sphere."""
 """Quantity -> protocols. Photographs determine the level of roughness and metallic; that of emission and albedo may be open."""
 
 
@@ -70,6 +74,7 @@ METRICS = {
     },
     "log_l2": Metric("L2 of log(1 + E)", "log L2", False, ("emission",), 4, wide_range=True),
     "iou": Metric("IoU", "IoU", True, ("emission",)),
+    "relative": Metric("relative error of radiance", "relative", False, axis="sum |p - t| / sum t"),
     "shading_left": Metric("shading left (correlation with light inside objects)", "shading left", axis="shading_left"),
     "shading_slope": Metric("shading left (slope over light inside objects)", "its slope", axis="shading_slope"),
     "view_spread": Metric("spread of log albedo over views", "spread over views", False, axis="view_spread"),

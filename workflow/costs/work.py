@@ -174,6 +174,22 @@ def _pixels_of(camera: dict[str, Any], size: SceneSize) -> float:
     return camera["frames"] * shape / MILLION
 
 
+def _relit_pictures(settings: dict[str, Any], size: SceneSize) -> dict[str, float]:
+    """Pixels of all pictures under new light, if the room has as many lamps as may shine alone."""
+    relit = settings["relit"]
+    lights = relit["lamps"] + relit["moved"] + (relit["environment"] is not None) + relit["spheres"]
+    pixels = lights * relit["views"] * size.pixels / max(size.views, 1) / MILLION
+    return {"paths": pixels * relit["samples"], "pixels": pixels, "faces": size.faces / MILLION}
+
+
+def _relit_truth(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return settings["source"]["kind"], _relit_pictures(settings, size)
+
+
+def _relit_scores(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    return "all", _relit_pictures(settings, size)
+
+
 def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     metrics = settings["metrics"]
     share = 1.0 if metrics["views"] == "all" else min(1.0, metrics["views"] / max(size.views, 1))
@@ -220,6 +236,8 @@ _STAGES = {
     "relight": _relight,
     "metrics": _metrics,
     "unwrap": _unwrap,
+    "relit_truth": _relit_truth,
+    "relit_scores": _relit_scores,
     "export": _export,
     "room": _room,
     "report": _report,

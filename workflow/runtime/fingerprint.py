@@ -46,7 +46,11 @@ PLUGINS = {
     "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
 }
 # Stage -> modules that know (and check) further input files.
-FILE_MODULES = {"emission": ("workflow.scene.response_file",), "room": ("workflow.room.sources",)}
+FILE_MODULES = {
+    "emission": ("workflow.scene.response_file",),
+    "room": ("workflow.room.sources",),
+    "relit_truth": ("workflow.sources.relit",),
+}
 VGG = Path("results/weights/lpips_vgg.npz")
 
 

@@ -10,7 +10,7 @@ from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
 from workflow.settings.base import Base
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.limits import Limits
-from workflow.settings.outputs import Export, Metrics, Render, Report, Room
+from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
 from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import Prior
 from workflow.settings.relight import Relighting, lamp_bases, recombines
@@ -40,6 +40,7 @@ class SceneSettings(Section):
     affines: Affines = Affines()
     render: Render = Render()
     metrics: Metrics = Metrics()
+    relit: Relit = Relit()
     export: Export = Export()
     report: Report = Report()
     room: Room = Room()

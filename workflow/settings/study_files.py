@@ -46,7 +46,7 @@ BENCH_HELD_OUT = {"capture": {"test_every": 8}}
 
 METRICS = tuple(name for name in catalogue.METRICS if name != "psnr_3d")
 """Metrics that a study can show."""
-QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out")
+QUANTITIES = (*catalogue.PROTOCOLS_OF, "rgb_held_out", *catalogue.RELIT)
 
 
 class Variant(Section):
@@ -132,9 +132,9 @@ class Study(Section):
     """Seeds of the prior; everything else keeps the seed of the scene."""
     repeats: dict[str, Annotated[list[int], Field(min_length=1)]] = {}
     """Variant -> further seeds, where one of `seeds` does not tell how much a score varies."""
-    scores: Literal["base_scores", "metrics", "common_scores"] = "base_scores"
-    """Stage whose scores are collected: of the base texture, of the result and its re-rendering, or of the result at views that
-    all variants share."""
+    scores: Literal["base_scores", "metrics", "common_scores", "relit_scores"] = "base_scores"
+    """Stage whose scores are collected: of the base texture, of the result and its re-rendering, of the result at views that all
+    variants share, or of pictures under new light."""
     costs: list[str] = ["base"]
     """Stages whose times are added; they are made even if the scores do not need them."""
     growth: dict[str, dict[str, PositiveFloat]] = {}

@@ -14,8 +14,8 @@ from workflow.settings.study_files import Study
 if TYPE_CHECKING:
     import pandas as pd
 
-_MARKERS = {"raw": "o", "scaled": "^", "oracle_affine": "s"}
-_LINES = {"raw": "-", "scaled": ":", "oracle_affine": "--"}
+_MARKERS = {"raw": "o", "gain": "v", "scaled": "^", "oracle_affine": "s"}
+_LINES = {"raw": "-", "gain": "-.", "scaled": ":", "oracle_affine": "--"}
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # colour-blind safe (Okabe, Ito)
 _PANEL = (3.1, 2.9)  # inches
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from iif_core.errors import InputError
-from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF
+from iif_core.evaluation.catalogue import METRICS, PROTOCOLS, PROTOCOLS_OF, RELIT
 from workflow.artifacts.files import write_atomically
 from workflow.costs.records import disk_mb
 from workflow.registry import upstream_of
@@ -221,7 +221,7 @@ def _write_table(frame: pd.DataFrame, path: Path) -> None:
 
 def _protocol_of(paper: study_files.Paper, quantity: str) -> str:
     """The protocol of a publication's numbers; `raw` for quantities to which its own does not apply."""
-    return paper.protocol if paper.protocol in PROTOCOLS_OF[quantity] else "raw"
+    return paper.protocol if quantity in RELIT or paper.protocol in PROTOCOLS_OF.get(quantity, ()) else "raw"
 
 
 def _scores(cell: Cell, quality: str, stage: str, row: str) -> dict[tuple[str, str, str], tuple[float, int]]:
