@@ -12,7 +12,7 @@ import numpy as np
 from iif_core.camera.pinhole import direction_derivatives
 from iif_core.errors import InputError
 from iif_core.evaluation.metrics import Score
-from iif_core.evaluation.relit import RelitTarget
+from iif_core.evaluation.relit import METRICS, RelitTarget
 from iif_core.light.lamps import match_faces
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import denoise, require_denoiser
@@ -25,7 +25,8 @@ from workflow.stages.relit_truth import source_lamps
 
 _SEEDS = 0x726C7363  # keeps the random streams of this stage apart from those of others
 NOISE = "noise"
-"""Variant of the rows that compare the source with itself under other random numbers: what no method can exceed."""
+"""Variant of the rows that compare two renderings of the source. They differ by twice the variance of one; a result is compared
+with the mean of both and has three quarters of that, so their score is a bound on what noise takes from it."""
 
 
 def run(job: Job) -> None:
@@ -59,10 +60,12 @@ def run(job: Job) -> None:
             if not np.isfinite(radiance).all():
                 raise InputError(f"{light.name}, view {name}: radiance is not finite; please report it with the scene")
             seconds = time.monotonic() - started
-            target = RelitTarget(rgb(channels), channels["valid"] > 0.5, document["exposure"], networks)
             job.writer.exr(f"{light.name}/{name}.exr", split_rgb(radiance), "relative")
-            for variant, image in (("result", radiance), (NOISE, rgb(channels, "again"))):
-                _add(rows, extra, variant, name, light, found, seconds, list(target.scores(image)))
+            first, second, mask = rgb(channels), rgb(channels, "again"), channels["valid"] > 0.5
+            for variant, image, source in (("result", radiance, (first + second) / 2), (NOISE, second, first)):
+                target = RelitTarget(source, mask, document["exposure"], networks if variant != NOISE else None)
+                metrics = METRICS if variant != NOISE else ("l2", "psnr", "ssim")
+                _add(rows, extra, variant, name, light, found, seconds, list(target.scores(image, metrics)))
     job.progress(done, count, "pictures under new light")
     table = rows.table(job.scene)
     table |= {column: np.array(values, object) for column, values in extra.items() if column == "light"}

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+STILL = (0.0, 0.0, 0.0)
+AWAY = np.full(3, -1e4)
+"""Where the sphere is kept while it is dark, in metres."""
+
 
 def room(job: Job, capture: CaptureReader) -> _Room:
     """Load the scene that the settings name."""
@@ -36,11 +40,12 @@ class _Lamp:
     def __init__(self, shape: Any):
         self.shape = shape
         light = mi.traverse(shape.emitter())
-        self.keys = [key for key in light if key.startswith("radiance.") and key.rpartition(".")[2] in ("value", "data")]
+        self.keys = [key for key in light.keys() if key.startswith("radiance.") and key.rpartition(".")[2] in ("value", "data")]
         self.radiance = {key: _copy(light[key]) for key in self.keys}
         place = mi.traverse(shape)
         self.where = next((key for key in ("vertex_positions", "to_world") if key in place), "")
         self.place = _copy(place[self.where]) if self.where else None
+        self.shift = STILL
 
     def shine(self, on: bool) -> None:
         parameters = mi.traverse(self.shape.emitter())
@@ -51,11 +56,14 @@ class _Lamp:
         parameters.update()
 
     def move(self, shift: tuple[float, float, float]) -> None:
+        if shift == self.shift:
+            return
+        self.shift = shift
         parameters = mi.traverse(self.shape)
         if self.where == "vertex_positions":
             parameters[self.where] = mi.Float((np.array(self.place).reshape(-1, 3) + np.float32(shift)).ravel())
         elif self.where == "to_world":
-            parameters[self.where] = mi.ScalarTransform4f().translate(list(shift)) @ self.place
+            parameters[self.where] = mi.Transform4f().translate(mi.Vector3f(*shift)) @ self.place
         parameters.update()
 
 
@@ -85,7 +93,7 @@ class _Room:
         vertices, faces = self._unit
         ball = mi.Mesh("ball", len(vertices), len(faces), props=_ball_properties())
         parameters = mi.traverse(ball)
-        parameters["vertex_positions"] = (1e-3 * vertices - 1e4).ravel()
+        parameters["vertex_positions"] = (1e-3 * vertices + AWAY).astype(np.float32).ravel()
         parameters["faces"] = faces.astype(np.uint32).ravel()
         parameters.update()
         self._ball = ball
@@ -105,10 +113,10 @@ class _Room:
             lamp.shine(False)
         for number, lamp in self._lamps.items():
             lamp.shine(number == light.lamp)
-            lamp.move(light.shift if light.shift is not None and number == light.lamp else (0.0, 0.0, 0.0))
+            lamp.move(light.shift if light.shift is not None and number == light.lamp else STILL)
         parameters = mi.traverse(self._scene)
-        outside = light.environment or (0.0, 0.0, 0.0)
-        glow, centre, radius = (0.0, 0.0, 0.0), np.full(3, -1e4), 1e-3
+        outside = light.environment or STILL
+        glow, centre, radius = STILL, AWAY, 1e-3
         if light.ball is not None:
             glow, centre, radius = light.ball.radiance, np.array(light.ball.centre), light.ball.radius
         parameters["ball.vertex_positions"] = mi.Float((centre + radius * self._unit[0]).astype(np.float32).ravel())
