@@ -5,8 +5,10 @@ workflow batch` collect what jobs have left so far, `python -m workflow costs` f
 design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
 `python -m workflow relit <scene>` copies pictures of relightings to relight/,
 `python -m workflow bench <scene>` shows what three of them did in a room, `python -m workflow planned <scene>` what a room was
-found to require, `python -m workflow claims` takes from the study `regret` what is expected of that, and `python -m workflow
-lpips_vgg` fetches weights.
+found to require, `python -m workflow claims` takes from the study `regret` what is expected of that, `python -m workflow compare
+<a> <b>` puts two results side by side, `python -m workflow score <scene> <folder>` scores anyone's maps, `python -m workflow
+grid <study>` draws a sheet of pictures, `python -m workflow relighting` keeps the rows of that study and makes its page, and
+`python -m workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -64,6 +66,26 @@ def _arguments() -> argparse.Namespace:
     bench = commands.add_parser("bench")
     bench.add_argument("scene")
     bench.add_argument("--log", type=Path)
+    compare = commands.add_parser("compare")
+    compare.add_argument("a", help="a scene or a variant with a finished result")
+    compare.add_argument("b")
+    compare.add_argument("--quality", default="draft")
+    compare.add_argument("--output", type=Path, help="folder; by default compare/<a>,<b>")
+    compare.add_argument("--log", type=Path)
+    score = commands.add_parser("score")
+    score.add_argument("scene")
+    score.add_argument("maps", type=Path, help="folder with albedo/<view>.exr or .png, roughness/, metallic/, emission/, rgb/")
+    score.add_argument("--colour", default="auto", help="how albedo is decoded: srgb, linear, or auto (PNG as sRGB)")
+    score.add_argument("--quality", default="draft")
+    score.add_argument("--output", type=Path, help="folder; by default score/<scene>")
+    score.add_argument("--log", type=Path)
+    grid = commands.add_parser("grid")
+    grid.add_argument("study")
+    grid.add_argument("--quality", default="draft")
+    grid.add_argument("--log", type=Path)
+    relighting = commands.add_parser("relighting")
+    relighting.add_argument("--quality", default="draft")
+    relighting.add_argument("--log", type=Path)
     lpips = commands.add_parser("lpips_vgg")
     lpips.add_argument("--log", type=Path)
     batch = commands.add_parser("batch")
@@ -226,6 +248,27 @@ def main() -> int:
         from workflow.trade.bench import write_bench
 
         return _guarded("bench", partial(write_bench, arguments.scene))
+    if arguments.command == "compare":
+        from workflow.comparison.pair import write_comparison
+
+        pair = (arguments.a, arguments.b)
+        place = arguments.output or Path("compare") / ",".join(pair)
+        return _guarded("compare", partial(write_comparison, *pair, arguments.quality, place), JobState("studies", "compare"))
+    if arguments.command == "score":
+        from workflow.comparison.maps import write_scores
+
+        place = arguments.output or Path("score") / arguments.scene
+        work = partial(write_scores, arguments.scene, arguments.maps, arguments.quality, arguments.colour, place)
+        return _guarded(f"score {arguments.scene}", work, JobState("studies", "score"))
+    if arguments.command == "grid":
+        from workflow.studies.grid import write_grid
+
+        work = partial(write_grid, arguments.study, arguments.quality)
+        return _guarded(f"grid {arguments.study}", work, JobState("studies", f"{arguments.study}.grid"))
+    if arguments.command == "relighting":
+        from workflow.studies.relighting import keep
+
+        return _guarded("relighting", partial(keep, arguments.quality))
     if arguments.command == "design":
         return _guarded("design", lambda: _design(arguments.study, arguments.seed))
     if arguments.command == "lpips_vgg":

@@ -4,6 +4,7 @@ import pandas as pd
 import pytest
 
 from iif_core.errors import InputError
+from workflow.report.blocks import fill
 from workflow.stability import page, record, rows
 from workflow.stability.scalar import Accuracy
 from workflow.stability.solvers import Solved
@@ -13,7 +14,7 @@ from workflow.stability.sums import Order, Summed
 def test_the_page_shows_what_was_kept():
     text, frame = record.PAGE.read_text(), record.kept()
     assert set(rows.COLUMNS) == set(frame.columns)
-    assert page.fill(text, page.tables(frame)) == text
+    assert fill(text, page.tables(frame)) == text
     assert {*rows.PARTS, "orders", "measured"} == set(frame["part"])
     judged = frame[frame["limit"].notna()]
     assert (judged["in_order"] == (judged["value"] <= judged["limit"])).all() and judged["in_order"].all()
@@ -45,10 +46,10 @@ def test_what_is_above_its_limit_is_counted_and_a_guard_is_named():
 
 def test_a_page_is_filled_again_and_again_and_unknown_tables_are_refused():
     text = "# Title\n\n<!-- table: sums -->\n<!-- end -->\n\nText.\n"
-    once = page.fill(text, {"sums": "| a |"})
-    assert once == page.fill(once, {"sums": "| a |"}) and "| a |" in once and once.endswith("Text.\n")
+    once = fill(text, {"sums": "| a |"})
+    assert once == fill(once, {"sums": "| a |"}) and "| a |" in once and once.endswith("Text.\n")
     with pytest.raises(InputError, match="table nothing"):
-        page.fill("<!-- table: nothing -->\n<!-- end -->", {"sums": ""})
+        fill("<!-- table: nothing -->\n<!-- end -->", {"sums": ""})
 
 
 def test_unknown_and_missing_parts_are_named(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ sys.path.insert(0, workflow.basedir)
 from iif_core.errors import InputError
 from workflow.artifacts.verify import absent
 from workflow.batch import plan as batch_table
+from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, native
@@ -21,6 +22,7 @@ from workflow.scene.named import check_overrides
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings import refuse_target, study_files
+from workflow.studies import grid as study_sheet
 from workflow.studies import table as study_table
 from workflow.studies import relit
 from workflow.trade import bench, choose
@@ -66,10 +68,15 @@ for place in (".", "results", "scenes", ".snakemake"):
         )
 
 
+SCORED = (
+    "maps",
+    "colour",
+)  # keys of `--config` of score/<scene>, beside those that choose a quality
+
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
 REQUEST = or_stop(
     choose.read,
-    dict(config),
+    {key: value for key, value in config.items() if key not in SCORED},
     set(workflow.config_settings.overwrite_config or {}),
     workflow.resource_settings.cores,
 )
@@ -100,6 +107,8 @@ def image(wildcards):
 
 wildcard_constraints:
     scene=SCENE_NAME,
+    first=SCENE_NAME,
+    second=SCENE_NAME,
     study=rf"(?!(?:{KERNEL_BENCHMARKS}|stability)\.){study_files.STUDY}",
     benchmark=KERNEL_BENCHMARKS,
     part="|".join(STABILITY_PARTS),
@@ -253,6 +262,50 @@ def bench_inputs(wildcards):
     return [
         manifest("metrics", scene) for scene in bench.scenes(wildcards.scene).values()
     ]
+
+
+def compared(wildcards):
+    """Digest of the two results of a comparison; one that is not there stops here, before any job."""
+    folder_or_stop(f"compare/{wildcards.first},{wildcards.second}")
+    names = wildcards.first, wildcards.second
+    for name in names:
+        if "--" not in name and not os.path.isdir(f"results/{name}"):
+            or_stop(scene_file, name)
+    return or_stop(comparison.mark, *names, QUALITY)
+
+
+def scored_inputs(*names):
+    """What maps are scored against; without maps, or with none that are there, the run stops here."""
+    inputs_of = reads("metrics", *fingerprints.STAGES["metrics"].upstream)
+
+    def inputs(wildcards):
+        folder_or_stop(f"score/{wildcards.scene}")
+        if not config.get("maps"):
+            stop(
+                f"score/{wildcards.scene}: whose maps? Give their folder: --config maps=<folder>, with albedo/<view>.exr or"
+                " .png, roughness/, metallic/ and so on (docs/guide/comparing.md)"
+            )
+        found = inputs_of(wildcards)
+        return {name: found[name] for name in names}
+
+    return inputs
+
+
+def scored(wildcards):
+    """Arguments of the command that scores maps, and a digest of them, which Snakemake compares."""
+    folder, colour = Path(str(config.get("maps", ""))), str(
+        config.get("colour", "auto")
+    )
+    if not folder.is_dir():
+        stop(f"--config maps={folder}: no such folder")
+    quality = quality_of(wildcards.scene)
+    mark = or_stop(comparison.digest_of_maps, folder, colour)
+    return {
+        "folder": str(folder),
+        "colour": colour,
+        "quality": quality,
+        "mark": mark,
+    }
 
 
 def tell_target():

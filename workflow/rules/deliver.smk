@@ -118,3 +118,39 @@ rule bench:
         "{wildcards.scene}: three points of speed and accuracy, in bench/{wildcards.scene}/bench.md"
     shell:
         "python3 -m workflow bench {wildcards.scene} --log {log:q}"
+
+
+# Compares what is there and computes nothing else, so results are no inputs: a parameter changes with them.
+rule compare:
+    """Put two results side by side: settings, versions, plan, scores, materials by object, pictures."""
+    output:
+        page=directory("compare/{first},{second}"),
+    log:
+        "results/studies/logs/compare_{first},{second}.log",
+    localrule: True
+    params:
+        mark=compared,
+        quality=QUALITY,
+    message:
+        "{wildcards.first} beside {wildcards.second}: compare/{wildcards.first},{wildcards.second}/compare.html"
+    shell:
+        "python3 -m workflow compare {wildcards.first} {wildcards.second} --quality {params.quality} --output {output.page:q}"
+        " --log {log:q}"
+
+
+rule score:
+    """Score anyone's maps against a scene with truth: --config maps=<folder>."""
+    input:
+        unpack(scored_inputs("capture", "segmentation")),
+    output:
+        page=directory("score/{scene}"),
+    log:
+        "results/studies/logs/score_{scene}.log",
+    localrule: True
+    params:
+        scored=scored,
+    message:
+        "{wildcards.scene}: maps scored against its truth, score/{wildcards.scene}/score.html"
+    shell:
+        "python3 -m workflow score {wildcards.scene} {params.scored[folder]:q} --colour {params.scored[colour]:q}"
+        " --quality {params.scored[quality]} --output {output.page:q} --log {log:q}"

@@ -31,6 +31,24 @@ rule study:
         "python3 -m workflow study {wildcards.study} --quality {params.quality} --fingerprint {params.mark} --log {log:q}"
 
 
+# Shows the variants that are finished and computes nothing else, so a parameter changes with them.
+rule study_grid:
+    """Draw a sheet of pictures of a study, for a paper: methods beside each other, as PNG and PDF."""
+    output:
+        picture="results/studies/{study}.grid.png",
+        document="results/studies/{study}.grid.pdf",
+    log:
+        "results/studies/logs/{study}.grid.log",
+    localrule: True
+    params:
+        mark=of_study(study_sheet.mark),
+        quality=QUALITY,
+    message:
+        "study {wildcards.study}: sheet of pictures"
+    shell:
+        "python3 -m workflow grid {wildcards.study} --quality {params.quality} --log {log:q}"
+
+
 rule stability_part:
     """Measure the numerical errors of kernels, solvers or sums."""
     output:

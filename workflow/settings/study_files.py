@@ -121,6 +121,17 @@ class Plot(Section):
     """Logarithmic horizontal axis."""
 
 
+class Sheet(Section):
+    """The sheet of pictures, results/studies/<study>.grid.png and .pdf."""
+
+    views: int = Field(1, ge=1)
+    """Views of each scene, spread evenly."""
+    quantities: list[Literal["albedo", "roughness", "metallic", "relit"]] = ["albedo", "roughness", "metallic", "relit"]
+    """Rows of each view; `relit` is there in studies of relighting alone: one light of each kind."""
+    insets: dict[str, tuple[float, float, float]] = {}
+    """Scene -> [x, y, size] of a square that is shown enlarged, as shares of the width and the height."""
+
+
 class Study(Section):
     """One file under config/studies/."""
 
@@ -164,6 +175,8 @@ class Study(Section):
     show: list[str] = ["albedo/psnr", "albedo/ssim", "albedo/lpips", "roughness/l2", "metallic/l2"]
     """`quantity/metric` in the printed table and the picture; the Parquet file has all."""
     plot: Plot = Plot()
+    sheet: Sheet = Sheet()
+    """The sheet of pictures."""
 
     def seeds_of(self, variant: str) -> list[int]:
         """Return the seeds of a variant, those of all variants first."""

@@ -10,6 +10,9 @@ from workflow.registry import STAGES
 from workflow.settings import batch_table, study_files
 from workflow.settings.names import did_you_mean, scene_names
 
+FOLDERS = ("scenes", "plan", "bench", "relight", "score")
+"""Folders of targets that are named after one scene."""
+
 
 def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> None:
     """Say that nothing makes `target`, which targets there are, and which of them it resembles.
@@ -34,11 +37,11 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
 
 def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
     parts = Path(target).parts or (target,)
-    if parts[0] in ("scenes", "plan", "bench", "relight") and len(parts) > 1 and parts[1] in scenes:
+    if parts[0] in FOLDERS and len(parts) > 1 and parts[1] in scenes:
         return f" Did you mean {parts[0]}/{parts[1]}?"
     if parts[0] in scenes:
         return f" Did you mean scenes/{parts[0]}?"
-    if parts[0] in ("scenes", "plan", "bench", "relight") and len(parts) > 1:
+    if parts[0] in FOLDERS and len(parts) > 1:
         return did_you_mean(parts[-1], scenes, parts[0] + "/{}") or did_you_mean(parts[1], scenes, parts[0] + "/{}")
     if parts[:2] == ("results", "studies"):
         return did_you_mean(target, [f"results/studies/{name}.parquet" for name in study_files.study_names(root)])

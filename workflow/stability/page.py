@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from iif_core.errors import InputError
+from workflow.report.blocks import markdown
 
 if TYPE_CHECKING:
     import pandas as pd
 
 _FORMS = ("numpy float32", "numpy float64", "torch float32", "drjit float32", "numba float32")
-_BLOCK = re.compile(r"<!-- table: (\w+) -->\n.*?<!-- end -->", re.DOTALL)
 
 
 def tables(frame: pd.DataFrame) -> dict[str, str]:
@@ -41,31 +38,9 @@ def tables(frame: pd.DataFrame) -> dict[str, str]:
     return {name: "\n".join(make(frame)) for name, make in made.items()}
 
 
-def fill(text: str, blocks: dict[str, str]) -> str:
-    """Put tables into a page between `<!-- table: name -->` and `<!-- end -->`.
-
-    Raises:
-        InputError: the page asks for a table that does not exist.
-    """
-
-    def block(found: re.Match[str]) -> str:
-        name = found.group(1)
-        if name not in blocks:
-            raise InputError(f"the page asks for table {name}; there are {', '.join(blocks)}")
-        return f"<!-- table: {name} -->\n\n{blocks[name]}\n\n<!-- end -->"
-
-    return _BLOCK.sub(block, text)
-
-
 def whole(frame: pd.DataFrame) -> str:
     """Return a page of all tables."""
     return "\n".join(f"## {name.capitalize()}\n\n{table}\n" for name, table in tables(frame).items())
-
-
-def _markdown(head: Iterable[str], body: Iterable[Iterable[str]], words: int = 1) -> list[str]:
-    head = list(head)
-    lines = [head, ["---"] * words + ["---:"] * (len(head) - words), *body]
-    return [f"| {' | '.join(line)} |" for line in lines]
 
 
 def _number(value: float) -> str:
@@ -80,7 +55,7 @@ def _number(value: float) -> str:
 
 def _measured(frame: pd.DataFrame) -> list[str]:
     rows = frame[frame["part"] == "measured"]
-    return _markdown(
+    return markdown(
         ["part", "commit", "machine", "seconds"],
         [[r.subject, r.form, r.case, f"{r.value:.0f}"] for r in rows.itertuples()],
         3,
@@ -94,7 +69,7 @@ def _verdict(frame: pd.DataFrame) -> list[str]:
         guarded = rows[rows["says"].ne("") & rows["quantity"].eq("backward error / eps") & rows["limit"].isna()]
         forms = rows.groupby(["subject", "form"]).ngroups
         body.append([str(part), str(forms), str(len(judged)), str(int((~judged["in_order"]).sum())), str(len(guarded))])
-    return _markdown(["part", "subjects x forms", "figures with a limit", "above it", "known limits, with a guard"], body)
+    return markdown(["part", "subjects x forms", "figures with a limit", "above it", "known limits, with a guard"], body)
 
 
 def _kernels(frame: pd.DataFrame) -> list[str]:
@@ -107,7 +82,7 @@ def _kernels(frame: pd.DataFrame) -> list[str]:
         lost = rows[rows["quantity"] == "lost"]["value"].sum()
         cells = [f"{_number(ratio[form])} ({_number(ulp[form])})" if form in ratio else "" for form in _FORMS]
         body.append([str(kernel), *cells, _number(median), _number(lost)])
-    return _markdown(["kernel", *_FORMS, "largest median", "lost"], body)
+    return markdown(["kernel", *_FORMS, "largest median", "lost"], body)
 
 
 def _solvers(frame: pd.DataFrame) -> list[str]:
@@ -119,7 +94,7 @@ def _solvers(frame: pd.DataFrame) -> list[str]:
         says = " ".join(dict.fromkeys(text for text in rows["says"] if text))
         body.append([str(solver), str(case), *(_number(value[name]) for name in names), _number(value["lost"]), says])
     head = ["solver", "matrix", "size", "condition", "backward error / eps", "forward error", "growth", "lost", "what it does"]
-    return _markdown(head, body, 2)
+    return markdown(head, body, 2)
 
 
 def _sums(frame: pd.DataFrame) -> list[str]:
@@ -131,14 +106,14 @@ def _sums(frame: pd.DataFrame) -> list[str]:
         count = rows[rows["quantity"] == "terms"]["value"].max()
         cells = [_number(error.loc[kind, "value"]) for kind in kinds]
         body.append([str(way), str(rows["form"].iloc[0]), _number(count), *cells, _number(error["limit"].max())])
-    return _markdown(["sum", "accumulator", "terms", *kinds, "bound"], body, 2)
+    return markdown(["sum", "accumulator", "terms", *kinds, "bound"], body, 2)
 
 
 def _orders(frame: pd.DataFrame) -> list[str]:
     own = frame[frame["part"] == "orders"]
     same = {True: "the same bytes", False: ""}
     body = [[r.subject, r.case, same[r.value == 0] or _number(r.value), _number(r.limit)] for r in own.itertuples()]
-    return _markdown(["result", "changed", "largest difference", "allowed"], body, 2)
+    return markdown(["result", "changed", "largest difference", "allowed"], body, 2)
 
 
 def _relations(frame: pd.DataFrame) -> list[str]:
@@ -153,7 +128,7 @@ def _relations(frame: pd.DataFrame) -> list[str]:
         ]
         says = next((text for text in rows["says"] if text), "")
         body.append([str(room), str(case), str(form), *cells, says])
-    return _markdown(["room", "changed", "yardstick", *names, "why"], body, 3)
+    return markdown(["room", "changed", "yardstick", *names, "why"], body, 3)
 
 
 def _digits(frame: pd.DataFrame) -> list[str]:
@@ -164,7 +139,7 @@ def _digits(frame: pd.DataFrame) -> list[str]:
         value = rows.set_index("quantity")["value"]
         share = [f"{100 * value[name]:.1f} %" if name.startswith("share") else _number(value[name]) for name in names]
         body.append([str(room), str(form), str(case), *share])
-    return _markdown(["room", "moved", "output", *names], body, 3)
+    return markdown(["room", "moved", "output", *names], body, 3)
 
 
 def _flips(frame: pd.DataFrame) -> list[str]:
@@ -173,7 +148,7 @@ def _flips(frame: pd.DataFrame) -> list[str]:
     for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
         value = rows.set_index("quantity")["value"]
         body.append([str(room), str(form), str(case), f"{value['flips']:.0f}", f"{value['of']:.0f}"])
-    return _markdown(["room", "moved", "decision", "otherwise", "of"], body, 3)
+    return markdown(["room", "moved", "decision", "otherwise", "of"], body, 3)
 
 
 def _renderings(frame: pd.DataFrame) -> list[str]:
@@ -183,7 +158,7 @@ def _renderings(frame: pd.DataFrame) -> list[str]:
     for room, rows in own.groupby("subject", sort=False):
         value = rows.set_index("quantity")["value"]
         body.append([str(room), *(_number(value[name]) for name in names)])
-    return _markdown(["room", *names], body)
+    return markdown(["room", *names], body)
 
 
 def _samplers(frame: pd.DataFrame) -> list[str]:
@@ -194,7 +169,7 @@ def _samplers(frame: pd.DataFrame) -> list[str]:
         mean, worst = value["statistic / freedom"].mean(), value["threshold / p"].max()
         count, cells, draws = len(value["draws"]), value["cells"].max(), value["draws"].max()
         body.append([str(sampler), str(form), str(count), *(_number(x) for x in (draws, cells, mean, worst))])
-    return _markdown(
+    return markdown(
         ["what is drawn", "form", "tests", "draws", "cells", "mean statistic / freedom", "largest threshold / p"], body, 2
     )
 
@@ -206,7 +181,7 @@ def _caches(frame: pd.DataFrame) -> list[str]:
     for (room, form, case), rows in own.groupby(["subject", "form", "case"], sort=False):
         value = rows.set_index("quantity")["value"]
         body.append([str(room), str(form), str(case), *(_number(value[name]) for name in names)])
-    return _markdown(["room", "cache", "paths", *names], body, 3)
+    return markdown(["room", "cache", "paths", *names], body, 3)
 
 
 def _extremes(frame: pd.DataFrame) -> list[str]:
@@ -223,7 +198,7 @@ def _extremes(frame: pd.DataFrame) -> list[str]:
             says = next((text for text in one["says"] if text), "")
             body.append([str(case), str(room), *(_number(value[name]) if name in value else "" for name in names), says])
     head = ["extreme", "room", "albedo, dB", "as it is, dB", "roughness", "metallic", "log light", "lost", "seconds", "message"]
-    return _markdown(head, body, 2)
+    return markdown(head, body, 2)
 
 
 def ranked(frame: pd.DataFrame, room: str, score: str) -> list[tuple[str, str, float, float, float]]:
@@ -251,4 +226,4 @@ def _sensitivity(frame: pd.DataFrame) -> list[str]:
                 cells.append(f"**{text}**" if size > error and size > 0.05 else text)
         body.append([factor, levels, *cells])
     head = ["factor", "levels", *(f"{room}: {score.replace('_', ' ')}" for room in rooms for score in scores)]
-    return _markdown(head, body, 2)
+    return markdown(head, body, 2)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from iif_core.errors import InputError
 from workflow.artifacts.files import write_atomically
+from workflow.report.blocks import fill
 from workflow.settings.names import REPOSITORY, did_you_mean
 from workflow.stability import page, picture
 from workflow.stability.rows import COLUMNS, PARTS, measure
@@ -69,7 +70,7 @@ def keep() -> None:
         raise InputError(f"{TABLE}: not found; `snakemake --cores 2 {TABLE}` makes it")
     frame = pd.read_parquet(TABLE)
     write_atomically(KEPT, lambda path: frame.to_csv(path, index=False, float_format="%.4g"))
-    text = page.fill(PAGE.read_text(), page.tables(kept()))
+    text = fill(PAGE.read_text(), page.tables(kept()))
     write_atomically(PAGE, lambda path: path.write_text(text))
     picture.draw(frame, picture.PICTURE)
 
