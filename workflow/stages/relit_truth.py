@@ -67,7 +67,10 @@ def run(job: Job) -> None:
                 if wanted.denoise:
                     image = denoise(image, truth.albedo, _seen_normals(normals, face_id, view))
                 images.append(image.astype(np.float32))
-            pictures.append((view, images, valid & truth.valid & (face_id >= 0)))
+            mask = valid & truth.valid & (face_id >= 0)
+            if light.shift is not None:  # what the lamp hid has no truth, and the denoiser is told of the lamp there
+                mask &= ~np.isin(face_id, next(lamp.faces for lamp in setup.lamps if lamp.lamp == light.lamp))
+            pictures.append((view, images, mask))
         reason = _useless(light, setup, [(images[0], mask) for _, images, mask in pictures])
         if reason:
             left_out.append({"light": light.name, "reason": reason})
