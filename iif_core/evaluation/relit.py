@@ -25,7 +25,7 @@ METRICS = ("l2", "psnr", "ssim", "flip", "lpips", "lpips_vgg")
 
 
 def exposure_of(pictures: Iterable[ArrayLike], masks: Iterable[ArrayLike]) -> float:
-    """Return the factor that brings the quantile `SHARE` of the largest channel of all counted pixels to `WHITE` (Eq. E.21).
+    """Return the factor that brings the quantile `SHARE` of the largest channel of all counted pixels to `WHITE` (Eq. E.18).
 
     Raises:
         InputError: the pictures are black.
@@ -39,7 +39,7 @@ def exposure_of(pictures: Iterable[ArrayLike], masks: Iterable[ArrayLike]) -> fl
 
 
 def best_gain(prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike, exposure: float, by_channel: bool) -> Array:
-    """Return the gains (3,) that bring a picture nearest to the truth in least squares of radiance (Eq. E.22).
+    """Return the gains (3,) that bring a picture nearest to the truth in least squares of radiance (Eq. E.19).
 
     Only pixels count whose true radiance stays below white in every channel, because a picture does not show what lies above.
     A black picture, and one without such pixels, keeps the gain 1.
@@ -59,7 +59,7 @@ def best_gain(prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike, exposure
 
 
 def relative_error(prediction: ArrayLike, truth: ArrayLike, mask: ArrayLike) -> float:
-    """Return sum |p - t| / sum t over counted pixels and channels of radiance (Eq. E.23); 0 = same, 1 = as wrong as black."""
+    """Return sum |p - t| / sum t over counted pixels and channels of radiance (Eq. E.20); 0 = same, 1 = as wrong as black."""
     on = np.asarray(mask, bool)
     p, t = np.asarray(prediction, np.float64)[on], np.asarray(truth, np.float64)[on]
     total = t.sum()

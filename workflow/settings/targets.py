@@ -29,8 +29,9 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
     hint = _meant(target, list(dict.fromkeys(scenes)), list(rules), root)
     raise InputError(
         f"{target}: no rule makes this.{hint} Targets are scenes/<name>, plan/<name>, bench/<name> and relight/<name> with the"
-        " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/,"
-        " results/<name>/<stage>/manifest.json, results/studies/<study>.parquet,"
+        " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/, score/<name>,"
+        " compare/<a>,<b> with the names of two results,"
+        " results/<name>/<stage>/manifest.json, results/studies/<study>.parquet and .grid.pdf,"
         " `scenes` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
     )
 

@@ -1,0 +1,114 @@
+"""`compare/<a>,<b>`, `score/<scene>` and scored relighting on the tiny scene."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from workflow.artifacts import StageReader
+from workflow.artifacts.files import write_exr
+from workflow.artifacts.store import rgb, split_rgb
+from workflow.comparison.maps import own_maps
+
+
+def fails(workflow, *arguments: str) -> str:
+    result = workflow.run(*arguments)
+    assert result.returncode != 0 and "Traceback" not in result.stderr and "Select jobs" not in result.stderr
+    return result.stderr
+
+
+def hand_over(folder: Path, maps: Path) -> None:
+    """Write our own maps as somebody else would deliver theirs."""
+    fitted = StageReader(folder / "results/tiny/affines", "affines", "tiny")
+    rendered = StageReader(folder / "results/tiny/render", "render", "tiny")
+    for name in fitted.names("maps/"):
+        view, channels = Path(name).stem, rendered.exr(name)
+        for quantity, values in own_maps(fitted, view).items():
+            write_exr(maps / quantity / f"{view}.exr", split_rgb(values) if values.ndim == 3 else {"Y": values})
+        write_exr(maps / f"emission/{view}.exr", split_rgb(rgb(channels, "emission")))
+        write_exr(maps / f"rgb/{view}.exr", split_rgb(rgb(channels)))
+
+
+def test_our_own_maps_score_as_stage_metrics_says(workflow):
+    hand_over(workflow.folder, workflow.folder / "mine")
+    result = workflow.run("score/tiny", "--config", "maps=mine")
+    assert result.returncode == 0, result.stderr[-3000:]
+    keys = ["view", "quantity", "metric", "protocol"]
+    ours = pd.read_parquet(workflow.folder / "results/tiny/metrics/metrics.parquet").set_index(keys)["value"]
+    found = pd.read_parquet(workflow.folder / "score/tiny/scores.parquet").set_index(keys)["value"]
+    of_images = ours[(ours.index.get_level_values("view") != "all")]
+    of_images = of_images.drop([key for key in of_images.index if key[1] == "rgb" and key[2] == "log_l2"])
+    assert set(found.index) == set(of_images.index) and len(found) > 100
+    materials = [key for key in found.index if key[1] != "rgb"]
+    assert (found[materials] == of_images[materials]).all()
+    rest = [key for key in found.index if key[1] == "rgb"]
+    assert np.allclose(found[rest], of_images[rest], rtol=1e-4)
+    page = (workflow.folder / "score/tiny/score.html").read_text()
+    assert "albedo: 4 of 4 views" in page and "http" not in page.partition("<body>")[2]
+    assert "Nothing to be done" in workflow.run("score/tiny", "--config", "maps=mine").stderr
+
+
+def test_maps_that_are_not_there_stop_before_any_job(workflow):
+    assert "score/tiny: whose maps? Give their folder: --config maps=<folder>" in fails(workflow, "score/tiny")
+    assert "--config maps=nowhere: no such folder" in fails(workflow, "score/tiny", "--config", "maps=nowhere")
+
+
+def test_a_result_beside_itself_and_beside_another(workflow):
+    folder = workflow.folder
+    assert workflow.run("compare/tiny,tiny").returncode == 0
+    same = pd.read_parquet(folder / "compare/tiny,tiny/compare.parquet")
+    assert same["same"].all() and set(same["part"]) == {"settings", "code", "versions", "plan", "scores", "objects", "pictures"}
+    numbers = same[same["part"].isin(["scores", "objects", "pictures"])]
+    assert len(numbers) > 50 and (numbers["difference"] == 0).all()
+    assert "No difference." in (folder / "compare/tiny,tiny/compare.html").read_text()
+
+    # Another result, planted: the albedo of every cell is halved, and one setting is another.
+    shutil.copytree(folder / "results/tiny", folder / "results/other")
+    manifest = folder / "results/other/affines/manifest.json"
+    document = json.loads(manifest.read_text())
+    document["settings"]["affines"]["pixels"] += 1
+    cells = pd.read_parquet(manifest.with_name("cells.parquet"))
+    cells[[f"albedo_{c}" for c in "rgb"]] *= np.float32(0.5)
+    cells.to_parquet(manifest.with_name("cells.parquet"))
+    path = manifest.with_name("cells.parquet")
+    from workflow.artifacts.files import sha256_of
+
+    document["files"]["cells.parquet"] |= {"sha256": sha256_of(path), "bytes": path.stat().st_size}
+    manifest.write_text(json.dumps(document))
+    result = workflow.run("compare/tiny,other")
+    assert result.returncode == 0, result.stderr[-2000:]
+    rows = pd.read_parquet(folder / "compare/tiny,other/compare.parquet")
+    differing = rows[~rows["same"]]
+    assert differing[differing["part"] == "settings"]["name"].tolist() == ["affines.pixels"]
+    objects = differing[differing["part"] == "objects"]
+    assert objects["name"].str.contains("/albedo_").all() and len(objects) >= 3
+    assert np.allclose(objects["b"].astype(float) / objects["a"].astype(float), 0.5, rtol=1e-3)
+    assert set(differing["part"]) == {"settings", "objects"}
+
+
+def test_results_that_are_not_there_stop_before_any_job(workflow):
+    assert "scenes/tinny.yaml: not found. Did you mean" in fails(workflow, "compare/tiny,tinny")
+    shutil.rmtree(workflow.folder / "results/tiny/affines")
+    assert "results/tiny: without affines, so there is no result to compare yet" in fails(workflow, "compare/tiny,tiny")
+
+
+def test_the_tiny_room_under_new_light(workflow):
+    path = workflow.folder / "config/scenes/tiny.yaml"
+    path.write_text(path.read_text() + "relit: {views: 1, lamps: 1, spheres: 1, samples: 64}\n")
+    result = workflow.run("results/tiny/relit_scores/manifest.json")
+    assert result.returncode == 0, result.stderr[-3000:]
+    folder = workflow.folder / "results/tiny"
+    lights = json.loads((folder / "relit_truth/lights.json").read_text())
+    assert [light["kind"] for light in lights["lights"]] == ["lamp", "moved", "sphere"]
+    reasons = {gone["light"]: gone["reason"] for gone in lights["left_out"]}
+    assert "no opening" in reasons.pop("environment") and list(reasons.values()) == ["only the 1 strongest shine alone"]
+    table = pd.read_parquet(folder / "relit_scores/scores.parquet")
+    assert set(table["quantity"]) == {"relit_lamp", "relit_moved", "relit_sphere"} and table["found"].all()
+    psnr = table[table["metric"] == "psnr"].set_index(["variant", "light", "protocol"])["value"]
+    for light in psnr["result"].index.unique("light"):
+        assert psnr["result", light, "raw"] > 22 and psnr["noise", light, "raw"] > psnr["result", light, "raw"] - 3
+    lamps = json.loads((folder / "relit_scores/scores.json").read_text())["lamps"]
+    assert [lamp["found"] for lamp in lamps] == [True, True]
+    assert all(0.7 < lamp["power_ratio"] < 1.4 and lamp["overlap"] > 0.9 for lamp in lamps)
