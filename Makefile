@@ -3,6 +3,7 @@
 #   bash envs/setup.sh && .venv/bin/python -m pytest
 .DEFAULT_GOAL := help
 CORES ?= all
+COMMA := ,
 PYTHON_BIN := .venv/bin/python
 SNAKEMAKE := .venv/bin/snakemake
 # QUALITY=draft|standard|paper; SNAKEMAKE_ARGS and PYTEST_ARGS pass anything else through.
@@ -11,7 +12,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all node doctor lint format lock docs clean always plan relight bench results \
+.PHONY: help setup scenes verify test test-all node doctor lint format lock docs clean always plan relight bench compare score results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -19,6 +20,8 @@ help:
 	@echo 'make relight/<name>   the scene under other light and from other cameras, as its file says'
 	@echo 'make plan/<name>      what the scene requires, before any long work'
 	@echo 'make bench/<name>     three points of speed and accuracy in this room'
+	@echo 'make compare/<a>,<b>  two finished results side by side'
+	@echo 'make score/<name>     scores of the maps in MAPS=<folder> against a scene with truth'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
 	@echo 'make verify           re-hash every artefact against its manifest'
@@ -47,12 +50,18 @@ plan/%: setup always
 bench/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
+compare/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+score/%: setup always
+	$(SNAKEMAKE) --cores $(CORES) $@ --config quality=$(or $(QUALITY),draft) $(if $(MAPS),maps=$(MAPS)) $(SNAKEMAKE_ARGS)
+
 results/%: setup always
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
 # Folders of the checkout, which make would take for targets that are up to date.
-plan relight bench results:
-	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter plan relight bench,$@),kitchen,kitchen/capture/manifest.json)' >&2; exit 1
+plan relight bench compare score results:
+	@echo '$@: not a target; name what is to be made in it, such as make $@/$(if $(filter plan relight bench score,$@),kitchen,$(if $(filter compare,$@),kitchen$(COMMA)hall,kitchen/capture/manifest.json))' >&2; exit 1
 
 config envs iif_core profiles tests workflow:
 	@echo '$@: a folder of the program and not a target; make help lists the targets' >&2; exit 1
