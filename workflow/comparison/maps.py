@@ -277,11 +277,11 @@ def _page(
         "Pixels with true emission, without truth and without surface do not count; for albedo neither do true mirrors"
         " (roughness below 0.05). Emission counts wherever there is truth."
     )
-    protocols = "; ".join(f"{PROTOCOLS[p].words}: {PROTOCOLS[p].explanation}" for p in ("raw", "scaled", "oracle_affine"))
+    protocols = "; ".join(PROTOCOLS[p].explanation for p in ("raw", "scaled", "oracle_affine"))
     facts = [
         ("maps", str(folder)),
         ("pixels that count", masks),
-        ("protocols", f"{protocols}. Every quantity has those of stage metrics."),
+        ("protocols", f"{protocols}. Every quantity has those of stage metrics"),
         ("colour", "scores of albedo are of linear values; pictures below are shown in sRGB"),
     ]
     strips = [strip for view, own, truth in kept for strip in _strips(view, own, truth)]

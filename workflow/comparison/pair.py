@@ -90,7 +90,7 @@ def _flat(value: Any, prefix: str = "") -> dict[str, str]:
         for key, inner in value.items():
             out |= _flat(inner, f"{prefix}.{key}" if prefix else str(key))
         return out
-    return {prefix: json.dumps(value, sort_keys=True)}
+    return {prefix: json.dumps(value, sort_keys=True)} if prefix else {}
 
 
 def _settings(result: Result) -> dict[str, str]:
@@ -203,7 +203,7 @@ def _strips(a: Result, b: Result) -> tuple[list[Strip], list[Row]]:
             y = y if x.shape == y.shape else _resampled(y, x.shape)
             draw = pictures.linear if layer == "albedo" else pictures.encoded
             off = float(np.abs(x - y).mean())
-            note = f"mean {off:.4f}, {a.name} = {x.mean():.4f}{resized}"
+            note = f"mean {off:.4f}; mean of {a.name} {x.mean():.4f}{resized}"
             tiles = [
                 Picture(a.name, pictures.data_uri(draw(np.clip(x, 0, 1)))),
                 Picture(b.name, pictures.data_uri(draw(np.clip(y, 0, 1)))),
