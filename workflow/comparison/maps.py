@@ -5,6 +5,7 @@ The truth, the pixels that count, the protocols and the metrics are those of sta
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -148,10 +149,8 @@ def _scene(scene: str, quality: str) -> _Scene:
     return _Scene(capture, readers["segmentation"])
 
 
-def score(
-    scene: str, folder: Path, quality: str, colour: str = "auto", with_vgg: bool = False
-) -> tuple[ScoreRows, list[str], Any]:
-    """Score the maps in a folder.
+def score(scene: str, folder: Path, quality: str, colour: str = "auto") -> tuple[ScoreRows, list[str], Any]:
+    """Score the maps in a folder; with LPIPS on VGG16 where stage metrics of the scene has it.
 
     Returns:
         The scores under variant `maps`, what is to be said about them, and (views scored, maps of them, truths) for the page.
@@ -159,7 +158,7 @@ def score(
     found = _scene(scene, quality)
     views = {view.name: view for view in found.capture.views}
     maps = find(folder, colour, list(views))
-    networks = perceptual_networks(with_vgg)
+    networks = perceptual_networks(json.loads(fp.resolved(scene, quality))["metrics"]["lpips_vgg"])
     networks_of = {q: networks if q == "albedo" else {"alex": networks["alex"]} for q in (*PROPERTIES, "rgb")}
     exposure = dict(zip(views, found.capture.exposures().tolist(), strict=True))
     rows, other, kept = ScoreRows(), [], []
@@ -237,11 +236,11 @@ def _notes(maps: Maps, views: list[str], other: list[list[float]]) -> list[str]:
     return out
 
 
-def write_scores(scene: str, folder: Path, quality: str, colour: str, output: Path, with_vgg: bool = False) -> None:
+def write_scores(scene: str, folder: Path, quality: str, colour: str, output: Path) -> None:
     """Write scores.parquet, scores.csv and score.html into `output`, and print the means."""
     import pandas as pd
 
-    rows, notes, (maps, kept) = score(scene, folder, quality, colour, with_vgg)
+    rows, notes, (maps, kept) = score(scene, folder, quality, colour)
     frame = pd.DataFrame(rows.table(scene, {"maps"}))
     output.mkdir(parents=True, exist_ok=True)
     write_atomically(output / "scores.parquet", lambda path: frame.to_parquet(path, index=False))

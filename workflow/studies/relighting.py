@@ -14,6 +14,7 @@ from workflow.runtime import fingerprint as fp
 from workflow.settings.names import REPOSITORY
 from workflow.settings.study_files import load_study
 from workflow.studies import table
+from workflow.studies.grid import write_grid
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,6 +23,7 @@ STUDY = "relighting"
 KEPT = REPOSITORY / "docs/results/data/relighting.csv"
 LAMPS = REPOSITORY / "docs/results/data/relighting_lamps.csv"
 PAGE = REPOSITORY / "docs/results/relighting.md"
+PICTURE = REPOSITORY / "docs/pictures/relighting.jpg"
 NOISE = "noise"
 KEY = ("scene", "variant", "seed", "light", "view", "quantity", "metric", "protocol")
 COLUMNS = (*KEY, "value", "found", "seconds", "fingerprint")
@@ -39,7 +41,7 @@ WORDS = {
 
 
 def keep(quality: str) -> None:
-    """Add the rows of the cells that are finished to docs/results/data/relighting.csv, and make the tables of the page anew.
+    """Add the rows of the cells that are finished to docs/results/data/relighting.csv, and make tables and picture of the page anew.
 
     Raises:
         InputError: nothing was ever scored.
@@ -58,6 +60,13 @@ def keep(quality: str) -> None:
     blocks = tables(pd.read_csv(KEPT), pd.read_csv(LAMPS))
     text = fill(PAGE.read_text(), blocks)
     write_atomically(PAGE, lambda temporary: temporary.write_text(text))
+    if len(new):
+        from PIL import Image
+
+        write_grid(STUDY, quality)
+        with Image.open(table.RESULTS / f"{STUDY}.grid.png") as sheet:
+            picture = sheet.convert("RGB")
+        write_atomically(PICTURE, lambda temporary: picture.save(temporary, "JPEG", quality=85))
 
 
 def _joined(new: pd.DataFrame, path: Path, cell: list[str], order: list[str], columns: tuple[str, ...]) -> pd.DataFrame:
