@@ -41,7 +41,7 @@ WORDS = {
 
 
 def keep(quality: str) -> None:
-    """Add the rows of the cells that are finished to docs/results/data/relighting.csv, and make tables and picture of the page anew.
+    """Add the rows of the cells that are finished to docs/results/data/relighting.csv, and make the page anew: tables, picture.
 
     Raises:
         InputError: nothing was ever scored.
