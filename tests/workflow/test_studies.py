@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from PIL import Image
 from support import planned
 
 TINY = """\
@@ -96,6 +97,23 @@ def test_page_log_and_picture(study):
     assert "weights of VGG16 are not there" in page
     assert "mean of an object" in study.said
     assert (study.folder / "results/studies/two.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_sheet_shows_the_finished_variants_beside_the_truth(study):
+    result = study.run("results/studies/two.grid.pdf")
+    assert result.returncode == 0, result.stderr[-3000:]
+    folder = study.folder / "results/studies"
+    assert (folder / "two.grid.pdf").read_bytes()[:5] == b"%PDF-"
+    with Image.open(folder / "two.grid.png") as sheet:
+        # Truth and two variants in columns; albedo, roughness and metallic of one room in rows.
+        assert abs(sheet.width / sheet.height - (0.75 + 3 * 1.38) / (0.3 + 3 * 1.38)) < 0.02
+    assert "Nothing to be done" in study.run("results/studies/two.grid.png").stderr
+    study.write("config/studies/never.yaml", STUDY.replace("variant: object_mean", "ridge: 0.7"))
+    never = study.run("results/studies/never.grid.pdf", "-n")
+    assert "no variant of this study is finished" not in never.stderr  # `plain` is shared with the other study
+    study.write("config/studies/never.yaml", STUDY.replace("seeds: [0, 1]", "seeds: [7]"))
+    never = study.run("results/studies/never.grid.pdf", "-n")
+    assert never.returncode != 0 and "results/studies/never.grid: no variant of this study is finished" in never.stderr
 
 
 def test_photographs_are_made_once_and_predictions_once_a_seed(study):
