@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from iif_core.light.lamps import Lamp, lamps_of
 from iif_core.light.relighting import sphere_mesh
 from workflow.scene.base_scene import Light
+from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import Recovered
 
 if TYPE_CHECKING:
@@ -74,6 +76,19 @@ class NewLight:
             return None
         vertices, faces = sphere_mesh(self.ball.centre, self.ball.radius)
         return vertices, faces, np.tile(np.float32(self.ball.radiance), (len(faces), 1))
+
+
+def source_lamps(capture: CaptureReader) -> list[Lamp]:
+    """Return the lamps of the mesh of a capture with true emission, the strongest first."""
+    vertices, faces = capture.mesh()
+    table = capture.faces()
+    if "emission_r" not in table:
+        return []
+    names: list[str] = []
+    if capture.reader.has("instances.parquet"):
+        names = [str(name) for name in capture.reader.table("instances.parquet")["name"]]
+    emission = np.stack([table[f"emission_{c}"] for c in "rgb"], 1)
+    return lamps_of(vertices, faces, table["instance_id"], emission, names)
 
 
 def relit_world(scene: Recovered, light: NewLight, lamp_of_face: np.ndarray) -> Scene:

@@ -17,11 +17,10 @@ from iif_core.light.lamps import match_faces
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
-from workflow.scene.new_light import NewLight, relit_world
+from workflow.scene.new_light import NewLight, relit_world, source_lamps
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered
 from workflow.scoring.scores import UNITS, ScoreRows, perceptual_networks
-from workflow.stages.relit_truth import source_lamps
 
 _SEEDS = 0x726C7363  # keeps the random streams of this stage apart from those of others
 NOISE = "noise"

@@ -8,12 +8,12 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.evaluation.relit import exposure_of
-from iif_core.light.lamps import Lamp, lamps_of
+from iif_core.light.lamps import Lamp
 from iif_core.light.relighting import frame_times
 from workflow.artifacts.store import split_rgb
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.runtime.job import Job
-from workflow.scene.new_light import Ball, NewLight
+from workflow.scene.new_light import Ball, NewLight, source_lamps
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.sources.relit import open_room
 
@@ -26,9 +26,8 @@ CLEARANCE = 5.0
 """Radii that its path keeps away from the cameras of the pictures."""
 MOVE = 0.5
 """Metres by which the strongest lamp is moved, towards the middle of the cameras."""
-DARKEST = 1e-4
-"""Pictures whose counted pixels have less light in the mean than this share of the light's own radiance are left out: nothing
-of it reaches the room."""
+OPEN = 1e-3
+"""Mean radiance in the room, as a share of that outside, below which the room has no opening: what comes in are cracks."""
 
 
 @dataclass(frozen=True)
@@ -104,19 +103,6 @@ def run(job: Job) -> None:
     )
 
 
-def source_lamps(capture: CaptureReader) -> list[Lamp]:
-    """Return the lamps of the mesh of a capture with true emission, the strongest first."""
-    vertices, faces = capture.mesh()
-    table = capture.faces()
-    if "emission_r" not in table:
-        return []
-    names: list[str] = []
-    if capture.reader.has("instances.parquet"):
-        names = [str(name) for name in capture.reader.table("instances.parquet")["name"]]
-    emission = np.stack([table[f"emission_{c}"] for c in "rgb"], 1)
-    return lamps_of(vertices, faces, table["instance_id"], emission, names)
-
-
 def _setup(capture: CaptureReader, count: int) -> _Setup:
     places = np.unique(np.linspace(0, len(capture.views) - 1, min(count, len(capture.views))).round().astype(int))
     views = [capture.views[place] for place in places]
@@ -187,7 +173,7 @@ def _useless(light: NewLight, setup: _Setup, pictures: list[tuple[np.ndarray, np
     mean = float(np.concatenate(seen).mean()) if seen else 0.0
     if light.kind == "environment":
         own = max(light.environment or (0.0,))
-        return "the room has no opening that lets it in" if mean < 10 * DARKEST * own else ""
+        return "the room has no opening that lets it in" if mean < OPEN * own else ""
     return "no light of it reaches what the views see" if mean <= 0 else ""
 
 
