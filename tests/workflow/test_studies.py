@@ -106,7 +106,8 @@ def test_a_sheet_shows_the_finished_variants_beside_the_truth(study):
     assert (folder / "two.grid.pdf").read_bytes()[:5] == b"%PDF-"
     with Image.open(folder / "two.grid.png") as sheet:
         # Truth and two variants in columns; albedo, roughness and metallic of one room in rows.
-        assert abs(sheet.width / sheet.height - (0.75 + 3 * 1.38) / (0.3 + 3 * 1.38)) < 0.02
+        left = 0.065 * len("roughness") + 0.12
+        assert abs(sheet.width / sheet.height - (left + 3 * 1.38) / (0.3 + 3 * 1.38)) < 0.02
     assert "Nothing to be done" in study.run("results/studies/two.grid.png").stderr
     study.write("config/studies/never.yaml", STUDY.replace("variant: object_mean", "ridge: 0.7"))
     never = study.run("results/studies/never.grid.pdf", "-n")

@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 MATERIALS = ("albedo", "roughness", "metallic")
 TILE = 1.35
 """Width of a picture in inches."""
-GAP, LEFT, TOP = 0.03, 0.75, 0.3
+GAP, TOP = 0.03, 0.3
+LETTER = 0.065
+"""Width of a letter of the labels in inches."""
 DPI = 200
 
 
@@ -107,21 +109,22 @@ def draw(lines: list[Line], columns: list[str], labels: dict[str, str], insets: 
     from matplotlib import pyplot as plt
 
     heights = [TILE * _aspect(line) for line in lines]
-    width = LEFT + len(columns) * (TILE + GAP)
+    left = LETTER * max(len(words) for line in lines for words in line.label.split("\n")) + 0.12
+    width = left + len(columns) * (TILE + GAP)
     height = TOP + sum(h + GAP for h in heights)
     figure = plt.figure(figsize=(width, height))
     plt.close(figure)
     y = height - TOP
     for j, column in enumerate(columns):
-        x = LEFT + j * (TILE + GAP) + TILE / 2
+        x = left + j * (TILE + GAP) + TILE / 2
         figure.text(x / width, (height - 0.55 * TOP) / height, _wrapped(labels[column]), ha="center", va="center", fontsize=7)
     for line, tall in zip(lines, heights, strict=True):
         y -= tall
-        figure.text((LEFT - 0.06) / width, (y + tall / 2) / height, line.label, ha="right", va="center", fontsize=7)
+        figure.text((left - 0.06) / width, (y + tall / 2) / height, line.label, ha="right", va="center", fontsize=7)
         for j, column in enumerate(columns):
             if column not in line.tiles:
                 continue
-            place = ((LEFT + j * (TILE + GAP)) / width, y / height, TILE / width, tall / height)
+            place = ((left + j * (TILE + GAP)) / width, y / height, TILE / width, tall / height)
             axes = figure.add_axes(place)
             axes.imshow(line.tiles[column], interpolation="nearest", aspect="auto")
             axes.axis("off")
@@ -179,7 +182,7 @@ def _lines(study: Study, cells: list[table.Cell], scene: str, quality: str) -> I
     lit = truth.json("lights.json") if truth is not None and study.scores == "relit_scores" else {"views": [], "lights": []}
     views = [view for view in capture.views if not lit["views"] or view.name in lit["views"]]
     count = min(study.sheet.views, len(views))
-    chosen = [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
+    chosen = [views[((2 * i + 1) * len(views) - 1) // (2 * count)] for i in range(count)]
     for view in chosen:
         for quantity in (q for q in study.sheet.quantities if q in MATERIALS):
             line = Line(scene, f"{scene}\n{quantity}")

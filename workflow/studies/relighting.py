@@ -24,6 +24,8 @@ KEPT = REPOSITORY / "docs/results/data/relighting.csv"
 LAMPS = REPOSITORY / "docs/results/data/relighting_lamps.csv"
 PAGE = REPOSITORY / "docs/results/relighting.md"
 PICTURE = REPOSITORY / "docs/pictures/relighting.jpg"
+LARGEST = (1000, 4000)
+"""Width and height of the picture of the page, at most."""
 NOISE = "noise"
 KEY = ("scene", "variant", "seed", "light", "view", "quantity", "metric", "protocol")
 COLUMNS = (*KEY, "value", "found", "seconds", "fingerprint")
@@ -66,6 +68,7 @@ def keep(quality: str) -> None:
         write_grid(STUDY, quality)
         with Image.open(table.RESULTS / f"{STUDY}.grid.png") as sheet:
             picture = sheet.convert("RGB")
+        picture.thumbnail(LARGEST, Image.Resampling.BOX)
         write_atomically(PICTURE, lambda temporary: picture.save(temporary, "JPEG", quality=85))
 
 
