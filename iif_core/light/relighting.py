@@ -90,7 +90,7 @@ def exposure_for(radiance: ArrayLike, quantile: float = 0.95, level: float = 0.8
 def coloured(radiance: ArrayLike, factor: float, colour: ArrayLike | None = None) -> Array:
     """Return the radiance (3,) of a lamp of radiance `radiance` (3,) that is dimmed by `factor` and has another colour.
 
-    With a colour c (3,), linear, the radiance is factor x Y(radiance) / Y(c) x c: the luminance Y stays (Eq. L.60).
+    With a colour c (3,), linear, the radiance is factor x Y(radiance) / Y(c) x c: the luminance Y stays (Eq. L.64).
 
     >>> coloured([1.0, 1.0, 1.0], 0.5).tolist()
     [0.5, 0.5, 0.5]
@@ -108,7 +108,7 @@ def coloured(radiance: ArrayLike, factor: float, colour: ArrayLike | None = None
 
 
 def sum_of_lamps(pictures: ArrayLike, weights: ArrayLike) -> Array:
-    """Return the picture under other light: sum over l of weights_l pictures_l (Eq. L.59).
+    """Return the picture under other light: sum over l of weights_l pictures_l (Eq. L.63).
 
     Args:
         pictures: (L, ..., 3) radiance that each lamp gives by itself; weights: (L, 3) factors on the light of each.

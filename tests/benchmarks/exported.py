@@ -2,9 +2,9 @@
 
     python tests/benchmarks/exported.py kitchen [--quality draft] [--views 3] [--samples 64] [--replicates 12] [--json rows.json]
 
-Run it in a working folder where the scene is finished. Prints, and adds to a JSON file: faults that Khronos' validator finds; mean
-differences of `scene.glb`, read by trimesh, from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the
-exact reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard
+Run it in a working folder where the scene is finished. Prints, and adds to a JSON file: faults that Khronos' validator finds;
+mean differences of `scene.glb`, read by trimesh, from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py`
+(the exact reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard
 error, and Sidak's test of all pixels.
 """
 

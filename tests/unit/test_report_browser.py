@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.browser import DESKTOP, PHONE, axe, browser, page_for  # noqa: F401
+from tests.browser import DESKTOP, PHONE, axe
 from workflow.report import pictures as pic
 from workflow.report.downloads import Command, downloads
 from workflow.report.page import Number, Page, Pair, Picture, Strip, Table, ViewRows, render_page

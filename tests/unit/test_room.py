@@ -55,8 +55,8 @@ def surface(parts):
     empty = np.zeros((0, 3), np.int32)
     faces = sum(len(one.faces) for one in parts)
     return BaseScene(
-        np.zeros((0, 3)), empty, np.zeros(0), np.zeros((0, 3)), np.zeros(faces), 3, 0.05, np.zeros(3), empty, np.zeros(0, np.int32),
-        np.zeros((0, 5), np.float32), values,
+        np.zeros((0, 3)), empty, np.zeros(0), np.zeros((0, 3)), np.zeros(faces), 3, 0.05, np.zeros(3), empty,
+        np.zeros(0, np.int32), np.zeros((0, 5), np.float32), values,
     )  # fmt: skip
 
 

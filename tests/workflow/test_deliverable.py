@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml metrics.parquet
-timings.parquet report.html room.html manifest.json""".split()
+timings.parquet report.html room.html scene_unlit.glb scene.usdc manifest.json""".split()
 
 
 @pytest.fixture(scope="module")

@@ -147,7 +147,7 @@ def test_a_lamp_adds_what_paths_find(room, stored, finished, monkeypatch, llvm):
     turn = np.reshape(stored.document["worldFromRoom"], (3, 3))
     room.evaluate("room.setGloss(false)")
     room.evaluate("room.setExposure(-2)")  # nothing is clipped
-    found, traced = [[], []], [[], []]
+    found, traced = ([[] for _ in stored.document["lamps"]] for _ in range(2))
     for number in range(len(stored.document["photographs"])):
         room.evaluate("i => room.showPhotograph(i)", number)
         facts, shown = samples(room)

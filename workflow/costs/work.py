@@ -208,7 +208,7 @@ def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
 
 def _room(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     texels = settings["room"]["lightmap_size"] ** 2 / MILLION
-    return "all", {"paths": texels * settings["room"]["samples"], "texels": texels, "faces": size.faces / MILLION}
+    return "all", {"paths": texels * settings["room"]["samples"], "pixels": texels, "faces": size.faces / MILLION}
 
 
 def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:

@@ -1,4 +1,5 @@
-"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part, one atlas for all.
+"""Writes scene.glb: glTF 2.0 with metallic-roughness materials, one mesh and one material per part, one atlas for all; and
+scene_unlit.glb, with the light of the room in the colours, for viewers that compute no light.
 
 trimesh is not used because it does not write `KHR_materials_emissive_strength`.
 """
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.numerics.color import linear_from_srgb, tone_map
+from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart, base_color_picture, encoded, surface_picture
 from workflow.scene.normal_form import View
 
@@ -32,6 +35,7 @@ def glb_bytes(
     up: np.ndarray,
     provenance: dict[str, Any],
     views: Sequence[View] = (),
+    exposure: float | None = None,
 ) -> bytes:
     """Make one binary glTF file of the scene.
 
@@ -44,12 +48,16 @@ def glb_bytes(
         up: unit vector.
         provenance: stored in `asset.extras`.
         views: photographs, which become cameras; glTF has no offset of the principal point, so that it is lost.
+        exposure: with a number, `base_color` is the lit room as it appears on a screen at this factor on radiance. Materials are
+            then `KHR_materials_unlit`, and emitters are `KHR_lights_punctual`, too, for what a user puts beside them; a renderer
+            of scene.glb would count such lights twice.
     """
     blob = _Blob()
     materials, meshes, nodes = [], [], []
     textures = {name: number for number, name in enumerate(images)}
     for part in parts:
-        mesh, material = _mesh(blob, part, len(materials)), _material(part, textures)
+        material = _material(part, textures) if exposure is None else _unlit(part, textures, exposure)
+        mesh = _mesh(blob, part, len(materials))
         extras = {"object_id": part.object_id, "emitter_id": part.emitter_id}
         nodes.append({"name": part.name, "mesh": len(meshes), "extras": extras})
         meshes.append(mesh)
@@ -58,6 +66,10 @@ def glb_bytes(
     for number, view in enumerate(views):
         pose = np.asarray(view.world_from_camera, np.float64) @ np.diag([1.0, -1.0, -1.0, 1.0])  # glTF looks along -z, y up
         nodes.append({"name": f"view {view.name}", "camera": number, "matrix": [float(v) for v in pose.T.ravel()]})
+    lights = [] if exposure is None else [part for part in parts if part.radiance.any()]
+    for number, part in enumerate(lights):
+        link = {"KHR_lights_punctual": {"light": number}}
+        nodes.append({"name": f"{part.name} light", "translation": _middle(part)[0], "extensions": link})
     root = {"name": "world", "rotation": rotation_to_y(up), "children": list(range(len(nodes)))}
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "Intrinsic Image Fusion", "extras": provenance},
@@ -75,9 +87,12 @@ def glb_bytes(
         document["textures"] = [{"source": number, "sampler": 0} for number in range(len(images))]
         document["images"] = [_image(blob, name, data) for name, data in images.items()]
     document |= {"bufferViews": blob.views, "buffers": [{"byteLength": len(blob.data)}]}
-    extensions = sorted({name for material in materials for name in material.get("extensions", {})})
+    extensions = {name for material in materials for name in material.get("extensions", {})}
+    if lights:
+        document["extensions"] = {"KHR_lights_punctual": {"lights": [_light(part) for part in lights]}}
+        extensions.add("KHR_lights_punctual")
     if extensions:
-        document["extensionsUsed"] = extensions
+        document["extensionsUsed"] = sorted(extensions)
     return _container(document, bytes(blob.data))
 
 
@@ -148,6 +163,33 @@ def _material(part: TexturedPart, textures: dict[str, int]) -> dict[str, Any]:
         material["emissiveFactor"] = [round(float(v) / strength, 6) for v in part.radiance]
         material["extensions"] = {"KHR_materials_emissive_strength": {"emissiveStrength": round(strength, 6)}}
     return material
+
+
+def _unlit(part: TexturedPart, textures: dict[str, int], exposure: float) -> dict[str, Any]:
+    surface: dict[str, Any] = {"baseColorFactor": [1.0, 1.0, 1.0, part.opacity]}
+    if part.emitter_id >= 0:
+        shown = linear_from_srgb(tone_map(part.radiance, exposure))
+        surface["baseColorFactor"] = [round(float(v), 6) for v in shown] + [1.0]
+    else:
+        surface["baseColorTexture"] = {"index": textures["base_color"]}
+    surface |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    material = {"name": part.name, "doubleSided": part.double_sided, "pbrMetallicRoughness": surface}
+    material["extensions"] = {"KHR_materials_unlit": {}}
+    return material | ({"alphaMode": "BLEND"} if part.opacity < 1 else {})
+
+
+def _middle(part: TexturedPart) -> tuple[list[float], float]:
+    """Centroid of the surface of a part, metres, and its area, m^2."""
+    area = face_geometry(part.vertices, part.faces)[1]
+    centre = np.average(part.vertices[part.faces].mean(1), 0, area)
+    return [float(v) for v in centre], float(area.sum())
+
+
+def _light(part: TexturedPart) -> dict[str, Any]:
+    """A point light with the intensity of the emitter along its normal, radiance times area, in the unit of the emitters."""
+    strength = float(part.radiance.max())
+    colour = [round(float(v) / strength, 6) for v in part.radiance]
+    return {"type": "point", "name": part.name, "color": colour, "intensity": round(strength * _middle(part)[1], 6)}
 
 
 def _camera(view: View) -> dict[str, Any]:

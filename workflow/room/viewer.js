@@ -507,7 +507,7 @@
     // ------------------------------------------------------------------------------------------------------- the picture
 
     // Where a picture takes long, those that follow one another have fewer pixels, and the last is drawn again with all of them.
-    const SMOOTH = 50; // ms that a picture of a movement may take
+    const SMOOTH = 25; // ms that a picture of a movement may take
     const REST = 250; // ms without a change after which it is drawn again
     let lightDirty = true;
     let waiting = false;
@@ -519,7 +519,9 @@
       waiting = true;
       requestAnimationFrame(() => {
         waiting = false;
-        coarseness = cost > SMOOTH ? Math.max(Math.sqrt(SMOOTH / cost), 0.25) : 1;
+        // In steps, because every other size of the picture is new memory.
+        const wanted = cost > SMOOTH ? Math.max(Math.sqrt(SMOOTH / cost), 0.25) : 1;
+        coarseness = 2 ** (Math.floor(2 * Math.log2(wanted)) / 2);
         render(coarseness);
         clearTimeout(resting);
         if (coarseness < 1) resting = setTimeout(() => render(1), REST);
@@ -541,8 +543,8 @@
       renderer.render(scene, camera);
       const gl = renderer.getContext();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, onePixel); // waits until it is drawn
-      const taken = (performance.now() - begun) / (share * share);
-      cost = cost ? 0.5 * cost + 0.5 * taken : 0.1 * taken; // the first picture has to compile and to upload
+      const taken = performance.now() - begun;
+      if (share === 1) cost = cost ? 0.5 * cost + 0.5 * taken : 0.1 * taken; // the first picture has to compile and to upload
     }
 
     // --------------------------------------------------------------------------------------------------------- clicking

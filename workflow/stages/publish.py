@@ -63,7 +63,13 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
     export = readers["export"]
     chosen = [("export", name) for name in export.names() if name != "export.json"]
     chosen += [("render", name) for name in readers["render"].names("maps/")]
-    chosen += [("report", "report.html"), ("room", "room.html"), ("report", "plan.yaml"), ("metrics", "metrics.parquet")]
+    chosen += [
+        ("report", "report.html"),
+        ("room", "room.html"),
+        ("room", "scene_unlit.glb"),
+        ("report", "plan.yaml"),
+        ("metrics", "metrics.parquet"),
+    ]
     chosen += [("affines", "objects.parquet")]
     if readers["affines"].has("camera_response.parquet"):
         chosen.append(("affines", "camera_response.parquet"))

@@ -9,7 +9,8 @@ import numpy as np
 from iif_core.errors import InputError
 from iif_core.light.light_maps import to_half
 from iif_core.numerics import color
-from workflow.exporters.atlas import bake, read_parts
+from workflow.exporters.atlas import bake, encoded, read_parts
+from workflow.exporters.glb import JPEG_QUALITY, glb_bytes
 from workflow.exporters.object_table import object_rows
 from workflow.exporters.surface import up_axis
 from workflow.models.denoise import require_denoiser
@@ -18,6 +19,7 @@ from workflow.room import build
 from workflow.room.light import Lamps, find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import Blob, array_blob
 from workflow.room.page import NOTES, Page, render_page
+from workflow.room.unlit import unlit_picture
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.normal_form import CaptureReader
@@ -29,7 +31,7 @@ FILL = 0.6
 
 
 def run(job: Job) -> None:
-    """Write room.html and room.json."""
+    """Write room.html, scene_unlit.glb and room.json."""
     capture, recovered = CaptureReader(job.read("capture")), read_recovered(job)
     wanted = job.settings.room
     if wanted.denoise:
@@ -89,6 +91,11 @@ def run(job: Job) -> None:
         blobs["environment"] = array_blob(surroundings.value[:, 0].view(np.uint16))
         shape = list(lamps.surroundings.shape[:2])
         document["environment"] = {"lamp": lamps.environment, "shape": shape, "scale": float(surroundings.scale[0])}
+    total = np.einsum("nlc,lc->nc", light, np.stack([lamp.color for lamp in lamps.lamps])) if lamps.lamps else light.sum(1)
+    lit = unlit_picture(atlas, texels, total, exposure)
+    provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "exposure": exposure}
+    shown = {"base_color": encoded(lit, JPEG_QUALITY)}
+    job.writer.bytes("scene_unlit.glb", glb_bytes(parts, shown, up, provenance, capture.views, exposure))
     page, width = _fitting(job, capture, frame, document, blobs)
     job.writer.bytes("room.html", page)
     facts = {

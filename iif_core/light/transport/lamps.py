@@ -86,7 +86,7 @@ def render_lamps(
     jitter: tuple[ArrayLike, ArrayLike],
     environment_lamp: int = -1,
 ) -> Array:
-    """Estimate the radiance that arrives along rays from every lamp by itself, seen directly or after any reflections (Eq. L.59).
+    """Estimate the radiance that arrives along rays from every lamp by itself, seen directly or after any reflections (Eq. L.63).
 
     The paths are those of `render.render`, and each adds what it meets to the lamp that emits it, so that the sum over the lamps
     is an estimate of the same radiance. A picture under other light is the sum with other weights.

@@ -10,43 +10,15 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iif_core.errors import InputError
 from iif_core.light.transport.arrays import batches, checked_points, on_device, to_numpy
 from iif_core.light.transport.geometry import offset_from
 from iif_core.light.transport.kernels import World, incoming, power_weight, sample_light, to_world, uniform
+from iif_core.light.transport.lamps import LampCollector, checked_lamps
 from iif_core.light.transport.scene import PathOptions, Scene
 from iif_core.numerics.xp import DRJIT
 from iif_core.reflectance import brdf
 
 Array = np.ndarray
-
-
-class _LampCollector:
-    """Adds emitted radiance times the weight of the path to the row of the lane, in the column of the lamp that emits it.
-
-    Nothing is returned to the path. A lane writes to its own row alone, so plain additions are safe and their order is fixed.
-    """
-
-    def __init__(self, rows: Any, lane: Any, lamps: int, lamp_of_face: Any, environment_lamp: int):
-        self.rows, self.lane, self.lamps = rows, lane, dr.opaque(mi.UInt32, lamps)
-        self.lamp_of_face = lamp_of_face
-        self.environment_lamp = None if environment_lamp < 0 else dr.opaque(mi.UInt32, environment_lamp)
-
-    def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
-        lamp = dr.gather(mi.Int32, self.lamp_of_face, face, active)
-        return self._add(mi.UInt32(lamp), weight * radiance, active & (lamp >= 0))
-
-    def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
-        if self.environment_lamp is None:
-            return mi.Color3f(0)
-        return self._add(self.environment_lamp, weight * radiance, active)
-
-    def _add(self, lamp: Any, value: Any, active: Any) -> Any:
-        entry = (self.lane * self.lamps + lamp) * 3
-        for channel in range(3):
-            mode = dr.ReduceMode.NoConflicts
-            dr.scatter_reduce(dr.ReduceOp.Add, self.rows, value[channel], entry + channel, active, mode=mode)
-        return mi.Color3f(0)
 
 
 @dr.syntax
@@ -104,22 +76,15 @@ def light_maps(
         InputError: wrong shapes, non-finite numbers, lamps out of range.
     """
     points, normals, _ = checked_points(points, normals, normals)
-    lamp_of_face = np.ascontiguousarray(lamp_of_face, np.int32)
-    faces = len(scene.geometry.faces)
-    if lamp_of_face.shape != (faces,) or max(lamp_of_face.max(initial=-1), environment_lamp) >= lamps:
-        raise InputError(
-            f"lamp_of_face has shape {lamp_of_face.shape} and values up to {lamp_of_face.max(initial=-1)}, the environment is"
-            f" lamp {environment_lamp}; expected ({faces},) and lamps 0 ... {lamps - 1}, -1 = none"
-        )
+    of_face = on_device(checked_lamps(scene, lamp_of_face, lamps, environment_lamp), mi.Int32)
     result = np.zeros((len(points), lamps, 3), np.float32)
     if paths.max_bounces == 0 or lamps == 0 or not len(points):
         return result
     scene = scene._replace(cache=None)
-    of_face = on_device(lamp_of_face, mi.Int32)
     for batch in batches(len(points), paths.samples, 3 * lamps, paths.chunk):
         rows = dr.zeros(mi.Float, batch.lanes * 3 * lamps)
         lane = dr.arange(mi.UInt32, batch.lanes)
-        world = World(scene, _LampCollector(rows, lane, lamps, of_face, environment_lamp))
+        world = World(scene, LampCollector(rows, lane, lamps, of_face, environment_lamp))
         gain = _trace_points(
             world,
             batch.streams(paths.seed, number),
