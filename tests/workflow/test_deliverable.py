@@ -63,4 +63,5 @@ def test_timings_name_every_job(scene):
 def test_the_last_line_says_where_to_look(workflow):
     result = workflow.run("scenes/tiny", "--forcerun", "publish")
     assert result.returncode == 0, result.stderr[-4000:]
-    assert result.stderr.rstrip().endswith(f"Open: {workflow.folder.resolve() / 'scenes/tiny/report.html'}")
+    pages = [workflow.folder.resolve() / f"scenes/tiny/{name}.html" for name in ("report", "room")]
+    assert result.stderr.rstrip().endswith(f"Open: {pages[0]}\n      {pages[1]}")
