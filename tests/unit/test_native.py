@@ -146,7 +146,11 @@ def python(code, repository, **environment):
 
 
 def test_prepare_after_drjit_is_refused(repository):
-    child = python("import drjit\nfrom workflow.runtime import native\nnative.prepare()", repository)
+    child = python(
+        f"import os\nos.environ.pop({native.LLVM_VARIABLE!r}, None)\nimport drjit\n"  # the environment sets it at every start
+        "from workflow.runtime import native\nnative.prepare()",
+        repository,
+    )
     assert child.returncode == 1 and "call prepare() first" in child.stderr
 
 
@@ -227,7 +231,7 @@ def test_the_command_of_mitsuba_finds_the_llvm_of_this_environment(repository, t
     (tmp_path / "site").mkdir()
     shutil.copy(repository / "envs/iif_llvm.pth", tmp_path / "site")
     code = (
-        "import site, sys, os; site.addsitedir(sys.argv.pop(1)); print(os.environ['DRJIT_LIBLLVM_PATH'])\n"
+        "import site, sys, os; site.addsitedir(sys.argv.pop(1)); print(os.environ['DRJIT_LIBLLVM_PATH'], flush=True)\n"
         "from mitsuba.cli import _main; sys.exit(_main())"
     )
     environment = {name: value for name, value in os.environ.items() if name != native.LLVM_VARIABLE}

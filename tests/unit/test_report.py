@@ -1,5 +1,6 @@
 """The last stages on a made-up scene: render, metrics, export, report and publish over artefacts written here."""
 
+import contextlib
 import functools
 import json
 import logging
@@ -29,7 +30,7 @@ from workflow.runtime.timings import read_timings
 from workflow.scene.cached_light import SpecularLight, table_of
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, Truth, View
 from workflow.scene.recovered import read_recovered, read_response, response_samples
-from workflow.stages import export, metrics, publish, render, report, unwrap
+from workflow.stages import export, metrics, publish, render, report, room, unwrap
 
 BOX = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], np.float32)
 OUTWARD = np.array([[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]])
@@ -51,6 +52,7 @@ class FakeJob:
             render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
             export=SimpleNamespace(max_faces_glb=100_000, texture_size=256, max_mb=40.0),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
+            room=SimpleNamespace(lightmap_size=64, texture_size=256, samples=16, max_bounces=3, denoise=False, max_mb=25.0),
             metrics=SimpleNamespace(views="all", lpips_vgg=False),
         )
         self.document = {"seed": 3}
@@ -70,6 +72,9 @@ class FakeJob:
 
     def progress(self, done, total, what):
         assert 0 <= done <= total and what
+
+    def timed(self, name):
+        return contextlib.nullcontext()
 
 
 def material_columns(values):
@@ -254,6 +259,7 @@ def finish(root, upto="publish"):
         ("metrics", metrics),
         ("unwrap", unwrap),
         ("export", export),
+        ("room", room),
         ("report", report),
         ("publish", publish),
     ):
@@ -407,7 +413,7 @@ def test_deliverable_is_complete_and_verifies(toy):
         "manifest.json",
         "objects.csv",
         *("cameras.json", "photos/v0.png", "photos/v1.png", "camera_response.cube", "blender_import.py"),
-        *("scene.usdc", "textures/base_color.png", "textures/seen.png"),
+        *("room.html", "scene_unlit.glb", "scene.usdc", "textures/base_color.png", "textures/seen.png"),
     }
     program = {"mitsuba/render.py", *(f"mitsuba/iif_bsdf/{name}.py" for name in ("__init__", "xp", "brdf", "mitsuba_bsdf"))}
     assert expected | program <= names and all(
