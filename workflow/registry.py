@@ -122,6 +122,7 @@ STAGES: dict[str, Stage] = {
             "report",
             ("capture", "plan", "prior", "segmentation", "base", "emission", "shading", "affines", "render", "metrics", "export"),
             ("report",),
+            reads_raw=True,
         ),
         Stage(
             "publish",

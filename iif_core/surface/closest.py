@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -9,8 +11,16 @@ CHUNK = 1 << 20
 """Points that are looked up at a time."""
 
 
-def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> NDArray:
-    """Return the point of a mesh that is nearest to each of `points` (n, 3), metres; (n, 3) float32.
+class Closest(NamedTuple):
+    """The nearest point of a mesh: `points` (n, 3) float32 metres, its face (n,) int64 and barycentric coordinates (n, 3)."""
+
+    points: NDArray
+    face: NDArray
+    barycentric: NDArray
+
+
+def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Closest:
+    """Find the point of a mesh that is nearest to each of `points` (n, 3), metres.
 
     Args:
         vertices, faces: (v, 3) and (m, 3), m >= 1.
@@ -21,8 +31,11 @@ def closest_points(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> 
     scene = o3d.t.geometry.RaycastingScene()
     corners = np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(faces, np.uint32)
     scene.add_triangles(*(o3d.core.Tensor(array) for array in corners))
-    out = np.empty_like(points)
+    out = Closest(np.empty_like(points), np.empty(len(points), np.int64), np.empty((len(points), 3), np.float32))
     for first in range(0, len(points), CHUNK):
         here = slice(first, first + CHUNK)
-        out[here] = scene.compute_closest_points(o3d.core.Tensor(points[here]))["points"].numpy()
+        found = scene.compute_closest_points(o3d.core.Tensor(points[here]))
+        second = found["primitive_uvs"].numpy()
+        out.points[here], out.face[here] = found["points"].numpy(), found["primitive_ids"].numpy()
+        out.barycentric[here] = np.stack([1 - second.sum(1), second[:, 0], second[:, 1]], 1)
     return out

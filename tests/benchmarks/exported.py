@@ -1,11 +1,12 @@
 """Whether other programs see what was recovered: the exported files of a finished scene, read again.
 
-    python tests/benchmarks/exported.py kitchen [--quality draft] [--views 3] [--samples 64] [--replicates 12] [--json rows.json]
+    python tests/benchmarks/exported.py kitchen modern-hall [--quality draft] [--views 3] [--samples 64] [--replicates 12]
 
-Run it in a working folder where the scene is finished. Prints, and adds to a JSON file: faults that Khronos' validator finds;
-mean differences of `scene.glb`, read by trimesh, from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py`
-(the exact reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard
-error, and Sidak's test of all pixels.
+Run it in a working folder where the scenes are finished. For each it prints, and keeps in docs/results/data/exported.json: faults that
+Khronos' validator finds; mean differences of the textures in `scene.glb`, read by trimesh, from the values that were written,
+and of what they show from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact reflectance) and as
+stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error, and Sidak's test of all
+pixels. The tables of docs/results/exports.md are made anew.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ import numpy as np
 from workflow.runtime import native
 
 VALIDATOR = Path(__file__).resolve().parents[2] / ".node/node_modules/gltf-validator"
+ROWS, PAGE = Path("docs/results/data/exported.json"), Path("docs/results/exports.md")
 VALIDATE = """
 const v = require(process.argv[1]), fs = require('fs');
 v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(r => console.log(JSON.stringify(r.issues)));
@@ -66,6 +68,29 @@ def round_trip(job: Any, capture: Any, views: list[Any]) -> dict[str, float]:
     means = sums / count
     names = {"albedo": means[:3].mean(), "roughness": means[3], "metallic": means[4]}
     return {name: float(255 * value) for name, value in names.items()} | {"other_surface": float(other / total)}
+
+
+def written(job: Any) -> dict[str, float]:
+    """Mean absolute differences of the textures that trimesh reads from the values that were written; nan if they are smaller."""
+    from iif_core.numerics.color import linear_from_srgb
+    from tests.oracles.exported import read_back
+    from workflow.artifacts.files import read_exr
+    from workflow.artifacts.store import rgb
+
+    meshes = read_back(job.read("export").path("scene.glb"), np.asarray(job.read("export").json("export.json")["up"]))
+    visuals = [visual.material for _, _, visual in meshes.values() if visual.material.baseColorTexture is not None]
+    colour, surface = (
+        np.asarray(picture)[..., :3] / 255 for picture in (visuals[0].baseColorTexture, visuals[0].metallicRoughnessTexture)
+    )
+    exact = {
+        name: read_exr(job.read("export").path(f"mitsuba/textures/{name}.exr")) for name in ("albedo", "roughness", "metallic")
+    }
+    found = {"albedo": linear_from_srgb(colour), "roughness": surface[..., 1], "metallic": surface[..., 2]}
+    out = {}
+    for name, values in found.items():
+        wanted = rgb(exact[name]) if name == "albedo" else exact[name]["Y"].astype(np.float32)
+        out[name] = float(255 * np.abs(values - wanted).mean()) if values.shape == wanted.shape else float("nan")
+    return out
 
 
 def rendered(job: Any, views: list[Any], samples: int, replicates: int) -> dict[str, dict[str, float]]:
@@ -111,12 +136,11 @@ def rendered(job: Any, views: list[Any], samples: int, replicates: int) -> dict[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene")
+    parser.add_argument("scenes", nargs="*")
     parser.add_argument("--quality", default="draft")
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--replicates", type=int, default=12)
-    parser.add_argument("--json", type=Path)
     asked = parser.parse_args()
     native.process_environment()
     native.prepare()
@@ -124,21 +148,75 @@ def main() -> None:
     from workflow.runtime import device
 
     device.mitsuba()
+    rows = json.loads(ROWS.read_text()) if ROWS.is_file() else []
+    for scene in asked.scenes:
+        row = measured(scene, asked)
+        rows = sorted([other for other in rows if other["scene"] != scene] + [row], key=lambda row: row["scene"])
+        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
+    from workflow.report.blocks import fill
+
+    PAGE.write_text(fill(PAGE.read_text(), tables(rows)))
+
+
+def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
+    """The row of one scene."""
+    from workflow.artifacts.store import StageReader
     from workflow.runtime.job import Job
     from workflow.scene.normal_form import CaptureReader
 
-    job = Job("publish", asked.scene, asked.quality, 2)
+    job = Job("publish", scene, asked.quality, 2)
     capture = CaptureReader(job.read("capture"))
-    glb = job.read("export").path("scene.glb")
-    row: dict[str, Any] = {"scene": asked.scene, "mb": glb.stat().st_size / 1e6, "validator": validated(glb)}
-    print(row)
-    row["glb"] = round_trip(job, capture, chosen(capture.views, 12))
-    print({name: round(value, 4) for name, value in row["glb"].items()}, "times 1/255; other_surface: share of pixels")
+    glb, unlit = job.read("export").path("scene.glb"), job.read("room").path("scene_unlit.glb")
+    found = [validated(path) for path in (glb, unlit)]
+    row: dict[str, Any] = {"scene": scene, "mb": glb.stat().st_size / 1e6}
+    row["validator"] = {name: sum(of[name] for of in found) for name in ("errors", "warnings")}
+    unwrapped = StageReader(Path("results") / scene / "unwrap", "unwrap", scene).json("unwrap.json")
+    row |= {"faces": unwrapped["faces"], "texture": job.read("export").json("export.json")["texture"]}
+    print(scene, row)
+    row["written"] = written(job)
+    row["maps"] = round_trip(job, capture, chosen(capture.views, 12))
+    print({name: round(value, 4) for name, value in (row["written"] | row["maps"]).items()})
     row["mitsuba"] = rendered(job, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
-    if asked.json:
-        rows = json.loads(asked.json.read_text()) if asked.json.is_file() else []
-        rows = [other for other in rows if other["scene"] != asked.scene] + [row]
-        asked.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return row
+
+
+def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
+    """The tables of the page."""
+    from workflow.report.blocks import markdown
+
+    files, materials, light = [], [], []
+    for row in rows:
+        name, texture = row["scene"], row["texture"]
+        faces = f"{row['faces']['mesh']:,} to {row['faces']['parts']:,}"
+        size = f"{texture['size']} ({texture['format']})"
+        lengths = [f"{1000 * texture[key]:.1f}" for key in ("texel_in_glb_m", "cell_m")]
+        faults = f"{row['validator']['errors']} / {row['validator']['warnings']}"
+        files.append([name, faces, size, *lengths, f"{row['mb']:.1f}", faults])
+        three = ("albedo", "roughness", "metallic")
+        materials.append(
+            [
+                name,
+                *(f"{row[of][q]:.2f}" for of in ("written", "maps") for q in three),
+                f"{100 * row['maps']['other_surface']:.2f} %",
+            ]
+        )
+        for kind in ("exact", "stock"):
+            one = row["mitsuba"][kind]
+            sidak = f"{one['smallest']:.1g} of {one['threshold']:.1g}"
+            light.append(
+                [name, {"exact": "render.py", "stock": "scene.xml"}[kind], f"{1 + one['bias']:.4f} ± {one['error']:.4f}", sidak]
+            )
+    heads = {
+        "files": ["scene", "faces", "texture", "texel, mm", "cell, mm", "scene.glb, MB", "errors / warnings"],
+        "materials": [
+            "scene",
+            *(f"{q}, {of}" for of in ("as written", "by pixel") for q in ("albedo", "roughness", "metallic")),
+            "other surface",
+        ],
+        "light": ["scene", "by", "radiance over ours", "smallest p, threshold"],
+    }
+    bodies = {"files": files, "materials": materials, "light": light}
+    return {name: "\n".join(markdown(head, bodies[name], 2 if name == "light" else 1)) for name, head in heads.items()}
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from iif_core.surface.atlas import (
 )
 from iif_core.surface.closest import closest_points
 from iif_core.surface.simplify import clean, simplify
+from iif_core.surface.tangents import in_tangent_frame, vertex_tangents
 from iif_core.surface.triangles import face_geometry
 
 
@@ -134,4 +135,23 @@ def test_simpler_meshes_keep_their_parts_and_their_shape():
 def test_closest_points():
     vertices, faces = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0.0]]), np.array([[0, 1, 2]])
     found = closest_points(vertices, faces, [[0.5, 0.5, 3.0], [-1, -1, 1], [3, 3, 0]])
-    np.testing.assert_allclose(found, [[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(found.points, [[0.5, 0.5, 0], [0, 0, 0], [1, 1, 0]], atol=1e-6)
+    np.testing.assert_allclose(texel_values(vertices, faces, found.face, found.barycentric), found.points, atol=1e-6)
+
+
+def test_tangents_point_to_u_and_components_come_back():
+    """A slanted quad whose texture is turned and mirrored: t is the direction of +u, b that of -v, for both handednesses."""
+    vertices = np.array([[0, 0, 0], [2, 0, 1], [2, 3, 1], [0, 3, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    normal = np.cross([2, 0, 1], [0, 3, 0]) / np.linalg.norm(np.cross([2, 0, 1], [0, 3, 0]))
+    x, y = np.array([2, 0, 1]) / np.sqrt(5), np.array([0, 1, 0.0])
+    plain = np.array([[0, 1], [1, 1], [1, 0], [0, 0.0]])  # +u along x, v falls along y
+    for uv, t, b in ((plain, x, y), (plain * [-1, 1], -x, y), (plain[:, ::-1], -y, -x)):
+        found = vertex_tangents(vertices, faces, uv, np.tile(normal, (4, 1)))
+        np.testing.assert_allclose(found[:, :3], np.tile(t, (4, 1)), atol=1e-12)
+        np.testing.assert_allclose(found[:, 3:] * np.cross(normal, found[:, :3]), np.tile(b, (4, 1)), atol=1e-12)
+        direction = np.array([[0.3, -0.2, 0.1] @ np.stack([t, b, normal])])
+        np.testing.assert_allclose(in_tangent_frame(direction, normal[None], found[:1]), [[0.3, -0.2, 0.1]], atol=1e-12)
+    nowhere = vertex_tangents(vertices, faces, np.zeros((4, 2)), np.tile(normal, (4, 1)))
+    np.testing.assert_allclose(np.linalg.norm(nowhere[:, :3], axis=1), 1)
+    np.testing.assert_allclose(nowhere[:, :3] @ normal, 0, atol=1e-12)

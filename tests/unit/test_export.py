@@ -17,14 +17,16 @@ import trimesh
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
-from iif_core.surface.atlas import nearest_covered, unwrap
+from iif_core.surface.atlas import nearest_covered, texel_values, unwrap
 from iif_core.surface.cells import voxel_indices
 from iif_core.surface.lookup import values_at
+from iif_core.surface.tangents import vertex_tangents
 from iif_core.surface.triangles import face_geometry, subdivide, vertex_normals
 from tests.oracles.exported import maps_of, read_back
 from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
+from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.surface import SeenSurface, build_parts, seen_sides, up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.runtime import native
@@ -283,7 +285,7 @@ def chunks_of(data):
 def accessor_array(document, binary, index):
     accessor = document["accessors"][index]
     view = document["bufferViews"][accessor["bufferView"]]
-    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
     dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
     raw = binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
     return np.frombuffer(raw, dtype).reshape(-1, width)
@@ -356,6 +358,41 @@ def test_structural_check_can_fail(glb):
     start = len(glb) - len(binary) + view["byteOffset"]
     broken[start : start + 12] = struct.pack("<3f", 0, 0, 0)
     assert structural_errors(bytes(broken)) == ["walls: normals"]
+
+
+def test_a_simplified_ball_looks_round_by_its_normal_map(tmp_path):
+    """Normals of the map, turned into the world by the frame that viewers use, are those of the fine ball."""
+    ball = trimesh.creation.icosphere(5, 0.5)
+    count = len(ball.faces)
+    empty, values = np.zeros(0, np.int32), np.array([[0.5, 0.5, 0.5, 0.9, 0]], np.float32)
+    surface = BaseScene(
+        np.float32(ball.vertices), np.int32(ball.faces), np.zeros(count, np.int32), *face_geometry(ball.vertices, ball.faces), 1,
+        0.05, np.full(3, -2.0), np.zeros((0, 3), np.int32), empty, np.zeros((0, 5), np.float32), values,
+    )  # fmt: skip
+    dark = Light(np.zeros((count, 3), np.float32), np.zeros(count, np.int8), np.zeros(count, bool), np.zeros(3, np.float32))
+    scene = Recovered(surface, ["ball"], np.zeros((0, 3), np.float32), dark, np.full(count, -1, np.int32), np.zeros((0, 3)), 1.0)
+    (coarse,) = build_parts(seen(scene, front=(9,), back=(0,)), 200)
+    made = unwrap([(coarse.vertices, coarse.faces)], [200.0], 512)
+    xyz, normals = (a[made.source[0]].astype(np.float32) for a in (coarse.vertices, coarse.normals))
+    part = TexturedPart("ball", 0, -1, xyz, normals, made.uv[0], made.faces[0].astype(np.int32), np.zeros(3), False, 1.0, True)
+    picture = normal_picture([part], scene, made.size)
+    texels = texels_of([part], made.size)
+    stored = picture.reshape(-1, 3)[texels.index] / 127.5 - 1
+    tangent = texel_values(vertex_tangents(xyz, part.faces, part.uv, normals), part.faces, texels.face, texels.barycentric)
+    t = tangent[:, :3] - texels.normals * (tangent[:, :3] * texels.normals).sum(1, keepdims=True)
+    t /= np.linalg.norm(t, axis=1, keepdims=True)
+    b = np.cross(texels.normals, t) * np.sign(tangent[:, 3:])
+    found = stored[:, :1] * t + stored[:, 1:2] * b + stored[:, 2:] * texels.normals
+    round_ = texels.points / np.linalg.norm(texels.points, axis=1, keepdims=True)
+    degrees = [
+        np.degrees(np.arccos(np.clip((a * round_).sum(1) / np.linalg.norm(a, axis=1), -1, 1))) for a in (found, texels.normals)
+    ]
+    assert degrees[0].mean() < 0.7 and degrees[1].mean() > 1.5 * degrees[0].mean()
+    atlas = bake([part], scene, np.zeros(0), made.size)
+    data, _ = fitting_glb([part], atlas, UP, {}, [], 40.0, picture)
+    assert structural_errors(data) == [] and khronos_issues(data, tmp_path) == []
+    document, _ = chunks_of(data)
+    assert "normalTexture" in document["materials"][0] and "TANGENT" in document["meshes"][0]["primitives"][0]["attributes"]
 
 
 def test_unlit_glb_has_the_light_in_its_colours_and_lamps_as_points(tmp_path):

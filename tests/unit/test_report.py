@@ -50,7 +50,7 @@ class FakeJob:
         self.stage = SimpleNamespace(name=stage, upstream=STAGES[stage].upstream)
         self.settings = SimpleNamespace(
             render=SimpleNamespace(samples=256, max_bounces=4, denoise=False),
-            export=SimpleNamespace(max_faces_glb=100_000, texture_size=256, max_mb=40.0),
+            export=SimpleNamespace(max_faces_glb=100_000, texture_size=256, max_mb=40.0, normal_map=False),
             report=SimpleNamespace(views=2, credit="by <nobody> & co"),
             room=SimpleNamespace(lightmap_size=64, texture_size=256, samples=16, max_bounces=3, denoise=False, max_mb=25.0),
             metrics=SimpleNamespace(views="all", lpips_vgg=False),

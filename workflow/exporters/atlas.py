@@ -103,7 +103,7 @@ class Texels:
         size: S.
         index: (t,) int64 flat index of each texel.
         part: (t,) int64 number of its part.
-        face: (t,) int64 face of all parts, counted on.
+        face, barycentric: (t,) int64 face of all parts, counted on, and (t, 3) float32 the place in it.
         points, normals: (t, 3) float32 of its centre, metres; the normals are those of the vertices, interpolated.
     """
 
@@ -111,8 +111,14 @@ class Texels:
     index: Array
     part: Array
     face: Array
+    barycentric: Array
     points: Array
     normals: Array
+
+    def rows_of_parts(self, parts: int) -> list[Array]:
+        """Return the rows of each part."""
+        order = np.argsort(self.part, kind="stable")
+        return np.split(order, np.searchsorted(self.part[order], np.arange(1, parts)))
 
 
 def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
@@ -126,7 +132,8 @@ def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
     points = texel_values(np.concatenate([part.vertices for part in parts]), faces, of, weights)
     normals = texel_values(np.concatenate([part.normals for part in parts]), faces, of, weights)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return Texels(size, index, part, of.astype(np.int64), points, normals / np.maximum(length, np.float32(1e-12)))
+    unit = normals / np.maximum(length, np.float32(1e-12))
+    return Texels(size, index, part, of.astype(np.int64), weights, points, unit)
 
 
 def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array, size: int) -> Atlas:
@@ -165,16 +172,18 @@ def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array
 def _on_the_mesh(parts: Sequence[TexturedPart], texels: Texels, recovered: Recovered) -> Array:
     """The points of the texels, those of simplified parts moved to the nearest point of the mesh of the photographs."""
     points = texels.points.copy()
-    surface = recovered.surface
-    order = np.argsort(texels.part, kind="stable")
-    bounds = np.searchsorted(texels.part[order], np.arange(len(parts) + 1))
-    for number in [number for number, part in enumerate(parts) if part.simplified]:
-        rows = order[bounds[number] : bounds[number + 1]]
-        faces = surface.faces[(surface.object_id == parts[number].object_id) & (recovered.emitter_id < 0)]
-        if len(rows) and len(faces):
-            used, local = np.unique(faces, return_inverse=True)
-            points[rows] = closest_points(surface.vertices[used], local.reshape(-1, 3), points[rows])
+    for part, rows in zip(parts, texels.rows_of_parts(len(parts)), strict=True):
+        if part.simplified and len(rows):
+            points[rows] = closest_points(*photographed(part, recovered), points[rows]).points
     return points
+
+
+def photographed(part: TexturedPart, recovered: Recovered) -> tuple[Array, Array]:
+    """Return vertices and faces of a part that does not emit as the mesh of the photographs has them."""
+    surface = recovered.surface
+    faces = surface.faces[(surface.object_id == part.object_id) & (recovered.emitter_id < 0)]
+    used, local = np.unique(faces, return_inverse=True)
+    return surface.vertices[used], local.reshape(-1, 3)
 
 
 # -------------------------------------------------------------------------------------------------------------- pictures

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.numerics.color import linear_from_srgb, tone_map
+from iif_core.surface.tangents import vertex_tangents
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart, base_color_picture, encoded, surface_picture
 from workflow.scene.normal_form import View
@@ -44,7 +45,8 @@ def glb_bytes(
 
     Args:
         parts: the meshes.
-        images: `base_color` and `surface` (`atlas.surface_picture`), each a PNG or JPEG file.
+        images: `base_color` and `surface` (`atlas.surface_picture`), each a PNG or JPEG file, and perhaps `normal`
+            (`normal_map.normal_picture`), which parts that were simplified then have.
         up: unit vector.
         provenance: stored in `asset.extras`.
         views: photographs, which become cameras; glTF has no offset of the principal point, so that it is lost.
@@ -57,7 +59,7 @@ def glb_bytes(
     textures = {name: number for number, name in enumerate(images)}
     for part in parts:
         material = _material(part, textures) if exposure is None else _unlit(part, textures, exposure)
-        mesh = _mesh(blob, part, len(materials))
+        mesh = _mesh(blob, part, len(materials), bumpy="normalTexture" in material)
         extras = {"object_id": part.object_id, "emitter_id": part.emitter_id}
         nodes.append({"name": part.name, "mesh": len(meshes), "extras": extras})
         meshes.append(mesh)
@@ -103,13 +105,16 @@ def fitting_glb(
     provenance: dict[str, Any],
     views: Sequence[View],
     max_mb: float,
+    normals: np.ndarray | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
     """Make the glTF file and keep it below `max_mb`: with PNG textures if they fit, then with JPEG, then with every second texel.
+    `normals` is a normal map (`normal_map.normal_picture`), if there shall be one.
 
     Returns:
         The file, and what its textures are: `format`, `size`, `mb`, and `fits`, false if the meshes alone are larger.
     """
     pictures = {"base_color": base_color_picture(atlas), "surface": surface_picture(atlas)}
+    pictures |= {} if normals is None else {"normal": normals}
     every = 1
     while True:
         for jpeg in (None, JPEG_QUALITY):
@@ -132,13 +137,16 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
     return [float(v) for v in q / np.linalg.norm(q)]
 
 
-def _mesh(blob: _Blob, part: TexturedPart, material: int) -> dict[str, Any]:
+def _mesh(blob: _Blob, part: TexturedPart, material: int, bumpy: bool) -> dict[str, Any]:
     attributes = {
         "POSITION": blob.add(part.vertices.astype("<f4"), _FLOAT, "VEC3", _VERTEX, bounds=True),
         "NORMAL": blob.add(part.normals.astype("<f4"), _FLOAT, "VEC3", _VERTEX),
     }
     if part.emitter_id < 0:  # emitters have no texture
         attributes["TEXCOORD_0"] = blob.add(part.uv.astype("<f4"), _FLOAT, "VEC2", _VERTEX)
+    if bumpy:
+        tangents = vertex_tangents(part.vertices, part.faces, part.uv, part.normals)
+        attributes["TANGENT"] = blob.add(tangents.astype("<f4"), _FLOAT, "VEC4", _VERTEX)
     indices = blob.add(part.faces.astype("<u4").ravel(), _UINT, "SCALAR", _INDEX)
     return {"name": part.name, "primitives": [{"attributes": attributes, "indices": indices, "material": material}]}
 
@@ -156,6 +164,8 @@ def _material(part: TexturedPart, textures: dict[str, int]) -> dict[str, Any]:
             "roughnessFactor": 1.0,
             "metallicRoughnessTexture": {"index": textures["surface"]},
         }
+        if part.simplified and "normal" in textures:
+            material["normalTexture"] = {"index": textures["normal"]}
     if part.opacity < 1:
         material["alphaMode"] = "BLEND"
     strength = float(part.radiance.max(initial=0.0))

@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any
 from iif_core.evaluation.catalogue import METRICS, PROTOCOLS
 from workflow.report import pictures as pic
 from workflow.report.downloads import Command, Download
+from workflow.report.sources import SCRIPT, STYLE, TEMPLATE
 from workflow.report.verdict import Verdict
 
 if TYPE_CHECKING:
     import jinja2
 
-TEMPLATE = Path(__file__).with_name("page.html.j2")
-STYLE, SCRIPT = TEMPLATE.with_name("page.css"), TEMPLATE.with_name("page.js")
 
 VARIANT_NAMES = {
     "prior_k0": "raw prediction (first)",

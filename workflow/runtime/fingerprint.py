@@ -48,6 +48,7 @@ PLUGINS = {
 # Stage -> modules that know (and check) further input files.
 FILE_MODULES = {
     "emission": ("workflow.scene.response_file",),
+    "report": ("workflow.report.sources",),
     "room": ("workflow.room.sources",),
     "relit_truth": ("workflow.sources.relit",),
 }

@@ -59,6 +59,8 @@ class Export(Section):
     """Largest number of faces, about; a larger mesh is simplified."""
     texture_size: int = Field(2048, ge=128, le=16384)
     """Largest side of the textures, in texels; smaller where the photographs show less. `export.json` says what it costs."""
+    normal_map: bool = False
+    """Give parts that were simplified a normal map from the photographs' mesh, in `scene.glb`."""
     max_mb: float = Field(40.0, gt=0)
     """Largest size of `scene.glb` in MB: its textures become JPEG, and then smaller, until it fits."""
 

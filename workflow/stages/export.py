@@ -13,6 +13,7 @@ from workflow.exporters import camera_files
 from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, read_parts, surface_picture
 from workflow.exporters.glb import fitting_glb
 from workflow.exporters.mitsuba_scene import mitsuba_files
+from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.object_table import csv_bytes, object_rows
 from workflow.exporters.surface import up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
@@ -35,16 +36,17 @@ def run(job: Job) -> None:
     up = _up(capture)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
     environment = recovered.light.environment
-    data, texture = fitting_glb(
-        parts, atlas, up, provenance | _environment_note(environment), capture.views, job.settings.export.max_mb
-    )
+    wanted, notes = job.settings.export, provenance | _environment_note(environment)
+    bumpy = wanted.normal_map and any(part.simplified for part in parts)
+    normals = normal_picture(parts, recovered, atlas.size) if bumpy else None
+    data, texture = fitting_glb(parts, atlas, up, notes, capture.views, wanted.max_mb, normals)
     job.writer.bytes("scene.glb", data)
     job.log.info("scene.glb: %.1f MB, textures of %d x %d as %s", texture["mb"], *2 * (texture["size"],), texture["format"])
     if not texture["fits"]:
         job.log.warning(
             "scene.glb has %.1f MB, export.max_mb allows %g: the meshes alone are larger; lower export.max_faces_glb",
             texture["mb"],
-            job.settings.export.max_mb,
+            wanted.max_mb,
         )
     job.writer.bytes(BASE_COLOR, encoded(base_color_picture(atlas)))
     job.writer.bytes(SURFACE, encoded(surface_picture(atlas)))

@@ -1,0 +1,14 @@
+"""The files of which the report is made; their content is part of the fingerprint of stage report, as code is of other stages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+TEMPLATE, STYLE, SCRIPT = (HERE / name for name in ("page.html.j2", "page.css", "page.js"))
+
+
+def raw_inputs(document: dict[str, Any]) -> list[Path]:
+    """Return the files, which are the same for all settings."""
+    return [TEMPLATE, STYLE, SCRIPT]
