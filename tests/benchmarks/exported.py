@@ -2,11 +2,11 @@
 
     python tests/benchmarks/exported.py kitchen modern-hall [--quality draft] [--views 3] [--samples 64] [--replicates 12]
 
-Run it in a working folder where the scenes are finished. For each it prints, and keeps in docs/results/data/exported.json: faults that
-Khronos' validator finds; mean differences of the textures in `scene.glb`, read by trimesh, from the values that were written,
-and of what they show from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact reflectance) and as
-stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error, and Sidak's test of all
-pixels. The tables of docs/results/exports.md are made anew.
+Run it in a working folder where the scenes are finished. For each it prints, and keeps in docs/results/data/exported.json:
+faults that Khronos' validator finds; mean differences of the textures in `scene.glb`, read by trimesh, from the values that were
+written, and of what they show from `maps/` of the same views; and the radiance of `mitsuba/` by `render.py` (the exact
+reflectance) and as stock `scene.xml`, over that of the workflow's own renderer: ratio of the means with its standard error, and
+Sidak's test of all pixels. The tables of docs/results/exports.md are made anew.
 """
 
 from __future__ import annotations
