@@ -36,6 +36,7 @@ _NOTE = """
   Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
   samples.
 
+  All surface has one material, `surface`; to change a thing, give its shape a bsdf of its own in place of the reference.
   Relight: change or remove the emitters below, or add your own.
   Sizes: mitsuba -m scalar_rgb scene.xml -Dspp=256 -Dresx=640 -Dresy=480
   Other views: mitsuba -m scalar_rgb -s 1 scene.xml  (one sensor a photograph, in order)
@@ -73,6 +74,7 @@ def mitsuba_files(
     """
     files = exact_files() | texture_files(atlas)
     body = [_texture(name) for name in ("albedo", "roughness", "metallic", "diffuse", "specular")]
+    body.append(_SURFACE)
     for part, stem in zip(parts, _stems(parts), strict=True):
         name = f"meshes/{stem}.ply"
         files[name] = ply_bytes(part)
@@ -185,18 +187,20 @@ def _shape(part: TexturedPart, file: str) -> str:
     else:
         if part.opacity < 1:
             lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
-        lines += ['\t\t<bsdf type="twosided"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>']
-        lines += [
-            '\t\t\t<bsdf type="diffuse"><ref name="reflectance" id="diffuse"/></bsdf>',
-            '\t\t\t<bsdf type="principled">',
-            '\t\t\t\t<ref name="base_color" id="specular"/>',
-            '\t\t\t\t<ref name="roughness" id="roughness"/>',
-            '\t\t\t\t<float name="metallic" value="1"/>',
-            "\t\t\t</bsdf>",
-            "\t\t</bsdf></bsdf>",
-        ]
+        lines += ['\t\t<ref id="surface"/>']
         lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     return "\n".join([*lines, "\t</shape>"])
+
+
+# One material for all parts, whose textures are in one atlas: a renderer traces and compiles each material once.
+_SURFACE = """\t<bsdf type="twosided" id="surface"><bsdf type="blendbsdf"><float name="weight" value="0.5"/>
+\t\t<bsdf type="diffuse"><ref name="reflectance" id="diffuse"/></bsdf>
+\t\t<bsdf type="principled">
+\t\t\t<ref name="base_color" id="specular"/>
+\t\t\t<ref name="roughness" id="roughness"/>
+\t\t\t<float name="metallic" value="1"/>
+\t\t</bsdf>
+\t</bsdf></bsdf>"""
 
 
 def _texture(name: str) -> str:
