@@ -176,6 +176,7 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     row["written"] = written(job)
     row["maps"] = round_trip(job, capture, chosen(capture.views, 12))
     print({name: round(value, 4) for name, value in (row["written"] | row["maps"]).items()})
+    row["paths"] = {"samples": asked.samples, "replicates": asked.replicates}
     row["mitsuba"] = rendered(job, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
     return row
 
@@ -203,9 +204,8 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
         for kind in ("exact", "stock"):
             one = row["mitsuba"][kind]
             sidak = f"{one['smallest']:.1g} of {one['threshold']:.1g}"
-            light.append(
-                [name, {"exact": "render.py", "stock": "scene.xml"}[kind], f"{1 + one['bias']:.4f} ± {one['error']:.4f}", sidak]
-            )
+            by, ratio = {"exact": "render.py", "stock": "scene.xml"}[kind], f"{1 + one['bias']:.4f} ± {one['error']:.4f}"
+            light.append([name, by, f"{row['paths']['replicates']} x {row['paths']['samples']}", ratio, sidak])
     heads = {
         "files": ["scene", "faces", "texture", "texel, mm", "cell, mm", "scene.glb, MB", "errors / warnings"],
         "materials": [
@@ -213,7 +213,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
             *(f"{q}, {of}" for of in ("as written", "by pixel") for q in ("albedo", "roughness", "metallic")),
             "other surface",
         ],
-        "light": ["scene", "by", "radiance over ours", "smallest p, threshold"],
+        "light": ["scene", "by", "renderings x paths", "radiance over ours", "smallest p, threshold"],
     }
     bodies = {"files": files, "materials": materials, "light": light}
     return {name: "\n".join(markdown(head, bodies[name], 2 if name == "light" else 1)) for name, head in heads.items()}

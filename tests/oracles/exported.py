@@ -19,6 +19,8 @@ def read_back(path: Path, up: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndar
 
     loaded = trimesh.load(path, process=False)
     turn = Rotation.align_vectors([[0, 1, 0]], [up])[0]  # the smallest one
+    if up[1] < -1 + 1e-9:
+        turn = Rotation.from_euler("x", 180, degrees=True)  # of all half turns, the one that the exporter takes
     world = np.eye(4)
     world[:3, :3] = turn.inv().as_matrix()
     meshes = {}
