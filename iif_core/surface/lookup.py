@@ -20,20 +20,6 @@ def values_at(
     cell_object: ArrayLike,
     values: ArrayLike,
     object_values: ArrayLike,
-) -> Array:
-    """Read the values of the surface at points, as `cells_at` does, without the cells."""
-    return cells_at(points, object_id, edge, origin, ijk, cell_object, values, object_values)[0]
-
-
-def cells_at(
-    points: ArrayLike,
-    object_id: ArrayLike,
-    edge: float,
-    origin: ArrayLike,
-    ijk: ArrayLike,
-    cell_object: ArrayLike,
-    values: ArrayLike,
-    object_values: ArrayLike,
 ) -> tuple[Array, Array]:
     """Read the values of the surface at points: of the cell there; where none was observed, the mean of the coarse cell around,
     then that of the object, and without an object the mean over all objects (docs/method/numerics.md#surface-that-nobody-saw).

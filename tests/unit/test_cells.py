@@ -125,12 +125,13 @@ def test_lowest_row_gets_a_slot_that_several_ask_for():
 def test_values_without_cells_are_those_of_the_object_and_far_points_find_none():
     means = np.float32([[1, 2], [3, 6]])
     none = np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros((0, 2), np.float32)
-    found = values_at(np.zeros((4, 3)), [0, 1, -1, 7], 0.1, np.zeros(3), *none, means)
+    found, _ = values_at(np.zeros((4, 3)), [0, 1, -1, 7], 0.1, np.zeros(3), *none, means)
     np.testing.assert_array_equal(found, np.float32([[1, 2], [3, 6], [2, 4], [2, 4]]))
     one = np.int32([[1, 1, 1]]), np.int32([0]), np.float32([[8, 9]])
     points = [[0.15, 0.15, 0.15], [0.35, 0.35, 0.35], [-0.05, 0, 0], [1e4, 0, 0]]  # in the cell, around it, outside of the grid
-    found = values_at(points, [0, 0, 0, 0], 0.1, np.zeros(3), *one, means)
+    found, row = values_at(points, [0, 0, 0, 0], 0.1, np.zeros(3), *one, means)
     np.testing.assert_array_equal(found, np.float32([[8, 9], [8, 9], [1, 2], [1, 2]]))
+    np.testing.assert_array_equal(row, [0, -1, -1, -1])  # around it nothing was observed, though its mean is known
     with pytest.raises(InputError, match="at least one row"):
         values_at(points, 0, 0.1, np.zeros(3), *one, means[:0])
     with pytest.raises(InputError, match="NaN"):

@@ -432,7 +432,7 @@ def test_glb_comes_back(glb, tmp_path):
     objects = np.array([parts[name].object_id for name in meshes])[of]
     own = scene.surface
     grid = own.cell_edge, own.cell_origin, own.cell_ijk, own.cell_object
-    wanted = values_at(hits, objects, *grid, own.cell_values, own.object_values)
+    wanted, _ = values_at(hits, objects, *grid, own.cell_values, own.object_values)
     error = np.abs(found - wanted)
     # Where red meets blue, or the floor the walls, resampling shifts the border by up to a texel.
     edge = (np.abs(hits[:, 0] - 1.5) < 0.05) | (np.minimum(hits, [3, 2, 9] - hits)[:, :2].min(1) < 0.05)

@@ -79,7 +79,7 @@ def report(tmp_path_factory):
 
 
 @pytest.fixture
-def opened(page_for):  # noqa: F811
+def opened(page_for):
     """`opened(path, ...)`: a page, with what it said and asked for in `page.seen`."""
     with ExitStack() as stack:
 

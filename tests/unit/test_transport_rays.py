@@ -161,7 +161,7 @@ def test_cell_materials_read_what_numpy_reads(T, room):
     expected[:, 3] = np.maximum(expected[:, 3], brdf.R_MIN)
     assert 0.2 < np.mean(row >= 0) < 0.8
     np.testing.assert_array_equal(got, expected.astype(np.float32))
-    on_host = values_at(room.points, objects[: len(ijk)], edge, origin, *cells.unpack_keys(keys), values, means)
+    on_host, _ = values_at(room.points, objects[: len(ijk)], edge, origin, *cells.unpack_keys(keys), values, means)
     on_host[:, 3] = np.maximum(on_host[:, 3], brdf.R_MIN)
     np.testing.assert_array_equal(on_host, got[: len(ijk)])
     assert np.isfinite(room.render(T, 2, seed=0)).all()

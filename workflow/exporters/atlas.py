@@ -12,7 +12,7 @@ from iif_core.numerics.color import srgb_from_linear, to_uint8
 from iif_core.reflectance.material import BLACK
 from iif_core.surface.atlas import nearest_covered, texel_surface, texel_values
 from iif_core.surface.closest import closest_points
-from iif_core.surface.lookup import cells_at
+from iif_core.surface.lookup import values_at
 from workflow.artifacts.store import StageReader
 from workflow.scene.recovered import Recovered
 
@@ -153,7 +153,7 @@ def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array
     emits = np.array([part.emitter_id >= 0 for part in parts])[texels.part]
     points = _on_the_mesh(parts, texels, recovered)
     grid = surface.cell_edge, surface.cell_origin, surface.cell_ijk, surface.cell_object
-    values, cell = cells_at(points, objects, *grid, surface.cell_values, surface.object_values)
+    values, cell = values_at(points, objects, *grid, surface.cell_values, surface.object_values)
     values[emits] = BLACK
     seen = (cell >= 0) & ~emits
     spread = np.where(seen, np.asarray(uncertainty)[cell] if len(uncertainty) else UNKNOWN, np.where(emits, 0, UNKNOWN))

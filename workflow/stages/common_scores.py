@@ -81,7 +81,7 @@ def _maps(surface: BaseScene, shared: CaptureReader, views: list[View]) -> list[
         faces.append(face_id)
     seen = np.concatenate([face_id[face_id >= 0] for face_id in faces])
     grid = surface.cell_edge, surface.cell_origin, surface.cell_ijk, surface.cell_object
-    values = values_at(np.concatenate(points), surface.object_id[seen], *grid, surface.cell_values, surface.object_values)
+    values, _ = values_at(np.concatenate(points), surface.object_id[seen], *grid, surface.cell_values, surface.object_values)
     out, first = [], 0
     for face_id in faces:
         image = np.zeros((*face_id.shape, 5), np.float32)
