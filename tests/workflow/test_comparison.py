@@ -3,14 +3,17 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
+import pytest
 
+from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import rgb, split_rgb
-from workflow.comparison.maps import own_maps
+from workflow.comparison.maps import find, own_maps, read_map
 
 
 def fails(workflow, *arguments: str) -> str:
@@ -48,6 +51,23 @@ def test_our_own_maps_score_as_stage_metrics_says(workflow):
     page = (workflow.folder / "score/tiny/score.html").read_text()
     assert "albedo: 4 of 4 views" in page and "http" not in page.partition("<body>")[2]
     assert "Nothing to be done" in workflow.run("score/tiny", "--config", "maps=mine").stderr
+
+
+def test_the_maps_of_a_finished_scene_are_maps(workflow):
+    """The layers of maps/ are the quantities, and say the same as a folder for each quantity."""
+    hand_over(workflow.folder, workflow.folder / "mine")
+    views = [path.stem for path in sorted((workflow.folder / "mine/albedo").iterdir())]
+    layered, apart = (find(workflow.folder / of, "auto", views) for of in ("scenes/tiny/maps", "mine"))
+    assert set(layered.files) == {"albedo", "roughness", "metallic", "emission"}
+    for name in views:
+        view = SimpleNamespace(name=name, width=48, height=48)
+        dark = read_map(layered, "emission", view).sum(-1) == 0  # emitters are black in the maps that are delivered
+        for quantity, files in layered.files.items():
+            assert list(files) == views
+            found, wanted = (read_map(of, quantity, view)[dark] for of in (layered, apart))
+            assert dark.mean() > 0.5 and np.allclose(found, wanted, rtol=2e-3, atol=2e-3), (quantity, name)
+    with pytest.raises(InputError, match="the scene has no view 003"):
+        find(workflow.folder / "scenes/tiny/maps", "auto", views[:-1])
 
 
 def test_maps_that_are_not_there_stop_before_any_job(workflow):

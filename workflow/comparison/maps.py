@@ -20,7 +20,7 @@ from iif_core.evaluation.catalogue import METRICS, METRICS_OF, PROTOCOLS
 from iif_core.numerics.color import linear_from_srgb
 from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts import StageReader
-from workflow.artifacts.files import write_atomically
+from workflow.artifacts.files import read_exr, write_atomically
 from workflow.artifacts.store import rgb
 from workflow.comparison.named import QUANTITIES
 from workflow.report import pictures
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 EXTENSIONS = (".exr", ".png")
 COLOURS = ("auto", "srgb", "linear")
+LAYERED = (*PROPERTIES, "emission")
+"""What is read from files with a layer for each quantity."""
 SHOWN_VIEWS = 6
 SUSPICIOUS_DB = 3.0
 """Albedo that is so much nearer to the truth, after a gain, when it is decoded the other way, was probably decoded wrongly."""
@@ -58,7 +60,7 @@ class Maps:
 
 
 def find(folder: Path, colour: str, views: list[str]) -> Maps:
-    """List the maps in a folder: `<quantity>/<view>.exr` or `.png`.
+    """List the maps in a folder: `<quantity>/<view>.exr` or `.png`, or `<view>.exr` with a layer for each quantity.
 
     Args:
         folder: the maps.
@@ -70,22 +72,24 @@ def find(folder: Path, colour: str, views: list[str]) -> Maps:
     """
     if colour not in COLOURS:
         raise InputError(f"colour={colour}: allowed are {', '.join(COLOURS)}; it says how files of albedo are decoded")
-    layout = f"needed: {', '.join(f'{q}/<view>.exr' for q in PROPERTIES)} or .png, as many of them as there are"
+    layout = (
+        f"needed: {', '.join(f'{q}/<view>.exr' for q in PROPERTIES)} or .png, as many of them as there are, or <view>.exr with"
+        " the layers of maps/ of a finished scene"
+    )
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of maps; {layout}")
     files: dict[str, dict[str, Path]] = {}
+    for path in sorted(p for p in folder.glob("*.exr") if p.is_file()):
+        _known(path, views)
+        for quantity in (q for q in LAYERED if f"{q}.R" in (channels := read_exr(path)) or q in channels):
+            files.setdefault(quantity, {})[path.stem] = path
     for quantity in QUANTITIES:
-        found: dict[str, Path] = {}
+        found = files.get(quantity, {})
         inside = sorted((folder / quantity).iterdir()) if (folder / quantity).is_dir() else []
         for path in (p for p in inside if p.is_file() and not p.name.startswith(".")):
             if path.suffix.lower() not in EXTENSIONS:
                 raise InputError(f"{path}: a {path.suffix or 'file without ending'}; maps are .exr or .png")
-            if path.stem not in views:
-                shown = ", ".join(views[:8]) + (" ..." if len(views) > 8 else "")
-                raise InputError(
-                    f"{path}: the scene has no view {path.stem}.{did_you_mean(path.stem, views)} Its views are {shown};"
-                    " rename the file, or take it away"
-                )
+            _known(path, views)
             if path.stem in found:
                 raise InputError(f"{path}: {found[path.stem].name} is there, too; one file for each view")
             found[path.stem] = path
@@ -94,6 +98,15 @@ def find(folder: Path, colour: str, views: list[str]) -> Maps:
     if not files:
         raise InputError(f"{folder}: no maps; {layout}")
     return Maps(folder, files, {ending: colour == "srgb" or (colour == "auto" and ending == ".png") for ending in EXTENSIONS})
+
+
+def _known(path: Path, views: list[str]) -> None:
+    if path.stem not in views:
+        shown = ", ".join(views[:8]) + (" ..." if len(views) > 8 else "")
+        raise InputError(
+            f"{path}: the scene has no view {path.stem}.{did_you_mean(path.stem, views)} Its views are {shown};"
+            " rename the file, or take it away"
+        )
 
 
 def read_map(maps: Maps, quantity: str, view: View, srgb: bool | None = None) -> np.ndarray:
@@ -116,7 +129,10 @@ def read_map(maps: Maps, quantity: str, view: View, srgb: bool | None = None) ->
             f"{path}: {size[0]} x {size[1]} pixels; view {view.name} has {view.width} x {view.height}. Resample it"
             " yourself, as your method would: no resampling is right for every map"
         )
-    if exr:
+    if exr and path.parent == maps.folder:
+        channels = read_exr(path)
+        values = rgb(channels, quantity) if three else channels[quantity].astype(np.float32)
+    elif exr:
         values = images.load_map(path, 3 if three else 1)
     else:
         loaded = images.load_photo(path).pixels

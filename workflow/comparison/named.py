@@ -104,6 +104,6 @@ def mark(a: str, b: str, quality: str = "draft") -> str:
 
 def digest_of_maps(folder: Path, colour: str) -> str:
     """Return a digest of the maps in a folder, which changes when a file does; of an absent folder, too."""
-    files = sorted(p for q in QUANTITIES for p in (folder / q).glob("*") if p.is_file())
+    files = sorted(p for q in ("", *QUANTITIES) for p in (folder / q).glob("*") if p.is_file())
     facts = [f"{path.relative_to(folder)}:{sha256_of(path)}" for path in files]
     return hashlib.sha256("\n".join([os.fspath(folder), colour, *facts]).encode()).hexdigest()[:16]
