@@ -10,7 +10,7 @@ import pytest
 
 from iif_core.errors import InputError
 from tests.browser import browser, page_for  # noqa: F401  fixtures
-from workflow.runtime import native
+from workflow.runtime import device, native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 THREADS = 2
@@ -39,12 +39,12 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def llvm():
-    """Mitsuba with `llvm_ad_rgb` on two threads; the value is the `mitsuba` module."""
+    """Mitsuba with `llvm_ad_rgb` on two threads; the value is the `mitsuba` module. `IIF_TEST_DEVICE=cuda` has the tests that ask
+    for it trace their rays on a CUDA device, with `cuda_ad_rgb`."""
     if _llvm_problem:
         pytest.fail(_llvm_problem, pytrace=False)
-    import mitsuba
-
-    mitsuba.set_variant("llvm_ad_rgb")
+    device.use(os.environ.get("IIF_TEST_DEVICE", "cpu"))
+    mitsuba = device.mitsuba()
     native.limit_threads(THREADS)
     return mitsuba
 

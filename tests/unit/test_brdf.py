@@ -7,7 +7,6 @@ import pytest
 
 from iif_core.numerics.xp import NUMPY
 from iif_core.reflectance import brdf
-from workflow.runtime import native
 
 RNG = np.random.default_rng(7)
 Z = (0.0, 0.0, 1.0)
@@ -149,11 +148,10 @@ def test_extremes_are_finite_and_one_sided():
         assert np.isfinite(brdf.sample_cosine(NUMPY, np.float32(u), np.float32(u))).all()
 
 
-def test_three_libraries_agree():
-    native.prepare()
+def test_three_libraries_agree(llvm):
     import torch
-    from drjit.llvm import Float
 
+    Float = llvm.Float
     from iif_core.numerics.xp import DRJIT, TORCH
 
     wo, wi = unit_vectors(3000, np.float32), unit_vectors(3000, np.float32)

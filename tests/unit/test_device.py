@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -17,10 +18,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture(autouse=True)
 def restored():
-    """The device of the test process, which others rely on."""
-    before = device._used
+    """The device of the test process and the driver that Dr.Jit shall load, which others rely on."""
+    before, driver = device._used, os.environ.get(device.DRIVER[0])
     yield
     device._used = before
+    os.environ.pop(device.DRIVER[0], None)
+    if driver is not None:
+        os.environ[device.DRIVER[0]] = driver
 
 
 CASES = [("auto", [], "cpu"), ("auto", ["A100"], "cuda"), ("cpu", ["A100"], "cpu"), ("cuda", ["A100"], "cuda")]
@@ -29,7 +33,10 @@ CASES = [("auto", [], "cpu"), ("auto", ["A100"], "cuda"), ("cpu", ["A100"], "cpu
 @pytest.mark.parametrize(("asked", "found", "kind"), CASES)
 def test_what_is_asked_and_what_is_there(monkeypatch, asked, found, kind):
     monkeypatch.setattr(device, "cuda_devices", lambda: found)
+    monkeypatch.setattr(device, "has_optix", lambda: True)
+    monkeypatch.delenv(device.DRIVER[0], raising=False)
     used = device.use(asked)
+    assert os.environ.get(device.DRIVER[0]) == ("libcuda.so.1" if kind == "cuda" else None)
     assert (used.kind, used.variant) == (kind, device.VARIANTS[kind])
     assert used.facts() == {"asked": asked, "kind": kind, "name": "A100" if kind == "cuda" else ""}
     assert str(used) == ("cuda (A100)" if kind == "cuda" else "cpu")
@@ -41,6 +48,28 @@ def test_cuda_without_a_device_is_an_error(monkeypatch):
         device.use("cuda")
 
 
+def test_a_device_that_cannot_trace_rays(monkeypatch, caplog):
+    """As in a container that has the driver's libraries for computing alone."""
+    monkeypatch.setattr(device, "cuda_devices", lambda: ["A100"])
+    monkeypatch.setenv(device.OPTIX[0], "/nowhere/libnvoptix.so.1")
+    with pytest.raises(InputError, match=r"device: found cuda, but A100 cannot trace rays.*OptiX.*_CAPABILITIES=all"):
+        device.use("cuda")
+    assert device.use("auto").kind == "cpu" and "A100 cannot trace rays" in caplog.text
+    caplog.clear()
+    assert device.use("cpu").kind == "cpu" and not caplog.text
+
+
+CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py"}
+"""The last two are programs of their own: a probe in a child process, and what is exported beside scene.xml."""
+
+
+def test_nothing_else_chooses_a_variant():
+    """A module that names one would take a job from its device, in the middle of it."""
+    files = [path for folder in ("iif_core", "workflow") for path in (ROOT / folder).rglob("*.py")]
+    found = {str(path.relative_to(ROOT / "workflow")) for path in files if "set_variant(" in path.read_text()}
+    assert found == CHOOSERS
+
+
 def test_no_driver_is_no_device(monkeypatch):
     def missing(_):
         raise OSError("libcuda.so.1: cannot open shared object file")
@@ -50,7 +79,10 @@ def test_no_driver_is_no_device(monkeypatch):
 
 
 def test_a_variant_that_was_chosen_before_stays(llvm):
-    assert device.mitsuba() is llvm and llvm.variant() == "llvm_ad_rgb"
+    """Also where a stage in the same process asks for another device, and where a study takes samples."""
+    before = llvm.variant()
+    device._used = device.Device("cuda", "cuda", "A100")
+    assert device.mitsuba() is llvm and llvm.variant() == before
 
 
 RENDER = """

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from iif_core.reflectance.brdf import kd_ks
 from iif_core.reflectance.directional_albedo import COSINES, directional_albedo
+from workflow.runtime import device
 
 ROUGHNESS = np.linspace(0.05, 1.0, 20)
 """Perceptual roughness of the table; both models change little below."""
@@ -49,9 +50,7 @@ def metal_reflectance() -> NDArray:
     Directions are drawn by the plug-in, on strata of its two dimensions, for cosines of the viewer at the middle of equal shares
     of the projected hemisphere.
     """
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+    mi = device.mitsuba()
     return np.array([[_reflectance(mi, base, r) for r in ROUGHNESS] for base in (0.0, 1.0)])
 
 

@@ -16,6 +16,7 @@ from iif_core.fusion.selection import selection_weights
 from iif_core.light import environment
 from iif_core.numerics import color, frames, laplace, normal_tail, xp
 from iif_core.reflectance import brdf
+from workflow.runtime import device
 from workflow.stability.scalar import Argument, Form, Kernel
 
 UNIT = Argument(0.0, 1.0, (0.5, 1.0), towards_one=True)
@@ -37,9 +38,8 @@ def _torch(function: Callable[..., Any], arrays: list[np.ndarray]) -> Any:
 
 def _drjit(function: Callable[..., Any], arrays: list[np.ndarray]) -> Any:
     import drjit as dr
-    import mitsuba as mi
 
-    mi.set_variant("llvm_ad_rgb")
+    mi = device.mitsuba()
     kind = mi.Float if arrays[0].dtype == np.float32 else mi.Float64
     result = function(xp.DRJIT, *(kind(array) for array in arrays))
     width = len(arrays[0])

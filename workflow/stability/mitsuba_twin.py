@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workflow.exporters import mitsuba_bsdf
+from workflow.runtime import device
 
 
 @dataclass(frozen=True)
@@ -44,10 +45,8 @@ class Room:
 
 
 def scene_of(room: Room) -> Any:
-    """Return a room as a scene of Mitsuba (variant `llvm_ad_rgb`)."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+    """Return a room as a scene of Mitsuba."""
+    mi = device.mitsuba()
     mitsuba_bsdf.register()
     document: dict[str, Any] = {"type": "scene"}
     for number, part in enumerate(room.parts):
@@ -93,9 +92,7 @@ def reference(scene: Any, room: Room, samples: int, max_bounces: int, seed: int)
 
 def ours(room: Room, samples: int, max_bounces: int, seed: int) -> NDArray:
     """Estimate the same with the path tracer of the project, (n, 3)."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+    device.mitsuba()
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.materials import CellMaterials

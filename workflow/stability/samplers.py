@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from iif_core.light.environment import direction_in, solid_angles, texel_of
 from iif_core.numerics.xp import DRJIT, NUMPY
 from iif_core.reflectance import brdf
+from workflow.runtime import device
 
 LEVEL = 0.05
 FEWEST = 5.0
@@ -235,8 +236,6 @@ def _environment(draws: int) -> Iterator[Drawn]:
 
 def measure(draws: int = DRAWS) -> Iterator[Drawn]:
     """Run all tests, with `draws` draws each."""
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
+    device.mitsuba()
     for sampler in (_streams, _cosine, _half_vectors, _mixture, _faces, _environment):
         yield from sampler(draws)

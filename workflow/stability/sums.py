@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from workflow.runtime import device
+
 PIECE_TERMS = 256
 """Terms that the kernels of the fusion add in single precision."""
 PATHS = 4096
@@ -107,9 +109,8 @@ def _parquet(terms: NDArray) -> float:
 def _rows_of_matrix(terms: NDArray) -> float:
     """The sum of one lane of a loop that adds to its own row, as the transport matrix is made; single precision."""
     import drjit as dr
-    import mitsuba as mi
 
-    mi.set_variant("llvm_ad_rgb")
+    mi = device.mitsuba()
     values, rows, end = mi.Float(terms), dr.zeros(mi.Float, 1), dr.opaque(mi.UInt32, len(terms))
 
     def body(i: Any) -> tuple[Any]:
