@@ -36,7 +36,7 @@ def test_fireflies_are_counted():
 
 @pytest.mark.parametrize("name", ["furnished room", "under the sky"])
 def test_our_paths_and_those_of_mitsuba_agree(llvm, name):
-    room = monte_carlo.rooms(16)[name]
+    room = monte_carlo.small_rooms(16)[name]
     scene = mitsuba_twin.scene_of(room)
     found = compare(
         name,
@@ -49,7 +49,7 @@ def test_our_paths_and_those_of_mitsuba_agree(llvm, name):
 
 
 def test_another_material_is_seen(llvm):
-    room = monte_carlo.rooms(16)["under the sky"]
+    room = monte_carlo.small_rooms(16)["under the sky"]
     scene = mitsuba_twin.scene_of(room)
     first, *others = room.parts
     material = (*(1.05 * value for value in first.material[:3]), *first.material[3:])

@@ -26,6 +26,7 @@ SIGMAS = 3.5
 ALONE = 0.01
 """Metres. New rays start 0.1 mm off a surface here and 0.27 mm in Mitsuba, which moves shadows at the foot of things; surface of
 the kitchen that is closer to another thing is left out."""
+_BLACK = (0.0, 0.0, 0.0, 1.0, 1.0)
 FIREFLY = 10.0
 """A replicate of a pixel that is so many times the median of its replicates counts as a firefly."""
 
@@ -89,7 +90,15 @@ def _rays(eye: Sequence[float], target: Sequence[float], size: int) -> tuple[NDA
 def rooms(size: int = 32) -> dict[str, Room]:
     """Return the rooms of the test, seen by size x size pixels: a furnished room, objects under the sky, and the built-in kitchen
     with one material for each object; and each of them under other light."""
-    black = (0.0, 0.0, 0.0, 1.0, 1.0)
+    kitchen = _kitchen(size)
+    fewer = [part for part in kitchen.parts if not any(part.radiance)]
+    panel = _quad((1.5, 1.2, 2.6), (0, 1.6, 0), (2.0, 0, 0))
+    night = replace(kitchen, parts=[*fewer, Part(*panel, _BLACK, (2.0, 1.6, 0.9))])
+    return {**small_rooms(size), "kitchen": kitchen, "kitchen, relit": night}
+
+
+def small_rooms(size: int = 32) -> dict[str, Room]:
+    """Return the rooms of `rooms` but the kitchen."""
     furnished = [
         Part(*_box((0, 0, 0), (4, 3, 2.5), inward=True), (0.7, 0.6, 0.5, 0.9, 0.0)),
         Part(*_box((0.6, 1.2, 0.0005), (1.4, 2, 0.9)), (0.3, 0.5, 0.7, 0.25, 0.0)),
@@ -97,9 +106,9 @@ def rooms(size: int = 32) -> dict[str, Room]:
     ]
     ceiling, wall = _quad((1.5, 1.0, 2.45), (0, 0.8, 0), (1, 0, 0)), _quad((3.95, 0.5, 1), (0, 0, 0.5), (0, 0.6, 0))
     eye = _rays((2, 0.2, 1.3), (2, 2.2, 0.9), size)
-    own = Room([*furnished, Part(*ceiling, black, (8, 7, 5)), Part(*wall, black, (2, 3, 6))], (0, 0, 0), *eye)
+    own = Room([*furnished, Part(*ceiling, _BLACK, (8, 7, 5)), Part(*wall, _BLACK, (2, 3, 6))], (0, 0, 0), *eye)
     lamp = _quad((0.8, 1.5, 1.6), (0, 0.1, 0), (0.1, 0, 0))
-    relit = replace(own, parts=[*furnished, Part(*ceiling, black), Part(*wall, black), Part(*lamp, black, (300, 250, 150))])
+    relit = replace(own, parts=[*furnished, Part(*ceiling, _BLACK), Part(*wall, _BLACK), Part(*lamp, _BLACK, (300, 250, 150))])
     floor = _quad((-3, -3, 0), (6, 0, 0), (0, 6, 0), 2)
     outside = Room(
         [
@@ -111,18 +120,12 @@ def rooms(size: int = 32) -> dict[str, Room]:
         *_rays((0, -2.6, 1.4), (0, 0, 0.4), size),
     )
     flash = _quad((-1.5, -2.0, 2.5), (0.3, 0, 0), (0, 0, 0.3))
-    dusk = replace(outside, parts=[*outside.parts, Part(*flash, black, (60, 40, 20))], sky=(0.05, 0.06, 0.1))
-    kitchen = _kitchen(size)
-    fewer = [part for part in kitchen.parts if not any(part.radiance)]
-    panel = _quad((1.5, 1.2, 2.6), (0, 1.6, 0), (2.0, 0, 0))
-    night = replace(kitchen, parts=[*fewer, Part(*panel, black, (2.0, 1.6, 0.9))])
+    dusk = replace(outside, parts=[*outside.parts, Part(*flash, _BLACK, (60, 40, 20))], sky=(0.05, 0.06, 0.1))
     return {
         "furnished room": own,
         "furnished room, relit": relit,
         "under the sky": outside,
         "under the sky, relit": dusk,
-        "kitchen": kitchen,
-        "kitchen, relit": night,
     }
 
 
@@ -170,9 +173,8 @@ def _alone(parts: Sequence[Part], origin: NDArray, ways: NDArray) -> NDArray:
 
 def extremes(size: int = 32) -> dict[str, Room]:
     """Return rooms with heavy tails: a lamp of 4 cm^2 and radiance 10^6, without and with a mirror (r = 0.02) beside it."""
-    black = (0.0, 0.0, 0.0, 1.0, 1.0)
     shell = Part(*_box((0, 0, 0), (4, 3, 2.5), inward=True), (0.6, 0.6, 0.6, 0.8, 0.0))
-    lamp = Part(*_quad((2.0, 1.5, 2.4), (0, 0.02, 0), (0.02, 0, 0)), black, (1e6, 1e6, 1e6))
+    lamp = Part(*_quad((2.0, 1.5, 2.4), (0, 0.02, 0), (0.02, 0, 0)), _BLACK, (1e6, 1e6, 1e6))
     mirror = Part(*_box((0.6, 1.2, 0.0005), (1.4, 2, 0.9)), (0.9, 0.9, 0.9, 0.02, 1.0))
     eye = _rays((2, 0.2, 1.3), (2, 2.2, 0.9), size)
     return {
