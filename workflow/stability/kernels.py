@@ -162,9 +162,9 @@ REFLECTANCE = [
     Kernel("chance of the GGX lobe", _chance, ("chance",),
            {"k_d": UNIT, "k_s": UNIT, "NoV": COSINE}, of_namespace(brdf.specular_chance)),
     Kernel("cosine sample", _cosine_direction, ("x", "y", "z"),
-           {"u1": UNIFORM, "u2": UNIFORM}, of_namespace(brdf.sample_cosine), _below_one),
+           {"u1": UNIFORM, "u2": UNIFORM}, of_namespace(brdf.sample_cosine), _below_one, turned=True),
     Kernel("GGX sample of the half vector", _ggx_half, ("x", "y", "z"),
-           {"u1": UNIFORM, "u2": UNIFORM, "r": ROUGHNESS}, of_namespace(brdf.sample_ggx_half), _below_one),
+           {"u1": UNIFORM, "u2": UNIFORM, "r": ROUGHNESS}, of_namespace(brdf.sample_ggx_half), _below_one, turned=True),
 ]  # fmt: skip
 
 # ------------------------------------------------------------------------------------------------------------ fusion
@@ -441,7 +441,7 @@ LIGHT = [
     Kernel("direction in a texel, 512 x 1024", partial(_texel_direction, 512, 1024), ("x", "y", "z"),
            {"row": UNIT, "column": UNIT, "u1": UNIFORM, "u2": UNIFORM},
            of_namespace(lambda space, row, column, u1, u2: environment.direction_in(space, row, column, u1, u2, 512, 1024)),
-           partial(_texels, 512, 1024)),
+           partial(_texels, 512, 1024), turned=True),
 ]  # fmt: skip
 
 # ----------------------------------------------------------------------------------------------------- interpolation

@@ -3,7 +3,9 @@
 Of a kernel f at floating-point arguments x the error is |computed - f(x)|, the condition number kappa the sum over the arguments
 of |x_i df/dx_i / f|, and the *ratio* error / (|f| eps max(kappa, 1)): what is left when the part of the error that any
 algorithm has to make is divided out. 30 is the threshold of LAPACK's own tests. Results below the smallest normal number count
-as zero, because vector units flush them.
+as zero, because vector units flush them. Components of a unit vector that a GPU computed are measured against the length of the
+vector, 1 in the place of |f|, because its sine and cosine have digits of that size alone
+(docs/method/numerics.md#arithmetic-of-a-gpu).
 """
 
 from __future__ import annotations
@@ -16,6 +18,8 @@ from typing import Any, NamedTuple
 
 import mpmath as mp
 import numpy as np
+
+from workflow.runtime import device
 
 DIGITS = 50
 """Of the oracle."""
@@ -89,6 +93,7 @@ class Kernel:
         arguments: name -> its range.
         forms: (library, dtype) -> the function of the project for a list of arrays.
         prepare: makes arguments that belong together, such as unit vectors, of those that were drawn.
+        turned: whether the results are components of a unit vector that is turned by sines and cosines of angles.
     """
 
     name: str
@@ -97,6 +102,7 @@ class Kernel:
     arguments: Mapping[str, Argument]
     forms: Mapping[tuple[str, type], Form]
     prepare: Callable[[list[np.ndarray], np.random.Generator], list[np.ndarray]] | None = None
+    turned: bool = False
 
 
 class Accuracy(NamedTuple):
@@ -149,8 +155,14 @@ def accuracy(kernel: Kernel, count: int, seed: int = 0) -> list[Accuracy]:
         for i, name in enumerate(kernel.outputs):
             column = np.asarray(columns[i], np.float64).reshape(-1)
             wanted, moved = [row[i] for row in exact], [row[i] for row in change]
-            out.append(_accuracy(kernel, name, (library, dtype), points, column, wanted, moved))
+            least = 1.0 if kernel.turned and library == "drjit" and _on_gpu() else float(np.finfo(dtype).tiny)
+            out.append(_accuracy(kernel, name, (library, dtype), points, column, wanted, moved, least))
     return out
+
+
+def _on_gpu() -> bool:
+    """Whether Dr.Jit's arrays are on a CUDA device."""
+    return device.mitsuba().variant().startswith("cuda")
 
 
 def _exact_and_change(kernel: Kernel, points: Sequence[np.ndarray]) -> tuple[list[tuple[Any, ...]], list[tuple[Any, ...]]]:
@@ -184,7 +196,9 @@ def _accuracy(
     computed: np.ndarray,
     exact: Sequence[Any],
     change: Sequence[Any],
+    least: float,
 ) -> Accuracy:
+    """Errors of one result; those of results below `least` count relative to `least`."""
     library, dtype = form
     info = np.finfo(dtype)
     ulps, ratios, conditions, lost = [], [], [], 0
@@ -205,7 +219,7 @@ def _accuracy(
                 ulps.append(0.0), ratios.append(0.0), conditions.append(1.0)
                 continue
             ulps.append(float(error / mp.mpf(float(np.spacing(dtype(max(float(size), float(info.tiny))))))))
-            scale = max(size, moved, floor) * float(info.eps)
+            scale = max(size, moved, mp.mpf(least)) * float(info.eps)
             ratios.append(float(error / scale))
             conditions.append(float(moved / size) if size else math.inf)
     worst = int(np.argmax(ratios))

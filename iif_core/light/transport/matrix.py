@@ -81,9 +81,9 @@ def _deposit_paths(world: World, rng: Any, vertex: Vertex, sample: Any, end: Any
 
 
 def _share(part: Any, rest: Any) -> Any:
-    """part / (part + rest) for each channel, 0 where both are 0."""
+    """part / (part + rest) for each channel, in [0, 1], 0 where both are 0 (docs/method/numerics.md#arithmetic-of-a-gpu)."""
     whole = part + rest
-    return dr.select(whole > 0, part / whole, 0)
+    return dr.select(whole > 0, dr.minimum(part / whole, 1), 0)
 
 
 def transport_matrix(
