@@ -56,8 +56,8 @@ class SceneSettings(Section):
     """Seed of all random numbers."""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     """Where rays are traced. `auto`: on a CUDA device where the machine has one, else on the CPU; `cuda` is an error where there
-    is none. Recorded in the manifests, and no reason to run a job again: numbers differ by rounding and noise alone. Not tried
-    on a GPU yet, hence the default."""
+    is none. Recorded in the manifests, and no reason to run a job again: numbers differ by rounding and noise alone. What a GPU
+    brings is in docs/results/performance.md#a-gpu."""
 
     @field_validator("segmentation", mode="before")
     @classmethod
