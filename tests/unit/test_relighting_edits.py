@@ -308,6 +308,36 @@ def test_meshes_come_with_their_materials(tmp_path):
     assert load_insert(tmp_path / "c.obj").textures[0].shape == (1, 1, 5)
 
 
+def test_colours_of_vertices_are_linear_in_gltf(tmp_path):
+    import trimesh
+    from trimesh.visual.material import PBRMaterial
+
+    coloured = trimesh.creation.box()
+    coloured.visual.vertex_colors = np.tile(np.uint8([128, 64, 255, 255]), (8, 1))
+    coloured.export(tmp_path / "a.glb")
+    texture = load_insert(tmp_path / "a.glb").textures[0]
+    np.testing.assert_allclose(texture[0, :, :3], np.tile([128 / 255, 64 / 255, 1], (12, 1)), atol=1e-6)
+    material = PBRMaterial(baseColorFactor=[0.2, 1.0, 0.6, 1.0], roughnessFactor=0.3, metallicFactor=0.0)
+    coloured.visual = trimesh.visual.TextureVisuals(material=material)
+    coloured.visual.vertex_attributes["color"] = np.tile(np.uint8([128, 64, 255, 255]), (8, 1))
+    coloured.export(tmp_path / "b.glb")
+    mesh = load_insert(tmp_path / "b.glb")  # both are multiplied, and what else the material says stays
+    np.testing.assert_allclose(mesh.textures[0][0], np.tile([0.2 * 128 / 255, 64 / 255, 0.6, 0.3, 0], (12, 1)), atol=2e-3)
+    assert mesh.uv.shape == (12, 3, 2)
+
+
+def test_mirrored_nodes_keep_their_outer_side_out(tmp_path):
+    import trimesh
+
+    for name, mirror in (("as-is", [1, 1, 1]), ("mirrored", [-2, 1, 1])):
+        scene = trimesh.Scene()
+        scene.add_geometry(trimesh.creation.box(), transform=np.diag([*mirror, 1.0]))
+        (tmp_path / f"{name}.glb").write_bytes(scene.export(file_type="glb"))
+        a, b, c = np.moveaxis(load_insert(tmp_path / f"{name}.glb").corners, 1, 0)
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+        assert volume == pytest.approx(abs(np.prod(mirror)))
+
+
 def test_meshes_stand_where_they_are_put(tmp_path):
     mesh = load_insert(plate(tmp_path / "plate.glb", size=(0.8, 0.1, 0.4)))
     put = {"position": [1, 2, 3], "rotation": [0, 0, 90], "scale": 2.0}

@@ -48,9 +48,10 @@ def load_insert(path: Path) -> InsertedMesh:
     files_of_mesh(path)
     import trimesh
 
+    is_gltf = path.suffix.lower() in (".glb", ".gltf")
     try:
         loaded = trimesh.load_scene(str(path), process=False)
-        parts = list(_parts(loaded))
+        parts = list(_parts(loaded, is_gltf))
     except InputError:
         raise
     except Exception as error:  # whatever trimesh makes of a broken file
@@ -62,10 +63,10 @@ def load_insert(path: Path) -> InsertedMesh:
     if not (np.isfinite(corners).all() and np.isfinite(uv).all()):
         raise InputError(f"{path}: has corners or texture coordinates that are not finite; export the mesh again")
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    return InsertedMesh(corners, uv, number, [part[2] for part in parts], path.suffix.lower() in (".glb", ".gltf"))
+    return InsertedMesh(corners, uv, number, [part[2] for part in parts], is_gltf)
 
 
-def _parts(scene: Any) -> Iterator[tuple[Array, Array, Array]]:
+def _parts(scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array]]:
     """(corners, uv, texture) of every mesh of a trimesh scene, in world axes of the file."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
@@ -73,27 +74,41 @@ def _parts(scene: Any) -> Iterator[tuple[Array, Array, Array]]:
         if not len(getattr(mesh, "faces", ())):
             continue
         vertices = np.asarray(mesh.vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
-        yield vertices[mesh.faces], *_material(mesh)
+        uv, texture = _material(mesh, is_gltf)
+        # A node that mirrors its mesh turns the order of the corners, and with it the side that an emitter shines to.
+        order = slice(None, None, -1 if np.linalg.det(transform[:3, :3]) < 0 else 1)
+        yield vertices[mesh.faces][:, order], uv[:, order], texture
 
 
-def _material(mesh: Any) -> tuple[Array, Array]:
-    """Texture coordinates (k, 3, 2) and texture (h, w, 5) of a mesh."""
+def _material(mesh: Any, is_gltf: bool) -> tuple[Array, Array]:
+    """Texture coordinates (k, 3, 2) and texture (h, w, 5) of a mesh. Colours of vertices are linear in glTF, sRGB elsewhere."""
     faces, visual = mesh.faces, mesh.visual
     uv = getattr(visual, "uv", None)
+    decoded = np.asarray if is_gltf else linear_from_srgb
     if visual.kind == "texture":
         texture = _texture(visual.material)
         if uv is None or texture.shape[:2] == (1, 1):
-            return np.zeros((len(faces), 3, 2)), texture
+            colours = (visual.vertex_attributes or {}).get("color")
+            if colours is None or texture.shape[:2] != (1, 1):
+                return np.zeros((len(faces), 3, 2)), texture
+            texture = np.tile(texture, (1, len(faces), 1))
+            texture[0, :, :3] *= decoded(np.asarray(colours)[:, :3] / 255.0)[faces].mean(1)
+            return _face_by_face(len(faces)), texture
         flipped = np.asarray(uv, np.float64) * [1, -1] + [0, 1]  # trimesh counts v upwards
         return flipped[faces], texture
     if visual.kind in ("vertex", "face"):
-        colours = visual.vertex_colors[faces].mean(1) if visual.kind == "vertex" else visual.face_colors
+        of_vertices = visual.kind == "vertex"
+        colours = decoded(np.asarray(visual.vertex_colors if of_vertices else visual.face_colors)[:, :3] / 255.0)
         texture = np.tile(PLAIN, (1, len(faces), 1))
-        texture[0, :, :3] = linear_from_srgb(np.asarray(colours)[:, :3] / 255.0)
-        # One texel for each face, read in its middle.
-        middle = (np.arange(len(faces)) + 0.5) / len(faces)
-        return np.repeat(np.stack([middle, np.full(len(faces), 0.5)], 1)[:, None], 3, 1), texture
+        texture[0, :, :3] = colours[faces].mean(1) if of_vertices else colours
+        return _face_by_face(len(faces)), texture
     return np.zeros((len(faces), 3, 2)), PLAIN[None, None].copy()
+
+
+def _face_by_face(count: int) -> Array:
+    """Texture coordinates (k, 3, 2) for a texture of one row with a texel for each face, which is read in its middle."""
+    middle = (np.arange(count) + 0.5) / count
+    return np.repeat(np.stack([middle, np.full(count, 0.5)], 1)[:, None], 3, 1)
 
 
 def _texture(material: Any) -> Array:
