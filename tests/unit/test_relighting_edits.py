@@ -117,6 +117,14 @@ def test_settings_of_lamps_and_paint():
         ({"camera": {"views": ["a"], "poses": [{"position": [0, 0, 0], "look_at": [1, 0, 0]}]}}, "both given"),
         ({"video": {"codec": "hevc"}}, "'av1' or 'h264'"),
         ({"method": "recombine", "sphere": {"center": [0, 0, 0], "path_to": [1, 0, 0]}}, "moves"),
+        ({"emitters": float("inf")}, "less than or equal|finite"),
+        ({"lamps": {"a": 1e300}}, "less than or equal"),
+        ({"lamps": {"a": {"move": [float("nan"), 0, 0]}}}, "finite"),
+        ({"sphere": {"center": [0, float("nan"), 0]}}, "finite"),
+        ({"sphere": {"center": [0, 0, 0], "radiance": [-1, 1, 1]}}, "greater than or equal"),
+        ({"insert": [{"file": "a.glb", "position": [0, 0, 0], "scale": float("inf")}]}, "finite"),
+        ({"environment_turn": float("nan")}, "finite"),
+        ({"environment": [float("inf"), 0, 0]}, "environment"),
     ):
         with pytest.raises(ValidationError, match=words):
             entry(**bad)

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, NonNegativeFloat, field_validator, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from iif_core.errors import InputError
 from workflow.settings.mesh_files import MESHES, files_of_mesh
@@ -15,7 +15,9 @@ from workflow.settings.names import did_you_mean_path
 from workflow.settings.override import TEXT_KEYS
 from workflow.settings.section import Section
 
-Colour = tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat]
+Light = Annotated[float, Field(ge=0, le=1e9)]
+"""Radiance, or a factor on it; pictures are single floats, which end at 3e38."""
+Colour = tuple[Light, Light, Light]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 SWITCH = {"on": 1.0, "off": 0.0, True: 1.0, False: 0.0}
 """What `on` and `off`, which YAML reads as booleans, stand for."""
@@ -28,7 +30,7 @@ def _switched(value: Any) -> Any:
 class RelightLamp(Section):
     """What becomes of one lamp. A number, `on` or `off` instead of this is its `factor`."""
 
-    factor: Annotated[float, BeforeValidator(_switched)] = Field(1.0, ge=0)
+    factor: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Factor on the radiance that was found; `on` is 1, `off` is 0."""
     colour: Colour | None = None
     """Linear R, G, B of its light; the luminance stays. By default as found."""
@@ -106,7 +108,7 @@ class RelightSphere(Section):
     """Position in metres, world axes."""
     radius: float = Field(0.2, gt=0)
     """Radius in metres."""
-    radiance: tuple[float, float, float] = (53.0, 50.0, 45.0)
+    radiance: Colour = (53.0, 50.0, 45.0)
     """R, G, B in the units of emitters.parquet."""
     path_to: tuple[float, float, float] | None = None
     """Position in the last frame; the sphere moves there in a straight line."""
@@ -160,11 +162,11 @@ class Relighting(Section):
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
     """Name of the folder of its pictures."""
-    emitters: Annotated[float, BeforeValidator(_switched)] = Field(1.0, ge=0)
+    emitters: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Recovered emitters that `lamps` does not name: `on`, `off`, or a factor on their radiance."""
     lamps: Annotated[dict[str, RelightLamp], TEXT_KEYS] = Field(default_factory=dict)
     """Single lamps: id of emitters.parquet, or name of an object that shines -> factor, `on`, `off`, or its keys."""
-    environment: Literal["keep", "off"] | NonNegativeFloat | Colour | Path = "keep"
+    environment: Literal["keep", "off"] | Light | Colour | Path = "keep"
     """Light from outside: `keep`, `off`, a factor on what was found, a uniform radiance `[r, g, b]`, or a latitude-longitude EXR
     (top row = up)."""
     environment_turn: float = 0.0

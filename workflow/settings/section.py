@@ -40,9 +40,10 @@ ON_OFF = BeforeValidator(lambda value: ("off", "on")[value] if isinstance(value,
 
 
 class Section(BaseModel):
-    """A part of the settings. Unknown keys are errors, and so are keys without effect beside the chosen solver or model."""
+    """A part of the settings. Unknown keys are errors, and so are numbers that are not finite, and keys without effect beside the
+    chosen solver or model."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True, allow_inf_nan=False)
 
     IDLE: ClassVar[dict[str, dict[str, tuple[str, tuple[str, ...]]]]] = {}
     """Setting that chooses -> its value -> (the choice that reads them, settings that this value does not read)."""
