@@ -1,5 +1,6 @@
 """Exporters: other programs read the same geometry, colours and light, on a room of known colours."""
 
+import io
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_directions
 from iif_core.errors import InputError
@@ -23,7 +25,7 @@ from iif_core.surface.lookup import values_at
 from iif_core.surface.tangents import vertex_tangents
 from iif_core.surface.triangles import face_geometry, subdivide, vertex_normals
 from tests.oracles.exported import maps_of, read_back
-from workflow.exporters.atlas import TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
+from workflow.exporters.atlas import Atlas, TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
@@ -452,6 +454,25 @@ def test_a_glb_that_must_be_small(glb):
     assert facts["size"] < atlas.size and len(smaller) <= 0.2 * len(whole)
     assert structural_errors(smaller) == []
     assert not fitting_glb(parts, noisy, UP, {}, [], 1e-4)[1]["fits"]
+
+
+@pytest.mark.parametrize("side", [1024, 1000])
+def test_a_smaller_texture_stays_in_its_place(side):
+    """A hill across the atlas has its top at the same texture coordinate, to a fifth of a texel of the whole atlas."""
+    parts, _ = textured(room(), 60.0)
+    u = (np.arange(side) + 0.5) / side
+    hill = np.broadcast_to(np.exp(-0.5 * ((u - 0.37) / 0.03) ** 2).astype(np.float32), (side, side))
+    placed = Atlas(np.stack([hill] * 3, -1), hill, hill.T, hill, hill > 0, hill > 0)
+    data, facts = fitting_glb(parts, placed, UP, {}, [], 1e-4)
+    assert facts["size"] == side // 4
+    document, binary = chunks_of(data)
+    image = document["bufferViews"][document["images"][1]["bufferView"]]
+    start = image["byteOffset"]
+    surface = np.asarray(Image.open(io.BytesIO(binary[start : start + image["byteLength"]])), np.float64)
+    at = (np.arange(len(surface)) + 0.5) / len(surface)
+    for channel, axis in ((1, 0), (2, 1)):  # roughness changes along columns, metallic along rows
+        profile = np.maximum(surface[..., channel].mean(axis) - 30, 0)  # JPEG leaves ripples beside the hill
+        assert (profile * at).sum() / profile.sum() == pytest.approx(0.37, abs=0.2 / side)
 
 
 def test_dark_albedo_survives(glb):

@@ -107,25 +107,37 @@ def fitting_glb(
     max_mb: float,
     normals: np.ndarray | None = None,
 ) -> tuple[bytes, dict[str, Any]]:
-    """Make the glTF file and keep it below `max_mb`: with PNG textures if they fit, then with JPEG, then with every second texel.
-    `normals` is a normal map (`normal_map.normal_picture`), if there shall be one.
+    """Make the glTF file and keep it below `max_mb`: with PNG textures if they fit, then with JPEG, then with half as many texels
+    a side. `normals` is a normal map (`normal_map.normal_picture`), if there shall be one.
 
     Returns:
         The file, and what its textures are: `format`, `size`, `mb`, and `fits`, false if the meshes alone are larger.
     """
     pictures = {"base_color": base_color_picture(atlas), "surface": surface_picture(atlas)}
     pictures |= {} if normals is None else {"normal": normals}
-    every = 1
+    size = atlas.size
     while True:
         for jpeg in (None, JPEG_QUALITY):
-            images = {name: encoded(picture[::every, ::every], jpeg) for name, picture in pictures.items()}
+            images = {name: encoded(_coarser(picture, size), jpeg) for name, picture in pictures.items()}
             data = glb_bytes(parts, images, up, provenance, views)
-            facts = {"format": "jpeg" if jpeg else "png", "size": -(-atlas.size // every), "mb": len(data) / MEGABYTE}
+            facts = {"format": "jpeg" if jpeg else "png", "size": size, "mb": len(data) / MEGABYTE}
             if len(data) <= max_mb * MEGABYTE:
                 return data, facts | {"fits": True}
-        if -(-atlas.size // every) <= 256:
+        if size <= 256:
             return data, facts | {"fits": False}
-        every *= 2
+        size = -(-size // 2)
+
+
+def _coarser(picture: np.ndarray, size: int) -> np.ndarray:
+    """Return a picture (S, S, C) uint8 with `size` texels a side, interpolated at their centres between the nearest four, so that
+    texture coordinates mean the same places and no texel has the colour of another chart."""
+    if size == len(picture):
+        return picture
+    at = (np.arange(size) + 0.5) * len(picture) / size - 0.5
+    first = np.floor(at).astype(int)
+    second, share = np.minimum(first + 1, len(picture) - 1), (at - first).astype(np.float32)
+    rows = picture[first] * (1 - share)[:, None, None] + picture[second] * share[:, None, None]
+    return np.rint(rows[:, first] * (1 - share)[:, None] + rows[:, second] * share[:, None]).astype(np.uint8)
 
 
 def rotation_to_y(up: np.ndarray) -> list[float]:
