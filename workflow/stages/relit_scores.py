@@ -101,7 +101,7 @@ def _picture(world: Any, view: View, wanted: Any, seed: int) -> np.ndarray:
     shape, eye = (view.height, view.width, 3), view.world_from_camera[:3, 3]
     rays, steps = view.directions().reshape(-1, 3), direction_derivatives(view.fx, view.fy, view.world_from_camera)
     radiance = render(world, eye, rays, PathOptions(wanted.samples, wanted.max_bounces, seed), steps).reshape(shape)
-    if not wanted.denoise:
+    if not wanted.denoise or not radiance.any():  # the denoiser makes a faint haze of black
         return radiance
     albedo, normals, _ = first_hits(world.geometry, world.material, eye, rays)
     return denoise(radiance, albedo.reshape(shape), normals.reshape(shape))

@@ -63,7 +63,7 @@ def run(job: Job) -> None:
             for again in (0, 1):
                 seed = np.random.SeedSequence([job.seed, _SEEDS, number, view.view_id, again]).generate_state(1)[0]
                 image, valid = room.relit(light, view, wanted.samples, wanted.max_bounces, int(seed))
-                if wanted.denoise:
+                if wanted.denoise and image.any():  # the denoiser makes a faint haze of black
                     image = denoise(image, truth.albedo, _seen_normals(normals, face_id, view))
                 images.append(image.astype(np.float32))
             mask = valid & truth.valid & (face_id >= 0)
