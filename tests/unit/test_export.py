@@ -407,7 +407,7 @@ def test_unlit_glb_has_the_light_in_its_colours_and_lamps_as_points(tmp_path):
     lamp = document["materials"][2]["pbrMetallicRoughness"]["baseColorFactor"]
     assert lamp == pytest.approx([0.45, 0.3, 0.15, 1.0], abs=1e-5)
     (light,) = document["extensions"]["KHR_lights_punctual"]["lights"]
-    assert light["intensity"] == pytest.approx(9 * 0.36, rel=1e-5)
+    assert light["intensity"] == pytest.approx(0.05 * 9 * 0.36, rel=1e-5)  # exposed, as the texture is
     assert light["color"] == pytest.approx([1, 6 / 9, 3 / 9], abs=1e-5)
     node = next(node for node in document["nodes"] if "KHR_lights_punctual" in node.get("extensions", {}))
     assert node["translation"] == pytest.approx([1.5, 1.1, 2.4], abs=1e-6)

@@ -90,8 +90,8 @@ def glb_bytes(
         document["images"] = [_image(blob, name, data) for name, data in images.items()]
     document |= {"bufferViews": blob.views, "buffers": [{"byteLength": len(blob.data)}]}
     extensions = {name for material in materials for name in material.get("extensions", {})}
-    if lights:
-        document["extensions"] = {"KHR_lights_punctual": {"lights": [_light(part) for part in lights]}}
+    if exposure is not None and lights:
+        document["extensions"] = {"KHR_lights_punctual": {"lights": [_light(part, exposure) for part in lights]}}
         extensions.add("KHR_lights_punctual")
     if extensions:
         document["extensionsUsed"] = sorted(extensions)
@@ -207,11 +207,12 @@ def _middle(part: TexturedPart) -> tuple[list[float], float]:
     return [float(v) for v in centre], float(area.sum())
 
 
-def _light(part: TexturedPart) -> dict[str, Any]:
-    """A point light with the intensity of the emitter along its normal, radiance times area, in the unit of the emitters."""
+def _light(part: TexturedPart, exposure: float) -> dict[str, Any]:
+    """A point light with the intensity of the emitter along its normal: exposure times radiance times area, so that what it lights
+    is as bright as the texture, which is exposed."""
     strength = float(part.radiance.max())
     colour = [round(float(v) / strength, 6) for v in part.radiance]
-    return {"type": "point", "name": part.name, "color": colour, "intensity": round(strength * _middle(part)[1], 6)}
+    return {"type": "point", "name": part.name, "color": colour, "intensity": round(exposure * strength * _middle(part)[1], 6)}
 
 
 def _camera(view: View) -> dict[str, Any]:
