@@ -13,6 +13,7 @@ from iif_core.light.relighting import axes_of_map, camera_path, ease, exposure_f
 from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
+from workflow.exporters.camera_files import environment_picture
 from workflow.relighting.world import read_environment
 from workflow.settings.relight import Relighting, lamp_bases
 from workflow.stages import lamp_images, relight
@@ -80,6 +81,14 @@ def test_settings_read_switches():
     ):
         with pytest.raises(ValueError):
             Relighting(**bad)
+
+
+def test_the_environment_of_a_scene_comes_back_as_it_was_found(tmp_path):
+    """The file beside a scene has other axes than relightings; where z is up, half a turn lies between them."""
+    found = np.random.default_rng(0).random((8, 16, 3), np.float32)
+    write_exr(tmp_path / "environment.exr", split_rgb(environment_picture(found)))
+    again = read_environment(tmp_path / "environment.exr", np.array([0.0, 0, 1]), 180.0)
+    np.testing.assert_allclose(again, found, rtol=1e-5)
 
 
 def test_environment_files_keep_up_and_turn_clockwise(tmp_path):
