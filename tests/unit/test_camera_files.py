@@ -61,6 +61,13 @@ def test_world_of_blender_has_z_up(up):
     assert np.linalg.det(turn) == pytest.approx(1)
 
 
+def test_nerfstudio_is_given_no_points():
+    """It reads `ply_file_path` as a cloud of points in PLY, which a glTF file is not."""
+    found = document()
+    assert "ply_file_path" not in found
+    assert found["camera_model"] == "OPENCV" and not any(found[name] for name in ("k1", "k2", "p1", "p2"))
+
+
 def test_attributes_of_an_exr(tmp_path):
     path, plain = tmp_path / "a.exr", tmp_path / "plain.exr"
     channels = {"R": np.zeros((30, 40), np.float32)}

@@ -71,7 +71,6 @@ def cameras_json(
     document = {
         "camera_model": "OPENCV",
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "ply_file_path": "scene.glb",
         "units": "metres; gain: factor on the radiance of scene.glb and emitters.parquet before the response",
         "blender": {
             "world_to_blender": _plain(world_to_blender(up)),
