@@ -208,8 +208,8 @@ def _middle(part: TexturedPart) -> tuple[list[float], float]:
 
 
 def _light(part: TexturedPart, exposure: float) -> dict[str, Any]:
-    """A point light with the intensity of the emitter along its normal: exposure times radiance times area, so that what it lights
-    is as bright as the texture, which is exposed."""
+    """A point light with the intensity of the emitter along its normal: exposure times radiance times area, so that what it
+    lights is as bright as the texture, which is exposed."""
     strength = float(part.radiance.max())
     colour = [round(float(v) / strength, 6) for v in part.radiance]
     return {"type": "point", "name": part.name, "color": colour, "intensity": round(exposure * strength * _middle(part)[1], 6)}
