@@ -47,22 +47,21 @@ def chosen(views: list[Any], count: int) -> list[Any]:
     return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))]
 
 
-def round_trip(job: Any, capture: Any, views: list[Any]) -> dict[str, float]:
-    """Mean absolute differences of the materials, over pixels that show the same surface."""
-    from tests.oracles.exported import maps_of, read_back
+def round_trip(job: Any, capture: Any, views: list[Any], read: Callable[[int, Any], tuple[Any, Any]]) -> dict[str, float]:
+    """Mean absolute differences of the materials, over pixels that show the same surface.
+
+    `read(number, view)` gives values (H W, 5) and depth along the camera's axis (H W,), nan or infinite where nothing is.
+    """
     from workflow.artifacts.store import material_maps
 
-    up = np.asarray(job.read("export").json("export.json")["up"])
-    meshes = read_back(job.read("export").path("scene.glb"), up)
     sums, count, other, total = np.zeros(5), 0, 0, 0
-    for view in views:
-        found, points, of = maps_of(meshes, view)
+    for number, view in enumerate(views):
+        found, z = read(number, view)
         depth, face_id = capture.gbuffer(view)
         maps = material_maps(job.read("render").exr(f"maps/{view.name}.exr"))
         wanted = np.concatenate([maps["albedo"], maps["roughness"][..., None], maps["metallic"][..., None]], -1).reshape(-1, 5)
-        z = (points - view.world_from_camera[:3, 3]) @ view.world_from_camera[:3, 2]
         hit = (face_id >= 0).ravel()
-        same = hit & (of >= 0) & (np.abs(z / np.where(hit, depth.ravel(), 1) - 1) < EDGE)
+        same = hit & np.isfinite(z) & (np.abs(z / np.where(hit, depth.ravel(), 1) - 1) < EDGE)
         sums += np.abs(found - wanted)[same].sum(0)
         count, other, total = count + same.sum(), other + (hit & ~same).sum(), total + hit.sum()
     means = sums / count
@@ -70,18 +69,69 @@ def round_trip(job: Any, capture: Any, views: list[Any]) -> dict[str, float]:
     return {name: float(255 * value) for name, value in names.items()} | {"other_surface": float(other / total)}
 
 
-def written(job: Any) -> dict[str, float]:
-    """Mean absolute differences of the textures that trimesh reads from the values that were written; nan if they are smaller."""
+def by_trimesh(job: Any, capture: Any, views: list[Any]) -> tuple[dict[str, float], dict[str, float]]:
+    """Differences that trimesh and rays see: as written, and by pixel."""
+    from tests.oracles.exported import maps_of, read_back
+
+    meshes = read_back(job.read("export").path("scene.glb"), np.asarray(job.read("export").json("export.json")["up"]))
+
+    def read(number: int, view: Any) -> tuple[Any, Any]:
+        found, points, of = maps_of(meshes, view)
+        return found, np.where(of >= 0, (points - view.world_from_camera[:3, 3]) @ view.world_from_camera[:3, 2], np.inf)
+
+    visuals = [visual.material for _, _, visual in meshes.values() if visual.material.baseColorTexture is not None]
+    pictures = np.asarray(visuals[0].baseColorTexture), np.asarray(visuals[0].metallicRoughnessTexture)
+    return written(job, *pictures), round_trip(job, capture, views, read)
+
+
+def by_blender(python: str, job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
+    """Differences that Blender sees: textures as written and by pixel, radiance of the lamps, and cameras."""
+    from tests.oracles.blender import read_by_blender
+
+    export = job.read("export")
+    document = export.json("cameras.json")
+    read = read_by_blender(python, export.path("scene.glb"), document, [view.name for view in views])
+    if read.spaces["base_color"] != "sRGB" or read.spaces["surface"] != "Non-Color":
+        raise SystemExit(f"Blender reads the textures in other colour spaces: {read.spaces}")
+    row: dict[str, Any] = {"version": read.version}
+    row["written"] = written(job, read.textures["base_color"], read.textures["surface"])
+    row["maps"] = round_trip(job, capture, views, lambda number, view: (read.values[number], read.depth[number]))
+    return row | {"lamps": lamps(export, read.emission), "cameras": cameras(document, read.cameras, capture.views)}
+
+
+def lamps(export: Any, emission: dict[str, np.ndarray]) -> dict[str, float]:
+    """How many lamps Blender has of those that shine, and the largest relative difference of their radiance."""
+    table = export.table("emitters.parquet")
+    radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
+    wanted = {int(number): row for number, row in zip(table["emitter_id"], radiance, strict=True) if row.any()}
+    found = {int(name.rpartition(".emitter")[2]): value for name, value in emission.items()}
+    both = sorted(wanted.keys() & found.keys())
+    worst = max((float(np.abs(found[n] - wanted[n]).max() / wanted[n].max()) for n in both), default=0.0)
+    return {"found": len(both), "extra": len(found.keys() - wanted.keys()), "wanted": len(wanted), "worst": worst}
+
+
+def cameras(document: dict[str, Any], found: dict[str, Any], views: list[Any]) -> dict[str, float]:
+    """The largest differences of position (m), direction and field of view (degrees) of the cameras in the file itself."""
+    turn = np.asarray(document["blender"]["world_to_blender"])[:3, :3]
+    away, turned, angle = [], [], []
+    for view in views:
+        own = found[f"view {view.name}"]
+        pose, wanted = np.asarray(own["pose"]), turn @ view.world_from_camera[:3] @ np.diag([1.0, -1.0, -1.0, 1.0])
+        away.append(np.linalg.norm(pose[:3, 3] - wanted[:, 3]))
+        turned.append(np.linalg.norm(pose[:3, :3] - wanted[:, :3], 2))
+        width, focal = (view.height, view.fy) if own["fit"] == "VERTICAL" else (view.width, view.fx)
+        field = own["angle_y"] if own["fit"] == "VERTICAL" else own["angle_x"]
+        angle.append(abs(field - 2 * np.arctan(0.5 * width / focal)))
+    return {"m": float(max(away)), "degrees": float(np.degrees(max(turned))), "field": float(np.degrees(max(angle)))}
+
+
+def written(job: Any, colour: np.ndarray, surface: np.ndarray) -> dict[str, float]:
+    """Mean absolute differences of decoded textures (h, w, 3 or 4) uint8 from the values that were written; nan if smaller."""
     from iif_core.numerics.color import linear_from_srgb
-    from tests.oracles.exported import read_back
     from workflow.artifacts.files import read_exr
     from workflow.artifacts.store import rgb
 
-    meshes = read_back(job.read("export").path("scene.glb"), np.asarray(job.read("export").json("export.json")["up"]))
-    visuals = [visual.material for _, _, visual in meshes.values() if visual.material.baseColorTexture is not None]
-    colour, surface = (
-        np.asarray(picture)[..., :3] / 255 for picture in (visuals[0].baseColorTexture, visuals[0].metallicRoughnessTexture)
-    )
+    colour, surface = (np.asarray(picture)[..., :3] / 255 for picture in (colour, surface))
     exact = {
         name: read_exr(job.read("export").path(f"mitsuba/textures/{name}.exr")) for name in ("albedo", "roughness", "metallic")
     }
@@ -173,8 +223,11 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     unwrapped = StageReader(Path("results") / scene / "unwrap", "unwrap", scene).json("unwrap.json")
     row |= {"faces": unwrapped["faces"], "texture": job.read("export").json("export.json")["texture"]}
     print(scene, row)
-    row["written"] = written(job)
-    row["maps"] = round_trip(job, capture, chosen(capture.views, 12))
+    some = chosen(capture.views, 12)
+    row["written"], row["maps"] = by_trimesh(job, capture, some)
+    python = python_with_bpy()
+    row["blender"] = by_blender(python, job, capture, some) if python else None
+    print(row["blender"] or "no Blender: name a Python that has bpy in IIF_BPY_PYTHON")
     print({name: round(value, 4) for name, value in (row["written"] | row["maps"]).items()})
     row["paths"] = {"samples": asked.samples, "replicates": asked.replicates}
     row["mitsuba"] = rendered(job, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
