@@ -16,6 +16,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +85,13 @@ def by_trimesh(job: Any, capture: Any, views: list[Any]) -> tuple[dict[str, floa
     return written(job, *pictures), round_trip(job, capture, views, read)
 
 
-def by_blender(python: str, job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
+def by_blender(job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
     """Differences that Blender sees: textures as written and by pixel, radiance of the lamps, and cameras."""
-    from tests.oracles.blender import read_by_blender
+    from tests.oracles.blender import python_with_bpy, read_by_blender
 
+    python = python_with_bpy()
+    if python is None:
+        raise SystemExit("no Blender: name a Python that has its module bpy in IIF_BPY_PYTHON (pip install bpy==4.5.*)")
     export = job.read("export")
     document = export.json("cameras.json")
     read = read_by_blender(python, export.path("scene.glb"), document, [view.name for view in views])
@@ -97,6 +101,25 @@ def by_blender(python: str, job: Any, capture: Any, views: list[Any]) -> dict[st
     row["written"] = written(job, read.textures["base_color"], read.textures["surface"])
     row["maps"] = round_trip(job, capture, views, lambda number, view: (read.values[number], read.depth[number]))
     return row | {"lamps": lamps(export, read.emission), "cameras": cameras(document, read.cameras, capture.views)}
+
+
+def by_browser(job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
+    """What a viewer in a browser sees: differences by pixel, lamps, time and complaints. The first picture is kept in logs/."""
+    from tests.oracles.gltf_viewer import available, open_in_browser
+
+    if not available():
+        raise SystemExit("no viewer: Chromium and three.js are needed (make node)")
+    export = job.read("export")
+    opened = open_in_browser(export.path("scene.glb"), views)
+    picture = Path("logs/exported") / f"{job.scene}.png"
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    picture.write_bytes(opened.picture)
+    row: dict[str, Any] = {
+        "maps": round_trip(job, capture, views, lambda number, view: (opened.values[number], opened.depth[number]))
+    }
+    row |= {"lamps": lamps(export, {name: np.asarray(value) for name, value in opened.facts["lamps"].items()})}
+    row |= {"seconds": opened.seconds, "first": opened.first, "complaints": opened.complaints}
+    return row | {"revision": opened.facts["revision"], "outside": [name for name in opened.requests if name.startswith("http")]}
 
 
 def lamps(export: Any, emission: dict[str, np.ndarray]) -> dict[str, float]:
@@ -225,10 +248,9 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     print(scene, row)
     some = chosen(capture.views, 12)
     row["written"], row["maps"] = by_trimesh(job, capture, some)
-    python = python_with_bpy()
-    row["blender"] = by_blender(python, job, capture, some) if python else None
-    print(row["blender"] or "no Blender: name a Python that has bpy in IIF_BPY_PYTHON")
     print({name: round(value, 4) for name, value in (row["written"] | row["maps"]).items()})
+    row |= {"blender": by_blender(job, capture, some), "browser": by_browser(job, capture, some)}
+    print(row["blender"], row["browser"])
     row["paths"] = {"samples": asked.samples, "replicates": asked.replicates}
     row["mitsuba"] = rendered(job, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
     return row
@@ -238,20 +260,32 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
     """The tables of the page."""
     from workflow.report.blocks import markdown
 
-    files, materials, light = [], [], []
+    three = ("albedo", "roughness", "metallic")
+    files, materials, others, light = [], [], [], []
     for row in rows:
-        name, texture = row["scene"], row["texture"]
+        name, texture, blender, browser = row["scene"], row["texture"], row["blender"], row["browser"]
         faces = f"{row['faces']['mesh']:,} to {row['faces']['parts']:,}"
         size = f"{texture['size']} ({texture['format']})"
         lengths = [f"{1000 * texture[key]:.1f}" for key in ("texel_in_glb_m", "cell_m")]
         faults = f"{row['validator']['errors']} / {row['validator']['warnings']}"
         files.append([name, faces, size, *lengths, f"{row['mb']:.1f}", faults])
-        three = ("albedo", "roughness", "metallic")
-        materials.append(
+        for by, read in (
+            ("trimesh", row),
+            (f"Blender {blender['version']}", blender),
+            (f"three.js r{browser['revision']}", browser),
+        ):
+            pairs = [f"{read['written'][q]:.2f}" if "written" in read else "" for q in three]
+            pairs += [f"{read['maps'][q]:.2f}" for q in three]
+            materials.append([name, by, *pairs, f"{100 * read['maps']['other_surface']:.2f} %"])
+        at = blender["cameras"]
+        others.append(
             [
                 name,
-                *(f"{row[of][q]:.2f}" for of in ("written", "maps") for q in three),
-                f"{100 * row['maps']['other_surface']:.2f} %",
+                f"{blender['lamps']['found']} and {browser['lamps']['found']} of {blender['lamps']['wanted']}",
+                *(f"{read['lamps']['worst']:.0e}" for read in (blender, browser)),
+                *(f"{value:.0e}" for value in (1000 * at["m"], at["degrees"], at["field"])),
+                str(len(browser["complaints"])),
+                f"{browser['seconds'] + browser['first']:.1f}",
             ]
         )
         for kind in ("exact", "stock"):
@@ -263,13 +297,26 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
         "files": ["scene", "faces", "texture", "texel, mm", "cell, mm", "scene.glb, MB", "errors / warnings"],
         "materials": [
             "scene",
-            *(f"{q}, {of}" for of in ("as written", "by pixel") for q in ("albedo", "roughness", "metallic")),
+            "read by",
+            *(f"{q}, {of}" for of in ("as written", "by pixel") for q in three),
             "other surface",
+        ],
+        "others": [
+            "scene",
+            "lamps in Blender and three.js",
+            "radiance, Blender",
+            "radiance, three.js",
+            "cameras: position, mm",
+            "direction, degrees",
+            "field of view, degrees",
+            "complaints of the browser",
+            "seconds to the first picture",
         ],
         "light": ["scene", "by", "renderings x paths", "radiance over ours", "smallest p, threshold"],
     }
-    bodies = {"files": files, "materials": materials, "light": light}
-    return {name: "\n".join(markdown(head, bodies[name], 2 if name == "light" else 1)) for name, head in heads.items()}
+    bodies = {"files": files, "materials": materials, "others": others, "light": light}
+    words = {"files": 1, "materials": 2, "others": 2, "light": 2}
+    return {name: "\n".join(markdown(head, bodies[name], words[name])) for name, head in heads.items()}
 
 
 if __name__ == "__main__":

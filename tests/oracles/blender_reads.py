@@ -2,10 +2,11 @@
 
     python blender_reads.py REQUEST.json
 
-REQUEST names `glb`, the folder `out`, and `views`: name, size, lens, shift and pose in the world of the file. It writes `out/read.json`
-(cameras, emission and textures as imported), `out/<texture>.npy` (bytes as decoded, first row on top) and for each view
-`out/<view>.exr`: base colour, and roughness, metallic and depth, which Cycles looks up itself at the middle of every pixel, at the
-nearest texel, with the texture coordinates and the colour spaces of the import.
+REQUEST names `glb`, the folder `out`, and `views`: size, lens, shift, pixel aspect, and pose in Blender's world. It writes
+`out/read.json` (cameras, emission and textures as imported), `out/<texture>.npy` (bytes as decoded, first row on top) and for
+each view `out/<number>-colour.exr`, the base colour, and `out/<number>-surface.exr`, roughness and metallic, both with the depth.
+Cycles looks them up itself at the middle of every pixel, at the nearest texel, with the texture coordinates and the colour
+spaces of the import.
 """
 
 import json

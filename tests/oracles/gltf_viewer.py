@@ -51,7 +51,10 @@ function camera(view) {
 
 const vertex = `
   out vec2 at; out float away;
-  void main() { vec4 eye = modelViewMatrix * vec4(position, 1.0); at = uv; away = -eye.z; gl_Position = projectionMatrix * eye; }`;
+  void main() {
+    vec4 eye = modelViewMatrix * vec4(position, 1.0);
+    at = uv; away = -eye.z; gl_Position = projectionMatrix * eye;
+  }`;
 const fragment = `
   in vec2 at; in float away; out vec4 found;
   uniform sampler2D colours, surfaces; uniform vec3 colour; uniform vec2 factors; uniform bool hasColours, hasSurfaces, second;
@@ -86,7 +89,8 @@ window.shown = (view) => {  // an ordinary picture, by the light of the viewer
 const own = meshes.map((mesh) => mesh.material);
 const bared = [false, true].map((second) => own.map((material) => bare(material, second)));
 window.values = (view) => {  // linear values and depth of every pixel, rows from the bottom
-  const target = new THREE.WebGLRenderTarget(view.w, view.h, { type: THREE.FloatType, minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
+  const nearest = { minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter };
+  const target = new THREE.WebGLRenderTarget(view.w, view.h, { type: THREE.FloatType, ...nearest });
   const eye = camera(view), out = [];
   renderer.setClearColor(0x000000, 0);
   for (const materials of bared) {

@@ -3,6 +3,7 @@
 import io
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,11 +17,14 @@ from tests.unit.test_report import FakeJob, make_scene
 from workflow.artifacts import StageReader, StageWriter
 from workflow.artifacts.files import read_exr, write_exr
 from workflow.artifacts.store import rgb, split_rgb
+from workflow.exporters.atlas import TexturedPart
+from workflow.exporters.glb import glb_bytes
 from workflow.relighting import sheet, video, world
-from workflow.relighting.inserts import load_insert, placed
+from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory, Lamp
 from workflow.relighting.tracing import Studio
 from workflow.settings import relight_files, relight_plans
+from workflow.settings.mesh_files import emissive_strengths
 from workflow.settings.relight import Relighting, key_of, lamp_bases, lamp_basis, recombines
 from workflow.stages import relight
 
@@ -346,6 +350,65 @@ def test_mirrored_nodes_keep_their_outer_side_out(tmp_path):
         assert volume == pytest.approx(abs(np.prod(mirror)))
 
 
+def lamp_glb(path, **changes):
+    """A square of 0.4 m that looks down, as the exporter writes a lamp: its radiance is 9, 6, 3."""
+    corners = np.float32([[0, 0, 0], [0.4, 0, 0], [0.4, 0, 0.4], [0, 0, 0.4]])  # in glTF's axes
+    down, faces = np.tile(np.float32([0, -1, 0]), (4, 1)), np.int32([[0, 1, 2], [0, 2, 3]])
+    lamp = TexturedPart("lamp", 0, 0, corners, down, np.zeros((4, 2), np.float32), faces, np.float32([9, 6, 3]), False)
+    path.write_bytes(glb_bytes([replace(lamp, **changes)], {}, np.array([0.0, 1, 0]), {}))
+    return path
+
+
+def test_what_shines_in_its_file_shines_in_the_room(studio, tmp_path):
+    """The strength of glTF counts, one side alone shines unless the material has two, and what a user gives goes before."""
+    path = lamp_glb(tmp_path / "lamp.glb")
+    put = {"file": str(path), "position": [1.5, 1.0, 1.5]}
+    up, down = ([1.5, 1.0, 1.0], [0.01, 0.01, 1]), ([1.5, 1.0, 2.0], [0.01, 0.01, -1])
+
+    def lit(where, **more):
+        return seen(studio, entry(emitters="off", insert=[{**put, **more}]), *where, samples=64)
+
+    np.testing.assert_allclose(lit(up), [9, 6, 3], rtol=1e-3)  # itself all but black
+    assert lit(down).max() < 0.1
+    below = seen(studio, entry(emitters="off", insert=[put]), [1.5, 1.0, 1.0], [0, 0, -1])
+    assert (below > 0.01).all() and below.argmax() == 0
+    np.testing.assert_allclose(lit(up, radiance=[0, 2, 0]), [0, 2, 0], atol=2e-3)
+    assert lit(up, radiance=[0, 0, 0]).max() == 0 and lit(up, material={"albedo": [0.5, 0.5, 0.5]}).max() == 0
+    lamp_glb(path, double_sided=True)
+    np.testing.assert_allclose(lit(down), [9, 6, 3], rtol=1e-3)
+
+
+def test_emission_that_is_not_read_is_refused_and_the_rest_is_named(tmp_path):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual.material import PBRMaterial
+
+    def made(name, **more):
+        square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]], process=False)
+        square.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1]], material=PBRMaterial(name=name, **more))
+        (tmp_path / f"{name}.glb").write_bytes(trimesh.Scene({"a": square}).export(file_type="glb"))
+        return load_insert(tmp_path / f"{name}.glb")
+
+    picture = Image.fromarray(np.full((2, 2, 3), 200, np.uint8))
+    screen = made("screen", emissiveTexture=picture, emissiveFactor=[1, 1, 1])
+    put = entry(insert=[{"file": str(tmp_path / "screen.glb"), "position": [0, 0, 0]}])["insert"][0]
+    with pytest.raises(InputError, match=r"screen.glb: material 'screen' has a texture of emission, .* or give `radiance`"):
+        light_of(screen, put)
+    assert light_of(screen, {**put, "radiance": [0, 1, 0]}).tolist() == [[0, 1, 0]]
+    dark = made("dark", emissiveTexture=picture, emissiveFactor=[0, 0, 0])
+    assert not dark.glowing and not light_of(dark, put).any()
+    glass = made("glass", alphaMode="BLEND", baseColorFactor=[255, 255, 255, 80], normalTexture=picture)
+    assert glass.left_out == ("transparency", "normal maps") and screen.left_out == ()
+    document = {"asset": {}, "materials": [{"name": "a"}, {"name": "a", "extensions": {"KHR_materials_emissive_strength": {}}}]}
+    path = tmp_path / "two.gltf"
+    path.write_text(json.dumps(document))
+    assert emissive_strengths(path) == {}
+    document["materials"][1]["extensions"]["KHR_materials_emissive_strength"]["emissiveStrength"] = 4
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="two materials are called 'a' and shine with different strength; rename one"):
+        emissive_strengths(path)
+
+
 def test_meshes_stand_where_they_are_put(tmp_path):
     mesh = load_insert(plate(tmp_path / "plate.glb", size=(0.8, 0.1, 0.4)))
     put = {"position": [1, 2, 3], "rotation": [0, 0, 90], "scale": 2.0}
@@ -640,7 +703,6 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
 
 
 def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):
-    from dataclasses import replace
     from types import SimpleNamespace
 
     from workflow.relighting.camera import photograph_exposure, plan_flight

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from workflow.relighting.inserts import load_insert
+from workflow.relighting.inserts import light_of, load_insert
 from workflow.relighting.inventory import Inventory, check_views
 from workflow.relighting.video import require_codec
 from workflow.scene.named import finished
@@ -28,7 +28,7 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
         if entry["video"] and entry["camera"]["frames"] > 1:
             require_codec(entry["video"]["codec"], entry["name"])
         for insert in entry["insert"]:
-            load_insert(Path(insert["file"]))
+            light_of(load_insert(Path(insert["file"])), insert)
         if capture is not None:
             check_views(entry, map(str, capture.table("cameras.parquet")["name"]))
         if segmentation is not None and emission is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
-from workflow.settings.mesh_files import files_of_mesh
+from workflow.settings.mesh_files import emissive_strengths, files_of_mesh
 
 Array = np.ndarray
 LARGEST_TEXTURE = 1024
@@ -30,6 +30,10 @@ class InsertedMesh:
         texture: (k,) int, which of `textures` a face has.
         textures: (h, w, 5) float32 each: linear albedo R, G, B, roughness, metallic.
         is_y_up: by the rules of its format.
+        radiance: (textures, 3) float64 that the material of each emits: factor times strength of glTF.
+        double_sided: (textures,) bool, the material is seen, and emits, on both sides.
+        glowing: names of materials whose emission has a texture.
+        left_out: what else of the file is not shown, in words.
     """
 
     corners: Array
@@ -37,6 +41,10 @@ class InsertedMesh:
     texture: Array
     textures: list[Array]
     is_y_up: bool
+    radiance: Array
+    double_sided: Array
+    glowing: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 def load_insert(path: Path) -> InsertedMesh:
@@ -46,6 +54,7 @@ def load_insert(path: Path) -> InsertedMesh:
         InputError: the file cannot be read, has no surface, or numbers that are not finite.
     """
     files_of_mesh(path)
+    strengths = emissive_strengths(path)
     import trimesh
 
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
@@ -63,11 +72,47 @@ def load_insert(path: Path) -> InsertedMesh:
     if not (np.isfinite(corners).all() and np.isfinite(uv).all()):
         raise InputError(f"{path}: has corners or texture coordinates that are not finite; export the mesh again")
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    return InsertedMesh(corners, uv, number, [part[2] for part in parts], is_gltf)
+    materials = [part[3] for part in parts]
+    emitted = np.array([_emission(material, strengths) for material in materials])
+    double_sided = np.array([bool(getattr(material, "doubleSided", False)) for material in materials])
+    textured = (getattr(material, "emissiveTexture", None) is not None for material in materials)
+    glowing = {str(m.name) for m, light, has in zip(materials, emitted, textured, strict=True) if has and light.any()}
+    textures, left_out = [part[2] for part in parts], _left_out(materials)
+    return InsertedMesh(corners, uv, number, textures, is_gltf, emitted, double_sided, tuple(sorted(glowing)), left_out)
 
 
-def _parts(scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array]]:
-    """(corners, uv, texture) of every mesh of a trimesh scene, in world axes of the file."""
+def light_of(mesh: InsertedMesh, insert: dict[str, Any]) -> Array:
+    """Return the radiance (k, 3) float64 of the faces of a mesh: that of a dumped `insert`, or else that of its materials.
+
+    Raises:
+        InputError: the emission of a material of the file, which would shine, has a texture.
+    """
+    given = insert["radiance"]
+    if given is not None or insert["material"] is not None:
+        return np.tile(np.zeros(3) if given is None else np.asarray(given, np.float64), (len(mesh.corners), 1))
+    if mesh.glowing:
+        raise InputError(
+            f"{insert['file']}: material {mesh.glowing[0]!r} has a texture of emission, which is not read; allowed: one colour"
+            " (emissiveFactor). Export it so, or give `radiance` of the object under `insert`, where [0, 0, 0] is dark"
+        )
+    return mesh.radiance[mesh.texture]
+
+
+def _emission(material: Any, strengths: dict[str, float]) -> Array:
+    """Radiance (3,) that a material of trimesh emits."""
+    factor = getattr(material, "emissiveFactor", None)
+    return np.zeros(3) if factor is None else np.asarray(factor, np.float64) * strengths.get(str(material.name), 1.0)
+
+
+def _left_out(materials: list[Any]) -> tuple[str, ...]:
+    """What of some materials is not shown."""
+    see_through = any(getattr(material, "alphaMode", None) in ("BLEND", "MASK") for material in materials)
+    bumpy = any(getattr(material, "normalTexture", None) is not None for material in materials)
+    return ("transparency",) * see_through + ("normal maps",) * bumpy
+
+
+def _parts(scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array, Any]]:
+    """(corners, uv, texture, material) of every mesh of a trimesh scene, in world axes of the file."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -77,7 +122,7 @@ def _parts(scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array]]:
         uv, texture = _material(mesh, is_gltf)
         # A node that mirrors its mesh turns the order of the corners, and with it the side that an emitter shines to.
         order = slice(None, None, -1 if np.linalg.det(transform[:3, :3]) < 0 else 1)
-        yield vertices[mesh.faces][:, order], uv[:, order], texture
+        yield vertices[mesh.faces][:, order], uv[:, order], texture, getattr(mesh.visual, "material", None)
 
 
 def _material(mesh: Any, is_gltf: bool) -> tuple[Array, Array]:

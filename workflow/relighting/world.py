@@ -13,7 +13,7 @@ from iif_core.light.environment import as_map, resample
 from iif_core.light.relighting import axes_of_map, coloured, sphere_mesh
 from workflow.artifacts.files import read_exr
 from workflow.artifacts.store import rgb
-from workflow.relighting.inserts import load_insert, placed
+from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory
 from workflow.runtime import device
 from workflow.scene.base_scene import BaseScene
@@ -109,8 +109,8 @@ def build_world(room: Recovered, inventory: Inventory, state: dict[str, Any], up
     lamp_of_face = np.array([place.get(int(e), -1) for e in range(-1, int(room.emitter_id.max(initial=-1)) + 1)], np.int32)
     lamp_of_face = lamp_of_face[room.emitter_id + 1]
 
-    def add(corners: Array, light: Any, name: str) -> None:
-        """Append faces (k, 3, 3), which shine if `light` is given."""
+    def add(corners: Array, light: Array, name: str, both: Array) -> None:
+        """Append faces (k, 3, 3) that emit `light` (k, 3), where it is not 0, on both sides or to the front alone (k,)."""
         nonlocal vertices, faces, object_id, passes, side, lamp_of_face, shift
         count = len(corners)
         own = np.arange(3 * count, dtype=np.int32).reshape(-1, 3) + len(vertices)
@@ -118,21 +118,21 @@ def build_world(room: Recovered, inventory: Inventory, state: dict[str, Any], up
         faces = np.concatenate([faces, own])
         object_id = np.concatenate([object_id, np.full(count, surface.n_objects, np.int32)])
         passes = np.concatenate([passes, np.zeros(count, np.float32)])
-        side = np.concatenate([side, np.ones(count, np.int8)])
+        side = np.concatenate([side, np.where(both, 0, 1).astype(np.int8)])
         shift = None if shift is None else np.concatenate([shift, np.zeros((count, 3), np.float32)])
-        column = -1
-        if light is not None:
-            column = len(columns)
-            columns.append(name)
-            radiance.append(np.asarray(light, np.float64))
-        lamp_of_face = np.concatenate([lamp_of_face, np.full(count, column, np.int32)])
+        column = np.full(count, -1, np.int32)
+        for number, one in enumerate(np.unique(light[light.any(1)], axis=0), 1):  # a lamp for each radiance
+            column[(light == one).all(1)] = len(columns)
+            columns.append(name if number == 1 else f"{name} {number}")
+            radiance.append(one)
+        lamp_of_face = np.concatenate([lamp_of_face, column])
 
     if state["sphere"] is not None:
         ball = state["sphere"]
         start = np.asarray(ball["center"], np.float64)
         centre = start if ball["path_to"] is None else start + time * (np.asarray(ball["path_to"]) - start)
         points, own = sphere_mesh(centre, ball["radius"])
-        add(points[own], ball["radiance"], "sphere")
+        add(points[own], np.tile(np.asarray(ball["radiance"], np.float64), (len(own), 1)), "sphere", np.zeros(len(own), bool))
     textures = _insert_all(state["insert"], up, add)
     columns.append("environment")
     radiance.append(np.ones(3))
@@ -203,7 +203,8 @@ def _insert_all(inserts: list[dict[str, Any]], up: Array, add: Any) -> Textures 
     for insert in inserts:
         mesh = load_insert(Path(insert["file"]))
         corners = placed(mesh, insert, up)
-        add(corners, insert["radiance"], name_of(insert))
+        both = mesh.double_sided[mesh.texture] & (insert["radiance"] is None)
+        add(corners, light_of(mesh, insert), name_of(insert), both)
         textures, number = mesh.textures, mesh.texture
         if insert["material"] is not None:
             own = insert["material"]

@@ -40,6 +40,24 @@ def files_of_mesh(path: Path) -> list[Path]:
     return [path]
 
 
+def emissive_strengths(path: Path) -> dict[str, float]:
+    """Return the factor on the emission of each material of a glTF file by its name, where it is not 1; empty for other files.
+
+    Raises:
+        InputError: as `files_of_mesh`, or materials of one name have two strengths.
+    """
+    if path.suffix.lower() not in (".glb", ".gltf"):
+        return {}
+    document = _json_of_glb(path) if path.suffix.lower() == ".glb" else _json_of(path, path.read_bytes())
+    found: dict[str, float] = {}
+    for material in document.get("materials", []):
+        own = material.get("extensions", {}).get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        name = str(material.get("name"))
+        if found.setdefault(name, float(own)) != float(own):
+            raise InputError(f"{path}: two materials are called {name!r} and shine with different strength; rename one of them")
+    return {name: strength for name, strength in found.items() if strength != 1.0}
+
+
 def _json_of_glb(path: Path) -> dict[str, Any]:
     data = path.read_bytes()
     if len(data) < _GLB_HEADER.size + _CHUNK_HEADER.size or data[:4] != b"glTF":

@@ -98,7 +98,8 @@ class RelightInsert(Section):
     material: InsertMaterial | None = None
     """One material for all of it; by default those of the file (metallic-roughness, with textures or vertex colours)."""
     radiance: Colour | None = None
-    """R, G, B that it emits, in the units of emitters.parquet; by default it does not shine."""
+    """R, G, B that it emits, in the units of emitters.parquet; by default what the materials of its file emit, and nothing if
+    `material` replaces them."""
 
 
 class RelightSphere(Section):

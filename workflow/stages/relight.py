@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import require_denoiser
 from workflow.relighting import sheet
 from workflow.relighting.camera import Flight, photograph_exposure
+from workflow.relighting.inserts import light_of, load_insert
 from workflow.relighting.tracing import Studio, trace_picture
 from workflow.relighting.video import encoded, require_codec
 from workflow.relighting.world import AS_FOUND, World, lamp_weights
@@ -110,6 +112,12 @@ def _prepare(studio: Studio, bases: dict[str, dict[str, Any]], entry: dict[str, 
     flight = studio.flight(entry)
     if entry["denoise"]:
         require_denoiser()
+    for insert in entry["insert"]:
+        mesh = load_insert(Path(insert["file"]))
+        light_of(mesh, insert)
+        if mesh.left_out and insert["material"] is None:
+            left_out = " and ".join(mesh.left_out)
+            studio.job.log.warning("relighting %s: %s of %s are left out", entry["name"], left_out, insert["file"])
     if len(flight.poses) > 1 and entry["video"]:
         require_codec(entry["video"]["codec"], entry["name"])
     before = {**entry, **AS_FOUND}
