@@ -693,6 +693,22 @@ def test_the_program_beside_the_scene_renders_what_we_render(mi, tmp_path):
     assert wrong.returncode == 2 and "no view z; there are a" in wrong.stderr
 
 
+def test_mitsuba_shades_flat_faces_as_we_do(mi, tmp_path):
+    """A ball of few faces, whose vertices have the normals of a round one: shaded by those it would reflect less in all."""
+    parts, atlas = textured(room())
+    ball = trimesh.creation.icosphere(1, 0.4)
+    round_normals = np.float32(ball.vertices / 0.4)
+    points, faces = np.float32(ball.vertices), np.int32(ball.faces)
+    uv = np.zeros((len(points), 2), np.float32)
+    part = replace(parts[0], vertices=points, normals=round_normals, uv=uv, faces=faces)
+    loaded = mi.load_file(str(written(tmp_path, mitsuba_files([part], atlas, [view()], np.zeros(3)))))
+    x, y = (a.ravel() for a in np.mgrid[-0.2:0.2:20j, -0.2:0.2:20j].astype(np.float32))
+    si = loaded.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 1.0), mi.Vector3f(0, 0, -1)))
+    shading, place = np.array(si.sh_frame.n).T, np.array(si.p).T
+    np.testing.assert_allclose(shading, np.array(si.n).T, atol=1e-5)
+    assert np.abs(shading - place / 0.4).max() > 0.1
+
+
 def test_slivers_are_no_hole_and_no_nan(mi, tmp_path):
     """On a face of 6 m x 1 mm Mitsuba's interpolation of attributes gives NaN; textures are read without it."""
     parts, atlas = textured(room())

@@ -36,6 +36,9 @@ _NOTE = """
   Curtains and blinds that let light through are a `mask`. Shadow rays do not pass it, so light behind it is noisy: take more
   samples.
 
+  Faces are flat, as they were when materials and light were recovered: rounded ones reflect less at grazing angles. The PLY files
+  have vertex normals, too; remove `face_normals` of a shape to have them.
+
   All surface has one material, `surface`; to change a thing, give its shape a bsdf of its own in place of the reference.
   Relight: change or remove the emitters below, or add your own.
   Sizes: mitsuba -m scalar_rgb scene.xml -Dspp=256 -Dresx=640 -Dresy=480
@@ -181,6 +184,7 @@ def _stems(parts: Sequence[TexturedPart]) -> list[str]:
 def _shape(part: TexturedPart, file: str) -> str:
     lines = [f'\t<shape type="ply" id={quoteattr(file.removeprefix("meshes/").removesuffix(".ply"))}>']
     lines.append(f'\t\t<string name="filename" value={quoteattr(file)}/>')
+    lines.append('\t\t<boolean name="face_normals" value="true"/>')
     if part.emitter_id >= 0:
         black = '<bsdf type="diffuse"><rgb name="reflectance" value="0, 0, 0"/></bsdf>'
         lines += [f"\t\t{black}", f'\t\t<emitter type="area">{_rgb("radiance", part.radiance)}</emitter>']
