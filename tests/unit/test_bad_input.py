@@ -16,11 +16,16 @@ from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 from tests.unit import test_colmap, test_fipt
 from workflow import settings
+from workflow.relighting import video
+from workflow.relighting.inserts import light_of, load_insert
+from workflow.relighting.inventory import Inventory, Lamp
 from workflow.runtime import fingerprint
+from workflow.settings import relight_plans
+from workflow.settings.relight import Relighting
 from workflow.sources.folder_scene import transforms
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/reference/bad-input.md"
-PENDING = {"no emitter seen"}
+PENDING = {"no emitter seen", "way of the camera through a wall", "browser without WebGL"}
 """Rows whose stage tests them elsewhere."""
 
 
@@ -802,6 +807,90 @@ def _(root):
     own.project(root, segmentation={"kind": "masks", "path": "elsewhere", "sam2": {}})
     with own.working_in(root):
         return error(lambda: settings.load("own"))
+
+
+# ------------------------------------------------------------------------------------------------------------------
+# relighting
+
+
+def relit(**more):
+    return Relighting(**{"name": "a", **more}).model_dump(mode="json")
+
+
+def put_in(path):
+    """The message about a mesh that is put in."""
+
+    def checked():
+        entry = relit(insert=[{"file": str(path), "position": [0, 0, 0]}])
+        settings.relight_files([entry])
+        light_of(load_insert(path), entry["insert"][0])
+
+    return error(checked)
+
+
+@case("plan that is not there")
+def _(root):
+    (root / "config/relight").mkdir(parents=True)
+    (root / "config/relight/night.yaml").write_text("relight: [{name: a}]")
+    return error(lambda: relight_plans.plan_layer("nihgt", root))
+
+
+@case("codec that is not there")
+def _(root):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(video.ENCODERS, "av1", "libnothing")
+        return error(lambda: video.require_codec("av1", "a"))
+
+
+def vase(root, **material):
+    """A triangle in a GLB."""
+    shape = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0]], [[0, 1, 2]], process=False)
+    material = trimesh.visual.material.PBRMaterial(**material)
+    shape.visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1]], material=material)
+    (root / "vase.glb").write_bytes(trimesh.Scene({"a": shape}).export(file_type="glb"))
+    return root / "vase.glb"
+
+
+def gltf(root, **keys):
+    (root / "vase.gltf").write_text(json.dumps({"asset": {"version": "2.0"}, **keys}))
+    return root / "vase.gltf"
+
+
+@case("mesh to put in: not there")
+def _(root):
+    return put_in(vase(root).with_name("vaes.glb"))
+
+
+@case("mesh to put in: cut short")
+def _(root):
+    path = vase(root)
+    path.write_bytes(path.read_bytes()[:-40])
+    return put_in(path)
+
+
+@case("mesh to put in: no GLB")
+def _(root):
+    (root / "vase.glb").write_text("a text, and longer than the header of a GLB")
+    return put_in(root / "vase.glb")
+
+
+case("mesh to put in: texture not there")(lambda root: put_in(gltf(root, images=[{"uri": "wood.png"}])))
+case("mesh to put in: compressed")(lambda root: put_in(gltf(root, extensionsRequired=["KHR_draco_mesh_compression"])))
+
+
+@case("mesh to put in: texture of emission")
+def _(root):
+    picture = Image.fromarray(np.full((2, 2, 3), 200, np.uint8))
+    return put_in(vase(root, name="screen", emissiveTexture=picture, emissiveFactor=[1, 1, 1]))
+
+
+def of_room(**more):
+    """The message of a room with walls and a lamp."""
+    return error(lambda: Inventory(["walls", "lamp"], [Lamp(0, (1,))]).check(relit(**more)))
+
+
+case("object that is not there, painted")(lambda root: of_room(materials={"wals": {"metallic": 0}}))
+case("lamp that is not there")(lambda root: of_room(lamps={"lmap": 0}))
 
 
 @pytest.mark.parametrize("name", sorted(CASES))

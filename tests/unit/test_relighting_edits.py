@@ -23,7 +23,7 @@ from workflow.relighting import sheet, video, world
 from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory, Lamp
 from workflow.relighting.tracing import Studio
-from workflow.settings import relight_files, relight_plans
+from workflow.settings import relight_files, relight_origin, relight_plans
 from workflow.settings.mesh_files import emissive_strengths
 from workflow.settings.relight import Relighting, key_of, lamp_bases, lamp_basis, recombines
 from workflow.stages import relight
@@ -693,13 +693,20 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
         return str(error.value)
 
     check.check_relightings({"relight": [entry(lamps={"lamp": 0}, materials={"walls": {"metallic": 0}})]}, "toy", "draft")
-    assert "there is no object 'wals'" in told(materials={"wals": {"metallic": 0}})
+    assert told(materials={"wals": {"metallic": 0}}).startswith(
+        "config/scenes/toy.yaml: relight.materials of a: there is no object"
+    )
     assert "there is no lamp 'lmap'. Did you mean 'lamp'" in told(lamps={"lmap": 0})
     assert "found v7; the views are v0, v1" in told(camera={"views": ["v7"]})
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
     assert "libnothing" in told(camera={"frames": 2})
     monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused
     check.check_relightings({"relight": [entry(lamps={"lmap": 0})]}, "toy", "draft")
+
+
+def test_mistakes_are_blamed_on_the_plan_that_lists_them():
+    assert relight_origin("kitchen--relight-evening-s0") == "config/relight/evening.yaml"
+    assert relight_origin("kitchen") == "config/scenes/kitchen.yaml"
 
 
 def test_held_out_photographs_lend_their_camera_but_not_their_exposure(studio):

@@ -185,14 +185,12 @@ def _shape(part: TexturedPart, file: str) -> str:
     lines = [f'\t<shape type="ply" id={quoteattr(file.removeprefix("meshes/").removesuffix(".ply"))}>']
     lines.append(f'\t\t<string name="filename" value={quoteattr(file)}/>')
     lines.append('\t\t<boolean name="face_normals" value="true"/>')
+    if part.opacity < 1:
+        lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
+    lines += ['\t\t<ref id="surface"/>']  # the texels of lamps are black, and gloss a little as ours do
+    lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
     if part.emitter_id >= 0:
-        black = '<bsdf type="diffuse"><rgb name="reflectance" value="0, 0, 0"/></bsdf>'
-        lines += [f"\t\t{black}", f'\t\t<emitter type="area">{_rgb("radiance", part.radiance)}</emitter>']
-    else:
-        if part.opacity < 1:
-            lines += ['\t\t<bsdf type="mask">', f'\t\t\t<float name="opacity" value="{part.opacity:.9g}"/>']
-        lines += ['\t\t<ref id="surface"/>']
-        lines += ["\t\t</bsdf>"] if part.opacity < 1 else []
+        lines += [f'\t\t<emitter type="area">{_rgb("radiance", part.radiance)}</emitter>']
     return "\n".join([*lines, "\t</shape>"])
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from iif_core.errors import InputError
 from workflow.relighting.inserts import light_of, load_insert
 from workflow.relighting.inventory import Inventory, check_views
 from workflow.relighting.video import require_codec
 from workflow.scene.named import finished
+from workflow.settings import relight_origin
 from workflow.settings.relight import require_relighting
 
 
@@ -23,6 +25,13 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
         InputError: a lamp, an object or a view does not exist, a mesh cannot be read, or a codec is not there.
     """
     entries = require_relighting(document, scene)
+    try:
+        _check(entries, scene, quality)
+    except InputError as error:
+        raise InputError(f"{relight_origin(scene)}: {error}") from None
+
+
+def _check(entries: list[dict[str, Any]], scene: str, quality: str) -> None:
     capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
     for entry in entries:
         if entry["video"] and entry["camera"]["frames"] > 1:

@@ -240,7 +240,8 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
     except InputError as error:
-        raise InputError(f"{settings_module.scene_origin(scene)}: {error}") from None
+        origin = settings_module.relight_origin if stage in ("relight", "lamp_images") else settings_module.scene_origin
+        raise InputError(f"{origin(scene)}: {error}") from None
     facts = {
         "stage": stage,
         "settings": settings_module.select(document, STAGES[stage].settings),

@@ -9,7 +9,7 @@ no hidden files.
 """
 
 from workflow.settings.document import plan_schema_json, reference_markdown, schema_json
-from workflow.settings.loading import load, scene_file, scene_origin
+from workflow.settings.loading import load, relight_origin, scene_file, scene_origin
 from workflow.settings.names import QUALITIES, RESERVED, SCENE_NAME, scene_names
 from workflow.settings.relight import relight_files, require_relighting
 from workflow.settings.relight_plans import active_plan, plan_names
@@ -34,6 +34,7 @@ __all__ = [
     "reference_markdown",
     "refuse_target",
     "relight_files",
+    "relight_origin",
     "require_relighting",
     "scene_file",
     "scene_names",

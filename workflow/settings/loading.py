@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from iif_core.errors import InputError
-from workflow.settings import batch_table, study_files
+from workflow.settings import batch_table, relight_plans, study_files
 from workflow.settings.explain import explain
 from workflow.settings.names import (
     DEFAULT,
@@ -80,6 +80,14 @@ def scene_origin(scene: str, root: Path = Path(".")) -> str:
     """Return where a scene is described, for messages: its file, or its line of the batch table."""
     line = batch_table.find(scene, root)
     return line.at() if line else str(scene_file(scene, root))
+
+
+def relight_origin(scene: str, root: Path = Path(".")) -> str:
+    """Return where the relightings of a scene are listed, for messages: a plan, or where the scene is described."""
+    parts = study_files.derived(scene, root)
+    if parts is not None and parts.study == study_files.RELIGHT:
+        return str(relight_plans.FOLDER / f"{parts.variant}.yaml")
+    return scene_origin(scene, root)
 
 
 def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSettings:

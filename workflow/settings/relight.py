@@ -279,7 +279,13 @@ def relight_files(entries: list[dict[str, Any]]) -> list[Path]:
                 f"`relight.environment` of {entry['name']}: found {str(path)!r}, which is no EXR file here; allowed: keep, off, a"
                 f" factor, [r, g, b] or the path of a latitude-longitude EXR.{did_you_mean_path(path)}"
             )
-    return list(dict.fromkeys(file for entry in entries for file in all_files_of(entry)))
+    found: dict[Path, None] = {}
+    for entry in entries:
+        try:
+            found |= dict.fromkeys(all_files_of(entry))
+        except InputError as error:
+            raise InputError(f"`relight.insert.file` of {entry['name']}: {error}") from None
+    return list(found)
 
 
 def all_files_of(entry: dict[str, Any]) -> list[Path]:
