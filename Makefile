@@ -84,12 +84,12 @@ test: setup node
 test-all: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) $(PYTEST_ARGS)
 
-# What tests take from npm: Khronos' validator of glTF, and axe-core, which looks for what hinders people with disabilities. Machines
-# without npm test the structure of the files alone. Pages need Chromium as well, which comes with the machine.
-NODE_PACKAGES := gltf-validator@2.0.0-dev.3.10 axe-core@4.14.1
-NODE_FOLDERS := $(addprefix .node/node_modules/,gltf-validator axe-core)
+# What tests take from npm: Khronos' validator of glTF, axe-core, which looks for what hinders people with disabilities, and three.js,
+# which opens scene.glb as viewers on the web do. Machines without npm test the structure of the files alone. Pages need Chromium as well, which comes with the machine.
+NODE_PACKAGES := gltf-validator@2.0.0-dev.3.10 axe-core@4.14.1 three@0.187.0
+NODE_FOLDERS := $(addprefix .node/node_modules/,gltf-validator axe-core three)
 node:
-	@if [ $$(ls -d $(NODE_FOLDERS) 2>/dev/null | wc -l) -lt 2 ] && command -v npm >/dev/null; then \
+	@if [ $$(ls -d $(NODE_FOLDERS) 2>/dev/null | wc -l) -lt 3 ] && command -v npm >/dev/null; then \
 	  npm install --fetch-retries=1 --fetch-timeout=60000 --no-save --no-audit --no-fund --silent --prefix .node $(NODE_PACKAGES) \
 	    || echo 'node: npm could not install $(NODE_PACKAGES); their tests will be skipped' >&2; fi
 

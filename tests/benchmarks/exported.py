@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,12 @@ from workflow.runtime import native
 
 VALIDATOR = Path(__file__).resolve().parents[2] / ".node/node_modules/gltf-validator"
 ROWS, PAGE = Path("docs/results/data/exported.json"), Path("docs/results/exports.md")
+LIGHT = {
+    "exact": "render.py",
+    "stock": "scene.xml",
+    "cells": "render.py, surface cells for textures",
+    "mesh": "the same, on the photographs' mesh",
+}
 VALIDATE = """
 const v = require(process.argv[1]), fs = require('fs');
 v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(r => console.log(JSON.stringify(r.issues)));
@@ -166,34 +173,48 @@ def written(job: Any, colour: np.ndarray, surface: np.ndarray) -> dict[str, floa
     return out
 
 
-def rendered(job: Any, views: list[Any], samples: int, replicates: int) -> dict[str, dict[str, float]]:
-    """Radiance of the exported scene over that of our renderer, by the exact and by the stock materials."""
+def rendered(job: Any, unwrapped: Any, views: list[Any], samples: int, replicates: int) -> dict[str, dict[str, float]]:
+    """Radiance of the exported scene over that of our renderer: by the exact and by the stock materials, and, to tell what the
+    textures and the simpler mesh do, by surface cells and by surface cells on the mesh of the photographs."""
     import mitsuba as mi
 
     from iif_core.camera.pinhole import direction_derivatives, pixel_directions
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
+    from tests.oracles.mitsuba_cells import load_with_cells, unsimplified
     from workflow.exporters import mitsuba_render
+    from workflow.exporters.atlas import bake, read_parts
     from workflow.scene.recovered import read_recovered
     from workflow.stability.monte_carlo import compare
 
     folder = job.read("export").directory / "mitsuba"
-    scenes = {"exact": mitsuba_render.load(folder), "stock": mi.load_file(str(folder / "scene.xml"))}
     recovered = read_recovered(job)
+    parts = read_parts(unwrapped, recovered)
+    small = bake(parts, recovered, np.zeros(len(recovered.cell_centres)), 64)  # nothing reads its textures
+    scenes = {
+        "exact": lambda: mitsuba_render.load(folder),
+        "stock": lambda: mi.load_file(str(folder / "scene.xml")),
+        "cells": lambda: load_with_cells(parts, small, views, recovered),
+    }
+    if any(part.simplified for part in parts):
+        scenes["mesh"] = lambda: load_with_cells(unsimplified(parts, recovered), small, views, recovered)
     geometry, material = recovered.surface.traceable(recovered.light.emits)
     world = Scene(geometry, material, recovered.light.emitters(geometry))
-    out = {}
-    for name, scene in scenes.items():
-        sensors = {sensor.id(): sensor for sensor in scene.sensors()}
 
-        def ours(seed: int) -> np.ndarray:
-            pictures = []
-            for view in views:
-                pose = view.world_from_camera
-                rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, pose).reshape(-1, 3)
-                jitter = direction_derivatives(view.fx, view.fy, pose)
-                pictures.append(render(world, pose[:3, 3], rays, PathOptions(samples, 8, seed), jitter))
-            return np.concatenate(pictures)
+    @lru_cache(None)
+    def ours(seed: int) -> np.ndarray:
+        pictures = []
+        for view in views:
+            pose = view.world_from_camera
+            rays = pixel_directions(view.fx, view.fy, view.cx, view.cy, view.width, view.height, pose).reshape(-1, 3)
+            jitter = direction_derivatives(view.fx, view.fy, pose)
+            pictures.append(render(world, pose[:3, 3], rays, PathOptions(samples, 8, seed), jitter))
+        return np.concatenate(pictures)
+
+    out = {}
+    for name, load in scenes.items():
+        scene = load()
+        sensors = {sensor.id(): sensor for sensor in scene.sensors()}
 
         def theirs(seed: int, scene: Any = scene, sensors: dict[str, Any] = sensors) -> np.ndarray:
             own = [mi.render(scene, sensor=sensors[f"view-{view.name}"], spp=samples, seed=seed) for view in views]
@@ -202,7 +223,8 @@ def rendered(job: Any, views: list[Any], samples: int, replicates: int) -> dict[
         found = compare(name, theirs, ours, replicates)
         out[name] = found._asdict()
         print(
-            f"{name}: {1 + found.bias:.4f} +- {found.error:.4f} of our radiance, p {found.smallest:.2g} of {found.threshold:.2g}"
+            f"{name}: {1 + found.bias:.4f} +- {found.error:.4f} of our radiance, p {found.smallest:.2g} of {found.threshold:.2g}",
+            flush=True,
         )
     return out
 
@@ -243,8 +265,8 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     found = [validated(path) for path in (glb, unlit)]
     row: dict[str, Any] = {"scene": scene, "mb": glb.stat().st_size / 1e6}
     row["validator"] = {name: sum(of[name] for of in found) for name in ("errors", "warnings")}
-    unwrapped = StageReader(Path("results") / scene / "unwrap", "unwrap", scene).json("unwrap.json")
-    row |= {"faces": unwrapped["faces"], "texture": job.read("export").json("export.json")["texture"]}
+    reader = StageReader(Path("results") / scene / "unwrap", "unwrap", scene)
+    row |= {"faces": reader.json("unwrap.json")["faces"], "texture": job.read("export").json("export.json")["texture"]}
     print(scene, row)
     some = chosen(capture.views, 12)
     row["written"], row["maps"] = by_trimesh(job, capture, some)
@@ -252,7 +274,7 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     row |= {"blender": by_blender(job, capture, some), "browser": by_browser(job, capture, some)}
     print(row["blender"], row["browser"])
     row["paths"] = {"samples": asked.samples, "replicates": asked.replicates}
-    row["mitsuba"] = rendered(job, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
+    row["mitsuba"] = rendered(job, reader, chosen(capture.views[:16], asked.views), asked.samples, asked.replicates)
     return row
 
 
@@ -288,10 +310,10 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
                 f"{browser['seconds'] + browser['first']:.1f}",
             ]
         )
-        for kind in ("exact", "stock"):
+        for kind in (kind for kind in LIGHT if kind in row["mitsuba"]):
             one = row["mitsuba"][kind]
             sidak = f"{one['smallest']:.1g} of {one['threshold']:.1g}"
-            by, ratio = {"exact": "render.py", "stock": "scene.xml"}[kind], f"{1 + one['bias']:.4f} ± {one['error']:.4f}"
+            by, ratio = LIGHT[kind], f"{1 + one['bias']:.4f} ± {one['error']:.4f}"
             light.append([name, by, f"{row['paths']['replicates']} x {row['paths']['samples']}", ratio, sidak])
     heads = {
         "files": ["scene", "faces", "texture", "texel, mm", "cell, mm", "scene.glb, MB", "errors / warnings"],

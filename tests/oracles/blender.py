@@ -24,6 +24,15 @@ def python_with_bpy() -> str | None:
     return os.environ.get("IIF_BPY_PYTHON") or (sys.executable if find_spec("bpy") else None)
 
 
+def require_bpy() -> str:
+    """Return a Python that has Blender's module; a test is skipped without one."""
+    import pytest
+
+    return python_with_bpy() or pytest.skip(
+        "Blender's module bpy is not installed; name a Python that has it in IIF_BPY_PYTHON (pip install bpy==4.5.*)"
+    )
+
+
 @dataclass(frozen=True)
 class Imported:
     """What Blender read.

@@ -15,6 +15,7 @@ from PIL import Image
 from iif_core.camera.pinhole import look_at
 from iif_core.numerics import color
 from iif_core.numerics.xp import NUMPY
+from tests.oracles.blender import require_bpy
 from workflow.artifacts.files import read_attributes, read_exr, sha256_of, write_exr
 from workflow.exporters import camera_files
 from workflow.exporters.object_table import csv_bytes, hex_colour, object_rows, read_csv
@@ -198,13 +199,6 @@ os._exit(0)  # Blender's own end may wait for ever in a module
 """
 
 
-def python_with_bpy():
-    named = os.environ.get("IIF_BPY_PYTHON")
-    if named or find_spec("bpy"):
-        return named or sys.executable
-    pytest.skip("Blender's module bpy is not installed; name a Python that has it in IIF_BPY_PYTHON (pip install bpy==4.5.*)")
-
-
 def small_glb():
     """A box of 1 x 2 x 3 m from the origin, in glTF's axes, as scene.glb has it for a world with z up."""
     import trimesh
@@ -216,7 +210,7 @@ def small_glb():
 
 def test_script_sets_up_blender(tmp_path):
     """Cameras project to the pixels of the pinhole camera, meshes stand where the capture has them, curves hold the response."""
-    python = python_with_bpy()
+    python = require_bpy()
     (tmp_path / "photos").mkdir()
     for view in VIEWS:
         image = camera_files.photograph_png(np.full((30, 40, 3), 0.5), np.ones((30, 40), bool))

@@ -24,8 +24,12 @@ from iif_core.surface.cells import voxel_indices
 from iif_core.surface.lookup import values_at
 from iif_core.surface.tangents import vertex_tangents
 from iif_core.surface.triangles import face_geometry, subdivide, vertex_normals
+from tests.browser import missing
+from tests.oracles import gltf_viewer
+from tests.oracles.blender import read_by_blender, require_bpy
 from tests.oracles.exported import maps_of, read_back
 from workflow.exporters.atlas import Atlas, TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
+from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
 from workflow.exporters.normal_map import normal_picture
@@ -521,6 +525,57 @@ def khronos_issues(glb, folder):
 
 def test_khronos_validator(glb, tmp_path):
     assert khronos_issues(glb, tmp_path) == []
+
+
+# ------------------------------------------------------------------------------------------------------- other programs
+
+
+def written_glb(folder, camera):
+    """A room, and what trimesh reads of it at the pixels of a camera: values (n, 5), and depth, infinite where nothing is."""
+    path = folder / "scene.glb"
+    path.write_bytes(glb_of(room(), [camera]))
+    values, points, of = maps_of(read_back(path, UP), camera)
+    depth = (points - camera.world_from_camera[:3, 3]) @ camera.world_from_camera[:3, 2]
+    return path, values, np.where(of >= 0, depth, np.inf)
+
+
+def same_pixels(found, depth, values, wanted):
+    """Almost all pixels show the same surface, and the same material on it."""
+    near = np.abs(depth / wanted - 1) < 1e-3
+    assert near.mean() > 0.98
+    apart = np.abs(found - values)[near].max(1)
+    assert (apart < 1.5 / 255).mean() > 0.98 and np.ptp(values[near, 0]) > 0.4  # a texel may fall to a neighbour
+
+
+def test_blender_reads_what_was_written(tmp_path):
+    python = require_bpy()
+    camera = view(cx=19.0, cy=21.0)
+    path, values, depth = written_glb(tmp_path, camera)
+    document = json.loads(cameras_json([camera], ["a.png"], np.ones((1, 3)), UP, None, None))
+    read = read_by_blender(python, path, document, ["a"], 120)
+    same_pixels(read.values[0], read.depth[0], values, depth)
+    assert read.spaces == {"base_color": "sRGB", "surface": "Non-Color"}
+    np.testing.assert_allclose(read.emission["lamp.emitter0"], [9, 6, 3], rtol=1e-5)
+    found = read.cameras["view a"]
+    wide = 2 * np.arctan(0.5 * camera.width / camera.fx), 2 * np.arctan(0.5 * camera.height / camera.fy)
+    assert found["angle_y" if found["fit"] == "VERTICAL" else "angle_x"] == pytest.approx(
+        wide[found["fit"] == "VERTICAL"], rel=1e-5
+    )
+    np.testing.assert_allclose(np.array(found["pose"])[:3, 3], camera.world_from_camera[:3, 3], atol=1e-5)  # z is up in both
+
+
+def test_a_browser_shows_what_was_written(tmp_path):
+    if not gltf_viewer.available():
+        missing("no Chromium, or no three.js, which `make node` installs")
+    camera = view(cx=19.0, cy=21.0)
+    path, values, depth = written_glb(tmp_path, camera)
+    opened = gltf_viewer.open_in_browser(path, [camera])
+    assert opened.complaints == [] and all(name == "" or name.startswith(("three/", "scene.glb")) for name in opened.requests)
+    same_pixels(opened.values[0], opened.depth[0], values, depth)
+    assert opened.facts["lamps"].keys() == {"lamp.emitter0"} and opened.facts["cameras"] == 1
+    np.testing.assert_allclose(opened.facts["lamps"]["lamp.emitter0"], [9, 6, 3], rtol=1e-5)
+    picture = np.asarray(Image.open(io.BytesIO(opened.picture)).convert("RGB"))
+    assert picture.shape == (camera.height, camera.width, 3) and picture.std() > 20
 
 
 # ----------------------------------------------------------------------------------------------------------------- usd
