@@ -485,9 +485,10 @@ def test_a_way_through_a_wall_is_named(toy):
     }
     camera |= {"frames": 5, "width": 16, "height": 16}
     wanted = {"name": "out", "camera": camera, "samples": 1, "video": False}
-    with pytest.raises(
-        InputError, match=r"way of the camera leads through 'walls' at \[0.30, 0.00, 1.60\] m, between frames 1 and 2"
-    ):
+    said = (
+        r"^config/scenes/toy.yaml: relight.camera of out: the way of the camera leads through 'walls' at \[0.30, 0.00, 1.60\] m,"
+    )
+    with pytest.raises(InputError, match=rf"{said} between frames 1 and 2"):
         lit(toy, wanted)
     with pytest.raises(InputError, match="leads through 'walls'"):
         lit(toy, {**wanted, "method": "path"})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +27,15 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
         InputError: a lamp, an object or a view does not exist, a mesh cannot be read, or a codec is not there.
     """
     entries = require_relighting(document, scene)
-    try:
+    with blamed_on_plan(scene):
         _check(entries, scene, quality)
+
+
+@contextmanager
+def blamed_on_plan(scene: str) -> Iterator[None]:
+    """Let messages about relightings of a scene begin with the file that lists them."""
+    try:
+        yield
     except InputError as error:
         raise InputError(f"{relight_origin(scene)}: {error}") from None
 

@@ -87,7 +87,10 @@ def relight_origin(scene: str, root: Path = Path(".")) -> str:
     parts = study_files.derived(scene, root)
     if parts is not None and parts.study == study_files.RELIGHT:
         return str(relight_plans.FOLDER / f"{parts.variant}.yaml")
-    return scene_origin(scene, root)
+    try:
+        return scene_origin(scene, root)
+    except InputError:  # a job can outlive the file that its scene had
+        return f"config/scenes/{scene}.yaml"
 
 
 def load(scene: str, quality: str = "draft", root: Path = Path(".")) -> SceneSettings:

@@ -9,6 +9,7 @@ import numpy as np
 
 from workflow.models.denoise import require_denoiser
 from workflow.relighting.camera import Flight
+from workflow.relighting.check import blamed_on_plan
 from workflow.relighting.tracing import Studio, trace_lamps
 from workflow.relighting.world import World
 from workflow.runtime.job import Job
@@ -22,7 +23,8 @@ def run(job: Job) -> None:
     """Write <key>/frame_<i>.exr, the radiance of every lamp in white light, and lamp_images.json."""
     bases: list[dict[str, Any]] = job.settings.lamp_images
     studio = Studio.open(job) if bases else None
-    flights = [studio.flight({**basis, "name": _readers(job, basis)}) for basis in bases] if studio else []
+    with blamed_on_plan(job.scene):
+        flights = [studio.flight({**basis, "name": _readers(job, basis)}) for basis in bases] if studio else []
     if any(basis["denoise"] for basis in bases):
         require_denoiser()
     facts = [_trace(studio, basis, flight) for basis, flight in zip(bases, flights, strict=True)] if studio else []

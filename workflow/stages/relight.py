@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from iif_core.camera.response import Response, response
-from iif_core.errors import InputError
 from iif_core.light.relighting import exposure_for, sum_of_lamps
 from iif_core.numerics.color import to_uint8
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.models.denoise import require_denoiser
 from workflow.relighting import sheet
 from workflow.relighting.camera import Flight, photograph_exposure
+from workflow.relighting.check import blamed_on_plan
 from workflow.relighting.inserts import light_of, load_insert
 from workflow.relighting.tracing import Studio, trace_picture
 from workflow.relighting.video import encoded, require_codec
@@ -25,7 +25,7 @@ from workflow.relighting.world import AS_FOUND, World, lamp_weights
 from workflow.runtime.job import Job
 from workflow.scene.base_scene import read_gains
 from workflow.scene.recovered import read_response
-from workflow.settings import relight_origin, require_relighting
+from workflow.settings import require_relighting
 from workflow.settings.relight import all_files_of, key_of, lamp_basis, recombines
 from workflow.stages.lamp_images import channel
 
@@ -38,10 +38,8 @@ def run(job: Job) -> None:
     wanted = require_relighting({"relight": job.settings.relight}, job.scene)
     studio = Studio.open(job)
     bases = {one["key"]: one for one in job.read("lamp_images").json("lamp_images.json")["bases"]}
-    try:
+    with blamed_on_plan(job.scene):
         prepared = [_prepare(studio, bases, entry) for entry in wanted]  # whatever is wrong stops the stage before any work
-    except InputError as error:
-        raise InputError(f"{relight_origin(job.scene)}: {error}") from None
     curve = response("srgb") if studio.capture.is_hdr else read_response(job.read("affines"))
     facts, rows = [], []
     for one in prepared:
