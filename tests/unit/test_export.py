@@ -813,6 +813,8 @@ def test_mitsuba_emitters(mi, tmp_path):
     hit = scene.ray_intersect(rays)
     seen = np.array(hit.emitter(scene).eval(hit)).T
     np.testing.assert_allclose(seen, np.tile([9, 6, 3], (2, 1)), rtol=1e-5)
+    gloss = np.array(hit.bsdf().eval(mi.BSDFContext(), hit, mi.Vector3f(0.6, 0, 0.8)))
+    assert (gloss > 1e-4).all() and (gloss < 0.02).all()  # black, and as glossy as the workflow's renderer has it
 
 
 def test_mitsuba_environment(mi, tmp_path):
