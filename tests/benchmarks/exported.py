@@ -111,14 +111,15 @@ def by_blender(job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
 
 
 def by_browser(job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
-    """What a viewer in a browser sees: differences by pixel, lamps, time and complaints. The first picture is kept in logs/."""
+    """What a viewer in a browser sees: differences by pixel, lamps, time and complaints. One picture of it is kept in
+    results/studies/exported/."""
     from tests.oracles.gltf_viewer import available, open_in_browser
 
     if not available():
         raise SystemExit("no viewer: Chromium and three.js are needed (make node)")
     export = job.read("export")
     opened = open_in_browser(export.path("scene.glb"), views)
-    picture = Path("logs/exported") / f"{job.scene}.png"
+    picture = Path("results/studies/exported") / f"{job.scene}.png"
     picture.parent.mkdir(parents=True, exist_ok=True)
     picture.write_bytes(opened.picture)
     row: dict[str, Any] = {
