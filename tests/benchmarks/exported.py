@@ -131,10 +131,11 @@ def by_browser(job: Any, capture: Any, views: list[Any]) -> dict[str, Any]:
 
 
 def lamps(export: Any, emission: dict[str, np.ndarray]) -> dict[str, float]:
-    """How many lamps Blender has of those that shine, and the largest relative difference of their radiance."""
+    """How many lamps a program has of the surface that shines, and the largest relative difference of their radiance."""
     table = export.table("emitters.parquet")
     radiance = np.stack([table[f"radiance_{c}"] for c in "rgb"], 1)
-    wanted = {int(number): row for number, row in zip(table["emitter_id"], radiance, strict=True) if row.any()}
+    own = np.flatnonzero(radiance.any(1) & (table["kind"] == "area"))  # glTF has no light from outside
+    wanted = {int(table["emitter_id"][row]): radiance[row] for row in own}
     found = {int(name.rpartition(".emitter")[2]): value for name, value in emission.items()}
     both = sorted(wanted.keys() & found.keys())
     worst = max((float(np.abs(found[n] - wanted[n]).max() / wanted[n].max()) for n in both), default=0.0)
@@ -305,7 +306,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
             [
                 name,
                 f"{blender['lamps']['found']} and {browser['lamps']['found']} of {blender['lamps']['wanted']}",
-                *(f"{read['lamps']['worst']:.0e}" for read in (blender, browser)),
+                *(f"{read['lamps']['worst']:.0e}" if read["lamps"]["found"] else "" for read in (blender, browser)),
                 *(f"{value:.0e}" for value in (1000 * at["m"], at["degrees"], at["field"])),
                 str(len(browser["complaints"])),
                 f"{browser['seconds'] + browser['first']:.1f}",
