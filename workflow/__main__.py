@@ -1,6 +1,7 @@
 """`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
-`python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow study <study>` and `python -m
+`python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow upgrade [scene ...]` brings
+manifests of an earlier version up to date, `python -m workflow study <study>` and `python -m
 workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
 design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
 `python -m workflow relit <scene>` copies pictures of relightings to relight/,
@@ -103,22 +104,46 @@ def _arguments() -> argparse.Namespace:
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
+    upgrade = commands.add_parser("upgrade")
+    upgrade.add_argument("scenes", nargs="*")
     return parser.parse_args()
 
 
-def _verify(scenes: list[str]) -> int:
-    from workflow.artifacts.verify import damaged, with_artefacts
+def _not_here(scenes: list[str], what: str) -> bool:
+    """Say of a scene that nothing of it is here, and return whether there is one."""
+    from workflow.artifacts.verify import with_artefacts
     from workflow.settings.names import did_you_mean
 
     known = with_artefacts()
     for scene in scenes:
         if scene not in known:
             print(
-                f"error: {scene}: neither results/{scene} nor scenes/{scene} holds anything to verify."
+                f"error: {scene}: neither results/{scene} nor scenes/{scene} holds anything to {what}."
                 f"{did_you_mean(scene, known)} What is here: {', '.join(known) or 'nothing'}.",
                 file=sys.stderr,
             )
-            return 1
+            return True
+    return False
+
+
+def _upgrade(scenes: list[str]) -> int:
+    from workflow.artifacts.upgrade import upgrade
+
+    if _not_here(scenes, "upgrade"):
+        return 1
+    done = []
+    for upgraded, line in upgrade(Path("results"), scenes or None):
+        done.append(upgraded)
+        print(line, flush=True)
+    print(f"{sum(done)} manifests upgraded, {len(done) - sum(done)} left as they are" if done else "nothing to upgrade")
+    return 0 if all(done) else 1
+
+
+def _verify(scenes: list[str]) -> int:
+    from workflow.artifacts.verify import damaged
+
+    if _not_here(scenes, "verify"):
+        return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(line)
@@ -210,6 +235,8 @@ def main() -> int:
     arguments = _arguments()
     if arguments.command == "verify":
         return _verify(arguments.scenes)
+    if arguments.command == "upgrade":
+        return _upgrade(arguments.scenes)
     from workflow.runtime import native
 
     try:  # before NumPy is imported: a BLAS that has started keeps its threads

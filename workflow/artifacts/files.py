@@ -31,7 +31,7 @@ def inside(folder: Path, name: str) -> Path:
     path = folder / name
     leaves = not Path(name).parts or Path(name).is_absolute() or ".." in Path(name).parts
     if leaves or not path.parent.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{folder}: the file name {name!r} would leave this folder; nothing is written there")
+        raise InputError(f"{folder}: the file name {name!r} would leave this folder; it is neither read nor written")
     return path
 
 

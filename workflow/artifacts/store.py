@@ -11,9 +11,10 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts.manifest import MANIFEST, STAGE_SCHEMA
 
-SCHEMA = "iif.stage/1"
-MANIFEST = "manifest.json"
+SCHEMA = STAGE_SCHEMA
 UNFINISHED = "unfinished"
 PARTS = "parts.json"
 
@@ -186,7 +187,7 @@ class StageWriter:
                     path.rmdir()
             elif str(path.relative_to(self.directory)) not in kept:
                 path.unlink()
-        io.write_json(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
+        manifests.write(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
 
 
 def _noted_parts(directory: Path) -> dict[str, Any]:
@@ -217,18 +218,17 @@ class StageReader:
         if not path.is_file():
             raise DamagedArtefact(path, stage, scene, "missing, so this stage is not finished", unfinished=True)
         try:
-            self.manifest: dict[str, Any] = dict(json.loads(path.read_text()))
-        except (ValueError, TypeError) as error:
-            raise DamagedArtefact(path, stage, scene, f"not readable as JSON ({error})") from None
-        found = self.manifest.get("schema")
-        if found != SCHEMA:
-            raise DamagedArtefact(
-                path, stage, scene, f"schema {found!r}, this version reads {SCHEMA!r}", self.manifest.get("quality")
-            )
+            self.manifest = manifests.read(path)
+        except manifests.Broken as error:
+            raise DamagedArtefact(path, stage, scene, str(error), _quality_in(path)) from None
+        of = {key: self.manifest.get(key, own) for key, own in (("stage", stage), ("scene", scene))}
+        if of != {"stage": stage, "scene": scene}:
+            problem = f"it belongs to stage {of['stage']} of scene {of['scene']}, and was put here"
+            raise DamagedArtefact(path, stage, scene, problem, self.manifest.get("quality"))
 
     @property
     def fingerprint(self) -> str:
-        return self.manifest["fingerprint"]
+        return str(self.manifest.get("fingerprint", ""))
 
     def _damaged(self, path: Path, problem: str) -> DamagedArtefact:
         return DamagedArtefact(path, self.stage, self.scene, problem, self.manifest.get("quality"))
@@ -244,7 +244,7 @@ class StageReader:
     def path(self, name: str) -> Path:
         """Return the path of a file after checking it, for readers of other formats."""
         facts = self.manifest["files"].get(name)
-        path = self.directory / name
+        path = io.inside(self.directory, name)
         if facts is None:
             known = ", ".join(list(self.manifest["files"])[:8])
             raise self._damaged(path, f"not in the manifest (it lists {known}, ...)")
@@ -280,6 +280,15 @@ class StageReader:
     def json(self, name: str) -> Any:
         """Return a small document."""
         return json.loads(self.path(name).read_text())
+
+
+def _quality_in(path: Path) -> str | None:
+    """Return the quality that a broken manifest names, if that can still be read, for the command that makes the stage again."""
+    try:
+        quality = json.loads(path.read_text())["quality"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return quality if isinstance(quality, str) and quality.isidentifier() else None
 
 
 def rgb(channels: dict[str, np.ndarray], layer: str = "") -> np.ndarray:

@@ -9,32 +9,27 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
-from workflow.artifacts.store import MANIFEST, PARTS, StageReader, chosen, command
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
+from workflow.artifacts.sound import wrong_files
+from workflow.artifacts.store import PARTS, StageReader, chosen, command
+from workflow.registry import SHARED
 
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
-    """Yield one line for each damaged, missing or unlisted file, and for each folder that is gone although others need it."""
+    """Yield one line for each file that is not what was written, is missing or unlisted, and for each link of the chain that is
+    broken: a folder that is gone although others were made from it, and a stage that is not the one from which they were made.
+
+    Every content is hashed, whatever time stamps say.
+    """
     upstream: set[str] = set()  # scenes with damaged results, which must be repaired before publishing
     for manifest in sorted(root.glob(f"results/*/*/{MANIFEST}")):
         stage, scene = manifest.parent.name, manifest.parent.parent.name
         if scenes and scene not in scenes:
             continue
-        try:
-            reader = StageReader(manifest.parent, stage, scene)
-        except InputError as error:
+        for line in _stage(manifest.parent, stage, scene):
             upstream.add(scene)
-            yield str(error)
-            continue
-        for name in reader.names():
-            try:
-                reader.path(name)
-            except InputError as error:
-                upstream.add(scene)
-                yield str(error)
-        listed = set(reader.names()) | {MANIFEST, PARTS}
-        for path in sorted(manifest.parent.rglob("*")):
-            if path.is_file() and str(path.relative_to(manifest.parent)) not in listed:
-                yield f"{path}: not written by rule {stage} (not in its manifest); remove it"
+            yield line
     for scene in with_artefacts(root):
         if scenes and scene not in scenes:
             continue
@@ -45,6 +40,30 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
         if scenes and scene not in scenes:
             continue
         yield from _published(root, scene, scene in upstream)
+
+
+def _stage(folder: Path, stage: str, scene: str) -> Iterator[str]:
+    try:
+        reader = StageReader(folder, stage, scene)
+    except InputError as error:
+        yield str(error)
+        return
+    quality = reader.manifest.get("quality")
+    for name in reader.names():
+        try:
+            reader.path(name)
+        except InputError as error:
+            yield str(error)
+    listed = set(reader.names()) | {MANIFEST, PARTS}
+    for path in sorted(folder.rglob("*")):
+        if not path.is_dir() and str(path.relative_to(folder)) not in listed:
+            yield f"{path}: not written by rule {stage} (not in its manifest); remove it"
+    results = folder.parent.parent
+    for name, facts in sorted(reader.manifest.get("inputs", {}).items()):
+        up = results / facts["scene"] / name.removeprefix(SHARED) / MANIFEST
+        if up.is_file() and io.sha256_of(up) != facts["manifest_sha256"]:
+            again = command(scene, stage, quality)
+            yield f"{folder}: it was made from another {up.parent} than is there now; rebuild with: {again}"
 
 
 def with_artefacts(root: Path = Path(".")) -> list[str]:
@@ -62,7 +81,7 @@ def _gone(root: Path, scene: str) -> Iterator[str]:
         made_from = document.get("inputs", document.get("fingerprints"))
         published = ["publish"] if path.parent.parent.name == "scenes" and document else []
         for stage in [*(made_from if isinstance(made_from, dict) else ()), *published]:
-            needed.setdefault(stage, (path.parent, document.get("quality")))
+            needed.setdefault(stage, (path.parent, _quality(document.get("quality"))))
     if (root / "relight" / scene).is_dir():
         needed.setdefault("relight", (root / "relight" / scene, None))
     if needed and not own.is_dir():
@@ -86,7 +105,7 @@ def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
     folder, results = root / "scenes" / scene, root / "results" / scene
     if folder.is_dir():
         if (folder / MANIFEST).is_file():
-            yield from _deliverable(folder / MANIFEST, scene, damaged_results)
+            yield from _deliverable(folder / MANIFEST, scene, results, damaged_results)
         else:
             yield f"{folder / MANIFEST}: missing; rebuild with: {command(scene, 'publish', None)}"
     elif folder.exists():
@@ -103,7 +122,7 @@ def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
 def _document(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
 
@@ -112,32 +131,33 @@ def _first(damaged_results: bool) -> str:
     return "repair results/ first (the lines above), then " if damaged_results else ""
 
 
-def absent(folder: Path, manifest: Path) -> list[str]:
-    """Return the files of `folder` that are gone, sorted: those that `manifest` lists, or the manifest itself.
-
-    Nothing is missing from a folder that does not exist. Only presence is checked; `damaged` compares contents.
-    """
-    if not folder.is_dir():
-        return []
+def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: bool) -> Iterator[str]:
+    first, folder = _first(damaged_results), manifest.parent
     try:
-        listed = json.loads(manifest.read_text())["files"]
-        return sorted(name for name in listed if not (folder / name).is_file())
-    except (OSError, ValueError, KeyError, TypeError):
-        return [manifest.name] if manifest.is_relative_to(folder) else []
-
-
-def _deliverable(manifest: Path, scene: str, damaged_results: bool) -> Iterator[str]:
-    first = _first(damaged_results)
-    try:
-        document = json.loads(manifest.read_text())
-        listed = document["files"]
-    except (ValueError, KeyError, TypeError) as error:
-        yield f"{manifest}: not readable ({error}); {first}rebuild with: {command(scene, 'publish', None)}"
+        document = manifests.read(manifest, SCENE_SCHEMA)
+    except manifests.Broken as error:
+        again = command(scene, "publish", _quality(_document(manifest).get("quality")))
+        yield f"{manifest}: {error}; {first}rebuild with: {again}"
         return
     again = f"{first}rebuild with: {command(scene, 'publish', document.get('quality'))}"
-    for name, facts in sorted(listed.items()):
-        path = manifest.parent / name
-        if not path.is_file():
-            yield f"{path}: missing; {again}"
-        elif io.sha256_of(path) != facts["sha256"]:
-            yield f"{path}: its content changed since it was published (sha256 differs); {again}"
+    if document.get("scene") != scene:
+        yield f"{manifest}: it belongs to scene {document.get('scene')}, and was put here; {again}"
+        return
+    for line in wrong_files(folder, document):
+        yield f"{line}; {again}"
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if not path.is_dir() and name != MANIFEST and name not in document["files"] and not name.startswith("."):
+            yield f"{path}: not published (not in {manifest}); move it away, or it is lost when the scene is published again"
+    for stage, digest in sorted(document.get("manifests", {}).items()):
+        up = results / stage / MANIFEST
+        if up.is_file() and io.sha256_of(up) != digest:
+            yield f"{folder}: it was made from another {up.parent} than is there now; {again}"
+            return
+    own = _document(results / "publish/published.json").get("manifest_sha256")
+    if own is not None and own != io.sha256_of(manifest):
+        yield f"{manifest}: it is not the one that {results / 'publish'} wrote; {again}"
+
+
+def _quality(found: Any) -> str | None:
+    return found if isinstance(found, str) and found.isidentifier() else None

@@ -11,7 +11,7 @@ from pathlib import Path
 sys.path.insert(0, workflow.basedir)
 
 from iif_core.errors import InputError
-from workflow.artifacts.verify import absent
+from workflow.artifacts import sound
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
@@ -131,8 +131,19 @@ def reads(stage, *names):
 
     def inputs(wildcards):
         quality = quality_of(wildcards.scene)
-        or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
+        mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
         or_stop(check_overrides, stage, wildcards.scene, quality)
+        again_if_unsound(
+            f"results/{wildcards.scene}/{stage}/manifest.json",
+            f"{wildcards.scene}: stage {stage} is made again",
+            or_stop(
+                sound.stage_faults,
+                Path("results"),
+                wildcards.scene,
+                stage,
+                mark,
+            ),
+        )
         common = study_files.shared_scene(wildcards.scene)
         found = {name: manifest(name, wildcards.scene) for name in own}
         return found | {f"{SHARED}{name}": manifest(name, common) for name in shared}
@@ -198,7 +209,11 @@ def publish_inputs(*names):
     def inputs(wildcards):
         folder = f"scenes/{wildcards.scene}"
         folder_or_stop(folder)
-        again_without(folder, f"{folder}/manifest.json")
+        again_if_unsound(
+            folder,
+            f"{folder} is published again",
+            sound.deliverable_faults(Path(folder), Path("results"), wildcards.scene),
+        )
         return inputs_of(wildcards)
 
     return inputs
@@ -220,10 +235,14 @@ def relit_inputs(wildcards):
         )
     if os.path.isdir(folder) and not os.path.isfile(f"{folder}/contact_sheet.png"):
         workflow.dag.forcefiles.add(folder)  # it holds plans alone
-    source = f"results/{or_stop(relit.source, scene, plan, quality_of(scene))}/relight/manifest.json"
+    source = or_stop(relit.source, scene, plan, quality_of(scene))
     folder_or_stop(folder)
-    again_without(folder, source)
-    return {"manifest": source}
+    again_if_unsound(
+        folder,
+        f"{folder} is copied again",
+        sound.copy_faults(Path(folder), Path("results"), source, "relight"),
+    )
+    return {"manifest": f"results/{source}/relight/manifest.json"}
 
 
 def folder_or_stop(folder):
@@ -232,13 +251,11 @@ def folder_or_stop(folder):
         stop(f"{folder}: a file, where the workflow makes a folder. Move it away.")
 
 
-def again_without(folder, manifest):
-    """Have the job run that makes `folder`, if files that `manifest` lists are gone: Snakemake looks at folders, not into them."""
-    gone = absent(Path(folder), Path(manifest))
-    if gone:
-        more = f" and {len(gone) - 3} more" if len(gone) > 3 else ""
-        print(f"{folder}: {', '.join(gone[:3])}{more} missing", file=sys.stderr)
-        workflow.dag.forcefiles.add(folder)
+def again_if_unsound(target, words, faults):
+    """Have the job run that makes `target`, if what is there is not what was written, and say once why."""
+    if faults and workflow.is_main_process and target not in workflow.dag.forcefiles:
+        print(sound.told(faults, words), file=sys.stderr)
+        workflow.dag.forcefiles.add(target)
 
 
 def plan_inputs(wildcards):

@@ -19,7 +19,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
-from workflow.artifacts import StageReader, StageWriter
+from workflow.artifacts import StageReader, StageWriter, stamps
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, forecast, input_digests
@@ -123,13 +123,18 @@ class Job:
     @cached_property
     def writer(self) -> StageWriter:
         """The writer of this stage's folder; it is finished after `run`."""
+        stamps.place(Path("results"), self.scene, self.stage.name).unlink(missing_ok=True)
         return StageWriter(stage_directory(self.scene, self.stage.name), self._provenance())
 
     def _provenance(self) -> dict[str, Any]:
         readers = {stage: self.read(stage) for stage in self.stage.upstream}
         readers |= {f"{SHARED}{stage}": self.read_shared(stage) for stage in self.stage.shared}
         inputs = {
-            name: {"fingerprint": reader.fingerprint, "manifest_sha256": sha256_of(reader.directory / "manifest.json")}
+            name: {
+                "scene": reader.scene,
+                "fingerprint": reader.fingerprint,
+                "manifest_sha256": sha256_of(reader.directory / "manifest.json"),
+            }
             for name, reader in readers.items()
         }
         return {
@@ -239,6 +244,7 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()
+    stamps.stamp_stage(Path("results"), scene, stage)
     if job.stage.reads_raw:
         input_digests.remember(fp.raw_inputs(stage, job.document))
     job.write_timings()

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from workflow.artifacts.files import inside, sha256_of, write_json, write_parquet
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts import stamps
+from workflow.artifacts.files import inside, sha256_of, write_parquet
+from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job, library_versions
 from workflow.runtime.timings import read_timings
 
-SCHEMA = "iif.scene/1"
 TIMING_COLUMNS: dict[str, Any] = {
     "rule": object,
     "wildcards": object,
@@ -39,7 +41,13 @@ def run(job: Job) -> None:
         _replace(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    job.writer.json("published.json", {"files": {name: facts["sha256"] for name, facts in files.items()}})
+    published = {
+        "files": {name: facts["sha256"] for name, facts in files.items()},
+        "manifest_sha256": sha256_of(target / MANIFEST),
+    }
+    job.writer.json("published.json", published)
+    document = manifests.read(target / MANIFEST, SCENE_SCHEMA)
+    stamps.note(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), target, document)
     job.log.info("%s: %d files, %.1f MB", target, len(files), sum(f["bytes"] for f in files.values()) / 1e6)
 
 
@@ -50,11 +58,11 @@ def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[s
         place(readers[stage].path(name), inside(temporary, name))
     timings = read_timings(job.scene)
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
-    write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCHEMA})
+    write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCENE_SCHEMA})
     files = {}
     for path in sorted(p for p in temporary.rglob("*") if p.is_file()):
         files[path.relative_to(temporary).as_posix()] = {"sha256": sha256_of(path), "bytes": path.stat().st_size}
-    write_json(temporary / "manifest.json", _manifest(job, files))
+    manifests.write(temporary / MANIFEST, _manifest(job, files))
     return files
 
 
@@ -93,11 +101,12 @@ def place(source: Path, destination: Path) -> None:
 
 def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
     return {
-        "schema": SCHEMA,
+        "schema": SCENE_SCHEMA,
         "scene": job.scene,
         "quality": job.quality,
         "fingerprint": job.fingerprint,
         "fingerprints": {stage: job.read(stage).fingerprint for stage in job.stage.upstream},
+        "manifests": {stage: sha256_of(job.read(stage).directory / MANIFEST) for stage in job.stage.upstream},
         "settings": job.document,
         "versions": library_versions(),
         "files": files,

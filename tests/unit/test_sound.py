@@ -1,0 +1,223 @@
+"""Damage of every kind is found by `verify` and when Snakemake plans; an untouched artefact is not read."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from iif_core.errors import InputError
+from workflow.artifacts import StageReader, StageWriter, sound, stamps
+from workflow.artifacts import files as io
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST
+from workflow.artifacts.upgrade import upgrade
+from workflow.artifacts.verify import damaged
+
+MARK = "0" * 16
+
+
+def finish(root, scene, stage, inputs=(), mark=MARK, value=0.01):
+    """A stage with two files, as a job leaves it."""
+    made_from = {name: root / "results" / scene / name / MANIFEST for name in inputs}
+    facts = {
+        "scene": scene,
+        "stage": stage,
+        "quality": "draft",
+        "fingerprint": mark,
+        "inputs": {
+            name: {"fingerprint": MARK, "scene": scene, "manifest_sha256": io.sha256_of(path)} for name, path in made_from.items()
+        },
+    }
+    writer = StageWriter(root / "results" / scene / stage, facts)
+    writer.json("facts.json", {"value": value})
+    writer.table("cells.parquet", {"edge": np.full(3, value)})
+    writer.finish()
+    stamps.stamp_stage(root / "results", scene, stage)
+    return root / "results" / scene / stage
+
+
+def faults(root, scene="s", stage="base", mark=MARK):
+    sound.stage_faults.cache_clear()
+    return sound.stage_faults(root / "results", scene, stage, mark)
+
+
+@pytest.fixture
+def room(tmp_path):
+    finish(tmp_path, "s", "capture")
+    return finish(tmp_path, "s", "base", ["capture"])
+
+
+def test_every_bit_of_a_manifest_counts(room, tmp_path):
+    path = room / MANIFEST
+    data = path.read_bytes()
+    assert list(damaged(tmp_path)) == [] and faults(tmp_path) == ()
+    for bit in range(0, 8 * len(data), 5):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(manifests.Broken):
+            manifests.parse(bytes(changed), manifests.STAGE_SCHEMA)
+    for text in (
+        data + b"\n",
+        data.replace(b"\n ", b"\n  ", 1),
+        data.replace(b'{\n "', b'{\n "a": 1,\n "', 1),
+        b"",
+        b"{}",
+        b"[" * 100000,
+    ):
+        with pytest.raises(manifests.Broken):
+            manifests.parse(text, manifests.STAGE_SCHEMA)
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def in_secret(harm):
+    """Damage with the time stamp set back."""
+
+    def harmed(path):
+        status = path.stat()
+        harm(path)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+    return harmed
+
+
+HARMS = {
+    "flipped": flip,
+    "flipped in secret": in_secret(flip),
+    "emptied": lambda path: path.write_bytes(b""),
+    "emptied in secret": in_secret(lambda path: path.write_bytes(b"")),
+    "removed": lambda path: path.unlink(),
+    "a folder": lambda path: (path.unlink(), path.mkdir()),
+}
+
+
+@pytest.mark.parametrize("name", ["facts.json", "cells.parquet", MANIFEST])
+@pytest.mark.parametrize("harm", HARMS)
+def test_damage_is_found_by_both(room, tmp_path, name, harm):
+    HARMS[harm](room / name)
+    found = faults(tmp_path)
+    assert found and all(str(room / name) in line for line in found)
+    finish(tmp_path, "s", "report", ["capture"])  # something that makes `verify` miss a manifest that is gone
+    lines = list(damaged(tmp_path))
+    if not (name == MANIFEST and harm in ("removed", "a folder")):
+        assert any(str(room / name) in line for line in lines)
+
+
+def test_a_stage_that_is_gone_is_missed(room, tmp_path):
+    shutil.rmtree(room)
+    assert faults(tmp_path) == (f"{room}: missing, although it was finished",)
+    stamps.place(tmp_path / "results", "s", "base").unlink()  # as a job does that begins to make it
+    assert faults(tmp_path) == ()
+
+
+def test_a_stage_of_another_scene_is_not_taken(room, tmp_path):
+    other = finish(tmp_path, "other", "base", mark="1" * 16, value=0.02)
+    shutil.rmtree(room)
+    shutil.copytree(other, room)
+    (line,) = faults(tmp_path)
+    assert "it belongs to stage base of scene other" in line
+    assert any("it belongs to stage base of scene other" in line for line in damaged(tmp_path))
+
+
+def test_a_stage_of_other_settings_is_not_taken(room, tmp_path):
+    other = finish(tmp_path / "elsewhere", "s", "base", mark="1" * 16, value=0.02)
+    shutil.rmtree(room)
+    shutil.copytree(other, room)
+    assert faults(tmp_path) == (f"{room / MANIFEST}: it is that of other settings, inputs or code, and was put here",)
+    assert faults(tmp_path, mark="1" * 16) == ()
+
+
+def test_other_settings_are_nothing_to_tell(room, tmp_path):
+    assert faults(tmp_path, mark="2" * 16) == ("",) and sound.told(("",), "again") == ""
+
+
+def test_the_chain_is_closed(room, tmp_path):
+    """The stage from which another was made is replaced by one that is sound in itself."""
+    finish(tmp_path, "s", "capture", value=0.5)
+    (line,) = faults(tmp_path)
+    assert line == f"{room}: it was made from another {tmp_path / 'results/s/capture'} than is there now"
+    (line,) = damaged(tmp_path)
+    assert "it was made from another" in line and line.endswith("scenes/s --forcerun base")
+
+
+@pytest.mark.parametrize("name", ["extra.json", "maps/extra.exr", "link"])
+def test_files_that_no_stage_wrote_are_named(room, tmp_path, name):
+    (room / name).parent.mkdir(exist_ok=True)
+    (room / name).symlink_to("nowhere") if name == "link" else (room / name).write_text("")
+    (line,) = damaged(tmp_path)
+    assert line.startswith(f"{room / name}: not written by rule base")
+
+
+def test_what_nobody_touched_is_not_read(room, tmp_path, monkeypatch):
+    def read(path):
+        raise AssertionError(f"{path} was read")
+
+    with monkeypatch.context() as untouched:
+        untouched.setattr(io, "sha256_of", read)
+        assert faults(tmp_path) == ()
+    os.utime(room / "facts.json")
+    seen = []
+    with monkeypatch.context() as watched:
+        original = io.sha256_of
+        watched.setattr(io, "sha256_of", lambda path: seen.append(path.name) or original(path))
+        assert faults(tmp_path) == ()  # the same content: nothing to do, and the new time stamp is noted
+    assert "facts.json" in seen and "cells.parquet" not in seen
+    monkeypatch.setattr(io, "sha256_of", read)
+    assert faults(tmp_path) == ()
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"files": 3}', '{"files": {"a": [1]}}', "null"])
+def test_stamps_that_cannot_be_read_are_noted_again(room, tmp_path, text):
+    path = stamps.place(tmp_path / "results", "s", "base")
+    kept = stamps.load(path)
+    path.write_text(text)
+    assert stamps.load(path) is None and faults(tmp_path) == () and stamps.load(path) == kept
+    flip(room / "facts.json")
+    path.write_text(text)
+    assert len(faults(tmp_path)) == 1
+
+
+def earlier(root, *stages):
+    """Stages as version 1 wrote them: without seal, and without the scene of inputs."""
+    for stage in stages:
+        path = root / "results/s" / stage / MANIFEST
+        document = json.loads(path.read_text()) | {"schema": EARLIER_SCHEMA}
+        del document["seal"]
+        for name, facts in document["inputs"].items():
+            del facts["scene"]
+            facts["manifest_sha256"] = io.sha256_of(root / "results/s" / name / MANIFEST)
+        path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n")
+        stamps.place(root / "results", "s", stage).unlink()
+
+
+def test_an_earlier_schema_is_refused_with_what_to_do_and_upgraded(room, tmp_path):
+    earlier(tmp_path, "capture", "base")
+    stamp = (room / MANIFEST).stat().st_mtime_ns
+    with pytest.raises(InputError, match=r"this version reads 'iif.stage/2'. `python -m workflow upgrade s`"):
+        faults(tmp_path)
+    assert faults(tmp_path, mark="3" * 16) == ("",)
+    with pytest.raises(InputError, match="python -m workflow upgrade"):
+        StageReader(room, "base", "s")
+    done = list(upgrade(tmp_path / "results"))
+    assert [upgraded for upgraded, _ in done] == [True, True] and list(upgrade(tmp_path / "results")) == []
+    assert list(damaged(tmp_path)) == [] and faults(tmp_path) == ()
+    assert (room / MANIFEST).stat().st_mtime_ns == stamp  # so that Snakemake does not take it for new
+
+
+def test_an_upgrade_seals_nothing_that_is_damaged_and_goes_on_where_it_was_killed(room, tmp_path):
+    earlier(tmp_path, "capture", "base")
+    assert next(upgrade(tmp_path / "results"))[0]  # the capture; then it is killed
+    assert [upgraded for upgraded, _ in upgrade(tmp_path / "results")] == [True]
+    earlier(tmp_path, "capture", "base")
+    flip(room / "facts.json")
+    first, second = upgrade(tmp_path / "results")
+    assert first[0] and not second[0] and "facts.json: its content changed" in second[1] and "--forcerun base" in second[1]
+    shutil.rmtree(tmp_path / "results/s/capture")
+    (only,) = upgrade(tmp_path / "results")
+    assert not only[0]

@@ -1,0 +1,93 @@
+"""Manifests: what a finished stage or a deliverable wrote, as sealed JSON of one possible spelling.
+
+The text is that of `json.dumps(document, indent=1, sort_keys=True)`, and its key `seal` is the SHA-256 of the text without that
+key. A file that differs from the spelling of its own content in any byte, or whose seal is not that of the rest, was changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from workflow.artifacts.files import write_atomically
+
+MANIFEST = "manifest.json"
+STAGE_SCHEMA = "iif.stage/2"
+EARLIER_SCHEMA = "iif.stage/1"
+"""Without a seal and without the scene of inputs; `workflow.artifacts.upgrade` brings it up to date."""
+SCENE_SCHEMA = "iif.scene/2"
+EARLIER_SCENE_SCHEMA = "iif.scene/1"
+
+
+class Broken(ValueError):
+    """A manifest is not what was written; the message says what is wrong, without the path."""
+
+
+def text_of(document: dict[str, Any]) -> str:
+    """Return the text of a manifest with its seal; a seal that `document` has is replaced.
+
+    Raises:
+        ValueError: a number that is not finite.
+    """
+    body = {key: value for key, value in document.items() if key != "seal"}
+    return _spelled({**body, "seal": hashlib.sha256(_spelled(body).encode()).hexdigest()})
+
+
+def _spelled(document: dict[str, Any]) -> str:
+    return json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
+
+
+def write(path: Path, document: dict[str, Any]) -> None:
+    """Write a manifest with its seal, in one piece."""
+    text = text_of(document)
+    write_atomically(path, lambda temporary: temporary.write_text(text))
+
+
+def parse(data: bytes, schema: str) -> dict[str, Any]:
+    """Return the content of a manifest.
+
+    Args:
+        data: of the file.
+        schema: that this version reads.
+
+    Raises:
+        Broken: it is no JSON object, has another schema, was changed since it was written, or lists no files.
+    """
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise Broken(f"not readable as JSON ({error})") from None
+    if not isinstance(document, dict):
+        raise Broken(f"not readable as JSON (an object is needed, found {type(document).__name__})")
+    found = document.get("schema")
+    if found != schema:
+        older = found in (EARLIER_SCHEMA, EARLIER_SCENE_SCHEMA)
+        hint = "; `python -m workflow upgrade` brings artefacts of earlier versions up to date" if older else ""
+        raise Broken(f"schema {found!r}, this version reads {schema!r}{hint}")
+    try:
+        sealed = text_of(document).encode()
+    except (ValueError, RecursionError):
+        sealed = b""
+    if sealed != data:
+        raise Broken("its content changed since it was written (its seal does not fit)")
+    files = document.get("files")
+    if not isinstance(files, dict) or not all(
+        isinstance(facts, dict) and {"sha256", "bytes"} <= set(facts) for facts in files.values()
+    ):
+        raise Broken("it lists no files with their hashes")
+    return document
+
+
+def read(path: Path, schema: str = STAGE_SCHEMA) -> dict[str, Any]:
+    """Return the content of a manifest.
+
+    Raises:
+        Broken: as `parse`, or it cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise Broken(f"not readable ({error.strerror})") from None
+    return parse(data, schema)

@@ -1,0 +1,191 @@
+"""Whether what a plan takes for finished is what was written: compared when Snakemake plans, by time stamps where they suffice.
+
+`workflow.artifacts.verify` compares every content, whatever the time stamps say.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from iif_core.errors import InputError
+from workflow.artifacts import files as io
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts import stamps
+from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST, SCENE_SCHEMA, STAGE_SCHEMA
+from workflow.registry import SHARED
+
+MOST_LINES = 3
+"""Faults of one folder that are told; the number of the others is added."""
+
+
+@lru_cache(None)
+def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tuple[str, ...]:
+    """Return what is wrong with a finished stage, a line for each file; nothing if it is not finished.
+
+    Args:
+        results: folder of the results.
+        scene, stage: which.
+        fingerprint: under which it is wanted. For one that was made under another, as after a change of settings, the line is
+            empty: it is to be made again, and there is nothing to tell.
+
+    Raises:
+        InputError: it is of an earlier schema and would otherwise be what is wanted.
+    """
+    folder, noted = results / scene / stage, stamps.place(results, scene, stage)
+    if not (folder / MANIFEST).is_file():
+        finished = noted.is_file()  # a job that starts removes it
+        return (f"{folder if not folder.is_dir() else folder / MANIFEST}: missing, although it was finished",) if finished else ()
+    return tuple(_faults(folder, noted, STAGE_SCHEMA, scene, stage, fingerprint))
+
+
+def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fingerprint: str) -> Iterator[str]:
+    known = stamps.load(noted)
+    own = known is not None and (known.scene, known.stage) == (scene, stage)
+    different = stamps.touched(folder, known) if known and own else None
+    if known and different == []:
+        yield from _broken_chain(folder, known.inputs) if known.fingerprint == fingerprint else [""]
+        return
+    try:
+        document = manifests.read(folder / MANIFEST, schema)
+    except manifests.Broken as error:
+        yield "" if _is_earlier(folder, fingerprint) else f"{folder / MANIFEST}: {error}"
+        return
+    found = document.get("scene"), document.get("stage", stage)
+    if found != (scene, stage):
+        yield f"{folder / MANIFEST}: it belongs to stage {found[1]} of scene {found[0]}, and was put here"
+        return
+    if document.get("fingerprint") != fingerprint:
+        put = known and own and known.fingerprint == fingerprint
+        yield f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here" if put else ""
+        return
+    problems = list(wrong_files(folder, document, None if different is None or MANIFEST in different else different))
+    yield from problems
+    if not problems:
+        stamps.note(noted, folder, document)
+        yield from _broken_chain(folder, {k: (v.get("scene", ""), v.get("manifest_sha256", "")) for k, v in _inputs(document)})
+
+
+def _is_earlier(folder: Path, fingerprint: str) -> bool:
+    """Whether the manifest is of the earlier schema, and of other settings than are wanted; of the same settings, it is refused."""
+    try:
+        document = json.loads((folder / MANIFEST).read_bytes())
+        if document["schema"] != EARLIER_SCHEMA:
+            return False
+        same = document["fingerprint"] == fingerprint
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
+    if same:
+        raise InputError(
+            f"{folder / MANIFEST}: schema {EARLIER_SCHEMA!r}, this version reads {STAGE_SCHEMA!r}. `python -m workflow upgrade"
+            f" {folder.parent.name}` checks what is there and brings it up to date; or move {folder.parent} away to make it again"
+        )
+    return True
+
+
+def _inputs(document: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    inputs = document.get("inputs", {})
+    return list(inputs.items()) if isinstance(inputs, dict) else []
+
+
+def wrong_files(folder: Path, document: dict[str, Any], names: list[str] | None = None) -> Iterator[str]:
+    """Yield a line for each listed file that is gone or has another content.
+
+    Args:
+        folder: with the files.
+        document: its manifest.
+        names: which to look at; None = all.
+    """
+    for name, facts in sorted(document["files"].items()):
+        if names is not None and name not in names:
+            continue
+        path = folder / name
+        try:
+            io.inside(folder, name)
+        except InputError as error:
+            yield str(error)
+            continue
+        if not path.is_file():
+            yield f"{path}: missing"
+        elif path.stat().st_size != facts["bytes"]:
+            yield f"{path}: {path.stat().st_size} bytes on disk, {facts['bytes']} were written"
+        elif io.sha256_of(path) != facts["sha256"]:
+            yield f"{path}: its content changed since it was written (sha256 differs)"
+
+
+def _broken_chain(folder: Path, inputs: Any) -> Iterator[str]:
+    """Yield a line if a stage that is there is not the one from which this one was made."""
+    results = folder.parent.parent
+    for name, (scene, digest) in inputs.items():
+        stage = name.removeprefix(SHARED)
+        found = _digest_of(results, scene, stage)
+        if found is not None and found != digest:
+            yield f"{folder}: it was made from another {results / scene / stage} than is there now"
+            return
+
+
+def _digest_of(results: Path, scene: str, stage: str) -> str | None:
+    """Return the SHA-256 of the manifest of a stage; None if it is not finished."""
+    path = results / scene / stage / MANIFEST
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    known = stamps.load(stamps.place(results, scene, stage))
+    if known and known.files.get(MANIFEST) == stamps.stamp_of(status):
+        return known.manifest
+    return io.sha256_of(path)
+
+
+@lru_cache(None)
+def deliverable_faults(folder: Path, results: Path, scene: str) -> tuple[str, ...]:
+    """Return what is wrong with `scenes/<scene>`, a line for each file; nothing if there is no such folder."""
+    if not folder.is_dir():
+        return ()
+    noted = stamps.place(results, scene, stamps.DELIVERABLE)
+    known = stamps.load(noted)
+    if known and known.scene == scene and not stamps.touched(folder, known):
+        return ()
+    try:
+        document = manifests.read(folder / MANIFEST, SCENE_SCHEMA)
+    except manifests.Broken as error:
+        problem = str(error) if (folder / MANIFEST).is_file() else "missing"
+        return (f"{folder / MANIFEST}: {problem}",)
+    if document.get("scene") != scene:
+        return (f"{folder / MANIFEST}: it belongs to scene {document.get('scene')}, and was put here",)
+    problems = tuple(wrong_files(folder, document))
+    if not problems:
+        stamps.note(noted, folder, document)
+    return problems
+
+
+@lru_cache(None)
+def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[str, ...]:
+    """Return what is wrong with a folder that is a copy of a stage, a line for each file; nothing if one of both is not there."""
+    source = results / scene / stage / MANIFEST
+    if not folder.is_dir() or not source.is_file():
+        return ()
+    noted = stamps.place(results, scene, f"{stage} {folder.name}")
+    known = stamps.load(noted)
+    if known and known.manifest == _digest_of(results, scene, stage) and not stamps.touched(folder, known):
+        return ()
+    try:
+        document = manifests.read(source)
+    except manifests.Broken:
+        return ()  # told of the stage itself
+    problems = tuple(wrong_files(folder, document))
+    if not problems:
+        stamps.note(noted, folder, document, source)
+    return problems
+
+
+def told(lines: tuple[str, ...], again: str) -> str:
+    """Return the faults of a folder in one text for people, with what is done about them."""
+    lines = tuple(line for line in lines if line)
+    if not lines:
+        return ""
+    shown = [*lines[:MOST_LINES], *([f"and {len(lines) - MOST_LINES} more"] if len(lines) > MOST_LINES else [])]
+    return "\n".join(shown) + f"\n{again}"
