@@ -15,6 +15,7 @@ grid <study>` draws a sheet of pictures, `python -m workflow relighting` keeps t
 from __future__ import annotations
 
 import argparse
+import errno
 import logging
 import signal
 import sys
@@ -151,6 +152,34 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
+CAUSES = {
+    errno.ENOSPC: "the disk is full; make room (results/ of scenes that are no longer needed), then run the same command again",
+    errno.EDQUOT: "your quota of the disk is used up; make room, then run the same command again",
+    errno.EIO: "the disk reports an error; look at the system's log, and check with `snakemake verify` when it is repaired",
+    errno.EROFS: "the disk is mounted read-only; remount it, or work in a folder on another disk",
+    errno.EACCES: "not allowed for you; give yourself the right to write there",
+    errno.EPERM: "not allowed for you; give yourself the right to write there",
+    errno.EMFILE: "too many open files; raise the limit (`ulimit -n 4096`), then run the same command again",
+    errno.ESTALE: "the network disk lost the file; run the same command again",
+    errno.ENOTDIR: "a file is in the place of a folder; move it away, then run the same command again",
+    errno.EEXIST: "a file is in the place of a folder; move it away, then run the same command again",
+    errno.EISDIR: "a folder is in the place of a file; move it away, then run the same command again",
+    errno.ENAMETOOLONG: "the name is too long for this disk; give the scene or its views shorter names",
+}
+"""What to do about errors of the machine, which no code of ours can mend."""
+
+
+def _of_the_machine(error: OSError) -> str:
+    """Return a sentence on an error of the operating system: the file, what is wrong, and what to do."""
+    place = f"{error.filename}: " if error.filename else ""
+    words = CAUSES.get(error.errno or 0)
+    return (
+        f"{place}{words}"
+        if words
+        else f"{place}{error.strerror or error} (if the file should be there, please report it with the log)"
+    )
+
+
 def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) -> int:
     """Call `run`; log an error, record it in `state`, and return the exit code."""
     if state:
@@ -161,6 +190,9 @@ def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) 
     except InputError as error:
         logging.getLogger("error").error("%s", error)
         reason = str(error)
+    except OSError as error:
+        reason = _of_the_machine(error)
+        logging.getLogger("error").error("%s", reason, exc_info=error.errno not in CAUSES)
     except Exception as error:
         logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
         reason = f"{type(error).__name__}: {error} (a bug: please report it with the log)"

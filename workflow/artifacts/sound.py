@@ -70,7 +70,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
 
 
 def _is_earlier(folder: Path, fingerprint: str) -> bool:
-    """Whether the manifest is of the earlier schema, and of other settings than are wanted; of the same settings, it is refused."""
+    """Whether the manifest is of the earlier schema and of other settings than are wanted; one of the same is refused."""
     try:
         document = json.loads((folder / MANIFEST).read_bytes())
         if document["schema"] != EARLIER_SCHEMA:
