@@ -129,3 +129,34 @@ def test_a_damaged_or_older_file_of_digests_is_made_anew(here):
         input_digests.CACHE.write_text(text)
         forget()
         assert input_digests.digests([path]) == first
+
+
+def test_a_time_stamp_that_is_set_back_hides_nothing(here):
+    folder, read = here
+    path = write(folder / "f", LARGE, 10**18)
+    first = input_digests.digests([path])
+    input_digests.remember([path])
+    write(path, EDITED, 10**18)  # the same size and the same time
+    forget()
+    assert input_digests.digests([path]) != first
+    replacement = write(folder / "g", LARGE, 10**18)
+    os.replace(replacement, path)  # another file of the same size and time in its place
+    forget()
+    assert input_digests.digests([path]) not in (first, []) and read[-1] == "f"
+
+
+def test_all_is_read_again_on_demand(here, monkeypatch):
+    """Also where `stat` says nothing, as on a disk that has lost a bit."""
+    folder, read = here
+    paths = [write(folder / name, LARGE) for name in ("a", "b")]
+    first = input_digests.digests(paths)
+    input_digests.remember(paths[:1])
+    forget()
+    read.clear()
+    assert input_digests.rehash() == [] and sorted(set(read)) == ["a", "b"] and input_digests.digests(paths) == first
+    stamps = {path: input_digests._stamp(path) for path in paths}
+    write(paths[0], EDITED)
+    monkeypatch.setattr(input_digests, "_stamp", stamps.get)
+    forget()
+    assert input_digests.digests(paths) == first  # nothing is seen
+    assert input_digests.rehash() == [paths[0]] and input_digests.digests(paths) != first

@@ -16,7 +16,7 @@ from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import forecast, native
+from workflow.runtime import forecast, input_digests, native
 from workflow.runtime.job_state import reasons
 from workflow.scene.named import check_overrides
 from workflow.relighting.check import check_relightings
@@ -60,6 +60,18 @@ def or_stop(compute, *arguments):
         stop(error)
 
 
+def inputs_again(asked):
+    """`--config inputs=rehash`: every input file that is known is read whole, also where nothing seems to have changed."""
+    if asked is None or not workflow.is_main_process:
+        return
+    if asked != "rehash":
+        raise InputError(
+            f"--config inputs={asked}: the only value is rehash, which reads every known input file again"
+        )
+    for path in input_digests.rehash():
+        print(f"{path}: its content changed", file=sys.stderr)
+
+
 for place in (".", "results", "scenes", ".snakemake"):
     if os.path.exists(place) and not os.access(place, os.W_OK):
         stop(
@@ -68,19 +80,21 @@ for place in (".", "results", "scenes", ".snakemake"):
         )
 
 
-SCORED = (
+OTHERS = (
     "maps",
     "colour",
-)  # keys of `--config` of score/<scene>, beside those that choose a quality
+    "inputs",
+)  # keys of `--config` beside those that choose a quality: of score/<scene>, and how inputs are compared
 
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
 REQUEST = or_stop(
     choose.read,
-    {key: value for key, value in config.items() if key not in SCORED},
+    {key: value for key, value in config.items() if key not in OTHERS},
     set(workflow.config_settings.overwrite_config or {}),
     workflow.resource_settings.cores,
 )
 QUALITY = REQUEST.quality  # of studies and batches
+or_stop(inputs_again, config.get("inputs"))
 CHOSEN = {}
 
 

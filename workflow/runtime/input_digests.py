@@ -2,9 +2,9 @@
 
 A file of at most `WHOLE` bytes is identified by its content. A larger one (the photographs and meshes of a batch can be hundreds
 of gigabytes) is identified by its size and three samples; the job that reads it anyway records the digest of its whole content
-(`remember`). When the time stamp of such a file changes, its whole content decides: a file that was touched or copied is the
-same, an edited one is different, even if size and samples agree. The digests are kept in `results/.input-digests.json` by path,
-size and time stamp.
+(`remember`). When the size, a time stamp or the inode of such a file changes, its whole content decides: a file that was touched
+or copied is the same, an edited one is different, even if size and samples agree, and even if its time stamp was set back,
+because that changes the time stamp of the inode. The digests are kept in `results/.input-digests.json`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,27 @@ SAMPLE = 1 << 12
 CACHE = Path("results/.input-digests.json")
 
 
+Stamp = tuple[int, int, int, int]
+
+
+def _stamp(path: Path) -> Stamp:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
+
+
 class Known(NamedTuple):
-    """A file as it was last seen: size, time stamp, digest for fingerprints, digest of the whole content ("" = not computed)."""
+    """A file as it was last seen: `stat`, digest for fingerprints, digest of the whole content ("" = not computed)."""
 
     size: int
     mtime_ns: int
+    ctime_ns: int
+    inode: int
     digest: str
     whole: str
+
+    @property
+    def stamp(self) -> Stamp:
+        return self[:4]
 
 
 _known: dict[str, Known] = {}
@@ -50,10 +64,29 @@ def remember(paths: Iterable[Path]) -> None:
     """Record the whole content of large files that a job has just read, except those that changed since their fingerprint."""
     _recall()
     for path in paths:
-        entry, status = _known.get(str(path)), path.stat()
-        if entry and not entry.whole and entry[:2] == (status.st_size, status.st_mtime_ns):
+        entry = _known.get(str(path))
+        if entry and not entry.whole and entry.stamp == _stamp(path):
             _note(path, entry._replace(whole=sha256_of(path)))
     _save()
+
+
+def rehash() -> list[Path]:
+    """Read every known file whole, whatever `stat` says of it, and return those whose content is another than was known."""
+    _recall()
+    changed = []
+    for name, before in list(_known.items()):
+        path = Path(name)
+        if not path.is_file():
+            continue
+        stamp = _stamp(path)
+        now = _look(path, stamp, before)
+        if before.whole == "":
+            now = now._replace(whole=sha256_of(path))
+        if now.digest != before.digest:
+            changed.append(path)
+        _note(path, now)
+    _save()
+    return changed
 
 
 @contextmanager
@@ -69,15 +102,13 @@ def saved_once() -> Iterator[None]:
 
 
 def _digest(path: Path) -> str:
-    status = path.stat()
-    stamp = (status.st_size, status.st_mtime_ns)
-    entry = _known.get(str(path))
-    if entry is None or entry[:2] != stamp:
+    stamp, entry = _stamp(path), _known.get(str(path))
+    if entry is None or entry.stamp != stamp:
         _note(path, entry := _look(path, stamp, entry))
     return entry.digest
 
 
-def _look(path: Path, stamp: tuple[int, int], before: Known | None) -> Known:
+def _look(path: Path, stamp: Stamp, before: Known | None) -> Known:
     if stamp[0] <= WHOLE:
         content = sha256_of(path)
         return Known(*stamp, content, content)
@@ -120,7 +151,10 @@ def _recall() -> None:
 
 def _stored() -> dict[str, Known]:
     try:
-        return {path: Known(*entry) for path, entry in json.loads(CACHE.read_text()).items() if len(entry) == 4}
+        document = json.loads(CACHE.read_text())
+        # Earlier versions kept (size, time stamp, digest, whole): without the rest of the stamp, the content is compared once.
+        entries = {path: [*entry[:2], 0, 0, *entry[2:]] if len(entry) == 4 else entry for path, entry in document.items()}
+        return {path: Known(*entry) for path, entry in entries.items() if len(entry) == len(Known._fields)}
     except (OSError, ValueError, AttributeError, TypeError):
         return {}
 
