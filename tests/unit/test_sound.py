@@ -39,7 +39,7 @@ def finish(root, scene, stage, inputs=(), mark=MARK, value=0.01):
 
 
 def faults(root, scene="s", stage="base", mark=MARK):
-    sound.stage_faults.cache_clear()
+    sound.forget()
     return sound.stage_faults(root / "results", scene, stage, mark)
 
 

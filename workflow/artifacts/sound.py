@@ -127,6 +127,7 @@ def _broken_chain(folder: Path, inputs: Any) -> Iterator[str]:
             return
 
 
+@lru_cache(None)
 def _digest_of(results: Path, scene: str, stage: str) -> str | None:
     """Return the SHA-256 of the manifest of a stage; None if it is not finished."""
     path = results / scene / stage / MANIFEST
@@ -180,6 +181,12 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     if not problems:
         stamps.note(noted, folder, document, source)
     return problems
+
+
+def forget() -> None:
+    """Compare anew what was compared: the results are kept for one plan."""
+    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of):
+        compared.cache_clear()
 
 
 def told(lines: tuple[str, ...], again: str) -> str:
