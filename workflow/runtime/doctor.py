@@ -181,7 +181,7 @@ def check_kernel_cache() -> Iterator[Finding]:
 def check_optional() -> Iterator[Finding]:
     """Report optional tools."""
     validator = REPOSITORY / ".node/node_modules/gltf-validator"
-    advice = "optional, lets the tests check scene.glb: `make validator` (needs npm)"
+    advice = "optional, lets the tests check scene.glb: `make node` (needs npm)"
     yield Finding("ok", "gltf-validator", *((str(validator), "") if validator.is_dir() else ("not found", advice)))
     oidn = find_spec("pyoidn") is not None
     advice = "rendered scenes and re-renderings are denoised with it: `bash envs/setup.sh`, or set denoise: false"
@@ -209,13 +209,15 @@ def _tried(what: str, code: str, answer: str, success: str, llvm: str = "") -> F
     if child.returncode == 0:
         return Finding("FAIL", what, f"computed {child.stdout.strip()!r} instead of {answer!r}", INSTALL)
     errors = [line for line in child.stderr.splitlines() if re.search(r"error|cannot|not be", line, re.IGNORECASE)]
-    reason = (errors or child.stderr.strip().splitlines() or [""])[-1].strip()[:300]
+    # Dr.Jit hides what it could not load behind an error of its own.
+    lacking = [line for line in errors if "cannot open shared object" in line]
+    reason = (lacking or errors or child.stderr.strip().splitlines() or [""])[-1].strip()[:300]
     if child.returncode < 0:
         first = (errors or [reason])[0].strip()[:120]
         reason = f"the process was ended by {signal.Signals(-child.returncode).name}" + (f" ({first})" if first else "")
     advice = INSTALL
     if library := re.search(r"(lib[\w+.-]+\.so[.\d]*): cannot open shared object", reason):
-        packages = "libgl1 libegl1 libx11-6 libusb-1.0-0"
+        packages = "libgl1 libegl1 libx11-6 libatomic1 libusb-1.0-0"
         advice = f"install the system library {library[1]} (Debian and Ubuntu: {packages})"
     return Finding("FAIL", what, reason or f"ended with code {child.returncode}", advice)
 
