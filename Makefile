@@ -12,7 +12,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all node doctor lint format lock docs clean always plan relight bench compare score results \
+.PHONY: help setup scenes verify test test-all node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -30,7 +30,8 @@ help:
 	@echo 'make doctor           what this machine offers and lacks'
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
-	@echo 'make lock             resolve envs/requirements.in again (needs uv)'
+	@echo 'make lock             resolve envs/*.in again (needs uv); lock-torch INDEX=<index> accepts more builds of torch'
+	@echo 'make licences | sbom  THIRD_PARTY.md | the bill of materials, sbom.json (need uv)'
 	@echo 'make docs             the documentation as a site, in site/'
 	@echo 'make clean            remove caches; results/ and scenes/ stay'
 
@@ -111,9 +112,24 @@ OUTSIDE_LOCK := torch triton cuda-bindings cuda-pathfinder cuda-toolkit nvidia-c
   nvidia-cuda-nvrtc nvidia-cuda-runtime nvidia-cudnn-cu13 nvidia-cufft nvidia-cufile nvidia-curand nvidia-cusolver \
   nvidia-cusparse nvidia-cusparselt-cu13 nvidia-nccl-cu13 nvidia-nvjitlink nvidia-nvshmem-cu13 nvidia-nvtx
 
+COMPILE := uv pip compile --quiet --generate-hashes --python-version 3.11 --python-platform x86_64-manylinux_2_36
 lock:
-	cd envs && uv pip compile --generate-hashes --python-version 3.11 --python-platform x86_64-manylinux_2_36 \
-	  $(addprefix --no-emit-package ,$(OUTSIDE_LOCK)) requirements.in -o requirements.lock
+	cd envs && $(COMPILE) $(addprefix --no-emit-package ,$(OUTSIDE_LOCK)) requirements.in -o requirements.lock
+	cd envs && $(COMPILE) --constraint requirements.lock requirements-cluster.in -o requirements-cluster.txt
+	cd envs && $(COMPILE) docs.in -o docs.txt
+	uv run --quiet envs/lock.py
+
+# More builds of torch that setup.sh accepts: those of another index, or of a folder of wheels.
+lock-torch:
+	@test -n "$(INDEX)" || { echo 'lock-torch: say INDEX=<address of a package index, or a folder of wheels>' >&2; exit 1; }
+	uv run --quiet envs/lock.py --index "$(INDEX)"
+
+# Licences of everything that the locks name; then the bill of materials of a release (docs/development/releasing.md).
+licences:
+	uv run --quiet envs/third_party.py
+
+sbom:
+	uv run --quiet envs/third_party.py --sbom sbom.json
 
 # The site has an environment of its own: none of its packages is needed to run the workflow.
 docs: .venv-docs/.made
@@ -121,7 +137,7 @@ docs: .venv-docs/.made
 
 .venv-docs/.made: envs/docs.txt
 	$${PYTHON:-python3} -m venv .venv-docs
-	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r envs/docs.txt
+	.venv-docs/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r envs/docs.txt
 	touch $@
 
 clean:

@@ -3,10 +3,13 @@
 What setup.sh does before pip is tried in copies of the checkout, with stand-ins for python and df on PATH.
 """
 
+import hashlib
 import os
+import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from email import message_from_string
 
 import pytest
@@ -54,7 +57,7 @@ def last_line(text):
     return text.strip().splitlines()[-1]
 
 
-@pytest.mark.parametrize("script", ["envs/setup.sh", ".ci/run"])
+@pytest.mark.parametrize("script", ["envs/setup.sh", "envs/image-check.sh", ".ci/run"])
 def test_scripts_are_executable_bash(script, repository, clean_environment):
     assert os.access(repository / script, os.X_OK)
     assert run(["bash", "-n", script], repository, clean_environment).returncode == 0
@@ -110,6 +113,121 @@ def test_small_disk(copy, stand_in, clean_environment):
     result = run(["bash", "envs/setup.sh"], copy, clean_environment, PYTHON=sys.executable)
     assert result.returncode == 1
     assert "1024 MB of disk are free" in result.stderr and "4000 are needed" in result.stderr
+
+
+def wheel(folder, name, version, tag="py3-none-any"):
+    """Write the smallest package that pip installs; return the file and its SHA-256."""
+    about = f"{name}-{version}.dist-info"
+    path = folder / f"{name}-{version}-{tag}.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{about}/METADATA", f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        archive.writestr(f"{about}/WHEEL", f"Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: {tag}\n")
+        archive.writestr(f"{about}/RECORD", "")
+    return path, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def empty_environment(tmp_path_factory):
+    """A .venv with nothing but pip, to be copied: making one takes seconds."""
+    folder = tmp_path_factory.mktemp("empty") / ".venv"
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    return folder
+
+
+@pytest.fixture
+def index(copy, empty_environment, tmp_path, stand_in, clean_environment):
+    """`index("+cpu", listed=True, sha256=...)`: a set-up checkout whose lock is one package, and pip's only source, a folder with
+    that package and a torch; returns what setup.sh is to be run with."""
+    pinned = re.search(r"^torch==(\S+)", (copy / "envs/requirements.in").read_text(), re.M)[1]
+    python = f"cp{sys.version_info[0]}{sys.version_info[1]}"
+    tag = f"{python}-{python}-linux_{os.uname().machine}"
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    environment = {k: v for k, v in clean_environment.items() if not k.startswith("PIP_")}
+    environment |= {"PIP_CONFIG_FILE": os.devnull, "PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheels), "PIP_NO_CACHE_DIR": "1"}
+    stand_in("df", "echo header; echo /dev/x 99999999 0 20971520 9% /\n")
+
+    def make(suffix, listed, sha256=None, extra=""):
+        _, of_package = wheel(wheels, "iif_tiny", "1")
+        (copy / "envs/requirements.lock").write_text(f"iif-tiny==1 --hash=sha256:{of_package}\n")
+        path, of_torch = wheel(wheels, "torch", f"{pinned}{suffix}", tag)
+        sha256 = sha256 or of_torch
+        row = f"#   {sha256}  3000000  9000000 {path.name}\n" if listed else ""
+        (copy / "envs/torch.lock").write_text(f"torch=={pinned} --hash=sha256:{sha256}\n{row}")
+        (copy / "envs/sizes.tsv").write_text(f"requirements.lock\t1\t10\t20\n{extra}")
+        (copy / ".venv").symlink_to(empty_environment)
+        # As if another lock had been installed: brought up to date in place.
+        (empty_environment / ".setup").write_text(f"lock torch {copy}\nchecked\n")
+        subprocess.run([empty_environment / "bin/python", "-m", "pip", "uninstall", "-qy", "torch"], env=environment, check=True)
+        return environment
+
+    return make
+
+
+def installed_torch(copy):
+    return [path.name for path in copy.glob(".venv/lib/python*/site-packages/torch-*.dist-info")]
+
+
+def test_torch_is_installed_by_its_hash_and_what_is_downloaded_is_said_first(copy, index):
+    result = run(["bash", "envs/setup.sh"], copy, index("+cpu", listed=True))
+    said = [line for line in result.stderr.splitlines() if line.startswith("setup: ")]
+    assert "1 packages (10 MB) and torch 2.13.0+cpu (3 MB); 532 MB of disk are needed, 20" in said[0]
+    assert said[1:3] == ["setup: installing the locked packages ...", "setup: installing torch 2.13.0+cpu ..."]
+    assert installed_torch(copy) == ["torch-2.13.0+cpu.dist-info"]
+    assert said[-1] == "setup: the environment is installed but does not work: see FAIL above"  # the packages are not there
+
+
+def test_a_torch_with_another_hash_is_refused(copy, index):
+    result = run(["bash", "envs/setup.sh"], copy, index("+cpu", listed=True, sha256="0" * 64))
+    assert result.returncode == 1
+    assert "torch==2.13.0+cpu is not a file that the lock names, by its SHA-256" in last_line(result.stderr)
+    assert not installed_torch(copy) and not (copy / ".venv/.setup").exists()
+
+
+def test_a_torch_that_pip_does_not_foresee_needs_a_hash_too(copy, index):
+    """`pip index` is experimental: without its answer nothing else gets in."""
+    environment = index("+cpu", listed=True, sha256="0" * 64)
+    python = copy / ".venv/bin/python"
+    real = os.readlink(python)
+    python.unlink()
+    python.write_text(f'#!/bin/bash\ncase "$*" in *"pip index"*) exit 1;; esac\nexec -a "$0" {real} "$@"\n')
+    python.chmod(0o755)
+    try:
+        result = run(["bash", "envs/setup.sh"], copy, environment)
+    finally:
+        python.unlink()
+        python.symlink_to(real)
+    assert "(its size is not known)" in result.stderr
+    assert "is not a file that the lock names, by its SHA-256" in last_line(result.stderr)
+    assert not installed_torch(copy)
+
+
+def test_the_cuda_builds_need_more_and_all_of_it_by_hash(copy, index, tmp_path):
+    environment = index("", listed=True, extra="torch-cuda.lock\t1\t2000\t4000\n")
+    _, right = wheel(tmp_path / "wheels", "iif_cuda", "1")
+    (copy / "envs/torch-cuda.lock").write_text(f"iif-cuda==1 --hash=sha256:{right[::-1]}\n")
+    result = run(["bash", "envs/setup.sh"], copy, environment)
+    assert "torch 2.13.0 (3 MB) with 1 packages for CUDA (2000 MB); 6532 MB of disk are needed" in result.stderr
+    assert "installing what torch needs for CUDA failed: iif-cuda==1 is not a file that the lock names" in last_line(
+        result.stderr
+    )
+
+
+def test_a_build_that_is_not_listed_is_refused_unless_it_is_chosen(copy, index):
+    """Before anything is downloaded; a choice is told that it comes without a hash."""
+    environment = index("+cu126", listed=False)
+    result = run(["bash", "envs/setup.sh"], copy, environment)
+    assert result.returncode == 1 and len(result.stderr.strip().splitlines()) == 1
+    for text in (
+        "offers torch 2.13.0+cu126, which envs/torch.lock does not list",
+        "make lock-torch",
+        "TORCH=torch==2.13.0+cu126",
+    ):
+        assert text in result.stderr
+    (copy / ".venv/.setup").write_text(f"lock torch {copy}\nchecked\n")
+    result = run(["bash", "envs/setup.sh"], copy, environment, TORCH="torch==2.13.0+cu126")
+    assert "envs/torch.lock does not list torch 2.13.0+cu126 for this Python: it is installed without a hash" in result.stderr
+    assert installed_torch(copy) == ["torch-2.13.0+cu126.dist-info"]
 
 
 def test_no_network(copy, stand_in, clean_environment):
@@ -182,6 +300,8 @@ def test_doctor_survives_and_names_an_abort():
 
 def test_doctor_names_a_wrong_result_and_a_missing_system_library():
     assert "computed '2' instead of '1'" in doctor._tried("x", "print(2)", "1", "").found
+    hidden = "import sys; sys.exit('ImportError: libatomic.so.1: cannot open shared object file\\nNameError: _drjit_ext')"
+    assert "libatomic.so.1 (Debian and Ubuntu: libgl1" in doctor._tried("drjit", hidden, "1", "").advice
     error = "raise ImportError('libGL.so.1: cannot open shared object file: No such file or directory')"
     assert "libGL.so.1 (Debian and Ubuntu: libgl1" in doctor._tried("x", error, "1", "").advice
 
