@@ -20,6 +20,7 @@ import logging
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -161,6 +162,9 @@ CAUSES = {
     errno.EPERM: "not allowed for you; give yourself the right to write there",
     errno.EMFILE: "too many open files; raise the limit (`ulimit -n 4096`), then run the same command again",
     errno.ESTALE: "the network disk lost the file; run the same command again",
+    errno.EINTR: "a call was interrupted; run the same command again",
+    errno.EFBIG: "the file would be larger than is allowed; raise the limit (`ulimit -f unlimited`), or use another disk",
+    errno.ENOMEM: "not enough memory; end other programs, then run the same command again",
     errno.ENOTDIR: "a file is in the place of a folder; move it away, then run the same command again",
     errno.EEXIST: "a file is in the place of a folder; move it away, then run the same command again",
     errno.EISDIR: "a folder is in the place of a file; move it away, then run the same command again",
@@ -180,13 +184,15 @@ def _of_the_machine(error: OSError) -> str:
     )
 
 
-def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) -> int:
+def _guarded(what: str, run: Callable[[], object], state: JobState | None = None) -> int:
     """Call `run`; log an error, record it in `state`, and return the exit code."""
-    if state:
-        state.started()
     code = 1
     try:
+        if state:
+            state.started()
         run()
+        if state:
+            state.done()
     except InputError as error:
         logging.getLogger("error").error("%s", error)
         reason = str(error)
@@ -200,32 +206,44 @@ def _guarded(what: str, run: Callable[[], None], state: JobState | None = None) 
         logging.getLogger("error").error("%s was interrupted", what)
         reason, code = INTERRUPTED, 128 + signal.SIGINT
     else:
-        if state:
-            state.done()
         return 0
     if state:
-        state.failed(reason)
+        with suppress(OSError):  # a full disk has been told of
+            state.failed(reason)
     return code
 
 
 def _run_stage(arguments: argparse.Namespace) -> int:
-    from workflow.runtime.job import run_stage
+    from workflow.artifacts import locks
+    from workflow.artifacts.files import write_atomically
+    from workflow.runtime.job import configure_logging, run_stage
     from workflow.runtime.job_state import JobState
     from workflow.scene.named import check_overrides
     from workflow.settings import scene_origin
 
     stage, scene = arguments.command, arguments.scene
-    if _guarded(f"{stage} of {scene}", lambda: scene_origin(scene)):
+    what, state = f"{stage} of {scene}", JobState(scene, stage, arguments.fingerprint)
+    if _guarded(what, lambda: scene_origin(scene)):
         return 1  # no folder is made for a scene that does not exist
-    note = Path("results") / scene / "benchmarks" / f"{stage}.threads"
-    note.parent.mkdir(parents=True, exist_ok=True)
-    note.write_text(f"{arguments.threads}\n")
 
     def run() -> None:
+        note = Path("results") / scene / "benchmarks" / f"{stage}.threads"
+        write_atomically(note, lambda path: path.write_text(f"{arguments.threads}\n"))
         check_overrides(stage, scene, arguments.quality)
         run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint)
 
-    return _guarded(f"{stage} of {scene}", run, JobState(scene, stage, arguments.fingerprint))
+    with ExitStack() as held:
+
+        def claim() -> None:
+            try:
+                held.enter_context(locks.alone(Path("results"), scene, stage))
+            except InputError as error:
+                state.failed(str(error))
+                raise
+
+        if _guarded(what, claim):
+            return 1
+        return _guarded(what, lambda: configure_logging(arguments.log)) or _guarded(what, run, state)
 
 
 def _batch(arguments: argparse.Namespace) -> int:
@@ -280,7 +298,11 @@ def main() -> int:
     from workflow.runtime.job import configure_logging
     from workflow.runtime.job_state import JobState
 
-    configure_logging(arguments.log)
+    log = None if arguments.command in STAGES else arguments.log  # that of a stage belongs to the process that makes it
+    if _guarded("the log", lambda: configure_logging(log)):
+        return 1
+    if arguments.command in STAGES:
+        return _run_stage(arguments)
     if arguments.command == "study":
         from workflow.studies.table import keep_rows, write_study
 
@@ -346,7 +368,7 @@ def main() -> int:
         from workflow.costs.refit import refit
 
         return _guarded("costs", lambda: print("\n".join(refit(arguments.results))))
-    return _run_stage(arguments)
+    raise AssertionError(f"command {arguments.command} is not written")
 
 
 if __name__ == "__main__":

@@ -448,7 +448,7 @@ def test_publishing_again_replaces(toy, monkeypatch):
 
 def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
     monkeypatch.chdir(toy)
-    monkeypatch.setattr(publish, "place", lambda source, target: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr(publish, "copy", lambda source, target: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         publish.run(FakeJob("publish", toy))
     assert (toy / "scenes/toy/manifest.json").is_file() and not list((toy / "scenes").glob(".*"))
@@ -457,7 +457,7 @@ def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
 def test_editing_the_deliverable_does_not_reach_the_results(toy, tmp_path):
     source, copy = tmp_path / "plan.yaml", tmp_path / "deep" / "plan.yaml"
     source.write_text("one")
-    publish.place(source, copy)
+    publish.copy(source, copy)
     copy.write_text("two")
     assert source.read_text() == "one"
 

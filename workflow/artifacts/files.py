@@ -1,11 +1,15 @@
-"""Atomic writes, hashes, and the two data formats (EXR, Parquet) as plain dictionaries of arrays."""
+"""Writes that survive a power cut, hashes, and the two data formats (EXR, Parquet) as plain dictionaries of arrays."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 import json
 import os
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,23 +39,102 @@ def inside(folder: Path, name: str) -> Path:
     return path
 
 
-def write_atomically(path: Path, write: Callable[[Path], None]) -> None:
-    """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True) -> None:
+    """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file, and
+    after a power cut `path` has its old content or the new one.
+
+    Args:
+        path: of the file; folders that lack are made.
+        write: writes the content to the path that it is given.
+        settled: flush the folder as well, so that the new content is there after a power cut. A caller that writes many files
+            flushes each folder once instead (`flush_folders`).
+
+    Raises:
+        OSError: with the name of the file, whatever part of the work failed.
+    """
+    with named(path):
+        make_folder(path.parent, settled)
+        temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+        try:
+            write(temporary)
+            _flush(temporary)
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        if settled:
+            flush_folder(path.parent)
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Add the name of a file to errors of the operating system that have none, such as those of writing and flushing."""
     try:
-        write(temporary)
-        with open(temporary, "rb") as handle:
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(path)
+        raise
 
 
-def write_exr(path: Path, channels: dict[str, np.ndarray], attributes: dict[str, Any] | None = None) -> dict[str, str]:
+def copy(source: Path, destination: Path) -> None:
+    """Copy the content of a file as `write_atomically`; the caller flushes the folder."""
+    write_atomically(destination, lambda temporary: _copy(source, temporary), settled=False)
+
+
+def _copy(source: Path, temporary: Path) -> None:
+    shutil.copyfile(source, temporary)
+
+
+def _flush(path: Path) -> None:
+    with open(path, "rb") as handle:
+        os.fsync(handle.fileno())
+
+
+def make_folder(folder: Path, settled: bool = True) -> None:
+    """Make a folder and those above it that lack; if `settled`, they are there after a power cut."""
+    lacking = [place for place in (folder, *folder.parents) if not place.exists()] if settled else []
+    folder.mkdir(parents=True, exist_ok=True)
+    for place in lacking:
+        flush_folder(place.parent)
+
+
+UNFLUSHED = (errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF)
+"""What disks answer that cannot flush a folder, some of the network among them; their names are theirs to keep."""
+
+
+def flush_folder(folder: Path) -> None:
+    """Flush the names in a folder to disk: files that were made, renamed or removed in it stay so after a power cut."""
+    with named(folder):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        except OSError as error:
+            if error.errno not in UNFLUSHED:
+                raise
+        finally:
+            os.close(handle)
+
+
+def flush_folders(folder: Path) -> None:
+    """Flush the names in a folder and in all below it, each once."""
+    for place, _, _ in os.walk(folder, topdown=False):
+        flush_folder(Path(place))
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if it is there, so that it stays away after a power cut."""
+    path.unlink(missing_ok=True)
+    if path.parent.is_dir():
+        flush_folder(path.parent)
+
+
+def write_exr(
+    path: Path, channels: dict[str, np.ndarray], attributes: dict[str, Any] | None = None, settled: bool = True
+) -> dict[str, str]:
     """Write (H, W) arrays of float16, float32 or uint32 as one EXR, compressed without loss. Returns channel -> dtype.
 
-    `attributes` go into its header: text, numbers, tuples, and (4, 4) float32 matrices for row vectors.
+    `attributes` go into its header: text, numbers, tuples, and (4, 4) float32 matrices for row vectors. `settled` is that of
+    `write_atomically`.
 
     Raises:
         ValueError: shapes that differ, another dtype, or a value that is not finite.
@@ -69,11 +152,15 @@ def write_exr(path: Path, channels: dict[str, np.ndarray], attributes: dict[str,
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **(attributes or {})}
     data = {name: np.ascontiguousarray(array) for name, array in channels.items()}
 
-    def write(temporary: Path) -> None:
-        with OpenEXR.File(header, data) as file:
-            file.write(str(temporary))
+    packed = io.BytesIO()  # OpenEXR tells nothing of an error of the disk when it writes the last part of a file
+    with OpenEXR.File(header, data) as file:
+        file.write(packed)
 
-    write_atomically(path, write)
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as handle:
+            handle.write(packed.getbuffer())
+
+    write_atomically(path, write, settled)
     return {name: array.dtype.name for name, array in channels.items()}
 
 
@@ -93,8 +180,10 @@ def read_attributes(path: Path) -> dict[str, Any]:
         return dict(file.header())
 
 
-def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str]) -> dict[str, str]:
+def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str], settled: bool = True) -> dict[str, str]:
     """Write named columns; (n, k) arrays become fixed-size lists. Equal input gives equal bytes. Returns column -> type.
+
+    `settled` is that of `write_atomically`.
 
     Raises:
         ValueError: columns of different length, or a value that is not finite.
@@ -115,7 +204,12 @@ def write_parquet(path: Path, columns: dict[str, Any], metadata: dict[str, str])
     if len(lengths) > 1:
         raise ValueError(f"{path}: columns of different length { {k: len(a) for k, a in arrays.items()} }")
     table = pa.table(arrays).replace_schema_metadata({k: v for k, v in metadata.items()})
-    write_atomically(path, lambda temporary: pq.write_table(table, temporary, row_group_size=1 << 20, **_encoding(table)))
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as handle:
+            pq.write_table(table, handle, row_group_size=1 << 20, **_encoding(table))
+
+    write_atomically(path, write, settled)
     return {name: str(array.type) for name, array in arrays.items()}
 
 
@@ -183,7 +277,7 @@ def _values(column: Any) -> np.ndarray:
     return np.frombuffer(data, kind, end)[column.offset :]
 
 
-def write_json(path: Path, document: Any) -> None:
-    """Write JSON with sorted keys."""
+def write_json(path: Path, document: Any, settled: bool = True) -> None:
+    """Write JSON with sorted keys. `settled` is that of `write_atomically`."""
     text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_atomically(path, lambda temporary: temporary.write_text(text), settled)

@@ -39,10 +39,40 @@ def _spelled(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
 
 
-def write(path: Path, document: dict[str, Any]) -> None:
-    """Write a manifest with its seal, in one piece."""
+def write(path: Path, document: dict[str, Any], settled: bool = True) -> None:
+    """Write a document with its seal, in one piece. `settled` is that of `write_atomically`."""
     text = text_of(document)
-    write_atomically(path, lambda temporary: temporary.write_text(text))
+    write_atomically(path, lambda temporary: temporary.write_text(text), settled)
+
+
+def sealed(data: bytes) -> dict[str, Any]:
+    """Return the content of a sealed document of any kind, without the seal.
+
+    Raises:
+        Broken: it is no JSON object, or was changed since it was written.
+    """
+    document = _object(data)
+    _compare(document, data)
+    return {key: value for key, value in document.items() if key != "seal"}
+
+
+def _object(data: bytes) -> dict[str, Any]:
+    try:
+        document = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise Broken(f"not readable as JSON ({error})") from None
+    if not isinstance(document, dict):
+        raise Broken(f"not readable as JSON (an object is needed, found {type(document).__name__})")
+    return document
+
+
+def _compare(document: dict[str, Any], data: bytes) -> None:
+    try:
+        text = text_of(document).encode()
+    except (ValueError, RecursionError):
+        text = b""
+    if text != data:
+        raise Broken("its content changed since it was written (its seal does not fit)")
 
 
 def parse(data: bytes, schema: str) -> dict[str, Any]:
@@ -55,23 +85,13 @@ def parse(data: bytes, schema: str) -> dict[str, Any]:
     Raises:
         Broken: it is no JSON object, has another schema, was changed since it was written, or lists no files.
     """
-    try:
-        document = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise Broken(f"not readable as JSON ({error})") from None
-    if not isinstance(document, dict):
-        raise Broken(f"not readable as JSON (an object is needed, found {type(document).__name__})")
+    document = _object(data)
     found = document.get("schema")
     if found != schema:
         older = found in (EARLIER_SCHEMA, EARLIER_SCENE_SCHEMA)
         hint = "; `python -m workflow upgrade` brings artefacts of earlier versions up to date" if older else ""
         raise Broken(f"schema {found!r}, this version reads {schema!r}{hint}")
-    try:
-        sealed = text_of(document).encode()
-    except (ValueError, RecursionError):
-        sealed = b""
-    if sealed != data:
-        raise Broken("its content changed since it was written (its seal does not fit)")
+    _compare(document, data)
     files = document.get("files")
     if not isinstance(files, dict) or not all(
         isinstance(facts, dict) and {"sha256", "bytes"} <= set(facts) for facts in files.values()

@@ -53,10 +53,11 @@ class StageWriter:
         self.provenance = provenance
         self.files: dict[str, dict[str, Any]] = {}
         self.parts: dict[str, Any] = {}
-        directory.mkdir(parents=True, exist_ok=True)
-        for part, note in _noted_parts(directory).items():
-            io.write_json(io.inside(directory, f"{UNFINISHED}/{part}.json"), note)
-        (directory / MANIFEST).unlink(missing_ok=True)
+        with io.named(directory):
+            io.make_folder(directory)
+            for part, note in _noted_parts(directory).items():
+                manifests.write(io.inside(directory, f"{UNFINISHED}/{part}.json"), note, settled=False)
+            io.remove(directory / MANIFEST)
 
     def exr(
         self,
@@ -79,25 +80,25 @@ class StageWriter:
             ValueError: shapes that differ, another dtype, or a value that is not finite.
         """
         channels = {k: a.astype(np.float16) if a.dtype == bool else a for k, a in channels.items()}
-        types = io.write_exr(io.inside(self.directory, name), channels, attributes)
+        types = io.write_exr(io.inside(self.directory, name), channels, attributes, settled=False)
         shape = list(next(iter(channels.values())).shape)
         self._record(name, kind="exr", shape=shape, channels=types, units=units, colour_space=colour_space)
 
     def table(self, name: str, columns: dict[str, Any], units: dict[str, str] | None = None) -> None:
         """Write one table; (n, k) arrays become fixed-size lists."""
         metadata = {"iif.schema": SCHEMA, "iif.stage": self.provenance["stage"]}
-        types = io.write_parquet(io.inside(self.directory, name), columns, metadata)
+        types = io.write_parquet(io.inside(self.directory, name), columns, metadata, settled=False)
         rows = len(np.asarray(next(iter(columns.values()))))
         self._record(name, kind="parquet", shape=[rows], channels=types, units=units or {}, colour_space="linear")
 
     def json(self, name: str, document: Any) -> None:
         """Write a small document."""
-        io.write_json(io.inside(self.directory, name), document)
+        io.write_json(io.inside(self.directory, name), document, settled=False)
         self._record(name, kind="json")
 
     def bytes(self, name: str, data: bytes) -> None:
         """Write a file of any other kind."""
-        io.write_atomically(io.inside(self.directory, name), lambda temporary: _write_bytes(temporary, data))
+        io.write_atomically(io.inside(self.directory, name), lambda temporary: _write_bytes(temporary, data), settled=False)
         self._record(name, kind=Path(name).suffix.lstrip(".") or "bytes")
 
     def part_done(self, part: str, names: list[str], facts: dict[str, Any], by: str = "") -> None:
@@ -112,7 +113,7 @@ class StageWriter:
         """
         files = {name: self.files[name] for name in names}
         document = {"by": by or self.provenance["fingerprint"], "files": files, "facts": facts}
-        io.write_json(io.inside(self.directory, f"{UNFINISHED}/{part}.json"), document)
+        manifests.write(io.inside(self.directory, f"{UNFINISHED}/{part}.json"), document, settled=False)
         if by:
             self.parts[part] = document
 
@@ -125,8 +126,8 @@ class StageWriter:
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
-            done = json.loads(note.read_text())
-        except (OSError, ValueError):
+            done = manifests.sealed(note.read_bytes())
+        except (OSError, manifests.Broken):
             return None
         if done["by"] != (by or self.provenance["fingerprint"]):
             return None
@@ -150,7 +151,7 @@ class StageWriter:
         path = io.inside(self.directory, f"{UNFINISHED}/{name}.npz")
         for left in path.parent.glob(f".{path.stem}.*"):  # by a job that was killed while it wrote
             left.unlink(missing_ok=True)
-        io.write_atomically(path, write)
+        io.write_atomically(path, write, settled=False)
 
     def kept_state(self, name: str) -> tuple[dict[str, np.ndarray], Any] | None:
         """Return arrays and facts of `keep_state`; None if there is nothing, or nothing that this job can go on from: it was
@@ -177,9 +178,9 @@ class StageWriter:
         self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}
 
     def finish(self) -> None:
-        """Remove the files that an earlier run left, then write the manifest."""
+        """Remove the files that an earlier run left, flush all names to disk, then write the manifest and flush its name."""
         if self.parts:
-            io.write_json(self.directory / PARTS, self.parts)
+            manifests.write(self.directory / PARTS, {"parts": self.parts}, settled=False)
         kept = set(self.files) | {MANIFEST} | ({PARTS} if self.parts else set())
         for path in sorted(self.directory.rglob("*"), reverse=True):
             if path.is_dir():
@@ -187,6 +188,7 @@ class StageWriter:
                     path.rmdir()
             elif str(path.relative_to(self.directory)) not in kept:
                 path.unlink()
+        io.flush_folders(self.directory)
         manifests.write(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
 
 
@@ -194,9 +196,8 @@ def _noted_parts(directory: Path) -> dict[str, Any]:
     """Return the notes that a finished job left of parts of its stage; none if there are none, or they cannot be read. They are
     not in the manifest, which Snakemake removes before it starts a job."""
     try:
-        parts = json.loads((directory / PARTS).read_text())
-        return parts if isinstance(parts, dict) else {}
-    except (OSError, ValueError):
+        return dict(manifests.sealed((directory / PARTS).read_bytes())["parts"])
+    except (OSError, manifests.Broken, KeyError):
         return {}
 
 

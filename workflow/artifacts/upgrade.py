@@ -12,9 +12,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from iif_core.errors import InputError
 from workflow.artifacts import files as io
+from workflow.artifacts import locks, stamps
 from workflow.artifacts import manifest as manifests
-from workflow.artifacts import stamps
 from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST, STAGE_SCHEMA
 from workflow.artifacts.sound import wrong_files
 from workflow.artifacts.store import command
@@ -46,7 +47,12 @@ def upgrade(results: Path = Path("results"), scenes: list[str] | None = None) ->
                 found[str(earlier.get("manifest_sha256"))] = (scene, digest)
             if schema != EARLIER_SCHEMA or (scenes and scene not in scenes):
                 continue
-            problem = _sealed_anew(path, document, scene, stage, digest, found)
+            try:
+                with locks.alone(results, scene, stage):
+                    problem = _sealed_anew(path, document, scene, stage, digest, found)
+            except InputError as error:
+                yield False, str(error)
+                continue
             if problem:
                 yield False, f"{problem}; rebuild with: {command(scene, stage, document.get('quality'))}"
             else:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import read_parquet, write_atomically
+from workflow.artifacts.files import read_parquet, remove, write_atomically
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
 from workflow.batch.page import render
@@ -47,7 +47,7 @@ def write_summary(quality: str, complete: str | None = None) -> None:
         complete: fingerprint of the plan, when all its jobs are done. Without it, `results/batch/complete` is removed, so that
             Snakemake does not take what a failed run left for the summary of a finished one.
     """
-    (FOLDER / "complete").unlink(missing_ok=True)
+    remove(FOLDER / "complete")
     plan = batch_plan.plan(quality)
     rows = [row_of(line, plan, quality) for line in plan.lines]
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))

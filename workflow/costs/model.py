@@ -18,6 +18,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+from workflow.artifacts.files import write_atomically
 from workflow.costs.work import SceneSize, Work, work_of
 
 SHIPPED = Path(__file__).with_name("coefficients.json")
@@ -205,7 +206,7 @@ def write_fits(path: Path, fits: Fits) -> None:
         entry |= {"divided": fit.divided} if measure == "cpu_seconds" else {}
         tree.setdefault(stage, {}).setdefault(kind, {})[measure] = entry
     lines = json.dumps(tree, indent=1)
-    path.write_text(lines + "\n")
+    write_atomically(path, lambda temporary: temporary.write_text(lines + "\n"))
 
 
 def read_fits(path: Path) -> Fits:

@@ -11,8 +11,9 @@ import numpy as np
 
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts import stamps
-from workflow.artifacts.files import inside, sha256_of, write_parquet
+from workflow.artifacts.files import copy, flush_folder, flush_folders, inside, make_folder, named, sha256_of, write_parquet
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
+from workflow.artifacts.sound import wrong_files
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job, library_versions
 from workflow.runtime.timings import read_timings
@@ -28,13 +29,15 @@ TIMING_COLUMNS: dict[str, Any] = {
 
 
 def run(job: Job) -> None:
-    """Build `scenes/.<scene>.tmp` and rename it to `scenes/<scene>`, so the folder is either complete or absent.
+    """Build `scenes/.<scene>.tmp` and rename it to `scenes/<scene>`, so the folder is complete, old or new, or absent.
 
     Every upstream stage is opened first, so an artefact that was built under other settings or code stops the stage.
     """
     readers = {stage: job.read(stage) for stage in job.stage.upstream}
     target = Path("scenes") / job.scene
     temporary = target.with_name(f".{job.scene}.tmp")
+    make_folder(target.parent)
+    bring_back(target)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         files = _build(job, readers, temporary)
@@ -52,17 +55,19 @@ def run(job: Job) -> None:
 
 
 def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[str, dict[str, Any]]:
-    """Fill the folder, its manifest last; return the files of the manifest."""
-    temporary.mkdir(parents=True)
+    """Fill the folder, its manifest last, and flush it to disk; return the files of the manifest."""
+    with named(temporary):
+        temporary.mkdir()
     for stage, name in deliverables(readers):
-        place(readers[stage].path(name), inside(temporary, name))
+        copy(readers[stage].path(name), inside(temporary, name))  # so that editing the deliverable does not change results/
     timings = read_timings(job.scene)
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
-    write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCENE_SCHEMA})
+    write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCENE_SCHEMA}, settled=False)
     files = {}
     for path in sorted(p for p in temporary.rglob("*") if p.is_file()):
         files[path.relative_to(temporary).as_posix()] = {"sha256": sha256_of(path), "bytes": path.stat().st_size}
-    manifests.write(temporary / MANIFEST, _manifest(job, files))
+    manifests.write(temporary / MANIFEST, _manifest(job, files), settled=False)
+    flush_folders(temporary)
     return files
 
 
@@ -93,12 +98,6 @@ def published_names(readers: dict[str, StageReader]) -> list[str]:
     return sorted({*(name for _, name in deliverables(readers)), *WRITTEN_HERE})
 
 
-def place(source: Path, destination: Path) -> None:
-    """Copy a file, so that editing the deliverable does not change results/."""
-    destination.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(source, destination)
-
-
 def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
     return {
         "schema": SCENE_SCHEMA,
@@ -113,11 +112,43 @@ def _manifest(job: Job, files: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def set_aside(target: Path) -> Path:
+    """Return where the folder that a deliverable replaces is while that is renamed."""
+    return target.with_name(f".{target.name}.old")
+
+
+def bring_back(target: Path) -> None:
+    """Rename a deliverable that was set aside to its place, if publishing was killed before the new one was there."""
+    old = set_aside(target)
+    if not old.is_dir() or target.exists():
+        return
+    try:
+        whole = next(wrong_files(old, manifests.read(old / MANIFEST, SCENE_SCHEMA)), None) is None
+    except manifests.Broken:
+        return  # what was left when it was being removed
+    if whole:
+        os.rename(old, target)
+        flush_folder(target.parent)
+
+
 def _replace(temporary: Path, target: Path) -> None:
-    """Rename into place. Snakemake has removed the old folder unless the stage is run by hand."""
-    old = target.with_name(f".{target.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
+    """Rename into place. Snakemake has removed the old folder unless the stage is run by hand.
+
+    At every moment, and after a power cut at any, the old folder or the new one is complete, here or set aside.
+    """
+    old = set_aside(target)
+    _discard(old)
     if target.exists():
         os.rename(target, old)
+        flush_folder(target.parent)
     os.rename(temporary, target)
+    flush_folder(target.parent)
+    _discard(old)
+
+
+def _discard(old: Path) -> None:
+    """Remove a folder that was set aside, its manifest first, so that what is left of it is not taken for whole."""
+    if old.is_dir():
+        (old / MANIFEST).unlink(missing_ok=True)
+        flush_folder(old)
     shutil.rmtree(old, ignore_errors=True)

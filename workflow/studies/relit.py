@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
+from workflow.artifacts.files import copy, flush_folders, make_folder
 from workflow.runtime import fingerprint as fp
 from workflow.settings import active_plan, plan_names
 from workflow.settings.study_files import RELIGHT, scene_of
@@ -53,7 +53,7 @@ def deliver(scene: str, plan: str, quality: str) -> None:
 
 def _copy(scene: str, target: Path) -> None:
     reader = StageReader(Path("results") / scene / "relight", "relight", scene)
+    make_folder(target)
     for name in reader.manifest["files"]:
-        path = target / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(reader.path(name), path)
+        copy(reader.path(name), target / name)
+    flush_folders(target)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from iif_core.errors import InputError
+from workflow.artifacts.files import write_atomically
 from workflow.settings.names import REPOSITORY
 from workflow.settings.scene import SceneSettings
 from workflow.settings.study_files import load_study
@@ -119,11 +120,12 @@ def write_points() -> list[str]:
     for old in folder.glob("p[0-9][0-9].yaml"):
         old.unlink()
     for file, text in texts.items():
-        (folder / file).write_text(text)
+        write_atomically(folder / file, lambda path, text=text: path.write_text(text))
     gone = [f"{quality}: {point}" for quality, point in named().items() if point not in points]
     if gone:
         lines.append(f"config/quality: these name points that are gone, set them anew: {', '.join(gone)}")
-    SHIPPED.write_text(json.dumps({"study": STUDY, "points": points}, indent=1) + "\n")
+    shipped = json.dumps({"study": STUDY, "points": points}, indent=1) + "\n"
+    write_atomically(SHIPPED, lambda path: path.write_text(shipped))
     draw(pooled, chosen, list(points), [one for one in every if one.variant in OTHER_METHODS], PICTURE)
     return lines
 
