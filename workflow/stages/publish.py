@@ -34,6 +34,7 @@ def run(job: Job) -> None:
     Every upstream stage is opened first, so an artefact that was built under other settings or code stops the stage.
     """
     readers = {stage: job.read(stage) for stage in job.stage.upstream}
+    writer = job.writer  # from here on, the stage is not finished
     target = Path("scenes") / job.scene
     temporary = target.with_name(f".{job.scene}.tmp")
     make_folder(target.parent)
@@ -48,7 +49,7 @@ def run(job: Job) -> None:
         "files": {name: facts["sha256"] for name, facts in files.items()},
         "manifest_sha256": sha256_of(target / MANIFEST),
     }
-    job.writer.json("published.json", published)
+    writer.json("published.json", published)
     document = manifests.read(target / MANIFEST, SCENE_SCHEMA)
     stamps.note(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), target, document)
     job.log.info("%s: %d files, %.1f MB", target, len(files), sum(f["bytes"] for f in files.values()) / 1e6)
