@@ -217,7 +217,10 @@ class Disk:
         if place is None or not set(mode) & set("wxa+"):
             return call(file, mode, buffering, *a, **keywords)
         self._step("open", place)
-        raw = _Raw(self, place, mode.replace("t", "").replace("b", ""))
+        opener = keywords.pop("opener", None)
+        raw = _Raw(self, place, mode.replace("t", "").replace("b", ""), opener)
+        if opener:  # a file without a name, of which nothing is left
+            return raw if buffering == 0 else io.BufferedRandom(raw)
         if place not in self._now:
             self._new(place, folder=False)
         elif "w" in mode:
@@ -298,21 +301,24 @@ def _survives(choice: str | random.Random, named: bool) -> bool | str:
 class _Raw(io.FileIO):
     """A file whose writes are recorded."""
 
-    def __init__(self, disk: Disk, path: str, mode: str):
-        super().__init__(path, mode)
-        self.disk, self.place, self.node = disk, path, -1
+    def __init__(self, disk: Disk, path: str, mode: str, opener: Any):
+        super().__init__(path, mode, opener=opener)
+        self.disk, self.place, self.node = disk, path, None
 
     def write(self, data: Any) -> int:
         view = bytes(data)
         how = self.disk._step("write", self.place)
-        offset = os.fstat(self.fileno()).st_size if "a" in self.mode else self.tell()
+        offset = os.fstat(self.fileno()).st_size if "a" in str(self.mode) else self.tell()
         done = super().write(view[: max(1, len(view) // 2)] if how else view)
-        self.disk._changes.append(("data", self.node, offset, view[:done]))
+        if self.node is not None:
+            self.disk._changes.append(("data", self.node, offset, view[:done]))
         if how == "torn":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return done
 
     def truncate(self, size: int | None = None) -> int:
+        if self.node is None:
+            return super().truncate(size)
         if (self.tell() if size is None else size) != 0:
             raise AssertionError("only cutting a file to nothing is recorded")
         self.disk._changes.append(("cut", self.node))
