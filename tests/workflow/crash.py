@@ -3,15 +3,18 @@
 A trial ends a run at one point, looks at what is there, and runs again. What is there must be the earlier result, the new one, or
 visibly unfinished; the second run must end with the bytes of an undisturbed one.
 
-`python -m tests.workflow.crash --all` tries every point of the layer (some minutes), `--scene <folder>` those of the stages of a
-finished scene, and both write docs/results/data/reliability_crash.json.
+`python -m tests.workflow.crash --all` tries every point of the layer and writes docs/results/data/reliability_crash.json;
+`--stages <file>` adds what `python -m tests.workflow.crash_stages` printed of the stages of a scene.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import logging
 import os
 import random
+import sys
 import tempfile
 import traceback
 from collections import Counter
@@ -415,14 +418,18 @@ def choices(call: int, seeds: int) -> list[tuple[str, str | random.Random]]:
     return [(name, name) for name in HOSTILE] + [(f"seed {seed}", random.Random(f"{call} {seed}")) for seed in range(seeds)]
 
 
-def try_power_cuts(case: Case, seeds: int, some: Callable[[list[Any]], Iterable[Any]] = lambda every: every) -> Tally:
-    """Cut power before every call, or some of them, with every choice."""
+def try_power_cuts(
+    case: Case, seeds: int, some: Callable[[list[Any]], Iterable[Any]] = lambda every: every, until: str | None = None
+) -> Tally:
+    """Cut power before every call, or `some` of them, with every choice; `until` something goes wrong that is called so."""
     tally = Tally()
     with tempfile.TemporaryDirectory(dir=_memory()) as folder:
         ready = prepare(case, Path(folder) / "w")
         every = [(call, *named) for call in range(len(ready.disk.steps) + 1) for named in choices(call, seeds)]
         for call, name, choice in some(every):
             tally.tried(f"{case.name}: {_where(ready, call)}, {name}", partial(power_cut, ready, call, choice))
+            if until is not None and tally.wrong and until in tally.wrong[-1]:
+                break
     return tally
 
 
@@ -446,3 +453,34 @@ def try_faults(case: Case, some: Callable[[list[Any]], Iterable[Any]] = lambda e
 def _where(ready: Prepared, call: int) -> str:
     steps = ready.disk.steps
     return f"call {call} of {len(steps)} ({' '.join(steps[call])})" if call < len(steps) else "the end"
+
+
+# -- the command ----------------------------------------------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Try every point of the layer and points of stages, and write what was found; the exit code is 1 if anything is wrong."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--all", action="store_true", help="the layer, at every call")
+    parser.add_argument("--seeds", type=int, default=4, help="of choices by chance at each power cut")
+    parser.add_argument("--stages", type=Path, help="what `python -m tests.workflow.crash_stages` printed, to be added")
+    arguments = parser.parse_args()
+    document = json.loads(PLACE.read_text()) if PLACE.is_file() else {}
+    wrong = []
+    if arguments.all:
+        document |= {"power_cuts": {}, "faults": {}}
+        for name, case in CASES.items():
+            for kind, tally in (("power_cuts", try_power_cuts(case, arguments.seeds)), ("faults", try_faults(case))):
+                document[kind][name] = tally.row()
+                wrong += tally.wrong
+                print(kind, name, tally.row(), *tally.wrong[:3], flush=True)
+    if arguments.stages:
+        found = json.loads(arguments.stages.read_text())
+        document["stages"] = found["stages"]
+        wrong += found["wrong"]
+    io.write_json(PLACE, document)
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
