@@ -116,7 +116,9 @@ def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
             finished = results / "report" / MANIFEST if (results / "logs/publish.log").is_file() else finished
         if finished.is_file():
             again = command(scene, "publish", _document(finished).get("quality"))
-            yield f"{folder}: missing, although it was published; {_first(damaged_results)}rebuild with: {again}"
+            aside = folder.with_name(f".{scene}.old")
+            kept = f" (an earlier one is in {aside})" if aside.is_dir() else ""
+            yield f"{folder}: missing, although it was published{kept}; {_first(damaged_results)}rebuild with: {again}"
 
 
 def _document(path: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from workflow.artifacts.files import write_atomically
 from workflow.costs.size import size_of_capture
 from workflow.costs.work import work_of
 from workflow.registry import SHARED, STAGES
@@ -94,10 +95,14 @@ def _upstream(manifest: dict[str, Any], known: dict[tuple[str, str], dict[str, A
 def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
     """Write rows as CSV, sorted; counts that a stage does not have are empty."""
     counts = sorted({name for row in rows for name in row} - {*FIXED, *MEASURES})
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*FIXED, *MEASURES, *counts], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(sorted(rows, key=lambda row: [str(row[name]) for name in (*FIXED, "seconds")]))
+
+    def write(temporary: Path) -> None:
+        with temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, [*FIXED, *MEASURES, *counts], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(sorted(rows, key=lambda row: [str(row[name]) for name in (*FIXED, "seconds")]))
+
+    write_atomically(path, write)
 
 
 def read_rows(path: Path) -> Iterator[dict[str, Any]]:
