@@ -44,7 +44,7 @@ def test_every_power_cut_and_every_fault(case):
 
 MUTANTS = {
     "folders are not flushed": (io, "flush_folder", lambda folder: None, "stage", "a power cut took it back"),
-    "content is not flushed": (io, "_flush", lambda path: None, "stage", "a power cut took it back"),
+    "content is not flushed": (io, "_flush", lambda path: None, "stage", "a manifest is there, and files are not what it says"),
     "the folder of a file is not flushed": (io, "flush_folder", lambda folder: None, "file", "a power cut took it back"),
     "a file is written in place": (
         io,
@@ -53,13 +53,21 @@ MUTANTS = {
         "file over an earlier one",
         "neither the earlier one nor the new one",
     ),
-    "hashes are not compared": (
+    "the manifest is written before the names of files are flushed": (
         io,
-        "sha256_of",
-        lambda path: "0",
-        "stage over an earlier one",
-        "a second run does not end",
+        "flush_folders",
+        lambda folder: None,
+        "stage",
+        "a manifest is there, and files are not what it says",
     ),
+    "the removal of the earlier manifest is not flushed": (
+        io,
+        "remove",
+        lambda path: path.unlink(missing_ok=True),
+        "stage over an earlier one",
+        "a manifest is there, and files are not what it says",
+    ),
+    "hashes are not compared": (io, "sha256_of", lambda path: "0", "stage", "a second run does not end"),
     "a deliverable is renamed before it is flushed": (
         publish,
         "flush_folders",
@@ -302,6 +310,7 @@ def test_a_reader_of_a_torn_stage_is_refused(tmp_path, monkeypatch):
     whole = {crash.NEW: crash.of_stage(crash.tree(tmp_path))}
     assert crash.stage_is_sound(whole, crash.NEW) == crash.NEW
     Path("results/s/base/page.html").write_bytes(b"torn")
-    assert crash.stage_is_sound(whole, crash.NEW) == ""
+    with pytest.raises(crash.Wrong, match="a manifest is there"):
+        crash.stage_is_sound(whole, crash.NEW)
     with pytest.raises(InputError):
         StageReader(Path("results/s/base"), "base", "s").path("page.html")

@@ -107,8 +107,10 @@ def stage_is_sound(wanted: dict[str, Tree], mark: str) -> str:
         reader = StageReader(Path("results/s/base"), "base", "s")
         content = {f"results/s/base/{name}": reader.path(name).read_bytes() for name in reader.names()}
         found = reader.fingerprint
-    except InputError:
+    except InputError as error:
         content = {}
+        if Path("results/s/base", MANIFEST).is_file():
+            raise Wrong(f"a manifest is there, and files are not what it says: {error}") from None
     sound.stage_faults.cache_clear()
     planned = Path("results/s/base", MANIFEST).is_file() and sound.stage_faults(Path("results"), "s", "base", mark) == ()
     if planned and found != mark:
@@ -462,21 +464,22 @@ def main() -> int:
     """Try every point of the layer and points of stages, and write what was found; the exit code is 1 if anything is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--all", action="store_true", help="the layer, at every call")
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="of the layer")
     parser.add_argument("--seeds", type=int, default=4, help="of choices by chance at each power cut")
     parser.add_argument("--stages", type=Path, help="what `python -m tests.workflow.crash_stages` printed, to be added")
     arguments = parser.parse_args()
     document = json.loads(PLACE.read_text()) if PLACE.is_file() else {}
     wrong = []
     if arguments.all:
-        document |= {"power_cuts": {}, "faults": {}}
-        for name, case in CASES.items():
+        for name in arguments.cases:
+            case = CASES[name]
             for kind, tally in (("power_cuts", try_power_cuts(case, arguments.seeds)), ("faults", try_faults(case))):
-                document[kind][name] = tally.row()
+                document.setdefault(kind, {})[name] = tally.row()
                 wrong += tally.wrong
                 print(kind, name, tally.row(), *tally.wrong[:3], flush=True)
     if arguments.stages:
         found = json.loads(arguments.stages.read_text())
-        document["stages"] = found["stages"]
+        document.setdefault("stages", {}).update(found["stages"])
         wrong += found["wrong"]
     io.write_json(PLACE, document)
     return 1 if wrong else 0

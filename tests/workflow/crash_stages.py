@@ -24,6 +24,7 @@ from tests.workflow.crash import FAULTS, Tally, Tree, Wrong, unflushed
 from tests.workflow.faulty_disk import Disk, Fault, lay_out, tree
 from workflow import __main__ as commands
 from workflow.artifacts import StageReader
+from workflow.artifacts.manifest import MANIFEST
 from workflow.registry import STAGES
 from workflow.runtime import native
 from workflow.runtime.job import configure_logging
@@ -130,7 +131,9 @@ class Stage:
             reader = StageReader(self.folders[0], self.name, self.scene)
             for name in reader.names():
                 reader.path(name)
-        except InputError:
+        except InputError as error:
+            if (self.folders[0] / MANIFEST).is_file():
+                raise Wrong(f"a manifest is there, and files are not what it says: {error}") from None
             return False
         if {name: data for name, data in stage.items() if name in reader.names()} != {
             name: data for name, data in self.start[0].items() if name in reader.names()
