@@ -8,7 +8,6 @@ import resource
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +66,7 @@ MUTANTS = {
         "stage over an earlier one",
         "a manifest is there, and files are not what it says",
     ),
-    "hashes are not compared": (io, "sha256_of", lambda path: "0", "stage", "a second run does not end"),
+    "hashes are not compared": (io, "sha256_of", lambda path: "0", "stage over an earlier one", "a second run does not end"),
     "a deliverable is renamed before it is flushed": (
         publish,
         "flush_folders",
@@ -230,7 +229,7 @@ from pathlib import Path
 from workflow.artifacts import locks
 with locks.alone(Path("results"), "s", "base"):
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(600)
 """
 
 
@@ -274,7 +273,6 @@ def test_the_second_of_two_runs_ends_at_once_and_disturbs_nothing(tmp_path, hold
     log = tmp_path / "results/s/logs/base.log"
     log.parent.mkdir(parents=True)
     log.write_text("of the first\n")
-    began = time.monotonic()
     second = subprocess.run(
         [sys.executable, "-m", "workflow", "base", "s", "--log", str(log)],
         cwd=tmp_path,
@@ -282,7 +280,7 @@ def test_the_second_of_two_runs_ends_at_once_and_disturbs_nothing(tmp_path, hold
         text=True,
         env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
     )
-    assert second.returncode == 1 and time.monotonic() - began < 50
+    assert second.returncode == 1 and holder.poll() is None  # it did not wait
     (line,) = second.stderr.strip().splitlines()
     assert line.startswith("error: results/s/locks/base: stage base of s is being made by process")
     assert log.read_text() == "of the first\n" and not (tmp_path / "results/s/base").exists()
