@@ -478,9 +478,10 @@ def main() -> int:
                 wrong += tally.wrong
                 print(kind, name, tally.row(), *tally.wrong[:3], flush=True)
     if arguments.stages:
-        found = json.loads(arguments.stages.read_text())
-        document.setdefault("stages", {}).update(found["stages"])
-        wrong += found["wrong"]
+        for line in arguments.stages.read_text().splitlines():
+            row = json.loads(line)
+            wrong += row.pop("said")
+            document.setdefault("stages", {})[row.pop("stage")] = row
     io.write_json(PLACE, document)
     return 1 if wrong else 0
 

@@ -14,7 +14,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -169,7 +169,7 @@ def points(stage: Stage) -> list[tuple[str, int, bool]]:
     return out
 
 
-def try_stages(folder: Path, scene: str, stages: Mapping[str, int], seed: int = 0) -> dict[str, Any]:
+def try_stages(folder: Path, scene: str, stages: Mapping[str, int], seed: int = 0) -> Iterator[dict[str, Any]]:
     """Try points of stages of a scene.
 
     Args:
@@ -178,12 +178,10 @@ def try_stages(folder: Path, scene: str, stages: Mapping[str, int], seed: int = 
         stages: name -> number of trials, chosen by chance; 0 = all. `warm` has been called.
         seed: of the choice.
 
-    Returns:
-        Under `stages` the counts of each, with the calls of a run; and under `wrong` what went wrong.
+    Yields:
+        For each, as soon as it is done: its name (`stage`), the counts, the calls of a run, and under `said` what went wrong.
     """
     os.chdir(folder)
-    out: dict[str, Any] = {}
-    wrong = []
     for name, most in stages.items():
         stage, tally = Stage(scene, name), Tally()
         every = points(stage)
@@ -191,14 +189,11 @@ def try_stages(folder: Path, scene: str, stages: Mapping[str, int], seed: int = 
             what = f"{name}: {kind} at call {call} of {len(stage.steps)} ({' '.join(stage.steps[call])})"
             tally.tried(what, partial(stage.trial, kind, call, empty))
         stage.begin_again(empty=False)
-        out[name] = {**tally.row(), "calls": len(stage.steps), "of": len(every)}
-        wrong += tally.wrong
-        print(name, out[name], *tally.wrong[:3], file=sys.stderr, flush=True)
-    return {"stages": out, "wrong": wrong}
+        yield {"stage": name, **tally.row(), "calls": len(stage.steps), "of": len(every), "said": tally.wrong}
 
 
 def main() -> int:
-    """Print the counts as JSON; the exit code is 1 if anything went wrong."""
+    """Print the counts, a line of JSON for each stage; the exit code is 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("scene")
@@ -207,9 +202,11 @@ def main() -> int:
     arguments = parser.parse_args()
     warm()
     chosen = {name: int(most or 0) for name, _, most in (text.partition("=") for text in arguments.stages)}
-    found = try_stages(arguments.folder, arguments.scene, chosen, arguments.seed)
-    print(json.dumps(found))
-    return 1 if found["wrong"] else 0
+    wrong = 0
+    for row in try_stages(arguments.folder, arguments.scene, chosen, arguments.seed):
+        wrong += row["wrong"]
+        print(json.dumps(row), flush=True)
+    return 1 if wrong else 0
 
 
 if __name__ == "__main__":
