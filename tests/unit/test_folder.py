@@ -1,14 +1,20 @@
 """Source `folder`: cameras, pictures and meshes of users, and the check that they belong together."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
 
 from iif_core.camera.distortion import Distortion, pinhole_inside
 from iif_core.errors import InputError
 from tests.unit import own_scene as own
 from workflow.artifacts import StageReader
+from workflow.exporters.camera_files import cameras_json
+from workflow.exporters.glb import rotation_to_y
+from workflow.scene.normal_form import View
 from workflow.sources import folder
 from workflow.sources.folder_scene import alignment, images, mesh, transforms
 
@@ -449,8 +455,37 @@ def test_mesh_turned_against_the_poses_is_named(tmp_path):
     path = own.project(tmp_path)
     own.photographed(path)
     vertices, faces, _ = own.room_mesh()
-    own.save_mesh(path / "mesh.ply", vertices @ alignment.Z_UP_TO_Y_UP[:3, :3].T, faces)  # as a glTF exporter turns it
-    assert "turning the mesh from y-up to z-up" in fails(tmp_path)
+    own.save_mesh(path / "mesh.ply", vertices @ mesh.TURNS["z"].T, faces)  # as a glTF exporter turns it
+    assert "`source.mesh_up: y`, which turns the mesh from y-up to z-up (x, -z, y), fits" in fails(tmp_path)
+    own.project(tmp_path, {"mesh_up": "y"})
+    np.testing.assert_allclose(own.run(tmp_path, "capture").mesh()[0], vertices, atol=1e-5)
+    own.save_mesh(path / "mesh.ply", vertices, faces)
+    assert "`source.mesh_up: as_poses` fits" in fails(tmp_path)
+
+
+def test_a_finished_scene_fits_itself(tmp_path):
+    """cameras.json and scene.glb of a room with z up, as they are delivered."""
+    path = own.project(tmp_path, {"cameras": "cameras.json", "mesh": "scene.glb", "mesh_up": "y"}, {"exposure": "estimate"})
+    document, shots = own.photographed(path, depth=False)
+    (path / "transforms.json").unlink()
+    (path / "mesh.ply").unlink()
+    up, names = np.array([0.0, 0.0, 1.0]), [frame["file_path"] for frame in document["frames"]]
+    sizes = [own.intrinsics()[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
+    views = [View(i, f"{i:03d}", *sizes, shot[0]) for i, shot in enumerate(shots)]
+    (path / "cameras.json").write_bytes(cameras_json(views, names, np.ones((4, 3)), up))
+    vertices, faces, _ = own.room_mesh()
+    trimesh.Trimesh(Rotation.from_quat(rotation_to_y(up)).apply(vertices), faces, process=False).export(path / "scene.glb")
+    assert own.run(tmp_path, "capture").facts["alignment"]["edge_correlation"] > 0.2
+
+
+def test_a_factor_between_mesh_and_poses_is_named():
+    room = mesh.Mesh(*own.room_mesh()[:2])
+    centres = np.array([pose[:3, 3] for pose in own.poses(5)])
+    mesh.check_size(Path("mesh.ply"), room, "m", 1.0, centres)
+    with pytest.raises(InputError, match="with camera positions times 0.01 they are inside it"):
+        mesh.check_size(Path("mesh.ply"), room, "m", 1.0, 100 * centres)
+    with pytest.raises(InputError, match="mesh and poses are in different units or frames: export both"):
+        mesh.check_size(Path("mesh.ply"), room, "m", 1.0, 100 + centres)
 
 
 def test_unrelated_depth_is_refused_without_advice(tmp_path):
@@ -510,13 +545,32 @@ def test_edges_find_a_shift():
     normal = np.broadcast_to(np.array([0, 0, 1.0]), (*depth.shape, 3))
     photo = np.repeat(blocks[..., None], 3, -1).astype(np.float32)
     valid = np.ones(depth.shape, bool)
-    here = alignment.edge_correlation(photo, valid, depth, normal)
+
+    def correlation(photo, rows=slice(None)):
+        return alignment.edge_correlation(*alignment.edge_pictures(photo[rows], valid[rows], depth[rows], normal[rows]))
+
+    here = correlation(photo)
     assert np.unravel_index(here.argmax(), here.shape) in {(4, 4), (5, 4), (4, 5), (5, 5)} and here.max() > 0.5
-    moved = alignment.edge_correlation(np.roll(photo, (3, -2), (0, 1)), valid, depth, normal)
+    moved = correlation(np.roll(photo, (3, -2), (0, 1)))
     dy, dx = np.array(np.unravel_index(moved.argmax(), moved.shape)) - np.unravel_index(here.argmax(), here.shape)
     assert (dy, dx) == (3, -2)
-    tiny = alignment.edge_correlation(photo[:4, :4], valid[:4, :4], depth[:4, :4], normal[:4, :4])
-    assert (tiny == 0).all()
+    assert (correlation(photo, slice(4)) == 0).all()  # too small
+
+
+@pytest.mark.parametrize("order, warned", [([0, 1, 2, 3, 4], False), ([1, 2, 3, 4, 0], True)])
+def test_photographs_with_the_poses_of_others_are_doubted(order, warned):
+    """Rooms of blocks: every photograph has edges where its own depth has them."""
+    rng = np.random.default_rng(3)
+    blocks = [np.kron(rng.random((n + 3, n + 4)), np.ones((120 // (n + 3), 160 // (n + 4)))) for n in order]
+    blocks = [block[:100, :140] for block in blocks]
+    normal, valid = np.broadcast_to(np.array([0, 0, 1.0]), (*blocks[0].shape, 3)), np.ones(blocks[0].shape, bool)
+    found = alignment.Alignment.empty()
+    for i, j in enumerate(order):
+        photo = np.repeat(blocks[j][..., None], 3, -1).astype(np.float32)
+        found.add_edges(str(i), *alignment.edge_pictures(photo, valid, (1 + blocks[i]).astype(np.float32), normal), True)
+    message = found.edge_warning(0.05)
+    assert ("may stand with each other's poses" in message) == warned and (message != "") == warned
+    assert (found.report()["edge_own_pose_standard_errors"] < alignment.CLEARLY_OWN) == warned
 
 
 def test_stage_reads_back(scene):

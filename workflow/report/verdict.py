@@ -41,7 +41,7 @@ class Limit(NamedTuple):
 LIMITS: dict[str, Limit] = {
     "escape": Limit(0.1, 0.4, "windows let 2 to 5 % of the rays out, a missing ceiling two thirds, and its light is a guess"),
     "depth": Limit(0.02, 0.05, "of the distance: 2 % is the noise of depth cameras; beyond 5 % the source refuses by default"),
-    "edges": Limit(0.2, 0.05, "correlation of edges in photographs and mesh: a good scan has 0.4; the source warns below 0.05"),
+    "edges": Limit(0.2, 0.05, "correlation of edges in photographs and mesh: a good scan has 0.4; the source warns below 0.2"),
     "agreement": Limit(0.7, 0.4, "correlation of a photograph with the others: 0.9 is usual; below 0.2 a single one is left out"),
     "lost": Limit(0.1, 1 / 3, "of the photographs; beyond a third the fault lies in the capture, not in single photographs"),
     "photographed": Limit(0.6, 0.3, "of the surface that lights the rest; below 0.3 indirect light is not read from photographs"),

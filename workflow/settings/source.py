@@ -46,6 +46,9 @@ class PhotographedSource(Section):
     registration: Annotated[Literal["auto", "off"], ON_OFF] = "auto"
     """`auto`: correct poses, focal length and principal point by the mesh and the other photographs, if held-out surface confirms
     the correction, and leave out blurred and badly posed photographs. `off`: use them as given."""
+    mesh_up: Literal["as_poses", "y", "z"] = "as_poses"
+    """Which axis is up in the mesh file, where it is another than in the poses: `y` turns the mesh to z-up (x, -z, y), as a GLB
+    of a room with z up needs it; `z` turns it to y-up (x, z, -y)."""
 
 
 class FolderSource(PhotographedSource):

@@ -59,7 +59,7 @@ class _Capture:
         self.job, self.source, self.settings, self.inputs = job, job.settings.source, job.settings.capture, inputs
         self.writer = CaptureWriter(job.writer)
         self.metres = inputs.metres
-        self.conventions = alignment.Conventions(inputs.transforms.axes, self.metres)
+        self.conventions = alignment.Conventions(inputs.transforms.axes, self.metres, mesh_up=self.source.mesh_up)
         self.listed = any(frame.split for frame in inputs.transforms.frames)
         self.encoded = self.settings.dynamic_range == "ldr"
         self.notes: list[str] = list(inputs.transforms.notes)
@@ -69,12 +69,15 @@ class _Capture:
         self.alignment = alignment.Alignment.empty()
         count = len(inputs.transforms.frames)
         self.tried = {inputs.transforms.frames[i].name for i in transforms.evenly_spread(count, alignment.TRIAL_VIEWS)}
+        spread = transforms.evenly_spread(count, alignment.COMPARED_VIEWS)
+        self.compared = {inputs.transforms.frames[i].name for i in spread}
         self.trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]] = []
 
     def run(self) -> None:
         frames = self.inputs.transforms.frames
         poses = [self.conventions.pose(f) for f in frames]
-        self.mesh = mesh.load(self.inputs.mesh, self.metres, self.inputs.of_vertices() if self.inputs.of_vertices else None)
+        of_vertices = self.inputs.of_vertices() if self.inputs.of_vertices else None
+        self.mesh = mesh.load(self.inputs.mesh, self.metres, of_vertices, self.source.mesh_up)
         self.notes += self.mesh.notes
         centres = np.array([pose[:3, 3] for pose in poses])
         mesh.check_size(self.inputs.mesh, self.mesh, getattr(self.source, "unit", "m"), self.metres, centres)
@@ -267,7 +270,8 @@ class _Capture:
             self.alignment.what = "sparse points"
             self.alignment.ratios[frame.name] = alignment.point_ratio(frame, self.conventions, _pinhole(view), depth)
         normal = np.where(face[..., None] >= 0, self.normals[face], 0)
-        self.alignment.edges[frame.name] = alignment.edge_correlation(photo, valid, depth, normal)
+        edges = alignment.edge_pictures(photo, valid, depth, normal)
+        self.alignment.add_edges(frame.name, *edges, frame.name in self.compared)
         if frame.name in self.tried:
             self._try(frame, view, photo, valid)
 
@@ -323,7 +327,7 @@ class _Capture:
         path, tolerance = self.inputs.transforms.path, self.source.alignment_tolerance
         message = self.alignment.refuse(path, tolerance, lambda: self._advice(list(zip(used, views, strict=True))))
         alignment.raise_or_note(message, self.source.alignment, self.notes)
-        warning = self.alignment.edge_warning()
+        warning = self.alignment.edge_warning(tolerance)
         better = self._edge_advice() if warning and not self.alignment.ratios else ""
         if better:
             message = f"{path}: photographs and mesh do not belong together as read: {better}. To go on anyway:"
@@ -336,16 +340,16 @@ class _Capture:
         if not pairs:
             return ""
         unit, tolerance = self.inputs.transforms.depth_unit, self.source.alignment_tolerance
-        axes, known = self.conventions.axes, self.inputs.transforms.known
-        return alignment.explain(pairs, self._depth_along, axes, self.metres, known, unit, tolerance)
+        known = self.inputs.transforms.known
+        return alignment.explain(pairs, self._depth_along, self.conventions, known, unit, tolerance)
 
     def _blind_advice(self, blind: list[tuple[Frame, View]]) -> str:
         """Return the same for photographs of which none sees the mesh."""
         for frame, view in blind:
             if frame.name in self.tried:
                 self._try(frame, view, *self._photo(frame, view, 1.0))
-        axes, known = self.conventions.axes, self.inputs.transforms.known
-        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, 0.0)
+        known = self.inputs.transforms.known
+        return alignment.explain_edges(self.trials, self._surface_along, self.conventions, known, 0.0)
 
     def _try(self, frame: Frame, view: View, photo: np.ndarray, valid: np.ndarray) -> None:
         small = alignment.shrunk(_pinhole(view), alignment.EDGE_WIDTH)
@@ -353,9 +357,9 @@ class _Capture:
 
     def _edge_advice(self) -> str:
         """Return which other convention fits the edges of the photographs clearly better, in words."""
-        axes, known = self.conventions.axes, self.inputs.transforms.known
+        known = self.inputs.transforms.known
         now = self.alignment.report()["edge_correlation"]
-        return alignment.explain_edges(self.trials, self._surface_along, axes, self.metres, known, now)
+        return alignment.explain_edges(self.trials, self._surface_along, self.conventions, known, now)
 
     def _depth_along(self, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
         return self._surface_along(origin, rays)[0]

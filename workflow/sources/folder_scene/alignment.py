@@ -14,6 +14,7 @@ from iif_core.camera.distortion import Pinhole, undistort
 from iif_core.camera.pinhole import pixel_directions, project
 from iif_core.errors import InputError
 from workflow.sources.folder_scene import images
+from workflow.sources.folder_scene.mesh import TURNS
 from workflow.sources.folder_scene.transforms import METRES, Frame, opencv_pose
 
 DEPTH_SAMPLES = 20_000  # depth pixels compared per view
@@ -22,7 +23,12 @@ MIN_POINTS = 20  # sparse points that a photograph must see to be compared by th
 TRIAL_POINTS, TRIAL_VIEWS, TRIAL_WIDTH = 300, 6, 96  # points per view, views and pixels across for trials of other conventions
 EDGE_WIDTH = 160  # pixels; edges are compared at this width at most, so that shifts do not depend on the size of the capture
 SHIFT = 4  # pixels of such a picture by which the photograph is shifted to either side
-WEAK_CORRELATION = 0.05
+WEAK_CORRELATION, WEAK_BESIDE_DEPTH = 0.2, 0.05
+"""Edge correlation below which a capture is doubted, and where measured depth agrees, which says more than edges
+(docs/method/numerics.md#edges-of-photographs-and-mesh)."""
+CLEARLY_OWN = 2.0
+"""Standard errors by which photographs must fit the mesh better from their own pose than from those of others."""
+COMPARED_VIEWS = 64  # at most so many photographs are compared with the mesh as the others see it
 CLEAR_CORRELATION = 0.12
 """Another convention is proposed if it reaches this correlation and three times that of the convention in use."""
 
@@ -36,12 +42,14 @@ class Conventions:
         metres: per unit.
         change: applied to the matrix before; None = identity.
         of_world: whether `change` concerns the world, and thus also the depth images' own poses and the sparse points.
+        mesh_up: `source.mesh_up`, as which the mesh was read.
     """
 
     axes: str
     metres: float
     change: Callable[[np.ndarray], np.ndarray] | None = None
     of_world: bool = False
+    mesh_up: str = "as_poses"
 
     def pose(self, frame: Frame) -> np.ndarray:
         """Return `world_from_camera` of the photograph."""
@@ -132,19 +140,18 @@ def disagreement(ratio: np.ndarray) -> float:
     return float(np.median(np.abs(both - 1))) if len(both) and len(both) >= MIN_COMPARED * len(ratio) else float("inf")
 
 
-def _turned(world: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda matrix: world @ matrix
+def _turned(rotation: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda matrix: np.concatenate([rotation @ matrix[:3], matrix[3:]])
 
 
 def _moved(factor: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda matrix: np.concatenate([matrix[:, :3], matrix[:, 3:] * [[factor], [factor], [factor], [1]]], 1)
 
 
-Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-
-
-def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Conventions]]:
-    """Return other conventions, each with the advice that applies it; `known`: the format of the file determines the axes."""
+def candidates(now: Conventions, known: bool) -> list[tuple[str, Conventions]]:
+    """Return other conventions than `now`, each with the advice that applies it; `known`: the format of the file determines the
+    axes."""
+    axes, metres = now.axes, now.metres
     other = "opencv" if axes == "opengl" else "opengl"
     inverse = "the matrices are world-to-camera: write their inverses into transforms.json"
     of_camera = [
@@ -153,8 +160,12 @@ def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Convent
         (f"{inverse} with `source.axes: {other}` fits", Conventions(other, metres, np.linalg.inv)),
     ]
     out = [] if known else of_camera
-    for text, world in (("y-up to z-up (x, -z, y)", Z_UP_TO_Y_UP), ("z-up to y-up (x, z, -y)", Z_UP_TO_Y_UP.T)):
-        out.append((f"turning the mesh from {text} fits", Conventions(axes, metres, _turned(world), of_world=True)))
+    for up, words in (("y", "from y-up to z-up (x, -z, y)"), ("z", "from z-up to y-up (x, z, -y)")):
+        text = f"`source.mesh_up: {up}`, which turns the mesh {words}, fits"
+        if now.mesh_up != "as_poses":  # it is turned already: this turns it back
+            text = "`source.mesh_up: as_poses` fits"
+        if now.mesh_up != up:
+            out.append((text, Conventions(axes, metres, _turned(TURNS[up].T), of_world=True)))
     for factor in (1000.0, 100.0, 0.01, 0.001):
         text = f"camera positions times {factor:g} fits (mesh and poses are in different units)"
         out.append((text, Conventions(axes, metres, _moved(factor), of_world=True)))
@@ -164,8 +175,7 @@ def candidates(axes: str, metres: float, known: bool) -> list[tuple[str, Convent
 def explain(
     frames: list[tuple[Frame, Pinhole]],
     trace: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    axes: str,
-    metres: float,
+    conventions: Conventions,
     known: bool,
     depth_unit: float | None,
     tolerance: float,
@@ -175,7 +185,7 @@ def explain(
     Args:
         frames: photographs with either, and their pinhole cameras.
         trace: (origin, directions (h, w, 3)) -> z-depth (h, w), 0 = miss.
-        axes, metres: the convention in use.
+        conventions: those in use.
         known: whether the format of the file determines the axes.
         depth_unit: metres per value of the depth images; None = by their format.
         tolerance: largest acceptable disagreement.
@@ -188,24 +198,24 @@ def explain(
     some = [replace(f, seen=f.seen[:: max(1, len(f.seen) // TRIAL_POINTS)]) if f.seen is not None else f for f, _ in chosen]
     chosen = [(frame, view) for frame, (_, view) in zip(some, chosen, strict=True)]
 
-    def ratios(conventions: Conventions) -> np.ndarray:
+    def ratios(tried: Conventions) -> np.ndarray:
         parts = []
         for (frame, view), depth in zip(chosen, depths, strict=True):
             small = shrunk(view, TRIAL_WIDTH)
-            pose = conventions.pose(frame)
+            pose = tried.pose(frame)
             mesh_depth = trace(pose[:3, 3], directions(small, pose))
             parts.append(
-                point_ratio(frame, conventions, small, mesh_depth)
+                point_ratio(frame, tried, small, mesh_depth)
                 if depth is None
-                else depth_ratio(frame, conventions, small, mesh_depth, depth)
+                else depth_ratio(frame, tried, small, mesh_depth, depth)
             )
         return np.concatenate(parts)
 
-    as_is = ratios(Conventions(axes, metres))
-    scores = [(disagreement(ratios(c)), text) for text, c in candidates(axes, metres, known)]
+    as_is = ratios(conventions)
+    scores = [(disagreement(ratios(c)), text) for text, c in candidates(conventions, known)]
     if np.isfinite(as_is).any() and any(depth is not None for depth in depths):  # sparse points have no scale of their own
         factor = float(np.nanmedian(as_is))
-        scores.append((disagreement(as_is / factor), _unit_advice(metres, factor)))
+        scores.append((disagreement(as_is / factor), _unit_advice(conventions.metres, factor)))
     best, text = min(scores)
     return f"{text} (disagreement {best:.1%})" if best <= min(tolerance, 0.5 * disagreement(as_is)) else ""
 
@@ -213,8 +223,7 @@ def explain(
 def explain_edges(
     trials: list[tuple[Frame, Pinhole, np.ndarray, np.ndarray]],
     trace: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
-    axes: str,
-    metres: float,
+    conventions: Conventions,
     known: bool,
     now: float,
 ) -> str:
@@ -223,7 +232,7 @@ def explain_edges(
     Args:
         trials: frame, pinhole camera, its photograph (h, w, 3) and valid (h, w).
         trace: (origin, directions (h, w, 3)) -> z-depth (h, w) with 0 = miss, and unit normals (h, w, 3).
-        axes, metres: the convention in use.
+        conventions: those in use.
         known: whether the format of the file determines the axes.
         now: correlation with the convention in use.
 
@@ -231,15 +240,16 @@ def explain_edges(
         Advice in words; empty if no convention is clearly better.
     """
 
-    def correlation(conventions: Conventions) -> float:
+    def correlation(tried: Conventions) -> float:
         found = []
         for frame, camera, photo, valid in trials:
-            pose = conventions.pose(frame)
+            pose = tried.pose(frame)
             depth, normal = trace(pose[:3, 3], directions(camera, pose))
-            found.append(edge_correlation(photo, valid, depth, normal)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
+            edges = edge_pictures(photo, valid, depth, normal)
+            found.append(edge_correlation(*edges)[SHIFT, SHIFT] if (depth > 0).any() else 0.0)
         return float(np.mean(found)) if found else 0.0
 
-    best, text = max((correlation(c), text) for text, c in candidates(axes, metres, known))
+    best, text = max((correlation(c), text) for text, c in candidates(conventions, known))
     return f"{text} (edges correlate {best:.2f}, as read {now:.2f})" if best >= max(CLEAR_CORRELATION, 3 * now) else ""
 
 
@@ -266,8 +276,8 @@ def directions(camera: Pinhole, pose: np.ndarray) -> np.ndarray:
     return pixel_directions(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, pose)
 
 
-def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Correlate photograph edges with mesh edges for shifts of the photograph; all pictures are reduced to EDGE_WIDTH first.
+def edge_pictures(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return how much of an edge every pixel of a photograph and of the mesh is, both reduced to EDGE_WIDTH.
 
     Args:
         photo: (H, W, 3).
@@ -276,16 +286,13 @@ def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, no
         normal: (H, W, 3) unit normals of the mesh.
 
     Returns:
-        (2 SHIFT + 1, 2 SHIFT + 1) float64; entry [SHIFT + dy, SHIFT + dx] compares mesh pixel (u, v) with photograph pixel
-        (u + dx, v + dy). Zeros if the picture is too small or has no edges.
+        (h, w) float64 of the photograph and of the mesh.
     """
     from scipy.ndimage import gaussian_filter
 
     width, height = images.fitted_size(depth.shape[1], depth.shape[0], EDGE_WIDTH, EDGE_WIDTH)
     photo, valid = images.reduce_area(photo, valid, width, height)
     depth, normal = images.reduce_nearest(depth, width, height), images.reduce_nearest(normal, width, height)
-    if min(height, width) < 8 * SHIFT:
-        return np.zeros((2 * SHIFT + 1, 2 * SHIFT + 1))
     grey = np.log(0.02 + np.where(valid, photo.mean(-1), 0) / max(float(np.percentile(photo, 99)), 1e-6))
     dv, du = np.gradient(gaussian_filter(grey, 0.7))
     seen = np.where(valid, np.hypot(du, dv), 0)
@@ -297,10 +304,23 @@ def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, no
         edge = np.maximum(bend, jump)
         edge[(-1, slice(None)) if axis == 0 else (slice(None), -1)] = 0
         mesh = np.maximum(mesh, edge)
-    seen, mesh = gaussian_filter(np.minimum(seen, 1.0), 1.0), gaussian_filter(mesh, 1.0)
+    return gaussian_filter(np.minimum(seen, 1.0), 1.0), gaussian_filter(mesh, 1.0)
+
+
+def edge_correlation(seen: np.ndarray, mesh: np.ndarray) -> np.ndarray:
+    """Correlate the edges of a photograph with those of the mesh, both (h, w) as `edge_pictures` returns them, for shifts of the
+    photograph.
+
+    Returns:
+        (2 SHIFT + 1, 2 SHIFT + 1) float64; entry [SHIFT + dy, SHIFT + dx] compares mesh pixel (u, v) with photograph pixel
+        (u + dx, v + dy). Zeros if the picture is too small or has no edges.
+    """
+    out = np.zeros((2 * SHIFT + 1, 2 * SHIFT + 1))
+    height, width = mesh.shape
+    if min(height, width) < 8 * SHIFT:
+        return out
     inner = mesh[SHIFT:-SHIFT, SHIFT:-SHIFT]
     inner = inner - inner.mean()
-    out = np.zeros((2 * SHIFT + 1, 2 * SHIFT + 1))
     for dy in range(-SHIFT, SHIFT + 1):
         for dx in range(-SHIFT, SHIFT + 1):
             other = seen[SHIFT + dy : height - SHIFT + dy, SHIFT + dx : width - SHIFT + dx]
@@ -310,17 +330,54 @@ def edge_correlation(photo: np.ndarray, valid: np.ndarray, depth: np.ndarray, no
     return out
 
 
+def own_and_others(pictures: list[tuple[np.ndarray, np.ndarray]]) -> tuple[float, float, float]:
+    """Compare photographs with the mesh as their own pose shows it, and as the poses of the other photographs do.
+
+    Args:
+        pictures: of at least two views of one size, as `edge_pictures` returns them.
+
+    Returns:
+        Mean correlation with the own pose, with those of others, and their difference in standard errors of its mean over views.
+    """
+    seen, mesh = (_standardised(np.stack(part)) for part in zip(*pictures, strict=True))
+    table = seen @ mesh.T
+    count = len(table)
+    own = table.diagonal()
+    others = (table.sum(1) - own) / (count - 1)
+    error = float((own - others).std(ddof=1)) / np.sqrt(count)
+    return float(own.mean()), float(others.mean()), float((own - others).mean()) / max(error, 1e-9)
+
+
+def _standardised(pictures: np.ndarray) -> np.ndarray:
+    rows = pictures.reshape(len(pictures), -1)
+    rows = rows - rows.mean(1, keepdims=True)
+    return rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9)
+
+
 @dataclass
 class Alignment:
-    """Collects the comparisons of all views: `report` for capture.json, `notes` and `edge_warning` in words, `refuse`."""
+    """Collects the comparisons of all views: `report` for capture.json, `notes` and `edge_warning` in words, `refuse`.
+
+    Attributes:
+        ratios: of depth; edges: correlations (2 SHIFT + 1, 2 SHIFT + 1), both by view.
+        pictures: edges of photograph and mesh, (h, w) float32 each, of some views of one size.
+        what: the depth is from.
+    """
 
     ratios: dict[str, np.ndarray]
     edges: dict[str, np.ndarray]
+    pictures: list[tuple[np.ndarray, np.ndarray]]
     what: str = "depth images"
 
     @classmethod
     def empty(cls) -> Alignment:
-        return cls({}, {})
+        return cls({}, {}, [])
+
+    def add_edges(self, name: str, seen: np.ndarray, mesh: np.ndarray, compared: bool) -> None:
+        """Add a view by the edges of its photograph and of the mesh (`edge_pictures`); `compared`: with the other views, too."""
+        self.edges[name] = edge_correlation(seen, mesh)
+        if compared and (not self.pictures or seen.shape == self.pictures[0][0].shape):
+            self.pictures.append((seen.astype(np.float32), mesh.astype(np.float32)))
 
     @property
     def depth_disagreement(self) -> float:
@@ -343,6 +400,10 @@ class Alignment:
             out["edge_correlation"] = round(float(mean[SHIFT, SHIFT]), 6)
             out["edge_correlation_best"] = round(float(mean.max()), 6)
             out["edge_best_shift"] = [int(dx) - SHIFT, int(dy) - SHIFT]
+        if len(self.pictures) > 2:
+            own, others, apart = own_and_others(self.pictures)
+            out["edge_correlation_other_poses"] = round(others, 6)
+            out["edge_own_pose_standard_errors"] = round(apart, 3)
         return out
 
     def disagreeing_views(self, tolerance: float) -> list[str]:
@@ -369,21 +430,28 @@ class Alignment:
             )
         return out
 
-    def edge_warning(self) -> str:
-        """Return a warning if edges do not lie on edges, else an empty text."""
+    def edge_warning(self, tolerance: float) -> str:
+        """Return a warning if edges do not lie on edges, else an empty text; `tolerance` of the measured depth."""
         r = self.report()
         if "edge_correlation" not in r:
             return ""
         now, best = r["edge_correlation"], r["edge_correlation_best"]
         shift = max(map(abs, r["edge_best_shift"]))
-        if now < WEAK_CORRELATION or (shift >= SHIFT - 1 and best > 1.2 * now):
-            return (
-                "photographs and mesh may not be aligned: their edges do not lie on each other (correlation"
-                f" {now:.3f}, {best:.3f} when shifted by {shift / EDGE_WIDTH:.1%} of the picture); look at the"
-                " overlay in the report, check `source.axes`, `source.unit`, that mesh and poses share a frame, and that every"
-                " photograph stands with its own pose"
+        weak = WEAK_BESIDE_DEPTH if self.depth_disagreement <= tolerance else WEAK_CORRELATION
+        if now >= weak and not (shift >= SHIFT - 1 and best > 1.2 * now):
+            return ""
+        mixed_up = ""
+        if r.get("edge_own_pose_standard_errors", np.inf) < CLEARLY_OWN:
+            mixed_up = (
+                f"; from the poses of other photographs they correlate {r['edge_correlation_other_poses']:.3f}, which is as much:"
+                " photographs may stand with each other's poses"
             )
-        return ""
+        return (
+            "photographs and mesh may not be aligned: their edges do not lie on each other (correlation"
+            f" {now:.3f}, {best:.3f} when shifted by {shift / EDGE_WIDTH:.1%} of the picture){mixed_up}; look at the"
+            " overlay in the report, check `source.axes`, `source.unit`, the focal length, that mesh and poses share a frame, and"
+            " that every photograph stands with its own pose"
+        )
 
     def refuse(self, path: Any, tolerance: float, advice: Callable[[], str]) -> str:
         """Return an error message if the measured depth contradicts the mesh, else an empty text."""

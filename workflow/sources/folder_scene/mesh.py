@@ -19,6 +19,14 @@ SUFFIXES = (".ply", ".obj", ".glb")
 MIN_AREA = 1e-12  # m^2; smaller triangles are removed (docs/method/numerics.md#degenerate-faces)
 DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another unit (docs/method/numerics.md#unit-of-the-mesh)
 AGAIN = "export the mesh again, or copy it again"
+FACTORS = (0.1, 0.01, 0.001)
+"""Factors on camera positions far away that are tried: decimetres, centimetres and millimetres beside metres."""
+TURNS = {
+    "as_poses": np.eye(3),
+    "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
+"""`source.mesh_up` -> rotation from the axes of the mesh file to those of the poses."""
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -120,11 +128,12 @@ class VertexIds:
     path: Path
 
 
-def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mesh:
-    """Read a mesh (PLY, OBJ or GLB), merge its nodes, scale it to metres, remove faces without area, keep `instance` of the
-    faces.
+def load(path: Path, metres: float, of_vertices: VertexIds | None = None, up: str = "as_poses") -> Mesh:
+    """Read a mesh (PLY, OBJ or GLB), merge its nodes, scale it to metres, turn it, remove faces without area, keep `instance` of
+    the faces.
 
-    `metres` is the unit of the file; `of_vertices` are ids from another file, which replace those of the mesh.
+    `metres` is the unit of the file; `of_vertices` are ids from another file, which replace those of the mesh; `up`: a key of
+    `TURNS`.
 
     Raises:
         InputError: unreadable, no triangles, none with an area, or instance ids that do not fit.
@@ -141,7 +150,7 @@ def load(path: Path, metres: float, of_vertices: VertexIds | None = None) -> Mes
                 " from the same release"
             )
         ids, names = majority_id(of_vertices.ids[faces]), None
-    mesh = _cleaned(path, vertices * metres, faces, ids)
+    mesh = _cleaned(path, vertices * metres @ TURNS[up].T, faces, ids)
     if names is not None:
         mesh.names, mesh.from_nodes = names, True
     elif mesh.instance is not None:
@@ -273,6 +282,18 @@ def check_size(path: Path, mesh: Mesh, unit: str | float, metres: float, centres
     if 2 * int(far.sum()) > len(centres):
         raise InputError(
             f"{path}: {int(far.sum())} of {len(centres)} cameras are more than the scene's size ({diagonal:.3g} m) away"
-            f" from the mesh (median {np.median(outside):.3g} m); mesh and poses are in different units or frames:"
+            f" from the mesh (median {np.median(outside):.3g} m); {_factor_advice(bounds, centres)}"
             " export both from the same tool (docs/guide/own-data.md, mesh and poses in one frame)"
         )
+
+
+def _factor_advice(bounds: np.ndarray, centres: np.ndarray) -> str:
+    """Return in words what is between mesh and poses; names the power of ten that brings nine of ten cameras into the mesh."""
+    for factor in FACTORS:
+        scaled = centres * factor
+        if ((scaled >= bounds[0]) & (scaled <= bounds[1])).all(1).mean() >= 0.9:
+            return (
+                f"with camera positions times {factor:g} they are inside it, so mesh and poses seem to be in different units:"
+                " scale the positions in transform_matrix, or"
+            )
+    return "mesh and poses are in different units or frames:"
