@@ -86,7 +86,7 @@ STAGES: dict[str, Stage] = {
         Stage(
             "relight",
             ("capture", "segmentation", "base", "emission", "affines", "lamp_images"),
-            ("relight", "seed"),
+            ("relight", "relight_title", "seed"),
             reads_raw=True,
             on_demand=True,
         ),

@@ -247,6 +247,11 @@ def test_the_forecast_names_every_stage_and_the_whole(repository, monkeypatch):
     assert [line.split()[0] for line in lines] == ["stage", "capture", "render", "expected:"]
     assert lines[-1].endswith("of wall time on 2 cores")
     assert forecast.forecast([], 2) == []
+    found = forecast.job_cost
+    monkeypatch.setattr(forecast, "job_cost", lambda stage, *_: model.Cost(None, None, None, None))
+    unknown = forecast.forecast([forecast.Planned("relight", "kitchen", 2, "draft")], 2)
+    assert unknown[-1] == "expected: unknown, because nothing was measured yet of relight"
+    monkeypatch.setattr(forecast, "job_cost", found)
     assert os.getcwd() == str(repository)
 
 

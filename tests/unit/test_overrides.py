@@ -90,7 +90,7 @@ def test_kinds_are_chosen_among_those_that_agree_with_what_is_given():
 def job_of(monkeypatch, lobes=True, **entries):
     monkeypatch.setattr(affines, "has_lobes", lambda job: lobes)
     rows = {key: SimpleNamespace(**{"roughness": None, "metallic": None, **value}) for key, value in entries.items()}
-    return SimpleNamespace(settings=SimpleNamespace(overrides=SimpleNamespace(**rows)))
+    return SimpleNamespace(scene="kitchen", settings=SimpleNamespace(overrides=SimpleNamespace(**rows)))
 
 
 def test_objects_are_named_by_name_or_id(monkeypatch):
@@ -105,7 +105,11 @@ def test_objects_are_named_by_name_or_id(monkeypatch):
 @pytest.mark.parametrize(
     "entries, lobes, words",
     [
-        ({"windw frame": {"metallic": 0.0}}, True, "no object 'windw frame'. Did you mean 'window frame'?"),
+        (
+            {"windw frame": {"metallic": 0.0}},
+            True,
+            "config/scenes/kitchen.yaml: `overrides`: there is no object 'windw frame'. Did you mean 'window frame'?",
+        ),
         ({"7": {"metallic": 0.0}}, True, "no object '7'"),
         ({"door": {"metallic": 0.0}, "2": {"roughness": 0.5}}, True, "'door' is there twice"),
         ({"door": {"metallic": 1.0}}, False, "without specular lobes"),

@@ -126,7 +126,7 @@ def lit(root, *wanted, run=None):
         job = FakeJob(stage, root)
         job.timed = lambda name: nullcontext()
         job.document["relight"] = job.settings.relight = entries
-        job.settings.lamp_images = lamp_bases(entries)
+        job.settings.lamp_images, job.settings.relight_title = lamp_bases(entries), ""
         module.run(job)
         job.writer.finish()
         if run is not None:

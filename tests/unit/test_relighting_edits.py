@@ -109,6 +109,9 @@ def test_factors_and_colours_are_no_part_of_what_is_traced():
     assert not recombines(entry(method="path")) and key_of(lamp_basis(entry(samples=8))) != key_of(lamp_basis(one))
 
 
+SPELLINGS = (("colour", "centre"), ("color", "center"))
+
+
 def test_settings_of_lamps_and_paint():
     lamps = entry(lamps={"a": "off", "b": False, 3: 0.5, "c": {"factor": True}})["lamps"]
     assert {key: lamp["factor"] for key, lamp in lamps.items()} == {"a": 0, "b": 0, "3": 0.5, "c": 1}
@@ -129,10 +132,19 @@ def test_settings_of_lamps_and_paint():
         ({"insert": [{"file": "a.glb", "position": [0, 0, 0], "scale": float("inf")}]}, "finite"),
         ({"environment_turn": float("nan")}, "finite"),
         ({"environment": [float("inf"), 0, 0]}, "environment"),
+        ({"lamps": {"a": "#ff8800"}}, "a colour is linear R, G, B"),
+        ({"camera": {"views": ["a"], "frames": 24}}, "24 frames and stands still"),
+        ({"camera": {"views": ["a", "b"]}}, "takes one picture; give the number of its `frames`"),
+        ({"video": {"codec": "h264"}}, "takes one picture; give the number of its `frames`, or leave out"),
+        ({"camera": {"poses": [{"position": [0, 1, 2], "look_at": [0, 1, 2]}]}}, "the same point"),
     ):
         with pytest.raises(ValidationError, match=words):
             entry(**bad)
     assert entry(video="off")["video"] is None and entry()["video"] == {"fps": 24, "codec": "av1"}
+    british, american = (entry(lamps={"a": {ou: [1, 0, 0]}}, sphere={re: [0, 1, 2]}) for ou, re in SPELLINGS)
+    assert british == american and british["sphere"]["center"] == [0, 1, 2]
+    moving = {"center": [0, 0, 0], "path_to": [1, 0, 0]}
+    assert entry(sphere=moving, camera={"frames": 3})["camera"]["frames"] == 3  # the camera stands still, the sphere does not
 
 
 # ------------------------------------------------------------------------------------------------------------- the room
@@ -432,7 +444,10 @@ def test_broken_meshes_are_refused(tmp_path):
 
     whole = plate(tmp_path / "plate.glb").read_bytes()
     (tmp_path / "short.glb").write_bytes(whole[:-40])
-    assert "cut short" in said(tmp_path / "short.glb")
+    assert "cut short (its header announces" in said(tmp_path / "short.glb")
+    for kind in (".glb", ".gltf", ".ply", ".obj"):
+        (tmp_path / f"nothing{kind}").touch()
+        assert f"nothing{kind}: empty (0 bytes)" in said(tmp_path / f"nothing{kind}")
     (tmp_path / "text.glb").write_text("not a mesh, and longer than its header")
     assert "does not begin with `glTF`" in said(tmp_path / "text.glb")
     spoilt = bytearray(whole)
@@ -494,8 +509,6 @@ def test_a_way_through_a_wall_is_named(toy):
         lit(toy, {**wanted, "method": "path"})
     _, folder = lit(toy, {**wanted, "camera": {**camera, "through_surface": True}})
     assert (folder / "out/frame_0004.png").is_file() and not (folder / "out/video.mp4").exists()
-    with pytest.raises(InputError, match="give two different points"):
-        lit(toy, {"name": "a", "camera": {"poses": [{"position": [1, 1, 1], "look_at": [1, 1, 1]}]}})
 
 
 def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
@@ -599,6 +612,8 @@ def test_flights_have_a_video_and_the_sheet_shows_what_was_before(toy):
     drawn = sheet.contact_sheet([one] * 4)
     assert drawn.shape[1] == 3 * 424 and drawn.shape[0] == 2 * (sheet.GAP + sheet.TITLE + 40 + sheet.CAPTION + sheet.GAP)
     assert (drawn[sheet.GAP + sheet.TITLE + 20, 20] == 0).all()
+    titled = sheet.contact_sheet([one] * 4, "Evening")
+    assert (titled[sheet.HEAD :] == drawn).all() and titled[: sheet.HEAD].min() < 128
 
 
 def test_captions_say_what_changes():
@@ -631,7 +646,11 @@ def test_plans_are_found_and_checked(tmp_path):
     place, layer = relight_plans.plan_layer("night", tmp_path)
     assert place == "config/relight/night.yaml" and layer["relight"][1]["insert"][0]["file"] == str(folder / "plate.glb")
     assert relight_plans.active_plan("night", tmp_path) == "night" and relight_plans.active_plan("x", tmp_path) == "example"
-    for text, words in (("relight: []\n", "needed a list"), ("relihgt: []\n", "unknown key. Did you mean `relight`")):
+    for text, words in (
+        ("title: t\n", "`relight`: no relightings; needed is a list"),
+        ("title: 5\nrelight: [{name: a}]\n", "`title`: found 5"),
+        ("relihgt: []\n", "unknown key. Did you mean `relight`"),
+    ):
         (folder / "bad.yaml").write_text(text)
         with pytest.raises(InputError, match=words):
             relight_plans.plan_layer("bad", tmp_path)
@@ -645,9 +664,16 @@ def test_mistakes_in_a_plan_are_blamed_on_it(tmp_path, repository):
     for part in ("relight", "scenes"):
         (tmp_path / f"config/{part}").mkdir(parents=True)
     shutil.copy(repository / "config/scenes/kitchen.yaml", tmp_path / "config/scenes/room.yaml")
-    (tmp_path / "config/relight/night.yaml").write_text("relight: [{name: a, lamsp: {bulb: off}}]\n")
-    with pytest.raises(InputError, match=r"config/relight/night.yaml: `relight.0.lamsp`: unknown key. Did you mean `lamps`"):
-        settings.load("room--relight-night-s0", "draft", tmp_path)
+    for entries, words in (
+        ("{name: a, lamsp: {bulb: off}}", "`relight.0.lamsp`: unknown key. Did you mean `lamps`"),
+        ("{name: a b/c}", "`relight.0.name`: found 'a b/c'. Needed: letters, digits, _ and -"),
+        ("{name: a}, {name: a}", "`relight`: 2 relightings are called 'a'; every one needs a name of its own"),
+        ("{name: a, camera: {views: [003]}}", '`relight.0.camera.views.0`: found 3. .* write it in quotes, such as "003"'),
+        ("{name: a, insert: [{file: a.glb}]}", "`relight.0.insert.0.position`: missing. Add it; config/relight/kitchen.yaml"),
+    ):
+        (tmp_path / "config/relight/night.yaml").write_text(f"relight: [{entries}]\n")
+        with pytest.raises(InputError, match=f"config/relight/night.yaml: {words}"):
+            settings.load("room--relight-night-s0", "draft", tmp_path)
     (tmp_path / "config/relight/night.yaml").write_text("relight: [{name: a, lamps: {bulb: off}}]\n")
     found = settings.dump(settings.load("room--relight-night-s0", "draft", tmp_path))
     plain = settings.dump(settings.load("room", "draft", tmp_path))
@@ -700,7 +726,7 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     assert "there is no lamp 'lmap'. Did you mean 'lamp'" in told(lamps={"lmap": 0})
     assert "found v7; the views are v0, v1" in told(camera={"views": ["v7"]})
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
-    assert "libnothing" in told(camera={"frames": 2})
+    assert "libnothing" in told(camera={"views": ["v0", "v1"], "frames": 2})
     monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused
     check.check_relightings({"relight": [entry(lamps={"lmap": 0})]}, "toy", "draft")
 

@@ -84,6 +84,11 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "capture: {Views: 3}\n", ["x.yaml", "capture.Views", "unknown key", "Did you mean `views`?"]),
         (GOOD + "affines: {VIEWS: 3}\n", ["x.yaml", "affines.VIEWS", "unknown key", "Allowed here"]),
         (GOOD + "colour: 3\n", ["colour", "unknown key", "capture"]),
+        (
+            GOOD + "override: {window frame: {metallic: 0}}\n",
+            ["`override.window frame`", "Did you mean `overrides`, where materials"],
+        ),
+        (GOOD + "overrides: {components: {specular: off}}\n", ["Did you mean `override`, where parts of the model"]),
         (GOOD + "capture: {views: 0}\n", ["capture.views", "found 0", "greater than or equal to 1"]),
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", "found 0"]),
@@ -383,3 +388,10 @@ def test_a_bench_of_a_scene_that_is_not_there_says_so(tmp_path):
     (tmp_path / "config/scenes").mkdir(parents=True)
     with pytest.raises(InputError, match=r"config/scenes/typo.yaml: not found"):
         settings.load("typo--bench-p01-s0", "draft", tmp_path)
+
+
+def test_a_comparison_needs_two_names(repository):
+    with pytest.raises(
+        InputError, match="compare/kitchen: no rule makes this. It needs the names of two results, such as compare/kitchen,"
+    ):
+        settings.refuse_target("compare/kitchen", [], repository)

@@ -225,8 +225,15 @@ def test_a_quality_by_name_says_what_it_takes_what_it_scored_and_which_scenes_se
     taken = read_yaml(REPOSITORY / f"config/quality/{point.name}.yaml")["capture"]
     assert len(lines) == 1 and f"at most {taken['views']} photographs of {taken['width']} x {taken['height']}" in lines[0]
     assert f"albedo {point.expected('albedo').mean:.1f} dB" in lines[0]
+    assert [choose.fits(stage, "kitchen") for stage in ("capture", "affines", "relight", "lamp_images")] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+    assert not choose.fits("affines", "kitchen--bench-p01-s0")
     lines = choose.told(request, dict.fromkeys(["kitchen", "redkitchen"], choose.Choice("draft")))
-    assert lines[1:] == ["redkitchen: other than that, because config/scenes/redkitchen.yaml sets capture.views"]
+    assert lines[1:] == ["redkitchen may differ: config/scenes/redkitchen.yaml sets capture.views itself"]
     monkeypatch.setattr(choose, "MOST_SCENES", 0)
     assert choose.told(request, {"redkitchen": choose.Choice("draft")})[1:] == ["1 of 1 scenes set some of it themselves"]
 

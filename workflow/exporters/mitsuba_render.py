@@ -10,6 +10,8 @@ command `mitsuba`.
 from __future__ import annotations
 
 import argparse
+import sys
+import time
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -18,6 +20,8 @@ from workflow.exporters import mitsuba_bsdf
 
 PARAMETERS = {"base_color": "albedo", "roughness": "roughness", "metallic": "metallic"}
 """Parameters of the plug-in, and the textures that they are read from."""
+PASS = 64
+"""Samples a pixel between two messages."""
 
 
 def exact_scene(text: str) -> str:
@@ -44,13 +48,32 @@ def load(folder: Path, **parameters: str) -> Any:
     return mi.load_string(exact_scene((folder / "scene.xml").read_text()), **parameters)
 
 
+def rendered(scene: Any, sensor: Any, samples: int) -> Any:
+    """Render a view in passes that have random numbers of their own, and say after each how long the rest will take."""
+    import drjit as dr
+    import mitsuba as mi
+
+    total, started = 0.0, time.monotonic()
+    for done in range(0, samples, PASS):
+        count = min(PASS, samples - done)
+        picture = mi.TensorXf(mi.render(scene, sensor=sensor, spp=count, seed=done))
+        total = total + count * picture
+        dr.eval(total)
+        dr.sync_thread()
+        left = (time.monotonic() - started) / (done + count) * (samples - done - count)
+        print(f"{done + count} of {samples} samples a pixel, about {left:.0f} s left", file=sys.stderr)
+    return total / samples
+
+
 def main() -> None:
     import mitsuba as mi
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--view", default="", help="name of a photograph, without `view-`; the first one if it is left out")
-    parser.add_argument("--samples", type=int, default=256, help="a pixel")
-    parser.add_argument("--size", default="", help="WIDTHxHEIGHT in pixels; that of the first photograph if it is left out")
+    parser.add_argument("--samples", type=int, default=256, help="paths per pixel")
+    parser.add_argument(
+        "--size", default="", help="WIDTHxHEIGHT in pixels, such as 960x960; that of the photographs if it is left out"
+    )
     parser.add_argument("--output", type=Path, default=Path("room.exr"), help=".exr (linear) or .png")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")
     asked = parser.parse_args()
@@ -61,7 +84,7 @@ def main() -> None:
     if asked.view and asked.view not in sensors:
         parser.error(f"no view {asked.view}; there are {', '.join(sensors)}")
     sensor = sensors[asked.view] if asked.view else scene.sensors()[0]
-    mi.util.write_bitmap(str(asked.output), mi.render(scene, sensor=sensor, spp=asked.samples))
+    mi.util.write_bitmap(str(asked.output), rendered(scene, sensor, asked.samples))
     print(asked.output)
 
 

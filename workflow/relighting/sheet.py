@@ -11,8 +11,9 @@ import numpy as np
 from workflow.settings.relight import name_of
 
 Array = np.ndarray
-GAP, TITLE, CAPTION, LARGEST, LEAST_WIDTH = 6, 20, 18, 384, 320
-"""Pixels between pictures, of a line of a title, of a caption, of the longer side of a picture, and of a relighting at least."""
+GAP, TITLE, CAPTION, HEAD, LARGEST, LEAST_WIDTH = 6, 20, 18, 34, 384, 320
+"""Pixels between pictures, of a line of a title, of a caption, of the title of the sheet, of the longer side of a picture, and of
+a relighting at least."""
 PAIRS = 3
 """Frames of a flight that are shown."""
 
@@ -46,23 +47,25 @@ def png(picture: Array) -> bytes:
     return buffer.getvalue()
 
 
-def contact_sheet(rows: list[Row]) -> Array:
+def contact_sheet(rows: list[Row], title: str = "") -> Array:
     """Draw the relightings in the order of reading, (H, W, 3) uint8: each with its title, then pairs of pictures with captions.
-    Those that fit beside one another stand on one line."""
-    from PIL import Image
+    Those that fit beside one another stand on one line, and the title of all of them stands above."""
+    from PIL import Image, ImageDraw, ImageFont
 
     blocks = [_block(row) for row in rows]
     widest = max(block.width for block in blocks)
     if len(blocks) > 1:
         widest = max(widest, PAIRS * min(block.width for block in blocks))
     placed: list[tuple[int, int, Any]] = []
-    x, y, deepest = 0, 0, 0
+    x, y, deepest = 0, HEAD if title else 0, 0
     for block in blocks:
         if x and x + block.width > widest:
             x, y, deepest = 0, y + deepest, 0
         placed.append((x, y, block))
         x, deepest = x + block.width, max(deepest, block.height)
     sheet = Image.new("RGB", (widest, y + deepest), "white")
+    if title:
+        ImageDraw.Draw(sheet).text((GAP, GAP), title, fill="black", font=ImageFont.load_default(22))
     for left, top, block in placed:
         sheet.paste(block, (left, top))
     return np.asarray(sheet)

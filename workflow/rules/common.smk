@@ -3,6 +3,7 @@ import atexit
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import time
@@ -21,6 +22,7 @@ from workflow.runtime.job_state import reasons
 from workflow.scene.named import check_overrides
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
+from workflow.settings.names import did_you_mean_path
 from workflow.settings import refuse_target, study_files
 from workflow.studies import grid as study_sheet
 from workflow.studies import table as study_table
@@ -328,7 +330,10 @@ def scored(wildcards):
         config.get("colour", "auto")
     )
     if not folder.is_dir():
-        stop(f"--config maps={folder}: no such folder")
+        stop(
+            f"--config maps={folder}: no such folder; a relative path counts from {os.getcwd()}.{did_you_mean_path(folder)} Give the"
+            " folder that holds albedo/<view>.exr or .png, roughness/, metallic/ and so on (docs/guide/comparing.md)"
+        )
     quality = quality_of(wildcards.scene)
     mark = or_stop(comparison.digest_of_maps, folder, colour)
     return {
@@ -348,18 +353,23 @@ def tell_target():
 PAGES = ("report.html", "room.html")
 
 
+def made_now(folder, pattern):
+    """Files below a folder that were written since this run began."""
+    paths = sorted(folder.glob(pattern))
+    return [path for path in paths if path.stat().st_mtime >= STARTED]
+
+
 def tell_pages():
-    """Say where to look, after the last line of Snakemake: the pages of the scenes that were made, or of the batch."""
+    """Say where to look, after the last line of Snakemake: the pages of the scenes that were made, or of the batch, and the contact
+    sheets of relightings."""
     if not workflow.is_main_process:
         return  # a job on a node of a cluster
-    folders = [
-        path.parent
-        for path in sorted(Path("scenes").glob("*/manifest.json"))
-        if path.stat().st_mtime >= STARTED
-    ]
+    folders = [path.parent for path in made_now(Path("scenes"), "*/manifest.json")]
     pages = [folder / page for folder in folders for page in PAGES]
     if batch_asked:
         pages = [Path("results/batch/report.html")]
+    for pattern in ("*/contact_sheet.png", "*/*/contact_sheet.png"):
+        pages += made_now(Path("relight"), pattern)
     found = [str(page.resolve()) for page in pages if page.is_file()]
     if found:
         atexit.register(print, "\nOpen: " + "\n      ".join(found), file=sys.stderr)
@@ -475,9 +485,9 @@ def tell_costs():
     ]
     for line in forecast.forecast(jobs, workflow.cores):
         print(line, file=sys.stderr)
-    scenes = {job.scene for job in jobs}
+    scenes = {job.scene for job in jobs if choose.fits(job.stage, job.scene)}
     chosen = {scene: choice for scene, choice in CHOSEN.items() if scene in scenes}
-    for line in choose.told(REQUEST, chosen) if jobs else []:
+    for line in choose.told(REQUEST, chosen) if chosen else []:
         print(line, file=sys.stderr)
 
 
@@ -492,6 +502,23 @@ atexit.register(tell_costs_of_dry_run)
 
 
 # ------------------------------------------------------------------------------------------------------------ errors
+
+
+def tell_lock():
+    """Give the command that removes a lock, after Snakemake's message that the folder is locked."""
+    if workflow.is_main_process and workflow.dag is not None and not workflow.dryrun:
+        os.chdir(FOLDER)
+        if workflow.persistence.locked:
+            again = shlex.join(["snakemake", *sys.argv[1:]])
+            print(
+                f"\nerror: another run holds this folder, or was killed in it. If none is running: `{again} --unlock`, then"
+                f" `{again}`",
+                file=sys.stderr,
+            )
+
+
+if "--unlock" not in sys.argv:
+    atexit.register(tell_lock)
 
 
 def tell_reasons():

@@ -162,6 +162,8 @@ def forecast(jobs: Iterable[Planned], cores: int) -> list[str]:
     widths = [max(len(row[i]) for row in rows) for i in range(5)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
     unknown = sorted(stage for stage, costs in of_stage.items() if any(cost.seconds is None for cost in costs))
+    if len(unknown) == len(of_stage):
+        return [*lines, f"expected: unknown, because nothing was measured yet of {', '.join(unknown)}"]
     beside = f", without {', '.join(unknown)}, of which nothing was measured yet" if unknown else ""
     whole = f"expected: {_span(START + busy[1], START + busy[2], duration)} of wall time on {cores} cores{beside}"
     return [*lines, whole]

@@ -10,6 +10,7 @@ from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.registry import upstream_of
 from workflow.runtime import fingerprint as fp
+from workflow.settings import scene_origin
 from workflow.settings.names import did_you_mean
 
 
@@ -47,7 +48,7 @@ def check_overrides(stage: str, scene: str, quality: str) -> None:
     if reader is not None:
         names = names_of(reader)
         for key in wanted:
-            object_number(key, names, "overrides")
+            object_number(key, names, f"{scene_origin(scene)}: `overrides`")
 
 
 def names_of(segmentation: StageReader) -> list[str]:

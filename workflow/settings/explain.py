@@ -22,6 +22,13 @@ NEEDED = {
     **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "Needed: true or false"),
 }
+EXAMPLES = {"relight": "config/relight/kitchen.yaml"}
+"""Files that show all of a section that config/scenes/kitchen.yaml does not have."""
+TWINS = {
+    "override": " Did you mean `overrides`, where materials of objects are given?",
+    "overrides": " Did you mean `override`, where parts of the model are forced in or out?",
+}
+"""Sections whose names are alike: what is said about a key that they do not know."""
 """What a value of the wrong type should have been, by the type of pydantic's error."""
 
 
@@ -80,6 +87,11 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
     return kept
 
 
+def _is_section(found: Any) -> bool:
+    """Return whether a value is a mapping or a list of mappings, too long to be shown."""
+    return isinstance(found, dict) or (isinstance(found, list) and any(isinstance(entry, dict) for entry in found))
+
+
 def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
     """Return one line per problem; `origin` maps a dotted key to its file."""
     lines = []
@@ -92,23 +104,28 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
-            hint = REMOVED.get(dotted) or did_you_mean(where[-1], allowed, "`{}`")
+            hint = REMOVED.get(dotted) or did_you_mean(where[-1], allowed, "`{}`") or TWINS.get(str(where[0]), "")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(f"{path}: `{dotted}`: found {found!r}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`.")
         elif kind == "missing":
-            lines.append(f"{path}: `{dotted}`: missing. Add it; config/scenes/kitchen.yaml is a complete example.")
+            example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
+            lines.append(f"{path}: `{dotted}`: missing. Add it; {example} is a complete example.")
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             union = UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
             said = "missing. Add it;" if got is None else f"found {got!r},"
             hint = did_you_mean(got, union) if got is not None else ""
             lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.{hint}")
-        elif kind == "value_error" and isinstance(found, dict):  # keys that do not go together: the message says which
+        elif kind == "value_error" and _is_section(found):  # keys that do not go together: the message says which
             lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
         else:
             shown = found if not isinstance(found, dict) else "a mapping"
             needed = NEEDED.get(kind) or problem["msg"].removeprefix("Value error, ")
+            if kind == "string_type" and isinstance(found, int | float):
+                needed = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
+            elif kind == "string_pattern_mismatch" and where[-1] == "name":
+                needed = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
             hint = did_you_mean(found, re.findall(r"'([^']*)'", needed)) if isinstance(found, str) else ""
             lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed}.{hint}")
     return "\n".join(lines)

@@ -27,9 +27,11 @@ def files_of_mesh(path: Path) -> list[Path]:
     """Return a mesh that is there and the files that it names: buffers and textures of glTF, materials and textures of OBJ.
 
     Raises:
-        InputError: the file is cut short or is no file of its kind, or a file that it names is missing.
+        InputError: the file is empty, cut short or no file of its kind, or a file that it names is missing.
     """
     kind = path.suffix.lower()
+    if not path.stat().st_size:
+        raise InputError(f"{path}: empty (0 bytes); export the mesh again, or copy it again")
     if kind in (".glb", ".gltf"):
         document = _json_of_glb(path) if kind == ".glb" else _json_of(path, path.read_bytes())
         return [path, *_named_by_gltf(path, document)]
@@ -64,7 +66,9 @@ def _json_of_glb(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: no GLB file; it does not begin with `glTF`. Export the mesh again")
     _, _, length = _GLB_HEADER.unpack_from(data)
     if length > len(data):
-        raise InputError(f"{path}: cut short; its header tells of {length} bytes, and {len(data)} are there. Copy it again")
+        raise InputError(
+            f"{path}: cut short (its header announces {length} bytes, it has {len(data)}); export it again, or copy it again"
+        )
     size, kind = _CHUNK_HEADER.unpack_from(data, _GLB_HEADER.size)
     start = _GLB_HEADER.size + _CHUNK_HEADER.size
     if kind != _JSON_CHUNK:

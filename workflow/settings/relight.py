@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, AliasChoices, BeforeValidator, Field, field_validator, model_validator
 
 from iif_core.errors import InputError
 from workflow.settings.mesh_files import MESHES, files_of_mesh
@@ -32,7 +32,7 @@ class RelightLamp(Section):
 
     factor: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Factor on the radiance that was found; `on` is 1, `off` is 0."""
-    colour: Colour | None = None
+    colour: Colour | None = Field(None, validation_alias=AliasChoices("colour", "color"))
     """Linear R, G, B of its light; the luminance stays. By default as found."""
     move: tuple[float, float, float] | None = None
     """By how much it is moved, in metres along the world axes."""
@@ -40,6 +40,8 @@ class RelightLamp(Section):
     @model_validator(mode="before")
     @classmethod
     def _factor_alone(cls, value: Any) -> Any:
+        if isinstance(value, str | list | tuple) and value not in ("on", "off"):
+            raise ValueError("Needed: a factor, `on`, `off`, or keys; a colour is linear R, G, B: `{colour: [1, 0.5, 0.2]}`")
         return value if isinstance(value, dict) else {"factor": value}
 
     @field_validator("colour")
@@ -105,7 +107,7 @@ class RelightInsert(Section):
 class RelightSphere(Section):
     """A black sphere that emits light, put into the room."""
 
-    center: tuple[float, float, float]
+    center: tuple[float, float, float] = Field(validation_alias=AliasChoices("center", "centre"))
     """Position in metres, world axes."""
     radius: float = Field(0.2, gt=0)
     """Radius in metres."""
@@ -122,6 +124,12 @@ class RelightPose(Section):
     """Metres, world axes."""
     look_at: tuple[float, float, float]
     """The point in the middle of the picture, in metres."""
+
+    @model_validator(mode="after")
+    def _looks_somewhere(self) -> RelightPose:
+        if self.look_at == self.position:
+            raise ValueError(f"`look_at` and `position` are the same point, {list(self.position)}; look at another one")
+        return self
 
 
 class RelightCamera(Section):
@@ -162,7 +170,7 @@ class Relighting(Section):
     """One relighting of the recovered scene: `snakemake --cores 2 relight/<scene>` (docs/guide/relighting.md)."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
-    """Name of the folder of its pictures."""
+    """Name of the folder of its pictures: letters, digits, `_` and `-`."""
     emitters: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Recovered emitters that `lamps` does not name: `on`, `off`, or a factor on their radiance."""
     lamps: Annotated[dict[str, RelightLamp], TEXT_KEYS] = Field(default_factory=dict)
@@ -210,6 +218,22 @@ class Relighting(Section):
         return value
 
     @model_validator(mode="after")
+    def _moves(self) -> Relighting:
+        """A flight needs something that moves, and a film more than one picture."""
+        camera = self.camera
+        frames, stands = camera.frames, len(camera.views) + len(camera.poses) < 2
+        if frames > 1 and stands and (self.sphere is None or self.sphere.path_to is None):
+            raise ValueError(
+                f"`camera` has {frames} frames and stands still, so all of them are one picture; name several `views` or `poses`"
+                " to fly along, or leave out `frames`"
+            )
+        if frames == 1 and len(camera.views) + len(camera.poses) > 1:
+            raise ValueError("`camera` has several `views` or `poses` and takes one picture; give the number of its `frames`")
+        if frames == 1 and self.video is not None and "video" in self.model_fields_set:
+            raise ValueError("`video` of a camera that takes one picture; give the number of its `frames`, or leave out `video`")
+        return self
+
+    @model_validator(mode="after")
     def _can_be_summed(self) -> Relighting:
         if self.method == "recombine" and self.sphere is not None and self.sphere.path_to is not None:
             raise ValueError(
@@ -218,12 +242,23 @@ class Relighting(Section):
         return self
 
 
+def _named_apart(entries: list[Relighting]) -> list[Relighting]:
+    names = [entry.name for entry in entries]
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"{names.count(twice[0])} relightings are called {twice[0]!r}; every one needs a name of its own")
+    return entries
+
+
+Relightings = Annotated[list[Relighting], AfterValidator(_named_apart)]
+
+
 class RelightPlan(Section):
     """A file `config/relight/<plan>.yaml`: relightings for any scene, `snakemake --cores 2 relight/<scene>/<plan>`."""
 
     title: str = ""
-    """What the plan shows, for people."""
-    relight: list[Relighting] = Field(min_length=1)
+    """What the plan shows, for people: the title of the contact sheet."""
+    relight: Relightings = Field(min_length=1)
     """The relightings, as in a scene file."""
 
 
@@ -231,7 +266,7 @@ def require_relighting(document: dict[str, Any], scene: str) -> list[dict[str, A
     """Return the relightings of a dumped settings tree.
 
     Raises:
-        InputError: there are none, or two have the same name.
+        InputError: there are none.
     """
     wanted: list[dict[str, Any]] = document["relight"]
     if not wanted:
@@ -240,9 +275,6 @@ def require_relighting(document: dict[str, Any], scene: str) -> list[dict[str, A
             f" `snakemake --cores 2 relight/{scene}/example`, or add one, for example"
             " `relight: [{name: evening, emitters: off, sphere: {center: [2, 2, 1.5]}}]` (docs/guide/relighting.md)."
         )
-    names = [entry["name"] for entry in wanted]
-    if len(set(names)) < len(names):
-        raise InputError(f"`relight`: found the names {', '.join(names)}; every relighting needs a name of its own")
     return wanted
 
 

@@ -42,12 +42,14 @@ def plan_layer(plan: str, root: Path = Path(".")) -> tuple[str, dict[str, Any]]:
     if unknown:
         hint = did_you_mean(unknown[0], KEYS, "`{}`")
         raise InputError(f"{shown}: `{unknown[0]}`: unknown key.{hint} Allowed here: {', '.join(KEYS)}.")
-    if not isinstance(document.get("relight"), list) or not document["relight"]:
-        raise InputError(
-            f"{shown}: `relight`: found {document.get('relight')!r}, needed a list of relightings, as in a scene file."
-        )
+    listed, title = document.get("relight"), document.get("title", "")
+    if not isinstance(listed, list) or not listed:
+        found = f"found {listed!r}" if listed else "no relightings"
+        raise InputError(f"{shown}: `relight`: {found}; needed is a list of them, as in {FOLDER / 'kitchen.yaml'}")
+    if not isinstance(title, str):
+        raise InputError(f"{shown}: `title`: found {title!r}, needed text; write it in quotes")
     folder = configuration("relight", root)
-    return str(shown), {"relight": [_beside(entry, folder) for entry in document["relight"]]}
+    return str(shown), {"relight_title": title, "relight": [_beside(entry, folder) for entry in listed]}
 
 
 def _beside(entry: Any, folder: Path) -> Any:

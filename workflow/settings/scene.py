@@ -13,7 +13,7 @@ from workflow.settings.limits import Limits
 from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
 from workflow.settings.override import ByObject, Override
 from workflow.settings.prior import Prior
-from workflow.settings.relight import Relighting, lamp_bases, recombines
+from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
 from workflow.settings.segmentation import GivenSegmentation, Segmentation
 from workflow.settings.source import Capture, Source
@@ -49,7 +49,9 @@ class SceneSettings(Section):
     overrides: ByObject = Field(default_factory=dict)
     """Corrections by hand: name or id of an object -> its `roughness`, `metallic` or both, which are then not fitted
     (docs/guide/relighting.md#corrections-by-hand)."""
-    relight: list[Relighting] = Field(default_factory=list)
+    relight_title: str = ""
+    """Title of the contact sheet of `relight`; plans of relightings have `title`."""
+    relight: Relightings = Field(default_factory=list)
     """Pictures under other light, edited, and from other positions, made on demand; where there are none,
     `config/relight/<scene>.yaml` or `config/relight/example.yaml` stands for them."""
     seed: int = Field(0, ge=0, lt=2**31)

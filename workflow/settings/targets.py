@@ -40,6 +40,9 @@ def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:
     parts = Path(target).parts or (target,)
     if parts[0] in FOLDERS and len(parts) > 1 and parts[1] in scenes:
         return f" Did you mean {parts[0]}/{parts[1]}?"
+    if parts[0] == "compare":
+        other = next((scene for scene in scenes if scene not in parts[1:]), "other")
+        return f" It needs the names of two results, such as compare/{parts[-1] if len(parts) > 1 else 'kitchen'},{other}."
     if parts[0] in scenes:
         return f" Did you mean scenes/{parts[0]}?"
     if parts[0] in FOLDERS and len(parts) > 1:

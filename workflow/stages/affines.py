@@ -41,6 +41,7 @@ from workflow.scene.cached_light import has_lobes, read_diffuse, read_specular
 from workflow.scene.named import object_number
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.recovered import object_names, write_response
+from workflow.settings import scene_origin
 from workflow.settings.affines import KnownLamp
 
 
@@ -220,16 +221,17 @@ def _given(job: Job, names: list[str]) -> np.ndarray | None:
     wanted: dict[str, Any] = vars(job.settings.overrides)
     if not wanted:
         return None
+    where = f"{scene_origin(job.scene)}: `overrides`"
     if not has_lobes(job):
         raise InputError(
-            "overrides: found materials given by hand, but this scene is fitted without specular lobes, so they would change"
+            f"{where}: found materials given by hand, but this scene is fitted without specular lobes, so they would change"
             " nothing; set `override: {components: {specular: on}}`, or remove them"
         )
     given = np.full((len(names), 2), np.nan)
     for key, entry in wanted.items():
-        number = object_number(key, names, "overrides")
+        number = object_number(key, names, where)
         if not np.isnan(given[number]).all():
-            raise InputError(f"overrides.{key}: object {names[number]!r} is there twice, by its name and by its id; remove one")
+            raise InputError(f"{where}: {key}: object {names[number]!r} is there twice, by its name and by its id; remove one")
         given[number] = [np.nan if value is None else value for value in (entry.roughness, entry.metallic)]
     return given
 

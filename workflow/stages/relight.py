@@ -46,8 +46,8 @@ def run(job: Job) -> None:
         made, row = _relight(one, curve)
         facts.append(made)
         rows.append(row)
-    job.writer.bytes("contact_sheet.png", sheet.png(sheet.contact_sheet(rows)))
-    job.writer.json("relight.json", {"relightings": facts, "up": studio.up.tolist()})
+    job.writer.bytes("contact_sheet.png", sheet.png(sheet.contact_sheet(rows, job.settings.relight_title)))
+    job.writer.json("relight.json", {"title": job.settings.relight_title, "relightings": facts, "up": studio.up.tolist()})
 
 
 @dataclass

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
 from workflow.artifacts.files import write_json
+from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast
 from workflow.settings import study_files
@@ -63,7 +64,7 @@ def read(config: Mapping[str, Any], given: Collection[str], cores: int | None) -
     if odd:
         raise InputError(
             f"--config {', '.join(odd)}: unknown key.{did_you_mean(odd[0], CHOOSES)} Allowed: {', '.join(CHOOSES)}."
-            " Everything else belongs into config/scenes/<scene>.yaml (docs/reference/settings.md)."
+            " Everything else belongs in config/scenes/<scene>.yaml (docs/reference/settings.md)."
         )
     asked = [key for key in CHOOSES if key in config and (key in given or key != "quality")]
     if len(asked) > 1:
@@ -130,6 +131,11 @@ def _marks(request: Request, scene: str, quality: str) -> dict[str, str]:
     return {"request": f"{request.key}={request.value}", "points": table, "settings": settings}
 
 
+def fits(stage: str, scene: str) -> bool:
+    """Return whether a job makes materials of a scene, whose scores depend on its quality, and no variant of a study."""
+    return not STAGES[stage].on_demand and not study_files.derived(scene)
+
+
 def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
     """Return what is said about the qualities of a run, `chosen` for each scene."""
     point = point_of(request.quality) if request.key in ("quality", "point") else None
@@ -139,7 +145,7 @@ def told(request: Request, chosen: Mapping[str, Choice]) -> list[str]:
     for scene in chosen:
         changed = [] if study_files.derived(scene) else overridden(scene, request.quality)
         if changed:
-            lines.append(f"{scene}: other than that, because {scene_origin(scene)} sets {', '.join(changed)}")
+            lines.append(f"{scene} may differ: {scene_origin(scene)} sets {', '.join(changed)} itself")
     if len(lines) > MOST_SCENES + 1:
         return [lines[0], f"{len(lines) - 1} of {len(chosen)} scenes set some of it themselves"]
     return lines
