@@ -513,6 +513,9 @@ def test_a_way_through_a_wall_is_named(toy):
 
 def test_nothing_is_rendered_before_everything_was_checked(toy, monkeypatch):
     monkeypatch.setattr(relight, "trace_picture", lambda *_: pytest.fail("rendered although the second relighting is wrong"))
+    for key, far in (("center", {"center": [0, 0, 70]}), ("path_to", {"center": [0, 0, 1], "path_to": [0, 0, 70]})):
+        with pytest.raises(InputError, match=f"relight.sphere.{key} of b: .* m away from the room"):
+            lit(toy, {"name": "a", "method": "path"}, {"name": "b", "sphere": far})
     with pytest.raises(InputError, match="no lamp 'lmap'"):
         lit(toy, {"name": "a", "method": "path"}, {"name": "b", "lamps": {"lmap": 0}, "method": "path"})
 
@@ -725,6 +728,12 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     )
     assert "there is no lamp 'lmap'. Did you mean 'lamp'" in told(lamps={"lmap": 0})
     assert "found v7; the views are v0, v1" in told(camera={"views": ["v7"]})
+    far = {"position": [90, 0, 0], "look_at": [0, 0, 0]}
+    several = told(lamps={"lmap": 0, "walls": 0}, materials={"wals": {"metallic": 0}}, camera={"poses": [far]}).splitlines()
+    assert [line.split(" of a: ")[0] for line in several] == [
+        "relight.camera.poses.0.position", "relight.lamps", "relight.lamps", "relight.materials"
+    ]  # fmt: skip
+    assert "[90.0, 0.0, 0.0] is 8" in several[0] and "away from the room, which reaches from [" in several[0]
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
     assert "libnothing" in told(camera={"views": ["v0", "v1"], "frames": 2})
     monkeypatch.setattr(check, "finished", lambda *_: None)  # nothing is known yet, and nothing is refused

@@ -115,7 +115,7 @@ def test_a_correction_by_hand_reruns_the_fit_alone(workflow):
     text = path.read_text()
     path.write_text(text + "overrides: {tabel: {metallic: 1}}\n")
     wrong = workflow.run("scenes/tiny", "-n")
-    assert wrong.returncode != 0 and "overrides: there is no object 'tabel'" in wrong.stderr and "Traceback" not in wrong.stderr
+    assert wrong.returncode != 0 and "`overrides`: there is no object 'tabel'" in wrong.stderr and "Traceback" not in wrong.stderr
     path.write_text(text + "overrides: {0: {metallic: 0, roughness: 0.6}}\n")
     assert planned(workflow.run("scenes/tiny", "-n")) == {"affines", "render", "metrics", "export", "room", "report", "publish"}
     result = workflow.run("results/tiny/affines/manifest.json")

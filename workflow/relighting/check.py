@@ -9,9 +9,10 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.relighting.inserts import light_of, load_insert
-from workflow.relighting.inventory import Inventory, check_views
+from workflow.relighting.inventory import Inventory, Problems, check_places, check_views
 from workflow.relighting.video import require_codec
 from workflow.scene.named import finished
+from workflow.scene.normal_form import CaptureReader
 from workflow.settings import relight_origin
 from workflow.settings.relight import require_relighting
 
@@ -24,7 +25,8 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
         scene: whose finished stages are looked at; quality: of its settings.
 
     Raises:
-        InputError: a lamp, an object or a view does not exist, a mesh cannot be read, or a codec is not there.
+        InputError: lamps, objects or views do not exist, something is far from the room, a mesh cannot be read, or a codec is not
+            there; one line for each.
     """
     entries = require_relighting(document, scene)
     with blamed_on_plan(scene):
@@ -33,21 +35,33 @@ def check_relightings(document: dict[str, Any], scene: str, quality: str) -> Non
 
 @contextmanager
 def blamed_on_plan(scene: str) -> Iterator[None]:
-    """Let messages about relightings of a scene begin with the file that lists them."""
+    """Let messages about relightings of a scene, one a line, begin with the file that lists them."""
     try:
         yield
     except InputError as error:
-        raise InputError(f"{relight_origin(scene)}: {error}") from None
+        where = relight_origin(scene)
+        raise InputError("\n".join(f"{where}: {line}" for line in str(error).splitlines())) from None
 
 
 def _check(entries: list[dict[str, Any]], scene: str, quality: str) -> None:
     capture, segmentation, emission = (finished(stage, scene, quality) for stage in ("capture", "segmentation", "emission"))
+    photographed = CaptureReader(capture) if capture is not None else None
+    inventory = Inventory.read(segmentation, emission) if segmentation is not None and emission is not None else None
+    vertices = photographed.mesh()[0] if photographed else None
+    problems = Problems()
     for entry in entries:
-        if entry["video"] and entry["camera"]["frames"] > 1:
-            require_codec(entry["video"]["codec"], entry["name"])
+        with problems.caught():
+            if entry["video"] and entry["camera"]["frames"] > 1:
+                require_codec(entry["video"]["codec"], entry["name"])
         for insert in entry["insert"]:
-            light_of(load_insert(Path(insert["file"])), insert)
-        if capture is not None:
-            check_views(entry, map(str, capture.table("cameras.parquet")["name"]))
-        if segmentation is not None and emission is not None:
-            Inventory.read(segmentation, emission).check(entry)
+            with problems.caught():
+                light_of(load_insert(Path(insert["file"])), insert)
+        if photographed:
+            with problems.caught():
+                check_views(entry, [view.name for view in photographed])
+            with problems.caught():
+                check_places(entry, vertices.min(0), vertices.max(0))
+        if inventory:
+            with problems.caught():
+                inventory.check(entry)
+    problems.tell()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,8 @@ from iif_core.errors import InputError
 from workflow.artifacts import StageReader
 from workflow.scene.named import names_of, object_number
 from workflow.settings.names import did_you_mean
+
+Array = np.ndarray
 
 
 @dataclass(frozen=True)
@@ -63,19 +66,65 @@ class Inventory:
         """Check the lamps and objects that a dumped relighting names.
 
         Raises:
-            InputError: one does not exist, or is named twice.
+            InputError: some do not exist, or are named twice; one line for each.
         """
         where, seen = f"relight.{{}} of {entry['name']}", {}
+        problems = Problems()
         for key in entry["lamps"]:
-            for lamp in self.lamps_called(key, where.format("lamps")):
-                if lamp in seen:
-                    raise InputError(
-                        f"{where.format('lamps')}: {key!r} and {seen[lamp]!r} are the same lamp,"
-                        f" {self.lamps[lamp].emitter_id}; remove one of the two"
-                    )
-                seen[lamp] = key
+            with problems.caught():
+                for lamp in self.lamps_called(key, where.format("lamps")):
+                    if lamp in seen:
+                        raise InputError(
+                            f"{where.format('lamps')}: {key!r} and {seen[lamp]!r} are the same lamp,"
+                            f" {self.lamps[lamp].emitter_id}; remove one of the two"
+                        )
+                    seen[lamp] = key
         for key in entry["materials"]:
-            object_number(key, self.names, where.format("materials"))
+            with problems.caught():
+                object_number(key, self.names, where.format("materials"))
+        problems.tell()
+
+
+class Problems:
+    """Collects what is wrong, so that all of it is told at once."""
+
+    def __init__(self) -> None:
+        self.messages: list[str] = []
+
+    @contextmanager
+    def caught(self) -> Iterator[None]:
+        """Go on after an `InputError` of the block."""
+        try:
+            yield
+        except InputError as error:
+            self.messages.append(str(error))
+
+    def tell(self) -> None:
+        """Raise one `InputError` with a line for each message, if there are any."""
+        if self.messages:
+            raise InputError("\n".join(self.messages))
+
+
+def check_places(entry: dict[str, Any], low: Array, high: Array) -> None:
+    """Check that what a dumped relighting puts somewhere is near the room, whose lowest and highest corners (3,) are given.
+
+    Raises:
+        InputError: something is further away from the room than the room is large.
+    """
+    camera, sphere = entry["camera"], entry["sphere"] or {}
+    places = [(f"insert.{i}.position", one["position"]) for i, one in enumerate(entry["insert"])]
+    places += [(f"camera.poses.{i}.position", one["position"]) for i, one in enumerate(camera["poses"])]
+    places += [(f"sphere.{key}", sphere[key]) for key in ("center", "path_to") if sphere.get(key)]
+    size, problems = float(np.linalg.norm(high - low)), Problems()
+    for key, place in places:
+        away = float(np.linalg.norm(np.maximum(np.maximum(low - place, place - high), 0)))
+        if away > size:
+            ends = " to ".join(f"[{', '.join(f'{x:.1f}' for x in np.round(end, 1) + 0.0)}]" for end in (low, high))
+            problems.messages.append(
+                f"relight.{key} of {entry['name']}: {list(place)} is {away:.0f} m away from the room, which reaches from"
+                f" {ends} m; positions are in metres along the axes of the capture"
+            )
+    problems.tell()
 
 
 def check_views(entry: dict[str, Any], names: Iterable[str]) -> None:
@@ -88,6 +137,6 @@ def check_views(entry: dict[str, Any], names: Iterable[str]) -> None:
     for name in entry["camera"]["views"]:
         if name not in known:
             raise InputError(
-                f"`relight.camera.views` of {entry['name']}: found {name}; the views are"
-                f" {', '.join(known[:8])}{' ...' if len(known) > 8 else ''}.{did_you_mean(name, known)}"
+                f"relight.camera.views of {entry['name']}: found {name}; the views are {', '.join(known[:8])}"
+                f"{f' and {len(known) - 8} more' if len(known) > 8 else ''}.{did_you_mean(name, known)}"
             )

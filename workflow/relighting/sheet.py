@@ -12,8 +12,8 @@ from workflow.settings.relight import name_of
 
 Array = np.ndarray
 GAP, TITLE, CAPTION, HEAD, LARGEST, LEAST_WIDTH = 6, 20, 18, 34, 384, 320
-"""Pixels between pictures, of a line of a title, of a caption, of the title of the sheet, of the longer side of a picture, and of
-a relighting at least."""
+"""Pixels between pictures, of a line of a title, of a caption, of a line of the title of the sheet, of the longer side of a
+picture, and of a relighting at least."""
 PAIRS = 3
 """Frames of a flight that are shown."""
 
@@ -52,20 +52,22 @@ def contact_sheet(rows: list[Row], title: str = "") -> Array:
     Those that fit beside one another stand on one line, and the title of all of them stands above."""
     from PIL import Image, ImageDraw, ImageFont
 
+    head, ruler = ImageFont.load_default(22), ImageDraw.Draw(Image.new("RGB", (1, 1)))
     blocks = [_block(row) for row in rows]
     widest = max(block.width for block in blocks)
     if len(blocks) > 1:
         widest = max(widest, PAIRS * min(block.width for block in blocks))
     placed: list[tuple[int, int, Any]] = []
-    x, y, deepest = 0, HEAD if title else 0, 0
+    lines = _wrapped(title, head, widest - 2 * GAP, ruler) if title else []
+    x, y, deepest = 0, HEAD * len(lines), 0
     for block in blocks:
         if x and x + block.width > widest:
             x, y, deepest = 0, y + deepest, 0
         placed.append((x, y, block))
         x, deepest = x + block.width, max(deepest, block.height)
     sheet = Image.new("RGB", (widest, y + deepest), "white")
-    if title:
-        ImageDraw.Draw(sheet).text((GAP, GAP), title, fill="black", font=ImageFont.load_default(22))
+    for number, line in enumerate(lines):
+        ImageDraw.Draw(sheet).text((GAP, GAP + HEAD * number), line, fill="black", font=head)
     for left, top, block in placed:
         sheet.paste(block, (left, top))
     return np.asarray(sheet)

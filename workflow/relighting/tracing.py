@@ -15,7 +15,7 @@ from iif_core.errors import InputError
 from workflow.exporters.surface import up_axis
 from workflow.models.denoise import denoise, require_denoiser
 from workflow.relighting.camera import Flight, check_way, plan_flight
-from workflow.relighting.inventory import Inventory
+from workflow.relighting.inventory import Inventory, check_places
 from workflow.relighting.world import World, build_world
 from workflow.runtime.fingerprint import raw_digest
 from workflow.runtime.job import Job
@@ -55,8 +55,10 @@ class Studio:
         """Return the frames of a dumped relighting, whose way is free.
 
         Raises:
-            InputError: a view does not exist, or the way leads through surface.
+            InputError: a view does not exist, something is far from the room, or the way leads through surface.
         """
+        corners = self.room.surface.vertices[self.room.surface.faces.ravel()]
+        check_places(entry, corners.min(0), corners.max(0))
         flight = plan_flight(self.capture, entry, self.up)
         if entry["camera"]["frames"] > 1 and not entry["camera"]["through_surface"]:
             geometry, _ = self.room.surface.traceable()

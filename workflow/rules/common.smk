@@ -506,7 +506,8 @@ atexit.register(tell_costs_of_dry_run)
 
 def tell_lock():
     """Give the command that removes a lock, after Snakemake's message that the folder is locked."""
-    if workflow.is_main_process and workflow.dag is not None and not workflow.dryrun:
+    runs = workflow.execution_settings is not None and not workflow.dryrun
+    if workflow.is_main_process and runs and workflow.dag is not None:
         os.chdir(FOLDER)
         if workflow.persistence.locked:
             again = shlex.join(["snakemake", *sys.argv[1:]])
