@@ -486,6 +486,10 @@ def test_a_factor_between_mesh_and_poses_is_named():
         mesh.check_size(Path("mesh.ply"), room, "m", 1.0, 100 * centres)
     with pytest.raises(InputError, match="mesh and poses are in different units or frames: export both"):
         mesh.check_size(Path("mesh.ply"), room, "m", 1.0, 100 + centres)
+    low, high = room.bounds
+    around = mesh.Mesh(room.vertices - (low + high) / 2, room.faces)  # any small factor leads into it
+    with pytest.raises(InputError, match="mesh and poses are in different units or frames: export both"):
+        mesh.check_size(Path("mesh.ply"), around, "m", 1.0, 100 + centres)
 
 
 def test_unrelated_depth_is_refused_without_advice(tmp_path):

@@ -13,7 +13,7 @@ relight:
   - {name: dimmed, emitters: 0.5, samples: 8}
   - name: lamp
     emitters: off
-    sphere: {center: [1.0, 1.0, 1.2], radius: 0.1, radiance: [20, 20, 20]}
+    sphere: {center: [1.0, 1.0, 1.2], path_to: [1.2, 1.0, 1.2], radius: 0.1, radiance: [20, 20, 20]}
     camera: {frames: 2, width: 32, height: 24, views: ["000"]}
     samples: 8
     video: {codec: h264}

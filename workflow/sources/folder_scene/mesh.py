@@ -21,6 +21,7 @@ DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another un
 AGAIN = "export the mesh again, or copy it again"
 FACTORS = (0.1, 0.01, 0.001)
 """Factors on camera positions far away that are tried: decimetres, centimetres and millimetres beside metres."""
+LEAST_SPREAD = 0.05  # of the scene's size; cameras nearer to one another lie in the mesh by any small factor
 TURNS = {
     "as_poses": np.eye(3),
     "y": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
@@ -291,7 +292,8 @@ def _factor_advice(bounds: np.ndarray, centres: np.ndarray) -> str:
     """Return in words what is between mesh and poses; names the power of ten that brings nine of ten cameras into the mesh."""
     for factor in FACTORS:
         scaled = centres * factor
-        if ((scaled >= bounds[0]) & (scaled <= bounds[1])).all(1).mean() >= 0.9:
+        spread = np.linalg.norm(np.ptp(scaled, axis=0)) > LEAST_SPREAD * np.linalg.norm(bounds[1] - bounds[0])
+        if spread and ((scaled >= bounds[0]) & (scaled <= bounds[1])).all(1).mean() >= 0.9:
             return (
                 f"with camera positions times {factor:g} they are inside it, so mesh and poses seem to be in different units:"
                 " scale the positions in transform_matrix, or"
