@@ -18,7 +18,7 @@ from tests.unit import test_colmap, test_fipt
 from workflow import settings
 from workflow.relighting import video
 from workflow.relighting.inserts import light_of, load_insert
-from workflow.relighting.inventory import Inventory, Lamp
+from workflow.relighting.inventory import Inventory, Lamp, check_places
 from workflow.runtime import fingerprint
 from workflow.settings import relight_plans
 from workflow.settings.relight import Relighting
@@ -868,6 +868,12 @@ def _(root):
     return put_in(path)
 
 
+@case("mesh to put in: empty")
+def _(root):
+    vase(root).write_bytes(b"")
+    return put_in(root / "vase.glb")
+
+
 @case("mesh to put in: no GLB")
 def _(root):
     (root / "vase.glb").write_text("a text, and longer than the header of a GLB")
@@ -887,6 +893,12 @@ def _(root):
 def of_room(**more):
     """The message of a room with walls and a lamp."""
     return error(lambda: Inventory(["walls", "lamp"], [Lamp(0, (1,))]).check(relit(**more)))
+
+
+@case("object put in far from the room")
+def _(root):
+    entry = relit(insert=[{"file": "vase.glb", "position": [200, 0, 0]}])
+    return error(lambda: check_places(entry, np.zeros(3), np.array([5.0, 4, 3])))
 
 
 case("object that is not there, painted")(lambda root: of_room(materials={"wals": {"metallic": 0}}))

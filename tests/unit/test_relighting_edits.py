@@ -731,8 +731,8 @@ def test_what_is_known_before_the_jobs_is_told_before_them(toy, monkeypatch):
     far = {"position": [90, 0, 0], "look_at": [0, 0, 0]}
     several = told(lamps={"lmap": 0, "walls": 0}, materials={"wals": {"metallic": 0}}, camera={"poses": [far]}).splitlines()
     assert [line.split(" of a: ")[0] for line in several] == [
-        "relight.camera.poses.0.position", "relight.lamps", "relight.lamps", "relight.materials"
-    ]  # fmt: skip
+        f"config/scenes/toy.yaml: relight.{key}" for key in ("camera.poses.0.position", "lamps", "lamps", "materials")
+    ]
     assert "[90.0, 0.0, 0.0] is 8" in several[0] and "away from the room, which reaches from [" in several[0]
     monkeypatch.setitem(video.ENCODERS, "av1", "libnothing")
     assert "libnothing" in told(camera={"views": ["v0", "v1"], "frames": 2})
