@@ -179,8 +179,6 @@ def test_a_closed_room_stays_dark_and_says_so(toy, caplog):
 def test_what_is_asked_for_must_be_there(toy):
     with pytest.raises(InputError, match="no relighting is configured"):
         lit(toy)
-    with pytest.raises(InputError, match="a name of its own"):
-        lit(toy, {"name": "a"}, {"name": "a"})
     with pytest.raises(InputError, match="found v9; the views are v0, v1"):
         lit(toy, {"name": "a", "camera": {"views": ["v9"]}})
 
