@@ -426,6 +426,8 @@ def test_deliverable_is_complete_and_verifies(toy):
     assert list(damaged(toy)) == []
     emitters = read_parquet(scene / "emitters.parquet")
     np.testing.assert_allclose(emitters["radiance_r"][0], LAMP[0])
+    assert list(emitters["object"]) == ["lamp", ""]  # the second was not kept
+    assert re.search(r'<th scope="row"[^>]*>lamp <small>0</small>', (scene / "report.html").read_text())
 
 
 def test_damage_is_named(toy, tmp_path):
@@ -612,12 +614,12 @@ def test_downloads_are_told_by_their_names():
 
 def test_commands_name_scene_and_quality():
     words = "override: {components: {specular: off}}"
-    said = {c.text for c in commands("room", "standard", [("specular", words)], ["scene.glb"])}
+    said = {c.text for c in commands("room", "standard", [("specular", words)], ["scene.glb"], "room")}
     assert "snakemake --cores 2 relight/room --config quality=standard" in said
     assert {f"snakemake --cores 2 scenes/room --config quality={q}" for q in ("draft", "paper")} <= said
     assert f"{words}\nsnakemake --cores 2 scenes/room --config quality=standard" in said
     assert not any("blender" in text or "mitsuba" in text for text in said)  # files that this deliverable lacks
-    more = {c.text for c in commands("room", "draft", [], ["blender_import.py", "mitsuba/render.py"])}
+    more = {c.text for c in commands("room", "draft", [], ["blender_import.py", "mitsuba/render.py"], "example")}
     assert "blender --python scenes/room/blender_import.py" in more and "python scenes/room/mitsuba/render.py" in more
     assert "snakemake --cores 2 relight/room" in more
 

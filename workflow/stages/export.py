@@ -17,6 +17,7 @@ from workflow.exporters.normal_map import normal_picture
 from workflow.exporters.object_table import csv_bytes, object_rows
 from workflow.exporters.surface import up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
+from workflow.relighting.inventory import Inventory
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.picture_facts import view_attributes
@@ -139,8 +140,11 @@ def _object_table(job: Job, recovered: Recovered) -> bytes:
 
 
 def _emitter_table(job: Job, recovered: Recovered) -> None:
-    """Write the emitters times the light scale of the fit, which goes with the published albedo."""
+    """Write the emitters times the light scale of the fit, which goes with the albedo, and the objects that they are on."""
     table = dict(job.read("emission").table("emitters.parquet"))
+    inventory = Inventory.read(job.read("segmentation"), job.read("emission"))
+    named = {lamp.emitter_id: inventory.name_of(lamp) for lamp in inventory.lamps if lamp.objects}
+    table["object"] = [named.get(int(emitter), "") for emitter in table["emitter_id"]]
     for name in [n for n in table if n.startswith(("radiance_", "error_"))]:
         table[name] = (table[name] * recovered.light_scale).astype(np.float32)
     job.writer.table("emitters.parquet", table, {"area_m2": "m^2", "radiance_r": "relative"})
