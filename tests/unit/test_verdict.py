@@ -1,16 +1,19 @@
 """The verdict of the report: extremes, thresholds, words."""
 
 import dataclasses
+import json
 import math
 from itertools import product
 
 import pytest
 
-from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, ORDER, RED, Evidence, judge, limits_table
+from workflow.report import wording
+from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, ORDER, RED, ROUGHNESS_HELD, Evidence, judge, limits_table
 
 GOOD = Evidence(
     escape=0.0, escape_camera=0.0, depth=0.004, edges=0.45, agreement=0.92, photographs=24, photographed=0.95, stability=0.9,
-    lamps=3, misfit=0.02, held_out=27.0, held_out_views=4, used=28.0, albedo=27.0, has_truth=True, prior="files", level="found",
+    lamps=3, misfit=0.02, held_out=27.0, held_out_views=4, used=28.0, albedo=27.0, roughness=24.0,
+    metallic=30.0, has_truth=True, prior="files", level="found",
     uncertainty=0.03, unfitted=0.01, level_error=0.1, raised=1.0, light_scale=1.03, discrepancy=0.8, light_spread=0.03,
 )  # fmt: skip
 
@@ -26,7 +29,7 @@ def changed(**facts):
 def test_a_good_result_is_green():
     verdict = judge(GOOD)
     assert verdict.level == GREEN and set(levels(GOOD).values()) == {GREEN}
-    assert verdict.sentence == "Everything that was checked speaks for this result."
+    assert verdict.sentence == "No check found a fault."
     assert all(not finding.remedy for light in verdict.lights for finding in light.findings)
 
 
@@ -34,15 +37,15 @@ def test_a_hopeless_capture_says_so_first():
     """A scan without a ceiling: no lamp, most rays leave, all light raised (the Red Kitchen at 160 x 120)."""
     poor = dataclasses.replace(
         GOOD, escape=0.633, escape_camera=0.046, lamps=0, environment=True, raised=4.7, has_truth=False, albedo=None,
-        light_spread=None, held_out=21.5, prior="retinex", discrepancy=1.94, level_error=0.19,
+        light_spread=None, held_out=21.5, prior="retinex", roughness_interval=0.2, discrepancy=1.94, level_error=0.19,
     )  # fmt: skip
     verdict = judge(poor)
     assert levels(poor) == {"geometry": RED, "light": RED, "materials": AMBER, "scale": RED}
-    assert verdict.sentence.startswith("Do not rely on this result for geometry, light and scale: 63.3% of the rays")
+    assert verdict.sentence.startswith("Do not rely on this result for geometry, light and scale: 63.3 % of the rays")
     said = {light.name: light.findings[0] for light in verdict.lights}
-    assert "Close the mesh" in said["geometry"].remedy and "63.3%" in said["geometry"].text
+    assert "Close the mesh" in said["geometry"].remedy and "63.3 %" in said["geometry"].text
     assert said["light"].text.startswith("0 lamps found") and "Photograph every lamp" in said["light"].remedy
-    assert "4.70 times" in said["scale"].text and "white patch" in said["scale"].remedy
+    assert "factor of 4.70" in said["scale"].text and "white patch" in said["scale"].remedy
 
 
 def test_nothing_that_lights_the_room():
@@ -68,7 +71,8 @@ def test_nothing_known_is_never_green():
     [
         ("escape", "geometry", RED), ("depth", "geometry", RED), ("agreement", "geometry", RED),
         ("photographed", "geometry", RED),
-        ("misfit", "light", RED), ("light_spread", "light", RED), ("albedo", "materials", RED), ("uncertainty", "materials", RED),
+        ("misfit", "light", RED), ("light_spread", "light", RED), ("albedo", "materials", RED),
+        ("roughness", "materials", RED), ("metallic", "materials", RED), ("uncertainty", "materials", RED),
         ("unfitted", "materials", RED), ("stability", "materials", AMBER), ("level_error", "scale", RED),
         ("raised", "scale", RED), ("light_scale", "scale", RED), ("discrepancy", "scale", RED),
     ],
@@ -92,11 +96,30 @@ def test_the_score_of_held_out_photographs_counts_before_that_of_the_others():
 
 
 def test_without_truth_something_must_be_held_out():
-    alone = dict(has_truth=False, albedo=None, held_out=None, light_spread=None)
+    alone = dict(has_truth=False, albedo=None, held_out=None, light_spread=None, roughness_interval=0.05)
     assert changed(**alone)["materials"] == AMBER
     text = judge(dataclasses.replace(GOOD, **alone)).lights[2].findings[0]
     assert "test_every" in text.remedy
     assert changed(**{**alone, "held_out": 27.0})["materials"] == GREEN
+
+
+def test_gloss_is_judged_by_the_truth_or_else_by_its_intervals():
+    """Without truth its own intervals judge it, which are too narrow, so that they turn nothing red."""
+    assert (
+        changed(roughness=15.9)["materials"] == AMBER and changed(roughness=15.9, roughness_interval=0.01)["materials"] == AMBER
+    )
+    assert "15.9 dB" in judge(dataclasses.replace(GOOD, roughness=15.9)).sentence
+    without = dict(has_truth=False, albedo=None, roughness=None, metallic=None)
+    limit = LIMITS["roughness_interval"]
+    for width, expected in ((limit.amber, GREEN), (limit.amber + 1e-6, AMBER), (0.9, AMBER), (None, AMBER)):
+        assert changed(**without, roughness_interval=width)["materials"] == expected, width
+    assert "none of them compares" in judge(dataclasses.replace(GOOD, **without, roughness_interval=0.05)).sentence
+
+
+def test_how_often_intervals_hold_is_what_was_measured(repository):
+    rows = json.loads((repository / "docs/results/data/object_intervals.json").read_text())
+    held = [round(100 * row["roughness_inside"]) for row in rows]
+    assert (min(held), max(held)) == ROUGHNESS_HELD
 
 
 def test_edges_weigh_less_where_depth_was_measured():
@@ -154,3 +177,21 @@ def test_the_page_of_the_documentation_holds_the_limits(repository):
 def test_every_limit_has_a_reason_and_an_order():
     for name, limit in LIMITS.items():
         assert limit.amber != limit.red and len(limit.why) > 20, name
+
+
+def test_terms_and_numbers_are_written_for_people():
+    assert wording.fit_words("full, roughness, metal") == "colour by a matrix, roughness, taken as metal"
+    assert (
+        wording.fit_words("population (0 pixels), roughness given")
+        == "nothing (0 usable pixels): as other objects, roughness given"
+    )
+    assert wording.fit_words("identity (1 pixels)") == "nothing (1 usable pixel): as predicted"
+    assert [wording.significant(v) for v in (5.0, 4.519, 16.2, 123.4, 1234.5, 0.0)] == [
+        "5.00",
+        "4.52",
+        "16.2",
+        "123",
+        "1234",
+        "0",
+    ]
+    assert wording.prose("`filmic` <b> 0.0% +- 3") == "<code>filmic</code> &lt;b&gt; 0.0\u00a0% ± 3"

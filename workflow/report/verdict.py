@@ -5,11 +5,13 @@ Everything here is pure. `workflow/stages/report.py` collects the `Evidence`; `L
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+
+from workflow.report.wording import percent
 
 GREEN, AMBER, RED = "green", "amber", "red"
 ORDER = (GREEN, AMBER, RED)
@@ -50,6 +52,9 @@ LIMITS: dict[str, Limit] = {
     "light_spread": Limit(0.1, 0.3, "spread of the light's error over objects, by the truth, as a logarithm: 10 % and 35 %"),
     "rerendering": Limit(22.0, 16.0, "dB: 22 is an error of 8 % of the sensor's range (as in a real kitchen), 16 is one of 16 %"),
     "albedo": Limit(20.0, 14.0, "dB against the truth: 20 is an error of 0.1; one grey for a whole room reaches 10 to 12"),
+    "roughness": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1, 10 one of 0.3; rooms have 13 to 24"),
+    "metallic": Limit(20.0, 10.0, "dB against the truth: 20 is an error of 0.1; rooms, mostly without metal, have 19 or more"),
+    "roughness_interval": Limit(0.1, 0.3, "half of the 95 % interval, median over the pixels; four rooms have 0.15 to 0.46"),
     "uncertainty": Limit(0.1, 0.2, "claimed standard error of the albedo, median over the surface; rooms have 0.02 to 0.05"),
     "unfitted": Limit(0.2, 0.6, "share of the pixels on objects that could not be fitted by themselves"),
     "level_error": Limit(0.25, 0.5, "claimed relative error of the level; rooms with truth have 0.05 to 0.28"),
@@ -62,7 +67,8 @@ LIMITS: dict[str, Limit] = {
 LIGHT_OF = {
     **dict.fromkeys(("escape", "depth", "edges", "agreement", "lost", "photographed"), "geometry"),
     **dict.fromkeys(("misfit", "light_spread"), "light"),
-    **dict.fromkeys(("stability", "rerendering", "albedo", "uncertainty", "unfitted"), "materials"),
+    **dict.fromkeys(("stability", "rerendering", "albedo", "roughness", "metallic"), "materials"),
+    **dict.fromkeys(("roughness_interval", "uncertainty", "unfitted"), "materials"),
     **dict.fromkeys(("level_error", "raised", "light_scale", "discrepancy"), "scale"),
 }
 """Which light a threshold is of."""
@@ -84,7 +90,8 @@ class Evidence:
         misfit: of the light; light_spread: of the light against the truth.
         held_out, used: PSNR of re-renderings of photographs that were held out, and that were used.
         held_out_views: number of held-out photographs.
-        albedo: PSNR against the truth, as it is; has_truth: whether there is truth.
+        albedo, roughness, metallic: PSNR against the truth, as they are; has_truth: whether there is truth.
+        roughness_interval: half of the 95 % interval of roughness, median over the pixels; None if less than half have one.
         prior: kind of the prior.
         uncertainty: claimed standard error of the albedo.
         unfitted: share of the pixels on objects that take what others have.
@@ -112,6 +119,9 @@ class Evidence:
     held_out_views: int = 0
     used: float | None = None
     albedo: float | None = None
+    roughness: float | None = None
+    metallic: float | None = None
+    roughness_interval: float | None = None
     has_truth: bool = False
     prior: str = ""
     uncertainty: float | None = None
@@ -170,14 +180,15 @@ class Verdict:
 def judge(e: Evidence) -> Verdict:
     """Judge a result by its evidence."""
     lights = [_geometry(e), _light(e), _materials(e), _scale(e)]
-    return Verdict(_sentence(lights), max((light.level for light in lights), key=ORDER.index), lights)
+    return Verdict(_sentence(lights, e), max((light.level for light in lights), key=ORDER.index), lights)
 
 
-def _sentence(lights: Sequence[Light]) -> str:
+def _sentence(lights: Sequence[Light], e: Evidence) -> str:
     worst = max((light.level for light in lights), key=ORDER.index)
     named = [light for light in lights if light.level == worst]
     if worst == GREEN:
-        return "Everything that was checked speaks for this result."
+        unknown = "" if e.has_truth else " Without ground truth, none of them compares albedo or gloss with what they really are."
+        return f"No check found a fault.{unknown}"
     names = _joined([light.name for light in named])
     reason = named[0].findings[0].text
     reason = reason[0].lower() + reason[1:] if not reason[:2].isupper() else reason
@@ -196,16 +207,25 @@ def _made(name: str, question: str, findings: Sequence[Finding | None]) -> Light
     return Light(name, question, ordered or [Finding(AMBER, "Nothing was measured", "Run the stage again")])
 
 
-def _finding(limit: str, value: float | None, text: str, remedy: str, format_: str = "", worst: str = RED) -> Finding | None:
+def _finding(
+    limit: str,
+    value: float | None,
+    text: str,
+    remedy: str,
+    format_: str = "",
+    worst: str = RED,
+    shown: Callable[[float], float] = float,
+) -> Finding | None:
     """Return the finding about a number, whose place in `text` is `{}`; None where the number is not known.
 
-    `worst` is the worst colour that it may have.
+    `worst` is the worst colour that it may have; `shown` makes of the value what people read.
     """
     if value is None:
         return None
     level = LIMITS[limit].level(value) if np.isfinite(value) else RED
     level = min(level, worst, key=ORDER.index)
-    return Finding(level, text.format(format(value, format_)), "" if level == GREEN else remedy)
+    words = format(shown(value), format_).replace("%", " %")
+    return Finding(level, text.format(words), "" if level == GREEN else remedy)
 
 
 def _warned(e: Evidence, stages: Sequence[str]) -> list[Finding]:
@@ -227,13 +247,13 @@ def _geometry(e: Evidence) -> Light:
         # Measured depth is stronger evidence than edges, which a room without texture hardly has.
         level = min(level, AMBER, key=ORDER.index) if e.depth is not None else level
         edges = Finding(level, f"Edges of photographs and mesh correlate by {e.edges:.2f}", "" if level == GREEN else remedy)
-    camera = "" if e.escape_camera is None else f" (of rays from cameras {e.escape_camera:.1%})"
+    camera = "" if e.escape_camera is None else f", and {percent(e.escape_camera, 1)} of those from the cameras"
     return _made(
         "geometry",
         "Does the mesh hold the room, and do the photographs lie on it?",
         [
             _finding(
-                "escape", e.escape, f"{{}} of the rays from surface leave the mesh{camera}",
+                "escape", e.escape, f"{{}} of the rays from surfaces leave the mesh{camera}",
                 "Close the mesh: it needs walls, floor and ceiling, because they reflect light and keep light out"
                 " (docs/guide/own-data.md)", ".1%",
             ),
@@ -248,12 +268,12 @@ def _geometry(e: Evidence) -> Light:
                 ".2f",
             ),
             _finding(
-                "photographed", e.photographed, "Photographs show {} of the surface that lights the rest",
+                "photographed", e.photographed, "The photographs show {} of the surfaces that reflect light onto others",
                 "Photograph also what lies behind the camera: every wall, floor and ceiling", ".0%",
             ),
             _finding(
                 "lost", lost if e.photographs else None,
-                f"{{}} of the photographs were left out ({e.lost} of {e.photographs + e.lost})",
+                f"{e.lost} of {e.photographs + e.lost} photographs were left out ({{}})",
                 "Take them again, sharper and with poses; the notes say why each was left out", ".0%",
             ),
         ],
@@ -283,12 +303,13 @@ def _light(e: Evidence) -> Light:
         [
             lamps,
             _finding(
-                "misfit", e.misfit, "Light explains the surface with a mean squared relative error of {}",
-                "Look for lamps that are missing in the list below; photograph each lamp from several sides", ".3f",
+                "misfit", e.misfit, "The light that was found explains how bright surfaces are to within {}",
+                "Look for lamps that are missing in the list below; photograph each lamp from several sides", ".0%",
+                shown=np.sqrt,
             ),
             _finding(
-                "light_spread", e.light_spread, "Against the truth the light's error spreads by {} over objects",
-                "Photograph each lamp from several sides", ".2f",
+                "light_spread", e.light_spread, "Against the truth, the error of the light varies by {} from object to object",
+                "Photograph each lamp from several sides", ".0%", shown=np.expm1,
             ),
             *_warned(e, ("emission", "shading")),
         ],
@@ -298,12 +319,12 @@ def _light(e: Evidence) -> Light:
 def _materials(e: Evidence) -> Light:
     if e.held_out is not None:
         scored = _finding(
-            "rerendering", e.held_out, f"Re-renderings of {e.held_out_views} photographs that were held out have {{}} dB",
+            "rerendering", e.held_out, f"Re-renderings reach {{}} dB PSNR on {_counted(e.held_out_views, 'held-out photograph')}",
             "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
         )  # fmt: skip
     else:
         scored = _finding(
-            "rerendering", e.used, "Re-renderings of the photographs have {} dB",
+            "rerendering", e.used, "Re-renderings reach {} dB PSNR on the photographs",
             "Look at the worst views first: a wrong pose, a lamp that is missing and a mirror each look different", ".1f",
         )  # fmt: skip
     judged = None
@@ -313,7 +334,7 @@ def _materials(e: Evidence) -> Light:
             "Hold some out: capture: {test_every: 8}",
         )  # fmt: skip
     elif not e.has_truth:
-        judged = Finding(GREEN, f"No ground truth: {e.held_out_views} held-out photographs judge the materials")
+        judged = Finding(GREEN, f"No ground truth: {_counted(e.held_out_views, 'held-out photograph')} stand in for it")
     weak = None
     if e.prior == "retinex":
         weak = Finding(
@@ -322,21 +343,22 @@ def _materials(e: Evidence) -> Light:
         )  # fmt: skip
     return _made(
         "materials",
-        "Are base colour, roughness and metallic those of the room?",
+        "Are albedo, roughness and metallic those of the room?",
         [
             scored,
             _finding(
-                "albedo", e.albedo, "The albedo has {} dB against the truth, as it is",
+                "albedo", e.albedo, f"Albedo reaches {{}} dB PSNR against the truth{_off(e.albedo)}",
                 "See which objects are off in the pictures 'albedo error'", ".1f",
             ),
+            *_gloss(e),
             judged,
             weak,
             _finding(
-                "uncertainty", e.uncertainty, "The albedo claims a standard error of {} (median)",
+                "uncertainty", e.uncertainty, "The fit claims a standard error of {} for the albedo (median)",
                 "More photographs of the surface, at more exposures, from more directions", ".3f",
             ),
             _finding(
-                "unfitted", e.unfitted, "{} of the pixels lie on objects that could not be fitted by themselves",
+                "unfitted", e.unfitted, "{} of the pixels lie on objects that could not be fitted on their own",
                 "More photographs, or larger objects (segmentation)", ".0%",
             ),
             _finding(
@@ -348,6 +370,45 @@ def _materials(e: Evidence) -> Light:
     )  # fmt: skip
 
 
+def _gloss(e: Evidence) -> list[Finding | None]:
+    """Judge roughness and metallic: by the truth, or else by what the fit claims, which is too little by experience."""
+    remedy = "Compare 'roughness' of result and truth; what you know, set under `overrides` in the scene file"
+    if e.has_truth:
+        return [
+            _finding(
+                "roughness", e.roughness, f"Roughness reaches {{}} dB PSNR against the truth{_off(e.roughness)}", remedy, ".1f",
+            ),
+            _finding(
+                "metallic", e.metallic, f"Metallic reaches {{}} dB PSNR against the truth{_off(e.metallic)}",
+                remedy.replace("roughness", "metallic"), ".1f",
+            ),
+        ]  # fmt: skip
+    remedy = "Photograph what shines from more directions; what you know, set under `overrides` in the scene file"
+    if e.roughness_interval is None:
+        return [Finding(AMBER, "Roughness was measured on less than 50 % of the surface seen; elsewhere it is a guess", remedy)]
+    return [
+        _finding(
+            "roughness_interval", e.roughness_interval,
+            "Roughness is known to within ±{}, a 95 % interval by its own claim"
+            f" ({ROUGHNESS_HELD[0]} to {ROUGHNESS_HELD[1]} % of the objects are inside it in rooms with truth)",
+            remedy, ".2f", AMBER,
+        )
+    ]  # fmt: skip
+
+
+ROUGHNESS_HELD = (76, 85)
+"""Per cent of the objects whose true roughness is inside the 95 % interval, in three rooms (docs/results/intervals.md)."""
+
+
+def _off(psnr: float | None) -> str:
+    """Return in words the error that a PSNR against a range of 1 stands for."""
+    return f", an error of about {10 ** (-psnr / 20):.2f}" if psnr is not None and np.isfinite(psnr) else ""
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 FIXED = {"white_patch": "a white patch of known albedo", "lamp": "a lamp of known radiance"}
 CONVENTION = {"prior": "the mean albedo of the prior's predictions", "mean_albedo": "a mean albedo that was set"}
 
@@ -357,14 +418,20 @@ def _scale(e: Evidence) -> Light:
     fixed = None
     if e.level in FIXED:
         fixed = Finding(
-            GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {e.level_error:.0%})" if e.level_error else "")
+            GREEN, f"The level is fixed by {FIXED[e.level]}" + (f" (within {percent(e.level_error)})" if e.level_error else "")
         )
     elif e.level in CONVENTION:
-        error = "" if e.level_error is None else f"; its error of {e.level_error:.0%} does not contain that of the convention"
+        error = (
+            "" if e.level_error is None else f"; its error of {percent(e.level_error)} does not contain that of the convention"
+        )
         fixed = Finding(AMBER, f"The level is a convention: {CONVENTION[e.level]}{error}", patch)
     else:
         fixed = _finding(
-            "level_error", e.level_error, "The level of light and albedo is known within {} (by indirect light)", patch, ".0%"
+            "level_error",
+            e.level_error,
+            "The level of light and albedo is known to within {} (from indirect light)",
+            patch,
+            ".0%",
         )
         fixed = fixed or Finding(AMBER, "The level of light and albedo is not known: 0 measurements of it", patch)
     moved = max(e.light_scale, 1 / e.light_scale) if e.light_scale > 0 else float("inf")
@@ -374,15 +441,15 @@ def _scale(e: Evidence) -> Light:
         [
             fixed,
             _finding(
-                "raised", e.raised, "All light was raised {} times, so that albedos stay below 1",
+                "raised", e.raised, "All light was raised by a factor of {}, so that albedos stay below 1",
                 "Light is missing: photograph every lamp and window and close the mesh, or fix the level by a white patch", ".2f",
-            ) if not e.raised <= 1 else Finding(GREEN, "Light had to be raised 1.00 times: albedos stay below 1 by themselves"),
+            ) if not e.raised <= 1 else Finding(GREEN, "Albedos stay below 1 without raising the light"),
             _finding(
-                "light_scale", moved, "Light found and albedo predicted disagree by a factor of {}"
+                "light_scale", moved, "The light that was found and the albedo that was predicted disagree by a factor of {}"
                 f" (the light was multiplied by {e.light_scale:.3g})", patch, ".2f",
             ) if e.level not in (*FIXED, "mean_albedo") else None,
             _finding(
-                "discrepancy", e.discrepancy, "Levels of single objects disagree by {} times their claimed variance",
+                "discrepancy", e.discrepancy, "Levels of single objects scatter by {} times their claimed variance",
                 "Look at objects whose uncertainty is large; lamps may be missing near them", ".2f",
             ),
         ],
