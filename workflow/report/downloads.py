@@ -32,7 +32,7 @@ KINDS = (
     Kind("textures/*", "texture images of the mesh", "any viewer", True),
     Kind("objects.csv", "objects: colour, roughness, metallic, their intervals, what was seen", "a spreadsheet"),
     Kind("objects.parquet", "objects: the fitted numbers and their errors", "pandas, DuckDB"),
-    Kind("emitters.parquet", "lamps: area, radiance and standard errors", "pandas, DuckDB"),
+    Kind("emitters.parquet", "lamps: object, area, radiance and standard errors", "pandas, DuckDB"),
     Kind("camera_response.parquet", "response curve of the camera", "pandas, DuckDB"),
     Kind("camera_response.cube", "response curve of the camera as a 1D lookup table", "OCIO, Nuke, Resolve"),
     Kind("environment.exr", "light from outside, a latitude-longitude map", "any renderer"),
@@ -76,19 +76,21 @@ class Command(NamedTuple):
     text: str
 
 
-def commands(scene: str, quality: str, overrides: Sequence[tuple[str, str]], names: Iterable[str]) -> list[Command]:
+def commands(scene: str, quality: str, overrides: Sequence[tuple[str, str]], names: Iterable[str], plan: str) -> list[Command]:
     """Return the commands that go on from this result.
 
     Args:
         scene, quality: of this result.
         overrides: (component, words for the scene's file) of the decisions that can be overridden.
         names: files of the deliverable.
+        plan: the plan of config/relight/ that stands for the relightings of a scene whose file lists none.
     """
     made, same = f"snakemake --cores 2 scenes/{scene}", chosen(quality)
     others = [other for other in ("draft", "standard", "paper") if other != quality]
     out = [
         Command(
-            "see it under other light, and from other cameras (section relight: of the scene's file)",
+            "see it under other light and from other cameras, which `relight` in the scene file lists,"
+            f" or else `config/relight/{plan}.yaml`",
             f"snakemake --cores 2 relight/{scene}{same}",
         )
     ]
@@ -96,7 +98,7 @@ def commands(scene: str, quality: str, overrides: Sequence[tuple[str, str]], nam
     out.append(Command("or in a time that you give, in seconds", f"{made} --config budget=600"))
     if overrides:
         component, words = overrides[0]
-        out.append(Command(f"decide about {component} yourself: add this to the scene's file, then", f"{words}\n{made}{same}"))
+        out.append(Command(f"decide about {component} yourself: add this to the scene file, then", f"{words}\n{made}{same}"))
     names = set(names)
     if "mitsuba/render.py" in names:
         out.append(Command("render it with Mitsuba and the exact reflectance", f"python scenes/{scene}/mitsuba/render.py"))

@@ -18,6 +18,7 @@ from workflow.report import pictures as pic
 from workflow.report.downloads import Command, Download
 from workflow.report.sources import SCRIPT, STYLE, TEMPLATE
 from workflow.report.verdict import Verdict
+from workflow.report.wording import prose
 
 if TYPE_CHECKING:
     import jinja2
@@ -31,6 +32,10 @@ VARIANT_NAMES = {
     "base": "base texture (fused)",
     "result": "result",
 }
+
+HERO_LEAST, HERO_ENLARGED = 480, 2.5
+"""The first picture is as wide as there is room, but not enlarged by more than this factor beyond so many CSS pixels: a small
+photograph would only be blurred."""
 
 METRIC_WORDS = {
     "l2": "mean squared error, of linear values for maps and of sensor values for photographs; 0 is exact",
@@ -117,11 +122,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Number:
-    """A number at the head of a section: label, value with unit, and the key of its explanation."""
+    """A number at the head of a section: label, value with unit, the key of its explanation, and what would be good."""
 
     label: str
     value: str
     explained: str
+    good: str = ""
 
 
 @dataclass(frozen=True)
@@ -160,7 +166,8 @@ def render_page(page: Page) -> str:
     """Render the page as HTML; all text is escaped."""
     bars = "".join(f".bar-{scheme}{{background:{pic.gradient(scheme)}}}" for scheme in ("error", "value"))
     hero = page.hero.width / max(page.hero.height, 1)  # a style of one element would not be allowed by the policy
-    style = f"{STYLE.read_text()}{bars}.large{{max-width:calc(80vh*{hero:.4f})}}\n"
+    wide = max(HERO_LEAST, HERO_ENLARGED * page.hero.width)
+    style = f"{STYLE.read_text()}{bars}:root{{--hero:min({wide:.0f}px,80vh*{hero:.4f})}}\n"
     script = SCRIPT.read_text()
     return template(TEMPLATE).render(
         page=page,
@@ -207,7 +214,7 @@ def template(path: Path) -> jinja2.Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["number"] = number
+    environment.filters |= {"number": number, "prose": prose}
     return environment.get_template(path.name)
 
 

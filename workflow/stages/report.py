@@ -28,14 +28,17 @@ from workflow.report.page import (
     ViewRows,
     explain,
     explanation_key,
+    number,
     render_page,
     score_table,
 )
-from workflow.report.verdict import Evidence, judge
+from workflow.report.verdict import LIMITS, Evidence, judge
+from workflow.report.wording import fit_words, percent, significant
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
+from workflow.settings import active_plan
 from workflow.stages import publish
 
 PLAN_KEYS = (
@@ -107,7 +110,7 @@ def run(job: Job) -> None:
         timings=read_timings(job.scene),
         versions=sorted(job.read("export").manifest.get("versions", {}).items()),
         downloads=downloads(names),
-        commands=commands(job.scene, job.quality, overrides, names),
+        commands=commands(job.scene, job.quality, overrides, names, active_plan(job.scene)),
         scene_file=_scene_file(job.scene),
     )
     data = render_page(page).encode()
@@ -157,6 +160,9 @@ def _evidence(job: Job, capture: CaptureReader, recovered: Recovered, summary: d
         held_out_views=int(score("rgb_held_out", "psnr").get("views", 0)),
         used=score("rgb", "psnr").get("mean"),
         albedo=score("albedo", "psnr").get("mean"),
+        roughness=score("roughness", "psnr").get("mean"),
+        metallic=score("metallic", "psnr").get("mean"),
+        roughness_interval=_roughness_interval(job),
         has_truth=capture.has_truth,
         prior=str(job.read("prior").manifest.get("settings", {}).get("prior", {}).get("kind", "")),
         uncertainty=uncertainty,
@@ -182,6 +188,22 @@ def _fit_evidence(job: Job) -> tuple[float | None, float | None]:
         alone = np.array([not str(model).startswith(("population", "identity")) for model in objects["model"]], bool)
         unfitted = float(objects["pixels"][~alone].sum() / objects["pixels"].sum())
     return unfitted, float(np.median(cells["uncertainty"])) if len(cells.get("uncertainty", ())) else None
+
+
+def _roughness_interval(job: Job) -> float | None:
+    """Return half of the 95 % interval of roughness, on its longer side, as the median over the pixels seen; None where less than
+    half of them are on objects that have one."""
+    width, pixels = [], []
+    for row in read_csv(job.read("export").path("objects.csv").read_bytes()):
+        value, low, high = (float(row[f"roughness{end}"] or "inf") for end in ("", "_low", "_high"))
+        width.append(max(high - value, value - low))
+        pixels.append(float(row["pixels"] or 0))
+    if not sum(pixels):
+        return None
+    order = np.argsort(width, kind="stable")
+    share = np.cumsum(np.array(pixels)[order])
+    middle = width[order[np.searchsorted(share, 0.5 * share[-1])]]
+    return middle if np.isfinite(middle) else None
 
 
 def _scene_file(scene: str) -> str:
@@ -226,20 +248,19 @@ def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
 def _headline(summary: dict[str, Any], capture: CaptureReader, recovered: Recovered) -> str:
     means = summary["means"].get("result", {})
     psnr = means.get("rgb", {}).get("raw", {}).get("psnr", {}).get("mean")
-    text = f"Re-rendered views match the photographs with {psnr:.1f} dB PSNR (sensor values)." if psnr is not None else ""
+    text = f"Re-renderings reach {psnr:.1f} dB PSNR on the photographs (sensor values)." if psnr is not None else ""
     held_out = means.get("rgb_held_out", {}).get("raw", {}).get("psnr")
     if held_out is not None:
-        text += f" The {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB."
+        text += f" On the {held_out['views']} held-out photographs: {held_out['mean']:.1f} dB."
     gains = summary.get("gain_over_raw_predictions", {})
     gain = gains.get("albedo", {}).get("scaled", {}).get("psnr_db")
     if gain is not None:
         raw = means.get("albedo", {}).get("raw", {}).get("psnr", {}).get("mean")
-        uncorrected = f"albedo has {raw:.1f} dB without correction; " if raw is not None else ""
-        text += f" Against ground truth, {uncorrected}up to scale it gains {gain:+.1f} dB over the raw predictions of the prior."
+        uncorrected = f"{raw:.1f} dB as it is and " if raw is not None else ""
         plain = summary["means"].get("object_mean", {}).get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
         own = means.get("albedo", {}).get("scaled", {}).get("psnr", {}).get("mean")
-        if plain is not None and own is not None:
-            text += f" Scaled albedo: {own:.1f} dB; the mean prediction of each object, as one flat colour, has {plain:.1f} dB."
+        text += f" Against ground truth, albedo reaches {uncorrected}{own:.1f} dB up to scale, {gain:.1f} dB above predictions"
+        text += "." if plain is None else f"; one flat colour per object, the mean of its predictions, reaches {plain:.1f} dB."
     if not np.any(recovered.light.emits):
         text += " No lamp was found, so relighting has none to switch off."
     if gain is None and not capture.has_truth:
@@ -269,12 +290,12 @@ def _facts(job: Job, capture: CaptureReader, recovered: Recovered) -> list[tuple
         ("source", str(capture.facts.get("source", ""))),
         ("photographs", f"{len(capture.views)} of {size} pixels, {capture.facts['dynamic_range'].upper()}"),
         ("exposures", f"{stops:.1f} stops apart" if stops > 0.01 else "all equal"),
-        ("mesh", f"{len(recovered.surface.faces)} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
+        ("mesh", f"{number(len(recovered.surface.faces))} faces, {' x '.join(f'{v:.2f}' for v in extent)} m"),
         ("objects", _objects_fact(job, len(recovered.object_names))),
         ("material fit", _fit_fact(job.read("affines").json("affines.json"))),
         (
             "surface cells",
-            f"{len(recovered.surface.cell_ijk)} of {1000 * recovered.surface.cell_edge:.1f} mm,"
+            f"{number(len(recovered.surface.cell_ijk))} of {1000 * recovered.surface.cell_edge:.1f} mm,"
             f" {100 * job.read('base').json('base.json')['seen_once_share']:.0f} % in one photograph only",
         ),
         ("prior", f"{prior.get('kind', 'unknown')}, {prior.get('samples', '?')} predictions a photograph"),
@@ -338,26 +359,27 @@ def _tables(summary: dict[str, Any]) -> list[Table]:
 
 
 HEADS = (
-    ("re-rendering, held-out photographs", "rgb_held_out", "raw", "psnr"),
-    ("re-rendering of the photographs", "rgb", "raw", "psnr"),
-    ("albedo, as it is", "albedo", "raw", "psnr"),
-    ("albedo, up to scale", "albedo", "scaled", "psnr"),
-    ("roughness", "roughness", "raw", "psnr"),
-    ("metallic", "metallic", "raw", "psnr"),
-    ("light left in the albedo", "albedo", "raw", "shading_left"),
+    ("re-rendering, held-out photographs", "rgb_held_out", "raw", "psnr", "rerendering"),
+    ("re-rendering of the photographs", "rgb", "raw", "psnr", "rerendering"),
+    ("albedo, as it is", "albedo", "raw", "psnr", "albedo"),
+    ("albedo, up to scale", "albedo", "scaled", "psnr", "albedo"),
+    ("roughness", "roughness", "raw", "psnr", "roughness"),
+    ("metallic", "metallic", "raw", "psnr", "metallic"),
+    ("light left in the albedo", "albedo", "raw", "shading_left", ""),
 )
-"""Scores at the head of the page: label, quantity, protocol, metric."""
+"""Scores at the head of the page: label, quantity, protocol, metric, and the limit of the verdict above which it is good."""
 
 
 def _numbers(summary: dict[str, Any]) -> list[Number]:
     out = []
-    for label, *column in HEADS:
+    for label, *column, limit in HEADS:
         quantity, protocol, metric = column
         entry = summary["means"].get("result", {}).get(quantity, {}).get(protocol, {}).get(metric)
         if entry is not None:
             unit = METRICS[metric].unit
             text = f"{entry['mean']:.{1 if unit else METRICS[metric].decimals}f}{' ' + unit if unit else ''}"
-            out.append(Number(label, text, explanation_key(*column)))
+            good = f"good from {LIMITS[limit].amber:g} {unit}" if limit else "0 is none"
+            out.append(Number(label, text, explanation_key(*column), good))
     return out
 
 
@@ -395,8 +417,8 @@ def _spread(views: Sequence[View], count: int) -> list[View]:
 
 def _hero_note(view: View, scores: dict[str, float]) -> str:
     score = scores.get(view.name)
-    return f"View {view.name}, the middle one of all by its score" + (
-        f" ({score:.1f} dB PSNR, sensor values)" if score is not None else ""
+    return f"View {view.name}" + (
+        f", the median of all by its score ({score:.1f} dB PSNR, sensor values)" if score is not None else ""
     )
 
 
@@ -592,6 +614,7 @@ def _objects(job: Job) -> list[dict[str, str]]:
             low, high = row[f"{name}_low"], row[f"{name}_high"]
             row[f"{name}_text"] = f"{float(row[name]):.2f}"
             row[f"{name}_interval"] = f"({float(low):.2f} to {float(high):.2f})" if low and high else ""
+        row["model"] = fit_words(row["model"])
         rows.append(row)
     return sorted(rows, key=lambda row: -float(row["pixels"] or 0))
 
@@ -611,15 +634,16 @@ def _emitters(job: Job, recovered: Recovered) -> list[dict[str, Any]]:
     for i in np.argsort(-power, kind="stable"):
         peak = radiance[i].max()
         swatch = color.to_uint8(color.srgb_from_linear(radiance[i] / peak if peak > 0 else radiance[i]))
-        share = f"{100 * power[i] / power.sum():.1f} %" if area[i] and power.sum() > 0 else "–"
+        share = percent(power[i] / power.sum(), 1) if area[i] and power.sum() > 0 else "–"
         rows.append(
             {
                 "id": int(table["emitter_id"][i]),
+                "object": str(table["object"][i]),
                 "kind": str(table["kind"][i]),
                 "faces": int(table["faces"][i]),
                 "area": float(table["area_m2"][i]),
-                "radiance": ", ".join(f"{v:.3g}" for v in radiance[i]),
-                "error": ", ".join(f"{v:.2g}" for v in error[i]),
+                "radiance": ", ".join(significant(v) for v in radiance[i]),
+                "error": ", ".join(significant(v, 2) for v in error[i]),
                 "swatch": "#{:02x}{:02x}{:02x}".format(*swatch),
                 "share": share,
                 "power": f"{power[i]:.6g}",
