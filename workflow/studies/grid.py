@@ -29,8 +29,12 @@ MATERIALS = ("albedo", "roughness", "metallic")
 TILE = 1.35
 """Width of a picture in inches."""
 GAP, TOP = 0.03, 0.3
-LETTER = 0.065
-"""Width of a letter of the labels in inches."""
+LETTERS = 7.0
+"""Size of the labels in points."""
+LETTER = 0.0093
+"""Width of a letter of one point in inches."""
+LIGHTS = {"lamp": "one lamp", "moved": "a moved lamp", "environment": "an environment", "sphere": "a glowing sphere"}
+"""Kinds of light of a study of relighting, in words."""
 DPI = 200
 
 
@@ -76,14 +80,20 @@ def mark(name: str, quality: str) -> str:
 
 def write_grid(name: str, quality: str) -> None:
     """Write results/studies/<study>.grid.png and .pdf."""
-    study, cells = _cells(name, quality)
-    lines = [line for scene in dict.fromkeys(cell.scene for cell in cells) for line in _lines(study, cells, scene, quality)]
-    columns = [c for c in ("truth", *study.variants) if any(c in line.tiles for line in lines)]
-    labels = {"truth": "ground truth", **{v: study.variants[v].label or v for v in study.variants}}
-    figure = draw(lines, columns, labels, study.sheet.insets)
+    figure = sheet(name, quality)
     for ending in ("png", "pdf"):
         path = table.RESULTS / f"{name}.grid.{ending}"
         write_atomically(path, partial(_save, figure, ending))
+
+
+def sheet(name: str, quality: str, rooms: int | None = None, letters: float = LETTERS) -> Any:
+    """Return the sheet of a study as a figure of matplotlib: all its rooms or the first few; `letters`: their size in points."""
+    study, cells = _cells(name, quality)
+    scenes = list(dict.fromkeys(cell.scene for cell in cells))[:rooms]
+    lines = [line for scene in scenes for line in _lines(study, cells, scene, quality)]
+    columns = [c for c in ("truth", *study.variants) if any(c in line.tiles for line in lines)]
+    labels = {"truth": "ground truth", **{v: study.variants[v].label or v for v in study.variants}}
+    return draw(lines, columns, labels, study.sheet.insets, letters)
 
 
 def _save(figure: Any, ending: str, path: Path) -> None:
@@ -91,7 +101,13 @@ def _save(figure: Any, ending: str, path: Path) -> None:
     figure.savefig(path, dpi=DPI, metadata=metadata)
 
 
-def draw(lines: list[Line], columns: list[str], labels: dict[str, str], insets: dict[str, tuple[float, float, float]]) -> Any:
+def draw(
+    lines: list[Line],
+    columns: list[str],
+    labels: dict[str, str],
+    insets: dict[str, tuple[float, float, float]],
+    letters: float = LETTERS,
+) -> Any:
     """Draw a sheet: a column for each method, a row for each line.
 
     Args:
@@ -99,6 +115,7 @@ def draw(lines: list[Line], columns: list[str], labels: dict[str, str], insets: 
         columns: keys of the pictures, from left to right.
         labels: words over the columns.
         insets: scene -> (x, y, size) of a square that is shown enlarged in a corner, as shares of the width and the height.
+        letters: size of the labels in points.
 
     Returns:
         The matplotlib figure.
@@ -109,18 +126,20 @@ def draw(lines: list[Line], columns: list[str], labels: dict[str, str], insets: 
     from matplotlib import pyplot as plt
 
     heights = [TILE * _aspect(line) for line in lines]
-    left = LETTER * max(len(words) for line in lines for words in line.label.split("\n")) + 0.12
+    top = TOP * letters / LETTERS
+    left = LETTER * letters * max(len(words) for line in lines for words in line.label.split("\n")) + 0.12
     width = left + len(columns) * (TILE + GAP)
-    height = TOP + sum(h + GAP for h in heights)
+    height = top + sum(h + GAP for h in heights)
     figure = plt.figure(figsize=(width, height))
     plt.close(figure)
-    y = height - TOP
+    y = height - top
     for j, column in enumerate(columns):
         x = left + j * (TILE + GAP) + TILE / 2
-        figure.text(x / width, (height - 0.55 * TOP) / height, _wrapped(labels[column]), ha="center", va="center", fontsize=7)
+        words = _wrapped(labels[column])
+        figure.text(x / width, (height - 0.55 * top) / height, words, ha="center", va="center", fontsize=letters)
     for line, tall in zip(lines, heights, strict=True):
         y -= tall
-        figure.text((left - 0.06) / width, (y + tall / 2) / height, line.label, ha="right", va="center", fontsize=7)
+        figure.text((left - 0.06) / width, (y + tall / 2) / height, line.label, ha="right", va="center", fontsize=letters)
         for j, column in enumerate(columns):
             if column not in line.tiles:
                 continue
@@ -225,7 +244,7 @@ def _relit_line(
     from iif_core.numerics.color import to_uint8, tone_map
     from workflow.artifacts.store import rgb
 
-    file, line = f"{light['name']}/{view.name}.exr", Line(scene, f"{scene}\n{light['name']}")
+    file, line = f"{light['name']}/{view.name}.exr", Line(scene, f"{scene}\n{LIGHTS[light['kind']]}")
     line.tiles["truth"] = to_uint8(tone_map(rgb(truth.exr(file)), light["exposure"]))
     for cell in own:
         reader = _reader("relit_scores", cell, quality)

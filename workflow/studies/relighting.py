@@ -14,7 +14,7 @@ from workflow.runtime import fingerprint as fp
 from workflow.settings.names import REPOSITORY
 from workflow.settings.study_files import load_study
 from workflow.studies import table
-from workflow.studies.grid import write_grid
+from workflow.studies.grid import LIGHTS, sheet, write_grid
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -24,8 +24,8 @@ KEPT = REPOSITORY / "docs/results/data/relighting.csv"
 LAMPS = REPOSITORY / "docs/results/data/relighting_lamps.csv"
 PAGE = REPOSITORY / "docs/results/relighting.md"
 PICTURE = REPOSITORY / "docs/pictures/relighting.jpg"
-LARGEST = (1000, 4000)
-"""Width and height of the picture of the page, at most."""
+WIDTH = 1200
+"""Pixels of the picture of the page, which has the first room alone, so that its labels can be read."""
 NOISE = "noise"
 KEY = ("scene", "variant", "seed", "light", "view", "quantity", "metric", "protocol")
 COLUMNS = (*KEY, "value", "found", "seconds", "fingerprint")
@@ -34,12 +34,7 @@ ASKED = {"raw": 26.0, "scaled": 30.8}
 """PSNR of single lamps that is aimed at, in dB."""
 LUXREMIX = ("LuxRemix (its scenes, not these)", "", "", "30.8", "0.867", "0.091", "", "")
 """What LuxRemix prints for single lamps after a gain per channel."""
-WORDS = {
-    "relit_lamp": "one lamp",
-    "relit_moved": "a moved lamp",
-    "relit_environment": "an environment",
-    "relit_sphere": "a glowing sphere",
-}
+WORDS = {f"relit_{kind}": words for kind, words in LIGHTS.items()}
 
 
 def keep(quality: str) -> None:
@@ -63,13 +58,13 @@ def keep(quality: str) -> None:
     text = fill(PAGE.read_text(), blocks)
     write_atomically(PAGE, lambda temporary: temporary.write_text(text))
     if len(new):
-        from PIL import Image
-
         write_grid(STUDY, quality)
-        with Image.open(table.RESULTS / f"{STUDY}.grid.png") as sheet:
-            picture = sheet.convert("RGB")
-        picture.thumbnail(LARGEST, Image.Resampling.BOX)
-        write_atomically(PICTURE, lambda temporary: picture.save(temporary, "JPEG", quality=85))
+        write_atomically(PICTURE, lambda temporary: save_picture(sheet(STUDY, quality, rooms=1, letters=10.0), temporary))
+
+
+def save_picture(figure: Any, path: Path) -> None:
+    """Save a sheet as the picture of the page."""
+    figure.savefig(path, dpi=WIDTH / figure.get_figwidth(), format="jpeg", pil_kwargs={"quality": 88})
 
 
 def _joined(new: pd.DataFrame, path: Path, cell: list[str], order: list[str], columns: tuple[str, ...]) -> pd.DataFrame:
