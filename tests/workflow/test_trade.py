@@ -18,7 +18,7 @@ def test_a_budget_chooses_a_point_and_says_what_is_expected(workflow):
 
 def test_what_cannot_be_had_ends_before_any_job_with_one_error(workflow):
     for asked, words in (
-        ("budget=3", "error: --config budget=3: tiny takes at least "),
+        ("budget=3", "error: --config budget=3: tiny is expected to take at least some "),
         ("target=albedo:90", "error: --config target=albedo:90: the best point, p"),
         ("budget=60 point=p01", "error: --config point, budget: each of them chooses the quality"),
         ("point=p77", "error: --config point=p77: unknown point."),

@@ -219,8 +219,8 @@ def _by_budget(text: str, scene: str, cores: int) -> Choice:
         least, changed = costs[cheapest].seconds, overridden(scene, cheapest)
         why = f"{scene_origin(scene)} sets {', '.join(changed)} itself. " if changed else ""
         raise InputError(
-            f"--config budget={text}: {scene} takes at least {least.middle:.0f} s on this machine, at point {cheapest}"
-            f" ({forecast.span(least)}){costs[cheapest].beside}. {why}Ask for more, or run it with --config point={cheapest}"
+            f"--config budget={text}: {scene} is expected to take at least some {least.middle:.0f} s on this machine, at point"
+            f" {cheapest} ({forecast.span(least)}){costs[cheapest].beside}. {why}Ask for more, or run it with --config point={cheapest}"
         )
     name = max(kept, key=lambda name: (points()[name].expected("albedo").mean, -costs[name].seconds.middle))
     line = f"{scene}, budget {text} s: {_about(scene, name, costs[name])}; {_expectation(name, points()[name])}"
