@@ -1,15 +1,18 @@
 """room.html without a browser: lamps, texels, packing, and what the vendored program is."""
 
+import base64
 import hashlib
+import io
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from iif_core.light.light_maps import to_half
 from tests.unit.transport_rooms import box, quad
-from workflow.exporters.atlas import TexturedPart
+from workflow.exporters.atlas import UNKNOWN, Atlas, TexturedPart
 from workflow.room import build
 from workflow.room.light import find_lamps, lit_texels, trace_lamps
 from workflow.room.pack import array_blob, normals_to_bytes, quantized
@@ -205,7 +208,7 @@ def test_what_a_click_tells():
         **{f"{name}{end}": [0.4, None] for name in ("roughness", "metallic") for end in ("", "_low", "_high")},
     }  # fmt: skip
     door, wall = build.object_facts(columns)
-    assert door["views"] == 3 and door["model"] == "gain" and len(door["numbers"]) == 5
+    assert door["views"] == 3 and door["model"] == "colour by factors" and len(door["numbers"]) == 5
     assert door["numbers"][0] == {"name": "albedo, red", "value": 0.2, "low": 0.1, "high": 0.3}
     assert wall["model"] == "not fitted" and wall["views"] == 0 and wall["numbers"][0]["low"] is None
     assert build.interval("radiance", 1.0, 2.0) == {
@@ -214,6 +217,19 @@ def test_what_a_click_tells():
         "low": 0.0,
         "high": pytest.approx(4.92, abs=0.01),
     }
+
+
+def test_surface_that_nothing_shows_is_told_apart_without_a_large_uncertainty():
+    """What is between seen and unseen surface on the screen is interpolated: red must not rise there, alpha alone may fall."""
+    seen = np.zeros((16, 16), bool)
+    seen[:, :4] = True
+    values = np.where(seen, 0.1, UNKNOWN).astype(np.float32)
+    flat = np.full((16, 16), 0.5, np.float32)
+    atlas = Atlas(np.full((16, 16, 3), 0.5, np.float32), flat, flat, values, seen, np.ones((16, 16), bool))
+    blob = build.picture_blobs(atlas, 16)["surface"]
+    picture = np.asarray(Image.open(io.BytesIO(base64.b64decode(blob.text))))
+    assert (picture[..., 0] == round(255 * 0.1 / build.UNCERTAINTY_MOST)).all()
+    assert (picture[:, : 4 + build.HOLES, 3] == 255).all() and (picture[:, 4 + build.HOLES :, 3] == 0).all()
 
 
 def test_three_is_the_file_that_its_readme_names():

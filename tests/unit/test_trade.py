@@ -61,7 +61,9 @@ def test_a_budget_gets_the_best_point_that_keeps_to_it(table, budget, point):
 
 
 def test_a_budget_below_the_cheapest_point_is_refused_with_the_least_and_what_holds_it_up(table):
-    with pytest.raises(InputError, match=r"room is expected to take at least some 30 s on this machine, at point p01 \(24 s to 39 s\)"):
+    with pytest.raises(
+        InputError, match=r"room is expected to take at least some 30 s on this machine, at point p01 \(24 s to 39 s\)"
+    ):
         chosen("budget", 29)
     with pytest.raises(InputError, match=r"config/scenes/fixed.yaml sets capture.views itself"):
         chosen("budget", 29, "fixed")

@@ -216,7 +216,38 @@ def test_a_click_tells_the_object(room, stored):
     assert "ceiling lamp" in room.inner_text("#object-name") and "radiance, red" in room.inner_text("#facts")
     room.focus("#view")
     room.keyboard.press("Escape")
-    assert "Nothing is selected" in room.inner_text("#object-name")
+    assert not room.is_visible("#card")
+
+
+def test_what_is_selected_has_a_card_in_view_and_a_line_around_it(room, stored):
+    """The line is beside the object, whose own colours stay as they are."""
+    ball = next(one["id"] for one in stored.document["objects"] if one["name"] == "ball")
+    room.evaluate("room.setPose([1.4, 0.6, 1.3], [0.8, 1.4, -0.338])")
+    box = room.locator("#view").bounding_box()
+    middle, steps = (box["width"] / 2, box["height"] / 2), range(-300, 301, 6)
+    points = [(int(middle[0]) + dx + 0.5, int(middle[1]) + dy + 0.5) for dy in steps for dx in steps]
+    hits = room.evaluate("points => points.map(([x, y]) => room.hit(x, y))", points)
+    on = np.array([bool(hit) and hit["object"] == ball for hit in hits])
+    before = pixels_at(room, points)
+    room.evaluate("id => room.select(id)", ball)
+    changed = (before != pixels_at(room, points)).any(1)
+    assert on.sum() > 100 and not changed[on].any()
+    assert 10 < changed[~on].sum() < on.sum()
+    card, screen = room.locator("#card").bounding_box(), room.viewport_size
+    assert card["y"] >= 0 and card["y"] + card["height"] <= screen["height"] and room.inner_text("#object-name") == "ball"
+    room.click("#close")
+    assert not room.is_visible("#card") and (pixels_at(room, points) == before).all()
+
+
+def test_controls_stay_where_they_are_and_tell_what_they_change(room):
+    place = "document.querySelector('#lamps .strength').getBoundingClientRect().y"
+    first = room.evaluate(place)
+    for mode in ("albedo", "roughness", "metallic", "emission", "uncertainty", "lit"):
+        room.evaluate("mode => room.setMode(mode)", mode)
+        assert room.evaluate(place) == first, mode
+        assert room.is_enabled("#exposure") == (mode in ("lit", "emission")) and room.is_enabled("#gloss") == (mode == "lit"), (
+            mode
+        )
 
 
 def test_lamps_have_sliders_numbers_and_colours(room, stored):
@@ -281,10 +312,13 @@ def check_keys(room):
     assert room.evaluate("room.camera().view") == "above"
     room.keyboard.press("v")
     order = []
-    for _ in range(6):
+    while order[-1:] != ["eye-height"] and len(order) < 50:
         room.keyboard.press("Tab")
-        order.append(room.evaluate("document.activeElement.id || document.activeElement.name"))
-    assert order == ["mode", "exposure", "exposure-number", "gloss", "way", "eye-height"]
+        order.append(
+            room.evaluate("document.activeElement.id || document.activeElement.name || document.activeElement.className")
+        )
+    lamps = ["strength", "exact", "color", "off"] * room.evaluate("room.data.lamps.length")
+    assert order == ["mode", *lamps, "as-found", "exposure", "exposure-number", "gloss", "way", "eye-height"]
 
 
 def test_from_above_the_ceiling_is_away(room, stored):
@@ -330,16 +364,18 @@ def test_a_phone_walks_by_touch(page_for, path):
             at = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
             client.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
 
-        touch("touchStart", (100, 200))
-        for x in range(110, 200, 10):
-            touch("touchMove", (x, 200))
+        card = page.locator("#card").bounding_box()
+        assert card["y"] + card["height"] < 300 < box["height"]  # leaves room to look around
+        touch("touchStart", (180, 300))
+        for x in range(190, 280, 10):
+            touch("touchMove", (x, 300))
         touch("touchEnd")
         turned = page.evaluate("room.camera()")
         assert leftwards(before["direction"], turned["direction"]) > 0.02
         assert turned["eye"] == before["eye"]
-        touch("touchStart", (180, 200), (200, 200))
+        touch("touchStart", (250, 300), (270, 300))
         for spread in range(10, 100, 10):
-            touch("touchMove", (180 - spread, 200), (200 + spread, 200))
+            touch("touchMove", (250 - spread, 300), (270 + spread, 300))
         touch("touchEnd")
         walked = np.subtract(page.evaluate("room.camera().eye"), turned["eye"])
         assert walked[:2] @ np.array(turned["direction"][:2]) > 0.05

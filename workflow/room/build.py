@@ -17,6 +17,7 @@ from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import Atlas, TexturedPart
 from workflow.exporters.object_table import NORMAL_95
 from workflow.report.pictures import false_colour
+from workflow.report.wording import fit_words
 from workflow.room.light import Lamps, LitTexels
 from workflow.room.pack import Blob, array_blob, normals_to_bytes, picture_blob, quantized
 from workflow.scene.normal_form import View
@@ -28,9 +29,8 @@ QUALITY = 92
 PHOTOGRAPH_QUALITY = 80
 PHOTOGRAPH_WIDTHS = (640, 480, 320, 0)
 """Widths of photographs in the page, in pixels, of which the first that fits is taken; 0 = without photographs."""
-UNCERTAINTY_MOST, UNCERTAINTY_TOP, UNCERTAINTY_SHOWN = 0.5, 0.625, 0.2
-"""Largest uncertainty, the value that 255 in the texture would mean if it did not stand for surface that was not seen, and the
-uncertainty that is shown lightest."""
+UNCERTAINTY_MOST, UNCERTAINTY_SHOWN = 0.5, 0.2
+"""Largest uncertainty, which 255 in the texture means, and the uncertainty that is shown lightest."""
 HOLES = 3
 """Texels across which surface between observed cells has the uncertainty of the nearest of them."""
 ROUGHNESSES = 17
@@ -117,18 +117,19 @@ def geometry_blobs(parts: Sequence[TexturedPart], frame: Frame) -> tuple[dict[st
 def picture_blobs(atlas: Atlas, largest: int) -> dict[str, Blob]:
     """Return the base colour (sRGB), and as red, green and blue of one picture the uncertainty, roughness and metallic.
 
-    Red is the uncertainty over UNCERTAINTY_TOP, and 1 where no photograph shows the surface.
+    Red is the uncertainty over UNCERTAINTY_MOST, that of the nearest surface where no photograph shows it; alpha is 0 there and 1
+    elsewhere. Interpolation between both then changes what is unknown into what is known, and never into a large uncertainty.
     """
     from scipy.ndimage import distance_transform_edt
 
     base = color.to_uint8(color.srgb_from_linear(np.clip(_smaller(atlas.base_color, largest), 0, 1)))
     known = atlas.seen | (atlas.uncertainty == 0)  # emitters are known to be black
-    uncertainty = np.ones(known.shape, np.float32)
+    uncertainty, shown = np.ones(known.shape, np.float32), np.zeros(known.shape, np.float32)
     if known.any():
         distance, (row, column) = distance_transform_edt(~known, return_indices=True)
-        nearest = np.minimum(atlas.uncertainty, UNCERTAINTY_MOST)[row, column] / UNCERTAINTY_TOP
-        uncertainty = np.where(distance <= HOLES, nearest, uncertainty)
-    rest = np.stack([uncertainty, atlas.roughness, atlas.metallic], -1)
+        uncertainty = np.minimum(atlas.uncertainty, UNCERTAINTY_MOST)[row, column] / UNCERTAINTY_MOST
+        shown = (distance <= HOLES).astype(np.float32)
+    rest = np.stack([uncertainty, atlas.roughness, atlas.metallic, shown], -1)
     return {"base": picture_blob(base, QUALITY), "surface": picture_blob(color.to_uint8(_smaller(rest, largest)), None)}
 
 
@@ -265,7 +266,7 @@ def object_facts(columns: Mapping[str, Sequence]) -> list[dict[str, Any]]:
             {
                 "id": number,
                 "name": columns["name"][row],
-                "model": columns["model"][row] or "not fitted",
+                "model": fit_words(columns["model"][row]) or "not fitted",
                 "views": columns["photographs"][row] or 0,
                 "pixels": columns["pixels"][row] or 0,
                 "area": columns["area_m2"][row],

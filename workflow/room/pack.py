@@ -45,7 +45,7 @@ def array_blob(values: Array) -> Blob:
 
 
 def picture_blob(picture: Array, quality: int | None) -> Blob:
-    """Encode (H, W, 3) or (H, W) uint8 as WebP of this quality, or without loss where it is None."""
+    """Encode (H, W, 3), (H, W, 4) or (H, W) uint8 as WebP of this quality, or without loss where it is None."""
     from PIL import Image
 
     buffer = io.BytesIO()

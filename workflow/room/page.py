@@ -15,9 +15,9 @@ from workflow.room.pack import Blob
 from workflow.room.sources import LIBRARY, STYLE, TEMPLATE, VENDORED, VIEWER
 
 NOTES = {
-    "lit": "Diffuse light of every lamp, path-traced with all reflections, times the surface, and its gloss as if the light at"
-    " the point came evenly from everywhere: mirrors show the brightness of the light and no images.",
-    "albedo": "Base colour, as fitted.",
+    "lit": "The light of every lamp, path-traced with all reflections, on matte surface; gloss as if the light came evenly from"
+    " everywhere, so that mirrors show no images.",
+    "albedo": "Albedo (base colour), as fitted, without light.",
     "roughness": "0 (black) to 1 (white), as fitted.",
     "metallic": "0 (black) to 1 (white), as fitted.",
     "emission": "What shines, with its strength and colour; all else is black.",

@@ -142,7 +142,7 @@
   const FRAGMENT = COMMON + `
     uniform sampler2D baseMap, surfaceMap, lightMap, lobes, colours;
     uniform vec3 cameraPosition, emission;
-    uniform float exposure, gloss, cut, opacity, chosen, uncertaintyRange, emissionExposure;
+    uniform float exposure, gloss, cut, opacity, uncertaintyRange, emissionExposure;
     uniform int mode;
     in vec3 vPlace;
     in vec3 vNormal;
@@ -151,7 +151,7 @@
     void main() {
       if (vPlace.z > cut) discard;
       vec3 base = texture(baseMap, vUv).rgb;
-      vec3 surface = texture(surfaceMap, vUv).rgb;
+      vec4 surface = texture(surfaceMap, vUv);
       float roughness = surface.g, metallic = surface.b;
       vec3 shown;
       if (mode == 0) {
@@ -166,10 +166,8 @@
       else if (mode == 2) shown = vec3(roughness);
       else if (mode == 3) shown = vec3(metallic);
       else if (mode == 4) shown = encoded(emissionExposure * emission);
-      else if (surface.r > 0.9) shown = vec3(0.35); // no photograph shows it
+      else if (surface.a < 0.5) shown = vec3(0.35); // no photograph shows it
       else shown = texture(colours, vec2(clamp(surface.r * uncertaintyRange, 0.0, 1.0) * (255.0 / 256.0) + 0.5 / 256.0, 0.5)).rgb;
-      float stripe = step(0.5, fract((gl_FragCoord.x + gl_FragCoord.y) / 12.0));
-      shown = mix(shown, mix(vec3(1.0, 0.75, 0.1), vec3(0.1, 0.25, 0.9), stripe), 0.2 * chosen);
       colour = vec4(shown, opacity);
     }`;
 
@@ -200,6 +198,42 @@
       gl_Position = projectionMatrix * viewMatrix * place;
     }`;
 
+  // What is selected, as a picture of 0 and 1, and a line around it that is seen on light and on dark ground.
+  const MASK_FRAGMENT = `
+    precision highp float;
+    uniform float cut;
+    in vec3 vPlace;
+    out vec4 colour;
+    void main() {
+      if (vPlace.z > cut) discard;
+      colour = vec4(1.0);
+    }`;
+
+  const OUTLINE_VERTEX = `
+    in vec3 position;
+    void main() { gl_Position = vec4(position.xy, 0.0, 1.0); }`;
+
+  const OUTLINE_FRAGMENT = `
+    precision highp float;
+    uniform sampler2D mask;
+    uniform float reach;
+    out vec4 colour;
+    float at(vec2 step) {
+      ivec2 last = textureSize(mask, 0) - 1;
+      return texelFetch(mask, clamp(ivec2(gl_FragCoord.xy + step), ivec2(0), last), 0).r;
+    }
+    float around(float r) {
+      float d = 0.7071 * r;
+      return max(max(max(at(vec2(r, 0)), at(vec2(-r, 0))), max(at(vec2(0, r)), at(vec2(0, -r)))),
+                 max(max(at(vec2(d, d)), at(vec2(-d, d))), max(at(vec2(d, -d)), at(vec2(-d, -d)))));
+    }
+    void main() {
+      if (at(vec2(0)) > 0.5) discard;
+      if (around(2.0 * reach) > 0.5) colour = vec4(1.0, 0.83, 0.3, 1.0);
+      else if (around(3.5 * reach) > 0.5) colour = vec4(0.07, 0.09, 0.2, 1.0);
+      else discard;
+    }`;
+
   const MODES = ['lit', 'albedo', 'roughness', 'metallic', 'emission', 'uncertainty'];
 
   // ------------------------------------------------------------------------------------------------------------ start
@@ -220,7 +254,8 @@
     const canvas = $('view');
     const renderer = new THREE.WebGLRenderer({ canvas, antialias: !bySoftware, alpha: false, preserveDrawingBuffer: true, powerPreference: 'high-performance' });
     renderer.outputColorSpace = THREE.LinearSRGBColorSpace; // the shader encodes
-    renderer.setClearColor(0x595959, 1);
+    const GROUND = 0x595959;
+    renderer.setClearColor(GROUND, 1);
     const scene = new THREE.Scene();
     const camera = new THREE.PerspectiveCamera(70, 1, 0.03, 300);
     camera.up.set(0, 0, 1);
@@ -300,7 +335,7 @@
       });
       // The values of shared uniforms are the same objects in all materials, so that setting one sets it for all.
       material.uniforms = {
-        ...shared, emission: { value: new THREE.Vector3() }, opacity: { value: part.opacity }, chosen: { value: 0 },
+        ...shared, emission: { value: new THREE.Vector3() }, opacity: { value: part.opacity },
       };
       const mesh = new THREE.Mesh(geometry, material);
       mesh.position.fromArray(low);
@@ -310,6 +345,38 @@
       return mesh;
     });
     scene.updateMatrixWorld(true);
+
+    const CHOSEN = 1; // layer of what is selected
+    let anyChosen = false;
+    const mask = new THREE.WebGLRenderTarget(1, 1, { minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter, depthBuffer: false });
+    const maskMaterial = new THREE.RawShaderMaterial({
+      vertexShader: VERTEX, fragmentShader: MASK_FRAGMENT, glslVersion: THREE.GLSL3, side: THREE.DoubleSide, depthTest: false, depthWrite: false,
+    });
+    maskMaterial.uniforms = { cut: shared.cut };
+    const outlineMaterial = new THREE.RawShaderMaterial({
+      vertexShader: OUTLINE_VERTEX, fragmentShader: OUTLINE_FRAGMENT, glslVersion: THREE.GLSL3, depthTest: false, depthWrite: false,
+    });
+    outlineMaterial.uniforms = { mask: { value: mask.texture }, reach: { value: 1 } };
+    const outline = new THREE.Mesh(new THREE.PlaneGeometry(2, 2), outlineMaterial);
+    outline.frustumCulled = false;
+    const outlineScene = new THREE.Scene().add(outline);
+
+    function drawOutline() {
+      mask.setSize(canvas.width, canvas.height);
+      outlineMaterial.uniforms.reach.value = canvas.width / canvas.clientWidth;
+      scene.overrideMaterial = maskMaterial;
+      camera.layers.set(CHOSEN);
+      renderer.setRenderTarget(mask);
+      renderer.setClearColor(0x000000, 1);
+      renderer.render(scene, camera);
+      renderer.setRenderTarget(null);
+      renderer.setClearColor(GROUND, 1);
+      camera.layers.set(0);
+      scene.overrideMaterial = null;
+      renderer.autoClear = false;
+      renderer.render(outlineScene, camera);
+      renderer.autoClear = true;
+    }
 
     let sky = null;
     if (data.environment) {
@@ -541,6 +608,7 @@
       placeCamera();
       const begun = performance.now();
       renderer.render(scene, camera);
+      if (anyChosen) drawOutline();
       const gl = renderer.getContext();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, onePixel); // waits until it is drawn
       const taken = performance.now() - begun;
@@ -584,6 +652,7 @@
       }
     }
 
+    const grouped = (count) => String(count).replace(/\B(?=(\d{3})+$)/g, '\u202f');
     const between = (value) => (value.low === null || value.low === undefined ? '' : `${number(value.low)} … ${number(value.high)}`);
 
     /** Shows what is known of an object, or of one part of it; -1 = of nothing. */
@@ -593,14 +662,17 @@
       meshes.forEach((mesh) => {
         const own = mesh.userData.part;
         const chosen = part ? mesh.userData.number === partNumber || (own.object === id && part.emitter < 0 && own.emitter < 0) : object && own.object === id;
-        mesh.material.uniforms.chosen.value = chosen ? 1 : 0;
+        if (chosen) mesh.layers.enable(CHOSEN);
+        else mesh.layers.disable(CHOSEN);
       });
+      anyChosen = Boolean(object || part);
+      $('card').hidden = !anyChosen;
       const table = $('facts');
       table.replaceChildren();
       $('object').value = object ? String(id) : '';
       $('swatch').hidden = true;
       if (!object && !part) {
-        $('object-name').textContent = 'Nothing is selected. Click on the room, or choose from the list.';
+        $('object-name').textContent = 'Nothing is selected';
         say('Nothing selected');
         draw();
         return;
@@ -608,11 +680,11 @@
       const name = part && part.emitter >= 0 ? part.name : object ? object.name : part.name;
       $('object-name').textContent = name;
       if (object) {
-        row(table, 'number', String(object.id));
-        row(table, 'model', object.model);
-        row(table, 'seen by', `${object.views} photograph${object.views === 1 ? '' : 's'}, ${object.pixels} pixels`);
+        if (!part || part.emitter < 0) object.numbers.forEach((one) => row(table, one.name, number(one.value), between(one)));
+        row(table, 'fitted', object.model);
+        row(table, 'seen by', `${object.views} photograph${object.views === 1 ? '' : 's'}, ${grouped(object.pixels)} pixels`);
         if (object.area !== null) row(table, 'area', `${number(object.area)} m²`);
-        object.numbers.forEach((one) => row(table, one.name, number(one.value), between(one)));
+        row(table, 'number', String(object.id));
         $('swatch').style.background = object.color;
         $('swatch').hidden = false;
       }
@@ -631,6 +703,8 @@
       document.querySelector(`input[name=mode][value=${name}]`).checked = true;
       $('legend').hidden = name !== 'uncertainty';
       $('mode-note').textContent = data.notes[name];
+      $('exposure').disabled = $('exposure-number').disabled = name !== 'lit' && name !== 'emission';
+      $('gloss').disabled = name !== 'lit';
       draw();
     }
     document.querySelectorAll('input[name=mode]').forEach((input) => input.addEventListener('change', () => setMode(input.value)));
@@ -749,6 +823,11 @@
       .sort((a, b) => (a[0] < b[0] ? -1 : a[0] > b[0] ? 1 : a[1] - b[1]))
       .forEach(([name, id]) => $('object').append(new Option(`${name} (${id})`, String(id))));
     $('object').addEventListener('change', () => select($('object').value === '' ? -1 : Number($('object').value)));
+
+    $('close').addEventListener('click', () => {
+      select(-1);
+      canvas.focus({ preventScroll: true });
+    });
 
     $('theme').addEventListener('change', () => { document.documentElement.dataset.theme = $('theme').value; });
 

@@ -70,7 +70,7 @@ def run(job: Job) -> None:
         "brightest": _brightest(parts, lamps),
         "light": {"size": size},
         "lobes": {"cosines": 33, "roughnesses": build.ROUGHNESSES},
-        "uncertainty": {"top": build.UNCERTAINTY_TOP, "shown": build.UNCERTAINTY_SHOWN},
+        "uncertainty": {"top": build.UNCERTAINTY_MOST, "shown": build.UNCERTAINTY_SHOWN},
         "notes": NOTES,
         "lamps": [
             {

@@ -9,8 +9,8 @@ npm install --prefix "$work" --no-save --no-audit --no-fund --silent three@0.187
 cat > "$work/parts.js" <<'PARTS'
 export {
   BackSide, BufferAttribute, BufferGeometry, DataTexture, DoubleSide, FrontSide, GLSL3, HalfFloatType,
-  LinearFilter, LinearMipmapLinearFilter, LinearSRGBColorSpace, Matrix3, Mesh, NearestFilter, NoColorSpace, PerspectiveCamera, Raycaster,
-  RawShaderMaterial, RGBAFormat, Scene, SphereGeometry, SRGBColorSpace, Texture, Vector2, Vector3, WebGLRenderer,
+  LinearFilter, LinearMipmapLinearFilter, LinearSRGBColorSpace, Matrix3, Mesh, NearestFilter, NoColorSpace, PerspectiveCamera, PlaneGeometry, Raycaster,
+  RawShaderMaterial, RGBAFormat, Scene, SphereGeometry, SRGBColorSpace, Texture, Vector2, Vector3, WebGLRenderer, WebGLRenderTarget,
 } from 'three';
 PARTS
 "$work/node_modules/.bin/esbuild" "$work/parts.js" --bundle --minify --format=iife --global-name=THREE --target=es2020 \
