@@ -7,6 +7,7 @@ from itertools import product
 
 import pytest
 
+from workflow.decisions import materials
 from workflow.report import wording
 from workflow.report.verdict import AMBER, GREEN, LIGHT_OF, LIMITS, ORDER, RED, ROUGHNESS_HELD, Evidence, judge, limits_table
 
@@ -186,6 +187,10 @@ def test_terms_and_numbers_are_written_for_people():
         == "nothing (0 usable pixels): as other objects, roughness given"
     )
     assert wording.fit_words("identity (1 pixels)") == "nothing (1 usable pixel): as predicted"
+    reason = materials.affine_size(["full", "gain+bias", "full", "population (3 pixels)"])["reason"]
+    told = "2 objects: colour by a matrix; 1 object: colour by factors and offsets; 1 object: nothing, as other objects"
+    assert wording.reason_words("affine_size", reason) == told and wording.reason_words("scale", reason) == reason
+    assert wording.reason_words("affine_size", materials.affine_size([])["reason"]) == "no objects"
     assert [wording.significant(v) for v in (5.0, 4.519, 16.2, 123.4, 1234.5, 0.0)] == [
         "5.00",
         "4.52",

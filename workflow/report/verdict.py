@@ -389,8 +389,8 @@ def _gloss(e: Evidence) -> list[Finding | None]:
     return [
         _finding(
             "roughness_interval", e.roughness_interval,
-            "Roughness is known to within ±{}, a 95 % interval by its own claim"
-            f" ({ROUGHNESS_HELD[0]} to {ROUGHNESS_HELD[1]} % of the objects are inside it in rooms with truth)",
+            "Roughness is known to within ±{} by the fit's own claim of 95 %, which held for"
+            f" {ROUGHNESS_HELD[0]} to {ROUGHNESS_HELD[1]} % of the objects in rooms with truth",
             remedy, ".2f", AMBER,
         )
     ]  # fmt: skip

@@ -42,6 +42,16 @@ def fit_words(model: str) -> str:
     return ", ".join(words(part) for part in model.split(", "))
 
 
+def reason_words(component: str, reason: str) -> str:
+    """Return the reason of a decision in words: what was fitted of how many objects is told in the terms of `fit_words`."""
+    if component != "affine_size":
+        return reason
+    words = FITTED | {"population": "nothing, as other objects", "identity": "nothing, as predicted"}
+    counted = re.findall(r"(\d+) ([^,]+)", reason)
+    told = (f"{count} {'object' if count == '1' else 'objects'}: {words.get(kind, kind)}" for count, kind in counted)
+    return "; ".join(told) or reason
+
+
 def prose(text: str) -> Markup:
     """Return a sentence of a stage as HTML: escaped, words in backticks as code, `±` for `+-`, and a space before `%`."""
     from markupsafe import Markup, escape

@@ -33,7 +33,7 @@ from workflow.report.page import (
     score_table,
 )
 from workflow.report.verdict import LIMITS, Evidence, judge
-from workflow.report.wording import fit_words, percent, significant
+from workflow.report.wording import fit_words, percent, reason_words, significant
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
 from workflow.scene.normal_form import CaptureReader, View
@@ -97,7 +97,7 @@ def run(job: Job) -> None:
         facts=_facts(job, capture, recovered),
         notes=[str(note) for note in capture.facts.get("notes", [])] + [str(n) for n in emission.get("notes", [])],
         warnings=numerics.warnings(warned),
-        plan=plan,
+        plan=[{**item, "reason": reason_words(item["component"], str(item.get("reason", "")))} for item in plan],
         tables=tables,
         pairs=_pairs(job, capture, ranked, scores),
         pairs_note=_pairs_note(job, ranked, summary),

@@ -220,7 +220,8 @@ def _by_budget(text: str, scene: str, cores: int) -> Choice:
         why = f"{scene_origin(scene)} sets {', '.join(changed)} itself. " if changed else ""
         raise InputError(
             f"--config budget={text}: {scene} is expected to take at least some {least.middle:.0f} s on this machine, at point"
-            f" {cheapest} ({forecast.span(least)}){costs[cheapest].beside}. {why}Ask for more, or run it with --config point={cheapest}"
+            f" {cheapest} ({forecast.span(least)}){costs[cheapest].beside}. {why}Ask for more, or run it with"
+            f" --config point={cheapest}"
         )
     name = max(kept, key=lambda name: (points()[name].expected("albedo").mean, -costs[name].seconds.middle))
     line = f"{scene}, budget {text} s: {_about(scene, name, costs[name])}; {_expectation(name, points()[name])}"
@@ -292,5 +293,6 @@ def _expectation(quality: str, point: Point) -> str:
     parts = []
     for score in SCORES:
         expected = point.expected(score)
-        parts.append(f"{score} {expected.mean:.1f} dB ({expected.low:.1f} to {expected.high:.1f})")
-    return f"quality {quality}, {photographs(quality)}: in {len(point.rooms)} measured rooms {', '.join(parts)}"
+        words = "held-out photographs, re-rendered" if score == "held_out" else score
+        parts.append(f"{words} {expected.mean:.1f} dB ({expected.low:.1f} to {expected.high:.1f})")
+    return f"quality {quality}, {photographs(quality)}: PSNR in {len(point.rooms)} measured rooms: {', '.join(parts)}"
