@@ -634,7 +634,7 @@
     }
 
     const say = (text) => { $('status').textContent = text; };
-    const number = (x) => (x === null || x === undefined ? '–' : Math.abs(x) >= 100 ? x.toFixed(0) : Number(x.toPrecision(3)).toString());
+    const number = (x) => (x === null || x === undefined ? '–' : x === 0 ? '0' : Math.abs(x) >= 100 ? x.toFixed(0) : x.toPrecision(3));
 
     function row(table, name, value, note) {
       const tr = table.insertRow();
