@@ -19,6 +19,7 @@ from workflow.scene.base_scene import BaseScene
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
+    from iif_core.light.transport.lamp_cache import LampCache
     from iif_core.light.transport.scene import Scene
 
 Array = np.ndarray
@@ -35,6 +36,12 @@ PROBES = 16
 """Rays from each texel that find out whether it is inside of a solid."""
 INSIDE = 0.25
 """Share of the rays that meet surface from behind, above which it is."""
+LEARNED = 0.5
+"""Rays for each point that find the surface from which light is reflected to the points."""
+LEARNED_SAMPLES = 16
+"""Paths from each place that they meet."""
+CELLS = 1 << 14
+"""Squares of which the surface would consist if it were cut evenly: the edge of the voxels in which light of surface is known."""
 
 
 @dataclass(frozen=True)
@@ -193,16 +200,16 @@ def trace_lamps(
     """
     if not lamps.lamps or not len(texels.index):
         return np.zeros((len(texels.index), len(lamps.lamps), 3), np.float32)
-    scene, lamp_of_face = lit_scene(parts, surface, lamps)
+    lit = lit_scene(parts, surface, lamps)
     two_sided = np.array([part.double_sided for part in parts], bool)
-    inside = _inside(scene.geometry, texels, np.repeat(two_sided, [len(part.faces) for part in parts]), seed)
+    inside = _inside(lit.scene.geometry, texels, two_sided[lit.part_of_face], seed)
     inside &= ~two_sided[texels.part]
     open_ = np.flatnonzero(~inside)
     back = np.flatnonzero(two_sided[texels.part])
     points = np.concatenate([texels.points[open_], texels.points[back]])
     normals = np.concatenate([texels.normals[open_], -texels.normals[back]])
     number = np.concatenate([open_, len(texels.index) + back]).astype(np.uint32)
-    traced = _trace(scene, points, normals, number, lamp_of_face, lamps, PathCount(samples, max_bounces, seed), progress)
+    traced = _trace(lit, points, normals, number, lamps, PathCount(samples, max_bounces, seed), progress)
     light = np.zeros((len(texels.index), len(lamps.lamps), 3), np.float32)
     light[open_] = traced[: len(open_)]
     if len(back):
@@ -224,11 +231,10 @@ class PathCount(NamedTuple):
 
 
 def _trace(
-    scene: Scene,
+    lit: LitScene,
     points: Array,
     normals: Array,
     number: Array,
-    lamp_of_face: Array,
     lamps: Lamps,
     count: PathCount,
     progress: Callable[[int, int], None],
@@ -237,14 +243,42 @@ def _trace(
     from iif_core.light.transport.lightmaps import light_maps
     from iif_core.light.transport.scene import PathOptions
 
-    paths, total = PathOptions(*count), len(lamps.lamps)
-    out = np.zeros((len(points), total, 3), np.float32)
-    for first in range(0, len(points), CHUNK):
-        progress(first, len(points))
+    of, paths, total = (lit.lamp_of_face, len(lamps.lamps)), PathOptions(*count), len(points)
+    out = np.zeros((total, len(lamps.lamps), 3), np.float32)
+    if not total:
+        return out
+    progress(0, total)
+    known = _known_light(lit, points, normals, lamps, count)
+    for first in range(0, total, CHUNK):
+        progress(first, total)
         some = slice(first, first + CHUNK)
-        out[some] = light_maps(scene, points[some], normals[some], lamp_of_face, total, paths, lamps.environment, number[some])
-    progress(len(points), len(points))
+        out[some] = light_maps(lit.scene, points[some], normals[some], *of, paths, lamps.environment, number[some], known)
+    progress(total, total)
     return out
+
+
+def _known_light(lit: LitScene, points: Array, normals: Array, lamps: Lamps, count: PathCount) -> LampCache | None:
+    """Trace the light of the surface that rays from some of the points meet; None where they meet none."""
+    from iif_core.light.transport.geometry import cosine_directions, trace
+    from iif_core.light.transport.lamp_cache import LampCache
+    from iif_core.light.transport.lightmaps import light_maps
+    from iif_core.light.transport.scene import PathOptions
+
+    geometry, rng = lit.scene.geometry, np.random.default_rng(count.seed + 1)
+    row = rng.choice(len(points), int(np.ceil(LEARNED * len(points))), replace=False)
+    start, way = points[row] + 1e-4 * normals[row], cosine_directions(normals[row], rng)
+    face, distance = trace(geometry, start, way)
+    met = np.flatnonzero((face >= 0) & (lit.lamp_of_face[face] < 0))
+    if not len(met) or count.max_bounces < 2:
+        return None
+    face, way = face[met], way[met]
+    place = start[met] + distance[met, None] * way
+    normal = geometry.normals[face]
+    normal = np.where(np.einsum("ij,ij->i", normal, way)[:, None] > 0, -normal, normal)
+    paths = PathOptions(LEARNED_SAMPLES, count.max_bounces - 1, count.seed + 1)
+    light = light_maps(lit.scene, place, normal, lit.lamp_of_face, len(lamps.lamps), paths, lamps.environment)
+    edge = float(np.sqrt(geometry.areas.sum() / CELLS))
+    return LampCache(edge, place, normal, lit.object_of_face[face], light)
 
 
 def _inside(geometry: Geometry, texels: LitTexels, two_sided: Array, seed: int) -> Array:
@@ -299,10 +333,17 @@ def _denoised(light: Array, texels: LitTexels, inside: Array, parts: int) -> Arr
     return with_mean_of(light, out, texels.part, np.where(inside, 0, texels.edge[texels.part] ** 2))
 
 
-def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -> tuple[Scene, Array]:
-    """Build the parts on the device with their lamps, and return the scene and the lamp (m,) of each of its faces."""
-    black = surface.n_objects  # of `BaseScene.materials`
-    material = surface.materials()
+class LitScene(NamedTuple):
+    """The parts on the device with their lamps; of each face: lamp, object (m,) int32, -1 = none, and part (m,) int64."""
+
+    scene: Scene
+    lamp_of_face: Array
+    object_of_face: Array
+    part_of_face: Array
+
+
+def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -> LitScene:
+    """Build the parts on the device with their lamps."""
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.scene import Scene
@@ -310,11 +351,13 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
+    part_of_face = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
 
     def of_face(values: list) -> Array:
-        return np.repeat(np.asarray(values), [len(part.faces) for part in parts], axis=0)
+        return np.asarray(values)[part_of_face]
 
     emitter = of_face([part.emitter_id for part in parts])
+    black = surface.n_objects  # of `BaseScene.materials`
     object_id = np.where(emitter >= 0, black, of_face([part.object_id for part in parts])).astype(np.int32)
     passes = of_face([1.0 - part.opacity for part in parts]).astype(np.float32)
     geometry = build_geometry(vertices, faces, object_id, passes)
@@ -324,7 +367,7 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
     weight = _draws(geometry.areas * radiance.mean(1), lamp, len(lamps.lamps))
     environment = lamps.surroundings if lamps.environment >= 0 else np.zeros(3, np.float32)
     emitters = Emitters(geometry, radiance, side, environment, sampling_weight=weight)
-    return Scene(geometry, material, emitters), lamp
+    return LitScene(Scene(geometry, surface.materials(), emitters), lamp, object_id, part_of_face)
 
 
 def _draws(power: Array, lamp: Array, lamps: int) -> Array:

@@ -30,14 +30,15 @@ class LampCollector:
 
     def emitter(self, face: Any, radiance: Any, weight: Any, active: Any) -> Any:
         lamp = dr.gather(mi.Int32, self.lamp_of_face, face, active)
-        return self._add(mi.UInt32(lamp), weight * radiance, active & (lamp >= 0))
+        return self.add(mi.UInt32(lamp), weight * radiance, active & (lamp >= 0))
 
     def environment(self, texel: Any, radiance: Any, weight: Any, active: Any) -> Any:
         if self.environment_lamp is None:
             return mi.Color3f(0)
-        return self._add(self.environment_lamp, weight * radiance, active)
+        return self.add(self.environment_lamp, weight * radiance, active)
 
-    def _add(self, lamp: Any, value: Any, active: Any) -> Any:
+    def add(self, lamp: Any, value: Any, active: Any) -> Any:
+        """Add the radiance `value` (Color3f) to that of `lamp` in the row of the lane; return what the path gains, 0."""
         entry = (self.lane * self.lamps + lamp) * 3
         for channel in range(3):
             mode = dr.ReduceMode.NoConflicts

@@ -11,8 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.light.transport.arrays import batches, checked_points, on_device, to_numpy
-from iif_core.light.transport.geometry import offset_from
-from iif_core.light.transport.kernels import World, incoming, power_weight, sample_light, to_world, uniform
+from iif_core.light.transport.geometry import nearest_hit, offset_from
+from iif_core.light.transport.kernels import (
+    Vertex,
+    World,
+    incoming,
+    light_by_lobe,
+    power_weight,
+    sample_light,
+    scatter_by_lobe,
+    to_world,
+    uniform,
+)
+from iif_core.light.transport.lamp_cache import LampCache
 from iif_core.light.transport.lamps import LampCollector, checked_lamps
 from iif_core.light.transport.scene import PathOptions, Scene
 from iif_core.numerics.xp import DRJIT
@@ -22,7 +33,17 @@ Array = np.ndarray
 
 
 @dr.syntax
-def _trace_points(world: World, rng: Any, point: Any, normal: Any, samples: Any, sample: Any, end: Any, max_bounces: Any) -> Any:
+def _trace_points(
+    world: World,
+    known: LampCache | None,
+    rng: Any,
+    point: Any,
+    normal: Any,
+    samples: Any,
+    sample: Any,
+    end: Any,
+    max_bounces: Any,
+) -> Any:
     """Follow the paths of every lane; the collector holds the result, and the returned gain is 0."""
     nothing = mi.Color3f(0)
     origin = offset_from(point, normal)
@@ -31,16 +52,53 @@ def _trace_points(world: World, rng: Any, point: Any, normal: Any, samples: Any,
             light = sample_light(world, rng, origin, normal, mi.Bool(True))
             cosine = dr.maximum(dr.dot(normal, light.wi), 0) * dr.inv_pi
             share = dr.select(light.valid, cosine * power_weight(light.pdf, cosine) / light.pdf, 0)
-            light.gain(world, mi.Color3f(share))
+            nothing += light.gain(world, mi.Color3f(share))
         # The first number of a direction is drawn once in each of as many strata as there are samples.
         u1 = dr.minimum((mi.Float(sample) + uniform(rng)) / mi.Float(samples), 1 - 2**-24)
         u2 = uniform(rng)
         wi = to_world(brdf.sample_cosine(DRJIT, u1, u2), normal)
         pdf = dr.dot(normal, wi) * dr.inv_pi
-        gain, rng = incoming(world, rng, origin, wi, pdf, 1, max_bounces, pdf > 0)
+        gain, rng = _arriving(world, known, rng, origin, wi, pdf, max_bounces)
         nothing += gain
         sample += 1
     return nothing
+
+
+def _arriving(
+    world: World, known: LampCache | None, rng: Any, origin: Any, direction: Any, pdf: Any, max_bounces: Any
+) -> tuple[Any, Any]:
+    """Collect what arrives along a ray that leaves a point of the map. Returns the gain, 0, and the random stream."""
+    if known is None:
+        return incoming(world, rng, origin, direction, pdf, 1, max_bounces, pdf > 0)
+    emitted, rng = incoming(world, rng, origin, direction, pdf, 1, 1, pdf > 0)
+    reflected, rng = _reflected(world, known, rng, origin, direction, max_bounces, (pdf > 0) & (max_bounces > 1))
+    return emitted + reflected, rng
+
+
+def _reflected(
+    world: World, known: LampCache, rng: Any, origin: Any, direction: Any, max_bounces: Any, active: Any
+) -> tuple[Any, Any]:
+    """Collect what the surface that a ray meets reflects: of known light if there is some, and its gloss, or all of a path, from
+    the path that goes on. Returns the gain, 0, and the random stream."""
+    hit = nearest_hit(world.geometry, origin, direction, active, world.geometry.draw_salt(rng))
+    front = -dr.dot(hit.normal, direction)
+    active &= hit.valid & (front != 0)
+    normal = dr.select(front < 0, -hit.normal, hit.normal)
+    base_color, roughness, metallic = world.material(hit.point, hit.face, hit.object_id, active)
+    kd, ks = brdf.kd_ks(base_color, metallic)
+    found, row = known.find(hit.point, normal, hit.object_id, hit.t, active)
+    gain = known.add(world.collector, row, kd, found)
+    chance = brdf.specular_chance(DRJIT, dr.max(kd), dr.max(ks), dr.dot(normal, -direction))
+    goes_on = active & (~found | (uniform(rng) < chance))
+    over = dr.select(found, dr.rcp(chance), 1)
+    diffuse, lobe = dr.select(found, mi.Color3f(0), kd), dr.select(found, 1, chance)
+    vertex = Vertex(offset_from(hit.point, normal), normal, -direction, diffuse, ks, roughness, lobe)
+    if world.emitters.can_be_sampled:
+        light, *shares = light_by_lobe(world, rng, vertex, goes_on)
+        gain += light.gain(world, over * (shares[0] + shares[1]))
+    goes_on, wi, *shares, pdf = scatter_by_lobe(rng, vertex, goes_on)
+    more, rng = incoming(world, rng, vertex.point, wi, pdf, 2, max_bounces, goes_on, over * (shares[0] + shares[1]))
+    return gain + more, rng
 
 
 def light_maps(
@@ -52,6 +110,7 @@ def light_maps(
     paths: PathOptions,
     environment_lamp: int = -1,
     number: Array | None = None,
+    known: LampCache | None = None,
 ) -> Array:
     """Integrate the diffuse light at points for every lamp by itself: D_l = 1/pi int L_l cos, of the light L_l that lamp l emits
     and that reaches the point directly or after any reflections (Eq. L.59).
@@ -68,6 +127,7 @@ def light_maps(
         paths: bounces include the point.
         environment_lamp: lamp of the environment, -1 = its light is left out.
         number: (n,) uint32, by which the points draw their random numbers; None = by their order.
+        known: light of the surface that paths meet first, with which they end there except for the gloss; None = they go on.
 
     Returns:
         (n, lamps, 3) float32 radiance, linear.
@@ -87,6 +147,7 @@ def light_maps(
         world = World(scene, LampCollector(rows, lane, lamps, of_face, environment_lamp))
         gain = _trace_points(
             world,
+            known,
             batch.streams(paths.seed, number),
             batch.spread(mi.Point3f, points),
             batch.spread(mi.Vector3f, normals),
