@@ -142,26 +142,9 @@ def _smaller(picture: Array, largest: int) -> Array:
 
 
 def light_blobs(halves: Halves, texels: LitTexels) -> dict[str, Blob]:
-    """Return the light maps and the texels at which they are stored: those with surface and their eight neighbours, which have
-    the light of the nearest one, so that interpolation finds light wherever there is surface."""
-    stored, source = bordered(texels)
-    value = halves.value[source].reshape(len(stored), 3 * len(halves.scale))
-    return {"light": array_blob(value.view(np.uint16)), "texels": array_blob(stored.astype(np.uint32)[:, None])}
-
-
-def bordered(texels: LitTexels) -> tuple[Array, Array]:
-    """Return the stored texels (t,) as row x S + column, increasing, and the row (t,) of `texels` whose light each has."""
-    from scipy.ndimage import binary_dilation, distance_transform_edt
-
-    size = texels.size
-    own = np.full(size * size, -1)
-    own[texels.index] = np.arange(len(texels.index))
-    has = (own >= 0).reshape(size, size)
-    if not has.any():
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    row, column = distance_transform_edt(~has, return_distances=False, return_indices=True)
-    stored = np.flatnonzero(binary_dilation(has, np.ones((3, 3), bool)))
-    return stored, own.reshape(size, size)[row, column].ravel()[stored]
+    """Return the light maps and the texels at which they are stored."""
+    value = halves.value[texels.source].reshape(len(texels.stored), 3 * len(halves.scale))
+    return {"light": array_blob(value.view(np.uint16)), "texels": array_blob(texels.stored.astype(np.uint32)[:, None])}
 
 
 def lightmap_size(wanted: int, lamps: int, fill: float, max_mb: float) -> int:

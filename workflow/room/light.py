@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from iif_core.light.environment import as_map, solid_angles
-from iif_core.light.light_maps import MOST_LAMPS, group_lamps, smooth, with_mean_of
+from iif_core.light.light_maps import MOST_LAMPS, NORMAL_REACH, group_lamps, smooth, with_mean_of
 from iif_core.numerics.color import id_colours
-from iif_core.surface.atlas import nearest_covered
+from iif_core.surface.atlas import nearest_covered, texel_values
+from iif_core.surface.closest import closest_points
 from iif_core.surface.triangles import face_geometry
 from workflow.exporters.atlas import TexturedPart, texels_of
 from workflow.models.denoise import denoise
@@ -24,8 +25,9 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-FINER = 3
-"""Points across a texel at which its surface is looked for, so that charts narrower than a texel have light too."""
+BESIDE = 2.0
+"""A texel beside a chart has the light of the nearest texel of its part up to this distance, in texels, where a difference of
+the normals of `NORMAL_REACH` counts as one."""
 EQUAL_SHARE = 0.5
 """Share of the draws that all lamps have alike; the rest is by power."""
 CHUNK = 1 << 16
@@ -127,7 +129,10 @@ def _color(radiance: Array) -> Array:
 
 @dataclass(frozen=True)
 class LitTexels:
-    """The surface under the texels of a light map, n of them; texels without surface are left out.
+    """The surface under the texels of a light map: n at which light is traced, and t that are stored.
+
+    Interpolation between texels reads those around each chart as well. They are stored with the light of the nearest texel of the
+    chart, and where there is none, as in charts narrower than a texel, light is traced at the nearest point of the surface.
 
     Attributes:
         size: S, of the map.
@@ -135,6 +140,8 @@ class LitTexels:
         points, normals: (n, 3) float64 metres, and unit normals of the faces, on the side of the photographs.
         part: (n,) int64 part of the surface.
         edge: size of a texel on each part, (parts,) float64 metres, in the mean over the part.
+        stored: (t,) int64 row x S + column, increasing: all of `index`, and others.
+        source: (t,) int64 row of the traced texels whose light each has.
     """
 
     size: int
@@ -143,32 +150,67 @@ class LitTexels:
     normals: Array
     part: Array
     edge: Array
+    stored: Array
+    source: Array
 
 
 def lit_texels(parts: Sequence[TexturedPart], size: int) -> LitTexels:
-    """Find the surface under each texel of a light map of S x S.
+    """Find the surface under each texel of a light map of S x S, and under those that interpolation reads besides.
 
-    It is the surface under the centre of the texel, and where there is none under the nearest of FINER x FINER points in it.
     Normals are those of the faces, because a path that starts under the shading normal may start inside of the surface.
     """
-    fine = texels_of(parts, size * FINER)
-    row, column = np.divmod(fine.index, size * FINER)
-    texel = row // FINER * size + column // FINER
-    from_centre = [axis % FINER - (FINER - 1) / 2 for axis in (row, column)]
-    order = np.lexsort((fine.index, from_centre[0] ** 2 + from_centre[1] ** 2, texel))
-    index, first = np.unique(texel[order], return_index=True)
-    chosen = order[first]
-    geometry = [face_geometry(part.vertices.astype(np.float64), part.faces) for part in parts]
-    flat = np.concatenate([normal for normal, _ in geometry])[fine.face[chosen]]
-    away = np.einsum("ij,ij->i", flat, fine.normals[chosen]) < 0
-    edge = np.empty(len(parts))
-    for number, part in enumerate(parts):
-        corner = part.uv[part.faces].astype(np.float64) * size
-        across, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-        in_map = 0.5 * np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]).sum()
-        edge[number] = np.sqrt(geometry[number][1].sum() / max(in_map, 1e-12))
-    points = fine.points[chosen].astype(np.float64)
-    return LitTexels(size, index, points, np.where(away[:, None], -flat, flat), fine.part[chosen], edge)
+    from scipy.spatial import cKDTree
+
+    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    corners = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
+    vertices, smooth_normals, uv = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
+    )
+    part_of = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    under = texels_of(parts, size)
+    covered = np.zeros(size * size, bool)
+    covered[under.index] = True
+    beside = np.flatnonzero(~covered)
+    plane = np.concatenate([uv.astype(np.float32) * size, np.zeros((len(uv), 1), np.float32)], 1)
+    at = np.column_stack([beside % size + 0.5, beside // size + 0.5, np.zeros(len(beside))])
+    near = closest_points(plane, corners, at)
+    read = np.flatnonzero(((near.points - at) ** 2).sum(1) < 2)
+    beside, face, weights = beside[read], near.face[read], near.barycentric[read]
+
+    face = np.concatenate([under.face, face])
+    weights = np.concatenate([under.barycentric, weights])
+    points = texel_values(vertices, corners, face, weights).astype(np.float64)
+    flat, area = face_geometry(vertices.astype(np.float64), corners)
+    away = np.einsum("ij,ij->i", flat[face], texel_values(smooth_normals, corners, face, weights)) < 0
+    normals = np.where(away[:, None], -flat[face], flat[face])
+    part = part_of[face]
+    edge = _texel_edges(plane, corners, part_of, area, len(parts))
+
+    middle = np.arange(len(face)) < len(under.index)
+    source = np.arange(len(face))
+    if middle.any() and not middle.all():
+        place = np.column_stack([points / edge[part, None], normals / NORMAL_REACH, part * 1e3])
+        distance, nearest = cKDTree(place[middle]).query(place[~middle])
+        alike = np.flatnonzero(distance < BESIDE)
+        source[len(under.index) + alike] = nearest[alike]
+    index = np.concatenate([under.index, beside])
+    traced = np.flatnonzero(source == np.arange(len(face)))
+    traced = traced[np.argsort(index[traced])]
+    row = np.empty(len(face), np.int64)
+    row[traced] = np.arange(len(traced))
+    order = np.argsort(index)
+    return LitTexels(
+        size, index[traced], points[traced], normals[traced], part[traced], edge, index[order], row[source[order]]
+    )
+
+
+def _texel_edges(plane: Array, faces: Array, part: Array, area: Array, parts: int) -> Array:
+    """(parts,) metres along the side of a texel, from the areas of faces in space and in the map."""
+    corner = plane[faces].astype(np.float64)
+    across, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    in_map = 0.5 * np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
+    total, texels = (np.bincount(part, values, parts) for values in (area, in_map))
+    return np.sqrt(total / np.maximum(texels, 1e-12))
 
 
 def trace_lamps(
@@ -348,6 +390,7 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
     from iif_core.light.transport.geometry import build_geometry
     from iif_core.light.transport.scene import Scene
 
+    material = surface.materials()  # before anything is on the device, which it chooses
     start = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
@@ -367,7 +410,7 @@ def lit_scene(parts: Sequence[TexturedPart], surface: BaseScene, lamps: Lamps) -
     weight = _draws(geometry.areas * radiance.mean(1), lamp, len(lamps.lamps))
     environment = lamps.surroundings if lamps.environment >= 0 else np.zeros(3, np.float32)
     emitters = Emitters(geometry, radiance, side, environment, sampling_weight=weight)
-    return LitScene(Scene(geometry, surface.materials(), emitters), lamp, object_id, part_of_face)
+    return LitScene(Scene(geometry, material, emitters), lamp, object_id, part_of_face)
 
 
 def _draws(power: Array, lamp: Array, lamps: int) -> Array:

@@ -46,9 +46,9 @@ def unlit_picture(atlas: Atlas, texels: LitTexels, light: Array, exposure: float
     from scipy.ndimage import map_coordinates
 
     covered = np.zeros(texels.size**2, bool)
-    covered[texels.index] = True
+    covered[texels.stored] = True
     row = np.zeros(texels.size**2, np.int64)
-    row[texels.index] = np.arange(len(texels.index))
+    row[texels.stored] = texels.source
     coarse = np.asarray(light)[row[nearest_covered(covered.reshape(texels.size, texels.size))]] if len(light) else None
     if coarse is None:
         return np.zeros((atlas.size, atlas.size, 3), np.uint8)
