@@ -250,9 +250,16 @@ def main() -> None:
         row = measured(scene, asked)
         rows = sorted([other for other in rows if other["scene"] != scene] + [row], key=lambda row: row["scene"])
         ROWS.write_text(json.dumps(rows, indent=1) + "\n")
+    write_page()
+
+
+def write_page() -> None:
+    """Make all tables of the page anew, those of `room_light.py` too."""
+    from tests.benchmarks import room_light
     from workflow.report.blocks import fill
 
-    PAGE.write_text(fill(PAGE.read_text(), tables(rows)))
+    rows, lit = (json.loads(path.read_text()) if path.is_file() else [] for path in (ROWS, room_light.ROWS))
+    PAGE.write_text(fill(PAGE.read_text(), tables(rows) | room_light.tables(lit)))
 
 
 def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:

@@ -94,19 +94,46 @@ def test_texels_lie_on_the_surface(parts):
     assert texels.edge[0] ** 2 * (64 * 64 * 0.81 / 3) == pytest.approx(area, rel=1e-3)
 
 
-def test_stored_texels_have_a_border_of_the_nearest_light(parts):
+def test_interpolation_finds_light_of_the_same_surface(parts):
+    """Every texel around any point of a chart is stored, and most have the light of a texel of the same wall beside them."""
     texels = lit_texels(parts, 64)
-    stored, source = build.bordered(texels)
-    has = np.zeros(64 * 64, bool)
-    has[stored] = True
-    for row, column in np.ndindex(3, 3):
-        r, c = texels.index // 64 + row - 1, texels.index % 64 + column - 1
-        inside = (r >= 0) & (r < 64) & (c >= 0) & (c < 64)
-        assert has[(64 * r + c)[inside]].all()
-    own = np.isin(stored, texels.index)
-    np.testing.assert_array_equal(texels.index[source[own]], stored[own])
-    distance = np.hypot(*(np.array(np.divmod(stored, 64)) - np.divmod(texels.index[source], 64)))
-    assert distance.max() < 1.5
+    row = np.full(64 * 64, -1)
+    row[texels.stored] = texels.source
+    assert (np.diff(texels.stored) > 0).all() and np.isin(texels.index, texels.stored).all()
+    np.testing.assert_array_equal(texels.index[row[texels.index]], texels.index)
+    rng = np.random.default_rng(4)
+    for number, one in enumerate(parts):
+        face, (a, b) = rng.integers(len(one.faces), size=500), rng.dirichlet([1, 1, 1], 500).T[:2]
+        weights = np.stack([a, b, 1 - a - b], 1)
+        uv, points, normals = (
+            np.einsum("ni,nij->nj", weights, values[one.faces[face]]) for values in (one.uv, one.vertices, one.normals)
+        )
+        low = np.floor(uv * 64 - 0.5).astype(int)
+        for step in np.ndindex(2, 2):
+            column, line = np.clip(low + step, 0, 63).T
+            source = row[64 * line + column]
+            assert (source >= 0).all() and (texels.part[source] == number).all()
+            assert (np.einsum("ij,ij->i", texels.normals[source], normals) > 0.99).mean() > 0.95
+            away = np.linalg.norm(texels.points[source] - points, axis=1)
+            assert np.quantile(away, 0.95) < 4 * texels.edge[number]
+
+
+def test_charts_narrower_than_a_texel_have_their_own_light(parts):
+    """A bevel whose chart lies between the centres of texels, next to the chart of a wall far away."""
+    uv = np.float32([[0.501, 0.502], [0.503, 0.502], [0.503, 0.9], [0.501, 0.9]])
+    assert not (np.abs(uv[:2, 0] * 64 % 1 - 0.5) < 0.1).any()
+    narrow = replace(parts[2], uv=uv, emitter_id=-1)
+    wall = replace(parts[2], uv=uv + np.float32([0.02, 0]) * [1, 0] + np.float32([0.3, 0]) * (uv[:, :1] > 0.502), emitter_id=-1)
+    wall = replace(wall, vertices=wall.vertices - np.float32([0, 0, 2]))
+    texels = lit_texels([narrow, wall], 64)
+    assert 0 in texels.part
+    height = texels.points[:, 2]
+    row = np.full(64 * 64, -1)
+    row[texels.stored] = texels.source
+    line = np.arange(34, 56)
+    source = row[64 * line + int(0.502 * 64)]
+    assert (texels.part[source] == 0).all()
+    np.testing.assert_allclose(height[source], 2.4, atol=1e-5)
 
 
 def test_a_lamp_of_a_million_is_stored_and_solids_cast_no_rims(llvm, parts, surface):

@@ -32,7 +32,7 @@ def test_light_is_interpolated_and_nothing_beyond_the_charts_is_dark():
     index = row * coarse + column
     one = np.zeros(len(index), np.int64)
     points = np.zeros((len(index), 3), np.float32)
-    texels = LitTexels(coarse, index, one, points, points, np.ones(1))
+    texels = LitTexels(coarse, index, points, points, one, np.ones(1), index, np.arange(len(index)))
     light = np.repeat(column[:, None] + 1.0, 3, 1).astype(np.float32)
     atlas = plain(fine, 0.8)
     shown = linear_from_srgb(unlit_picture(atlas, texels, light, 0.1).astype(float) / 255)

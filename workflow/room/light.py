@@ -20,7 +20,6 @@ from workflow.scene.base_scene import BaseScene
 
 if TYPE_CHECKING:
     from iif_core.light.transport.geometry import Geometry
-    from iif_core.light.transport.lamp_cache import LampCache
     from iif_core.light.transport.scene import Scene
 
 Array = np.ndarray
@@ -38,12 +37,8 @@ PROBES = 16
 """Rays from each texel that find out whether it is inside of a solid."""
 INSIDE = 0.25
 """Share of the rays that meet surface from behind, above which it is."""
-LEARNED = 0.5
-"""Rays for each point that find the surface from which light is reflected to the points."""
 LEARNED_SAMPLES = 16
-"""Paths from each place that they meet."""
-CELLS = 1 << 14
-"""Squares of which the surface would consist if it were cut evenly: the edge of the voxels in which light of surface is known."""
+"""Paths from each place at which the light of surface is found that reflects it to the texels."""
 
 
 @dataclass(frozen=True)
@@ -282,7 +277,7 @@ def _trace(
     progress: Callable[[int, int], None],
 ) -> Array:
     """(n, lamps, 3) float32."""
-    from iif_core.light.transport.lightmaps import light_maps
+    from iif_core.light.transport.lightmaps import known_light, light_maps
     from iif_core.light.transport.scene import PathOptions
 
     of, paths, total = (lit.lamp_of_face, len(lamps.lamps)), PathOptions(*count), len(points)
@@ -290,37 +285,14 @@ def _trace(
     if not total:
         return out
     progress(0, total)
-    known = _known_light(lit, points, normals, lamps, count)
+    learning = LEARNED_SAMPLES, count.max_bounces - 1, count.seed + 1
+    known = known_light(lit.scene, points, normals, *of, lit.object_of_face, PathOptions(*learning), lamps.environment)
     for first in range(0, total, CHUNK):
         progress(first, total)
         some = slice(first, first + CHUNK)
         out[some] = light_maps(lit.scene, points[some], normals[some], *of, paths, lamps.environment, number[some], known)
     progress(total, total)
     return out
-
-
-def _known_light(lit: LitScene, points: Array, normals: Array, lamps: Lamps, count: PathCount) -> LampCache | None:
-    """Trace the light of the surface that rays from some of the points meet; None where they meet none."""
-    from iif_core.light.transport.geometry import cosine_directions, trace
-    from iif_core.light.transport.lamp_cache import LampCache
-    from iif_core.light.transport.lightmaps import light_maps
-    from iif_core.light.transport.scene import PathOptions
-
-    geometry, rng = lit.scene.geometry, np.random.default_rng(count.seed + 1)
-    row = rng.choice(len(points), int(np.ceil(LEARNED * len(points))), replace=False)
-    start, way = points[row] + 1e-4 * normals[row], cosine_directions(normals[row], rng)
-    face, distance = trace(geometry, start, way)
-    met = np.flatnonzero((face >= 0) & (lit.lamp_of_face[face] < 0))
-    if not len(met) or count.max_bounces < 2:
-        return None
-    face, way = face[met], way[met]
-    place = start[met] + distance[met, None] * way
-    normal = geometry.normals[face]
-    normal = np.where(np.einsum("ij,ij->i", normal, way)[:, None] > 0, -normal, normal)
-    paths = PathOptions(LEARNED_SAMPLES, count.max_bounces - 1, count.seed + 1)
-    light = light_maps(lit.scene, place, normal, lit.lamp_of_face, len(lamps.lamps), paths, lamps.environment)
-    edge = float(np.sqrt(geometry.areas.sum() / CELLS))
-    return LampCache(edge, place, normal, lit.object_of_face[face], light)
 
 
 def _inside(geometry: Geometry, texels: LitTexels, two_sided: Array, seed: int) -> Array:

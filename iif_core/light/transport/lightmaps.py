@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from iif_core.light.transport.arrays import batches, checked_points, on_device, to_numpy
-from iif_core.light.transport.geometry import nearest_hit, offset_from
+from iif_core.light.transport.geometry import cosine_directions, nearest_hit, offset_from, trace
 from iif_core.light.transport.kernels import (
     Vertex,
     World,
@@ -23,13 +23,18 @@ from iif_core.light.transport.kernels import (
     to_world,
     uniform,
 )
-from iif_core.light.transport.lamp_cache import LampCache
+from iif_core.light.transport.lamp_cache import NEAR, LampCache
 from iif_core.light.transport.lamps import LampCollector, checked_lamps
 from iif_core.light.transport.scene import PathOptions, Scene
 from iif_core.numerics.xp import DRJIT
 from iif_core.reflectance import brdf
 
 Array = np.ndarray
+
+CELLS = 1 << 14
+"""Squares of which the surface would consist if it were cut evenly; their edge is that of the voxels of known light."""
+LEARNED = 0.5
+"""Rays for each point of a map that find the surface from which it gets reflected light."""
 
 
 @dr.syntax
@@ -158,3 +163,46 @@ def light_maps(
         dr.eval(gain, rows)
         result[batch.part] = to_numpy(rows).reshape(-1, batch.split, lamps, 3).sum(axis=1)
     return result / np.float32(paths.samples)
+
+
+def known_light(
+    scene: Scene,
+    points: ArrayLike,
+    normals: ArrayLike,
+    lamp_of_face: ArrayLike,
+    lamps: int,
+    object_of_face: ArrayLike,
+    paths: PathOptions,
+    environment_lamp: int = -1,
+) -> LampCache | None:
+    """Trace the light of the surface that reflects it to the points of a light map, for `light_maps`.
+
+    It is traced where rays from some of the points meet surface, and averaged over cells. Each part of a cell so counts as often
+    as it is met, and the mean over all points of what they get from a cell is that of the paths.
+
+    Args:
+        scene, lamp_of_face, lamps, environment_lamp: as in `light_maps`.
+        points, normals: (n, 3) of the map: metres; unit vectors on the side from which light arrives.
+        object_of_face: (m,) object of every face, -1 = none.
+        paths: from each place; bounces include the place, and their seed is another than that of the map.
+
+    Returns:
+        The light; None where no surface is met or paths have no bounce.
+    """
+    geometry, rng = scene.geometry, np.random.default_rng(paths.seed)
+    points, normals = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+    row = rng.choice(len(points), int(np.ceil(LEARNED * len(points))), replace=False)
+    start, way = points[row] + 1e-4 * normals[row], cosine_directions(normals[row], rng)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    face, distance = trace(geometry, start, way)
+    edge = float(np.sqrt(geometry.areas.sum() / CELLS))
+    # Nearer surface is not asked, and it would make cells in corners darker than those who ask see them.
+    met = np.flatnonzero((face >= 0) & (np.asarray(lamp_of_face)[face] < 0) & (distance > NEAR * edge))
+    if not len(met) or paths.max_bounces == 0 or not lamps:
+        return None
+    face, way = face[met], way[met]
+    place = start[met] + distance[met, None] * way
+    normal = geometry.normals[face]
+    normal = np.where(np.einsum("ij,ij->i", normal, way)[:, None] > 0, -normal, normal)
+    light = light_maps(scene, place, normal, lamp_of_face, lamps, paths, environment_lamp)
+    return LampCache(edge, place, normal, np.asarray(object_of_face)[face], light)
