@@ -6,7 +6,7 @@ Run it in a working folder where stage room of the scenes is finished. For each 
 software, walks to the cameras of some photographs, and looks at a grid of pixels with one lamp on at a time, without gloss. The
 exposure is chosen for each lamp so that few pixels are clipped; those are left out. The light of the lamp at the points under
 the pixels is traced anew, on the mesh of the photographs and by the integrator of stage shading, times the diffuse reflectance
-that the page has there. Rows are kept in docs/results/data/room_light.json, and the table of docs/results/exports.md is made anew.
+that the page has there. Rows are kept in docs/results/data/room_light.json, and the tables of docs/results/exports.md are new.
 """
 
 from __future__ import annotations

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+INWARDS = 0.25
+"""Texels from the border of a chart to the place at which light is traced where the centre of a texel has no surface."""
 BESIDE = 2.0
 """A texel beside a chart has the light of the nearest texel of its part up to this distance, in texels, where a difference of
 the normals of `NORMAL_REACH` counts as one."""
@@ -126,8 +128,9 @@ def _color(radiance: Array) -> Array:
 class LitTexels:
     """The surface under the texels of a light map: n at which light is traced, and t that are stored.
 
-    Interpolation between texels reads those around each chart as well. They are stored with the light of the nearest texel of the
-    chart, and where there is none, as in charts narrower than a texel, light is traced at the nearest point of the surface.
+    Interpolation between texels reads those around each chart as well. Light is traced at the centre of a
+    texel, where that has no surface at the nearest point that has, and at the point nearest to a texel beside a chart where no
+    texel with surface is near and alike, as in charts narrower than a texel; else a texel beside a chart has the light of that.
 
     Attributes:
         size: S, of the map.
@@ -169,34 +172,41 @@ def lit_texels(parts: Sequence[TexturedPart], size: int) -> LitTexels:
     plane = np.concatenate([uv.astype(np.float32) * size, np.zeros((len(uv), 1), np.float32)], 1)
     at = np.column_stack([beside % size + 0.5, beside // size + 0.5, np.zeros(len(beside))])
     near = closest_points(plane, corners, at)
-    read = np.flatnonzero(((near.points - at) ** 2).sum(1) < 2)
-    beside, face, weights = beside[read], near.face[read], near.barycentric[read]
-
+    away = near.points - at
+    read = np.flatnonzero((away**2).sum(1) < 2)
+    beside, face, away = beside[read], near.face[read], np.abs(away[read]).max(1)
+    weights = _inwards(plane[corners[face]], near.barycentric[read])
+    own = np.concatenate([np.ones(len(under.index), bool), away <= 0.5])  # the texel has surface
     face = np.concatenate([under.face, face])
     weights = np.concatenate([under.barycentric, weights])
     points = texel_values(vertices, corners, face, weights).astype(np.float64)
     flat, area = face_geometry(vertices.astype(np.float64), corners)
-    away = np.einsum("ij,ij->i", flat[face], texel_values(smooth_normals, corners, face, weights)) < 0
-    normals = np.where(away[:, None], -flat[face], flat[face])
+    behind = np.einsum("ij,ij->i", flat[face], texel_values(smooth_normals, corners, face, weights)) < 0
+    normals = np.where(behind[:, None], -flat[face], flat[face])
     part = part_of[face]
     edge = _texel_edges(plane, corners, part_of, area, len(parts))
 
-    middle = np.arange(len(face)) < len(under.index)
     source = np.arange(len(face))
-    if middle.any() and not middle.all():
+    if own.any() and not own.all():
         place = np.column_stack([points / edge[part, None], normals / NORMAL_REACH, part * 1e3])
-        distance, nearest = cKDTree(place[middle]).query(place[~middle])
-        alike = np.flatnonzero(distance < BESIDE)
-        source[len(under.index) + alike] = nearest[alike]
+        distance, nearest = cKDTree(place[own]).query(place[~own])
+        alike = distance < BESIDE
+        source[np.flatnonzero(~own)[alike]] = np.flatnonzero(own)[nearest[alike]]
     index = np.concatenate([under.index, beside])
     traced = np.flatnonzero(source == np.arange(len(face)))
     traced = traced[np.argsort(index[traced])]
     row = np.empty(len(face), np.int64)
     row[traced] = np.arange(len(traced))
     order = np.argsort(index)
-    return LitTexels(
-        size, index[traced], points[traced], normals[traced], part[traced], edge, index[order], row[source[order]]
-    )
+    return LitTexels(size, index[traced], points[traced], normals[traced], part[traced], edge, index[order], row[source[order]])
+
+
+def _inwards(corners: Array, weights: Array) -> Array:
+    """Move places at the border of faces, (n, 3) weights of `corners` (n, 3, 3) in texels, by INWARDS towards the middle: where
+    surface ends there often is other surface, in which a path would begin."""
+    way = corners.mean(1) - np.einsum("ni,nij->nj", weights, corners)
+    step = np.minimum(INWARDS / np.maximum(np.linalg.norm(way, axis=1), 1e-9), 0.5)[:, None]
+    return (1 - step) * weights + step / 3
 
 
 def _texel_edges(plane: Array, faces: Array, part: Array, area: Array, parts: int) -> Array:
