@@ -28,7 +28,17 @@ from tests.browser import missing
 from tests.oracles import gltf_viewer
 from tests.oracles.blender import read_by_blender, require_bpy
 from tests.oracles.exported import maps_of, read_back
-from workflow.exporters.atlas import Atlas, TexturedPart, bake, base_color_picture, encoded, surface_picture, texels_of
+from workflow.exporters.atlas import (
+    Atlas,
+    TexturedPart,
+    bake,
+    base_color_picture,
+    encoded,
+    joined,
+    surface_picture,
+    texels_beside,
+    texels_of,
+)
 from workflow.exporters.camera_files import cameras_json
 from workflow.exporters.glb import fitting_glb, glb_bytes, rotation_to_y
 from workflow.exporters.mitsuba_scene import mitsuba_files
@@ -200,11 +210,31 @@ def test_nothing_black_lies_between_charts():
     parts, atlas = textured(room())
     free = ~atlas.covered
     assert 0.1 < free.mean() < 0.9
-    emitter = np.zeros(atlas.size**2, bool)
+    emitter, known = np.zeros((2, atlas.size**2), bool)
     texels = texels_of(parts, atlas.size)
+    texels = joined(texels, texels_beside(parts, texels)[0])
     emitter[texels.index[np.array([p.emitter_id for p in parts])[texels.part] >= 0]] = True
-    lit = ~emitter[nearest_covered(atlas.covered)]
+    known[texels.index] = True
+    lit = ~emitter[nearest_covered(known.reshape(atlas.size, atlas.size))]
     assert atlas.base_color[free & lit].min() > 0.09
+
+
+def test_charts_narrower_than_a_texel_have_their_own_colour():
+    """The lamp as a strip of a twentieth of a texel between two rows of centres: around it the atlas is black, as the lamp is."""
+    parts, _ = textured(room())
+    lamp = next(i for i, one in enumerate(parts) if one.emitter_id >= 0)
+    low, high = parts[lamp].uv.min(0), parts[lamp].uv.max(0)
+    line = (np.floor(0.5 * (low[1] + high[1]) * 256) + np.float32([0.98, 1.03])) / 256
+    narrow = np.where(
+        np.arange(2) == 1, line[((parts[lamp].uv[:, 1] > 0.5 * (low[1] + high[1])).astype(int))][:, None], parts[lamp].uv
+    )
+    parts[lamp] = replace(parts[lamp], uv=narrow.astype(np.float32))
+    assert not (texels_of(parts, 256).part == lamp).any()
+    beside, inside = texels_beside(parts, texels_of(parts, 256))
+    own = beside.index[beside.part == lamp]
+    assert len(own) > 2 * 256 * (high[0] - low[0]) - 4 and inside[beside.part == lamp].any()
+    atlas = bake(parts, room(), np.zeros(0), 256)
+    assert not atlas.base_color.reshape(-1, 3)[own].any()
 
 
 def test_a_mesh_that_is_too_fine_becomes_simpler_and_keeps_its_colours():

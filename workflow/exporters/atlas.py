@@ -20,6 +20,8 @@ Array = np.ndarray
 
 UNKNOWN = 1.0
 """Uncertainty of albedo where no photograph shows the surface: the whole range."""
+INWARDS = 0.25
+"""Texels from the border of a chart to the place that stands for a texel whose centre has no surface."""
 
 
 @dataclass(frozen=True)
@@ -121,19 +123,71 @@ class Texels:
         return np.split(order, np.searchsorted(self.part[order], np.arange(1, parts)))
 
 
-def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
-    """Find the surface under the texels of an atlas of `size` x `size`, which may be coarser than that of the materials."""
+@dataclass(frozen=True)
+class _Charts:
+    """All parts as one mesh: vertices, normals, uv (n, 3), (n, 3), (n, 2); faces (m, 3) and the part (m,) of each."""
+
+    vertices: Array
+    normals: Array
+    uv: Array
+    faces: Array
+    part: Array
+
+
+def _charts(parts: Sequence[TexturedPart]) -> _Charts:
     first = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, first, strict=False)])
-    face, barycentric = texel_surface(np.concatenate([part.uv for part in parts]), faces, size)
+    vertices, normals, uv = (np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv"))
+    return _Charts(vertices, normals, uv, faces, np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts]))
+
+
+def _texels(charts: _Charts, size: int, index: Array, face: Array, weights: Array) -> Texels:
+    points, normals = (texel_values(values, charts.faces, face, weights) for values in (charts.vertices, charts.normals))
+    unit = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.float32(1e-12))
+    return Texels(size, index, charts.part[face], face.astype(np.int64), weights, points, unit)
+
+
+def texels_of(parts: Sequence[TexturedPart], size: int) -> Texels:
+    """Find the surface under the texels of an atlas of `size` x `size`, which may be coarser than that of the materials."""
+    charts = _charts(parts)
+    face, barycentric = texel_surface(charts.uv, charts.faces, size)
     index = np.flatnonzero(face >= 0)
-    of, weights = face.ravel()[index], barycentric.reshape(-1, 3)[index]
-    part = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])[of]
-    points = texel_values(np.concatenate([part.vertices for part in parts]), faces, of, weights)
-    normals = texel_values(np.concatenate([part.normals for part in parts]), faces, of, weights)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    unit = normals / np.maximum(length, np.float32(1e-12))
-    return Texels(size, index, part, of.astype(np.int64), weights, points, unit)
+    return _texels(charts, size, index, face.ravel()[index], barycentric.reshape(-1, 3)[index])
+
+
+def texels_beside(parts: Sequence[TexturedPart], texels: Texels) -> tuple[Texels, Array]:
+    """Find the surface that interpolation between texels shows with texels whose centre has none: those at the border of charts,
+    and all of a chart that is narrower than a texel.
+
+    Args:
+        parts: of the surface.
+        texels: of the parts, by `texels_of`.
+
+    Returns:
+        The texels, with the nearest point of a chart, moved from its border towards the middle of its face by up to `INWARDS`,
+        because where surface ends there often is other surface; and (t,) bool, whether the texel contains surface.
+    """
+    charts, size = _charts(parts), texels.size
+    free = np.ones(size * size, bool)
+    free[texels.index] = False
+    index = np.flatnonzero(free)
+    plane = np.concatenate([charts.uv * np.float32(size), np.zeros((len(charts.uv), 1), np.float32)], 1)
+    centre = np.column_stack([index % size + 0.5, index // size + 0.5, np.zeros(len(index))])
+    near = closest_points(plane, charts.faces, centre)
+    away = near.points - centre
+    read = np.flatnonzero((away**2).sum(1) < 2)
+    face, weights = near.face[read], near.barycentric[read]
+    corners = plane[charts.faces[face]]
+    way = corners.mean(1) - np.einsum("ni,nij->nj", weights, corners)
+    step = np.minimum(INWARDS / np.maximum(np.linalg.norm(way, axis=1), 1e-9), 0.5)[:, None]
+    weights = ((1 - step) * weights + step / 3).astype(np.float32)
+    return _texels(charts, size, index[read], face, weights), np.abs(away[read]).max(1) <= 0.5
+
+
+def joined(first: Texels, second: Texels) -> Texels:
+    """Return the texels of both, those of `first` first."""
+    names = ("index", "part", "face", "barycentric", "points", "normals")
+    return Texels(first.size, *(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
 
 
 def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array, size: int) -> Atlas:
@@ -148,7 +202,8 @@ def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array
         size: S.
     """
     surface = recovered.surface
-    texels = texels_of(parts, size)
+    centres = texels_of(parts, size)
+    texels = joined(centres, texels_beside(parts, centres)[0])
     objects = np.array([part.object_id for part in parts])[texels.part]
     emits = np.array([part.emitter_id >= 0 for part in parts])[texels.part]
     points = _on_the_mesh(parts, texels, recovered)
@@ -157,9 +212,10 @@ def bake(parts: Sequence[TexturedPart], recovered: Recovered, uncertainty: Array
     values[emits] = BLACK
     seen = (cell >= 0) & ~emits
     spread = np.where(seen, np.asarray(uncertainty)[cell] if len(uncertainty) else UNKNOWN, np.where(emits, 0, UNKNOWN))
-    covered = np.zeros(size * size, bool)
-    covered[texels.index] = True
-    nearest = nearest_covered(covered.reshape(size, size))
+    covered, known = np.zeros((2, size * size), bool)
+    covered[centres.index] = True
+    known[texels.index] = True
+    nearest = nearest_covered(known.reshape(size, size))
     row = np.zeros(size * size, np.int64)
     row[texels.index] = np.arange(len(texels.index))
     row = row[nearest]

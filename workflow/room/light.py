@@ -11,10 +11,9 @@ import numpy as np
 from iif_core.light.environment import as_map, solid_angles
 from iif_core.light.light_maps import MOST_LAMPS, NORMAL_REACH, group_lamps, smooth, with_mean_of
 from iif_core.numerics.color import id_colours
-from iif_core.surface.atlas import nearest_covered, texel_values
-from iif_core.surface.closest import closest_points
+from iif_core.surface.atlas import nearest_covered
 from iif_core.surface.triangles import face_geometry
-from workflow.exporters.atlas import TexturedPart, texels_of
+from workflow.exporters.atlas import TexturedPart, joined, texels_beside, texels_of
 from workflow.models.denoise import denoise
 from workflow.scene.base_scene import BaseScene
 
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-INWARDS = 0.25
-"""Texels from the border of a chart to the place at which light is traced where the centre of a texel has no surface."""
 BESIDE = 2.0
 """A texel beside a chart has the light of the nearest texel of its part up to this distance, in texels, where a difference of
 the normals of `NORMAL_REACH` counts as one."""
@@ -159,63 +156,35 @@ def lit_texels(parts: Sequence[TexturedPart], size: int) -> LitTexels:
     """
     from scipy.spatial import cKDTree
 
-    start = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    corners = np.concatenate([part.faces + first for part, first in zip(parts, start[:-1], strict=True)])
-    vertices, smooth_normals, uv = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("vertices", "normals", "uv")
-    )
-    part_of = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-    under = texels_of(parts, size)
-    covered = np.zeros(size * size, bool)
-    covered[under.index] = True
-    beside = np.flatnonzero(~covered)
-    plane = np.concatenate([uv.astype(np.float32) * size, np.zeros((len(uv), 1), np.float32)], 1)
-    at = np.column_stack([beside % size + 0.5, beside // size + 0.5, np.zeros(len(beside))])
-    near = closest_points(plane, corners, at)
-    away = near.points - at
-    read = np.flatnonzero((away**2).sum(1) < 2)
-    beside, face, away = beside[read], near.face[read], np.abs(away[read]).max(1)
-    weights = _inwards(plane[corners[face]], near.barycentric[read])
-    own = np.concatenate([np.ones(len(under.index), bool), away <= 0.5])  # the texel has surface
-    face = np.concatenate([under.face, face])
-    weights = np.concatenate([under.barycentric, weights])
-    points = texel_values(vertices, corners, face, weights).astype(np.float64)
-    flat, area = face_geometry(vertices.astype(np.float64), corners)
-    behind = np.einsum("ij,ij->i", flat[face], texel_values(smooth_normals, corners, face, weights)) < 0
-    normals = np.where(behind[:, None], -flat[face], flat[face])
-    part = part_of[face]
-    edge = _texel_edges(plane, corners, part_of, area, len(parts))
+    centres = texels_of(parts, size)
+    beside, inside = texels_beside(parts, centres)
+    all_ = joined(centres, beside)
+    own = np.concatenate([np.ones(len(centres.index), bool), inside])  # the texel has surface
+    points, part = all_.points.astype(np.float64), all_.part
+    geometry = [face_geometry(one.vertices.astype(np.float64), one.faces) for one in parts]
+    normals = np.concatenate([normal for normal, _ in geometry])[all_.face]
+    behind = np.einsum("ij,ij->i", normals, all_.normals) < 0
+    normals = np.where(behind[:, None], -normals, normals)
+    edge = np.empty(len(parts))
+    for number, (one, (_, area)) in enumerate(zip(parts, geometry, strict=True)):
+        corner = one.uv[one.faces].astype(np.float64) * size
+        across, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+        in_map = 0.5 * np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0]).sum()
+        edge[number] = np.sqrt(area.sum() / max(in_map, 1e-12))
 
-    source = np.arange(len(face))
+    source = np.arange(len(part))
     if own.any() and not own.all():
         place = np.column_stack([points / edge[part, None], normals / NORMAL_REACH, part * 1e3])
         distance, nearest = cKDTree(place[own]).query(place[~own])
         alike = distance < BESIDE
         source[np.flatnonzero(~own)[alike]] = np.flatnonzero(own)[nearest[alike]]
-    index = np.concatenate([under.index, beside])
-    traced = np.flatnonzero(source == np.arange(len(face)))
-    traced = traced[np.argsort(index[traced])]
-    row = np.empty(len(face), np.int64)
+    traced = np.flatnonzero(source == np.arange(len(part)))
+    traced = traced[np.argsort(all_.index[traced])]
+    row = np.empty(len(part), np.int64)
     row[traced] = np.arange(len(traced))
-    order = np.argsort(index)
-    return LitTexels(size, index[traced], points[traced], normals[traced], part[traced], edge, index[order], row[source[order]])
-
-
-def _inwards(corners: Array, weights: Array) -> Array:
-    """Move places at the border of faces, (n, 3) weights of `corners` (n, 3, 3) in texels, by INWARDS towards the middle: where
-    surface ends there often is other surface, in which a path would begin."""
-    way = corners.mean(1) - np.einsum("ni,nij->nj", weights, corners)
-    step = np.minimum(INWARDS / np.maximum(np.linalg.norm(way, axis=1), 1e-9), 0.5)[:, None]
-    return (1 - step) * weights + step / 3
-
-
-def _texel_edges(plane: Array, faces: Array, part: Array, area: Array, parts: int) -> Array:
-    """(parts,) metres along the side of a texel, from the areas of faces in space and in the map."""
-    corner = plane[faces].astype(np.float64)
-    across, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    in_map = 0.5 * np.abs(across[:, 0] * down[:, 1] - across[:, 1] * down[:, 0])
-    total, texels = (np.bincount(part, values, parts) for values in (area, in_map))
-    return np.sqrt(total / np.maximum(texels, 1e-12))
+    order = np.argsort(all_.index)
+    kept = (array[traced] for array in (all_.index, points, normals, part))
+    return LitTexels(size, *kept, edge, all_.index[order], row[source[order]])
 
 
 def trace_lamps(
