@@ -1,0 +1,166 @@
+"""The page docs/results/reliability.md: its tables are made anew from the rows that other commands have left.
+
+    python tests/benchmarks/reliability.py                  the page alone
+    python tests/benchmarks/reliability.py --damage folder  also damages a copy of folder/results, file by file
+
+Other rows: `python tests/benchmarks/soundness.py`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts import sound, stamps
+from workflow.artifacts.manifest import MANIFEST
+from workflow.artifacts.verify import damaged
+from workflow.report.blocks import fill, markdown
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT / "docs/results/data"
+PAGE = ROOT / "docs/results/reliability.md"
+HARMLESS = ("cases", "accepted", "refused")
+
+
+def rows(name: str) -> dict[str, Any]:
+    """Return the rows of a table; empty if it was never measured."""
+    path = DATA / f"{name}.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+# ---------------------------------------------------------------------------------------------------------------- damage
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def _with_old_time(harm: Callable[[Path], None]) -> Callable[[Path], None]:
+    def harmed(path: Path) -> None:
+        status = path.stat()
+        harm(path)
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+    return harmed
+
+
+KINDS: dict[str, Callable[[Path], None]] = {
+    "one bit": _flip,
+    "one bit, time stamp set back": _with_old_time(_flip),
+    "emptied": lambda path: path.write_bytes(b""),
+    "cut in half": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "removed": lambda path: path.unlink(),
+}
+
+
+def damage(source: Path) -> dict[str, Any]:
+    """Damage each file of each finished stage under `source`/results in each way, and count what is found."""
+    out: dict[str, Any] = {
+        kind: {"cases": 0, "verify": 0, "plan": 0} for kind in (*KINDS, "stage of another scene", "stage removed")
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        shutil.copytree(source / "results", root / "results", symlinks=True)
+        stages = sorted(path.parent for path in (root / "results").glob(f"*/*/{MANIFEST}"))
+        assert not list(damaged(root)), "what is there must be sound to begin with"
+        marks = {stage: json.loads((stage / MANIFEST).read_text())["fingerprint"] for stage in stages}
+        for stage in stages:
+            assert not _found(stage, marks[stage]), stage  # notes the stamps of the copy
+        for stage in stages:
+            for path in sorted(path for path in stage.rglob("*") if path.is_file()):
+                for kind, harm in KINDS.items():
+                    kept, noted = path.read_bytes(), _noted(stage).read_bytes()
+                    harm(path)
+                    _count(out[kind], root, stage, marks[stage], path)
+                    path.write_bytes(kept)
+                    _noted(stage).write_bytes(noted)
+                    assert not _found(stage, marks[stage])  # sound again; the new stamp is noted
+            aside = stage.with_name("aside")
+            stage.rename(aside)
+            _count(out["stage removed"], root, stage, marks[stage], stage)
+            shutil.copytree(aside, stage)
+            other = stage / MANIFEST
+            text = other.read_text().replace(f'"scene": "{stage.parent.name}"', '"scene": "elsewhere"')
+            manifests.write(other, json.loads(text))  # sound in itself
+            _count(out["stage of another scene"], root, stage, marks[stage], stage)
+            shutil.rmtree(stage)
+            aside.rename(stage)
+            assert not _found(stage, marks[stage])
+    return out
+
+
+def _noted(stage: Path) -> Path:
+    return stamps.place(stage.parent.parent, stage.parent.name, stage.name)
+
+
+def _found(stage: Path, mark: str) -> tuple[str, ...]:
+    sound.forget()
+    return sound.stage_faults(stage.parent.parent, stage.parent.name, stage.name, mark)
+
+
+def _count(row: dict[str, int], root: Path, stage: Path, mark: str, path: Path) -> None:
+    row["cases"] += 1
+    row["plan"] += any(str(path) in line for line in _found(stage, mark))
+    row["verify"] += any(str(path) in line for line in damaged(root, [stage.parent.name]))
+
+
+# ---------------------------------------------------------------------------------------------------------------- tables
+
+
+def table(heads: list[str], body: list[list[Any]]) -> str:
+    """Return a table in Markdown, integers with commas."""
+    return "\n".join(markdown(heads, ([f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in line] for line in body)))
+
+
+def tables() -> dict[str, str]:
+    """Return the tables of the page by name."""
+    crash, fuzz, harm = rows("reliability_crash"), rows("reliability_fuzz"), rows("reliability_damage")
+    out = {}
+    body = [[kind, row["cases"], row["verify"], row["plan"]] for kind, row in harm.items()]
+    out["damage"] = table(["what is done to a file", "cases", "named by verify", "named when a run is planned"], body)
+    body = []
+    for kind, words in (("power_cuts", "power cut"), ("faults", "error or kill")):
+        for case, row in crash.get(kind, {}).items():
+            body.append([f"{words}, {case}", row["points"], row["kept"] + row.get("unharmed", 0), row["lost"], row["wrong"]])
+    for case, row in crash.get("stages", {}).items():
+        body.append([f"stage {case}", row["points"], row["kept"] + row.get("unharmed", 0), row["lost"], row["wrong"]])
+    out["crash"] = table(["trial", "points", "old or new, whole", "to be made again", "silently wrong"], body)
+    bad = sorted({key for row in fuzz.get("kinds", {}).values() for key in row if key not in HARMLESS})
+    body = [
+        [kind, row["cases"], row["accepted"], row["refused"], *(row.get(key, 0) for key in bad)]
+        for kind, row in sorted(fuzz.get("kinds", {}).items())
+    ]
+    body.append(["all", *(sum(line[i] for line in body) for i in range(1, 4 + len(bad)))] if body else ["all", 0, 0, 0])
+    out["fuzz"] = table(["kind of file", "cases", "accepted", "refused", *bad], body)
+    cost = rows("soundness")
+    body = [[cost["scenes"], cost["stages"], cost["files"], cost["stamps"], cost["hashes"]]] if cost else []
+    out["cost"] = table(["scenes", "stages", "files", "seconds, stamps", "seconds, contents hashed"], body)
+    slurm = rows("reliability_slurm")
+    body = [[name, ", ".join(f"{key}: {value}" for key, value in row.items())] for name, row in slurm.items()]
+    out["slurm"] = table(["trial", "result"], body)
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--damage", type=Path, help="folder with results/ of finished scenes; a copy of it is damaged")
+    arguments = parser.parse_args()
+    if arguments.damage:
+        (DATA / "reliability_damage.json").write_text(json.dumps(damage(arguments.damage), indent=1) + "\n")
+    PAGE.write_text(fill(PAGE.read_text(), tables()))
+
+
+if __name__ == "__main__":
+    main()
