@@ -1,7 +1,7 @@
 """The page docs/results/reliability.md: its tables are made anew from the rows that other commands have left.
 
     python tests/benchmarks/reliability.py                  the page alone
-    python tests/benchmarks/reliability.py --damage folder  also damages a copy of folder/results, file by file
+    python tests/benchmarks/reliability.py --damage folder  also damages a copy of its results/, file by file
 
 Other rows: `python tests/benchmarks/soundness.py`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
 """
@@ -72,14 +72,15 @@ def damage(source: Path) -> dict[str, Any]:
     }
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        shutil.copytree(source / "results", root / "results", symlinks=True)
+        for part in ("results", "scenes"):
+            shutil.copytree(source / part, root / part, symlinks=True)
         stages = sorted(path.parent for path in (root / "results").glob(f"*/*/{MANIFEST}"))
         assert not list(damaged(root)), "what is there must be sound to begin with"
         marks = {stage: json.loads((stage / MANIFEST).read_text())["fingerprint"] for stage in stages}
         for stage in stages:
             assert not _found(stage, marks[stage]), stage  # notes the stamps of the copy
         for stage in stages:
-            for path in sorted(path for path in stage.rglob("*") if path.is_file()):
+            for path in sorted(path for path in stage.rglob("*") if path.is_file() and path.stat().st_size):
                 for kind, harm in KINDS.items():
                     kept, noted = path.read_bytes(), _noted(stage).read_bytes()
                     harm(path)
