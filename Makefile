@@ -12,7 +12,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
+.PHONY: help setup scenes verify test test-all fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo 'make verify           re-hash every artefact against its manifest'
 	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
 	@echo 'make test-all         every test, also those on large scenes'
+	@echo 'make fuzz             read changed files of every kind (CASES=100000 SEED=0 JOBS=2)'
 	@echo 'make doctor           what this machine offers and lacks'
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
@@ -84,6 +85,13 @@ test: setup node
 
 test-all: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) $(PYTEST_ARGS)
+
+# The counts are kept in docs/results/data/reliability_fuzz.json.
+CASES ?= 100000
+SEED ?= 0
+JOBS ?= $(shell nproc 2>/dev/null || echo 2)
+fuzz: setup
+	$(PYTHON_BIN) -m tests.fuzz.runner --cases $(CASES) --seed $(SEED) --jobs $(JOBS)
 
 # What tests take from npm: Khronos' validator of glTF, axe-core, which looks for what hinders people with disabilities, and three.js,
 # which opens scene.glb as viewers on the web do. Machines without npm test the structure of the files alone. Pages need Chromium as well, which comes with the machine.

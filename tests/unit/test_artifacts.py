@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, scratch
+from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, scratch
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import sha256_of, write_parquet
 from workflow.artifacts.manifest import SCENE_SCHEMA
@@ -55,6 +55,24 @@ def test_round_trip(stage):
     np.testing.assert_array_equal(table["T"], columns["T"])
     assert table["name"].tolist() == ["a", "b", "c"]
     assert reader.json("base.json") == {"edge": 0.01}
+
+
+@pytest.mark.parametrize("name, reader", [("maps/v.exr", "read_exr"), ("cells.parquet", "read_parquet")])
+def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, reader):
+    """What a library says of the content of a file is damage."""
+
+    def fails(error):
+        def read(path):
+            raise error
+
+        monkeypatch.setattr(files, reader, read)
+        found = StageReader(stage[0], "base", "s")
+        return found.exr if name.endswith(".exr") else found.table
+
+    with pytest.raises(OSError, match="Input/output error"):
+        fails(OSError(5, "Input/output error"))(name)
+    with pytest.raises(DamagedArtefact, match=r"not readable as (EXR|Parquet) \(no end\)"):
+        fails(OSError("no end"))(name)
 
 
 def test_same_content_same_bytes(stage, tmp_path):

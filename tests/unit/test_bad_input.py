@@ -3,6 +3,8 @@
 import functools
 import json
 import re
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -661,6 +663,119 @@ def _(root):
     return noted(root, "WARNING")
 
 
+# ------------------------------------------------------------------------------------------------------------- strangers
+
+
+def with_size(path, width, height):
+    """A PNG whose header states another size; its pixels are never read."""
+    data = path.read_bytes()
+    body = b"IHDR" + struct.pack(">II", width, height) + data[24:29]
+    path.write_bytes(data[:12] + body + struct.pack(">I", zlib.crc32(body)) + data[33:])
+
+
+@case("a photograph with too many pixels")
+def _(root):
+    own.bare(root / "data/own")
+    with_size(root / "data/own/images/000.png", 13_000, 13_000)
+    return planned(root)
+
+
+@case("an EXR with too many pixels")
+def _(root):
+    path = root / "data/own"
+    document = own.bare(path)
+    for entry in document["frames"]:
+        entry["file_path"] = entry["file_path"].replace(".png", ".exr")
+        own.save_exr(path / entry["file_path"], {c: np.zeros((48, 64), np.float32) for c in "RGB"})
+    own.write_transforms(path, document)
+    first = path / "images/000.exr"
+    data = first.read_bytes()
+    at = data.index(b"dataWindow\0box2i\0") + 21
+    first.write_bytes(data[:at] + struct.pack("<4i", 0, 0, 19_999, 19_999) + data[at + 16 :])
+    return planned(root, capture={"dynamic_range": "hdr"})
+
+
+def renamed(root, *names):
+    path = root / "data/own"
+    document = own.bare(path)
+    for entry, name in zip(document["frames"], names, strict=False):
+        entry["file_path"] = name
+        if name != "/":
+            own.save_png(path / name, np.full((48, 64, 3), 0.5))
+    own.write_transforms(path, document)
+    return planned(root)
+
+
+case("a path that names no file")(lambda root: renamed(root, "/"))
+case("two names that differ in capital letters alone")(lambda root: renamed(root, "images/000a.png", "images/000A.png"))
+
+
+@case("a key twice in transforms.json")
+def _(root):
+    path = root / "data/own"
+    text = json.dumps(own.bare(path))
+    (path / "transforms.json").write_text(text[:-1] + ', "w": 64}')
+    return planned(root)
+
+
+case("a focal length that no lens has")(lambda root: changed(root, fl_x=1e10, fl_y=1e10))
+case("a number without meaning in transforms.json")(lambda root: changed(root, fl_x=1e308))
+
+
+@case("an exposure without meaning")
+def _(root):
+    own.bare(root / "data/own")
+    exposures = {"000": 1.0, "001": 1e308, "002": 1.0}
+    (root / "data/own/exposures.json").write_text(json.dumps(exposures))
+    return planned(root)
+
+
+@case("mesh whose header announces more than there is")
+def _(root):
+    own.bare(root / "data/own")
+    path = root / "data/own/mesh.ply"
+    path.write_text(path.read_text().replace("element face 24", "element face 40000000"))
+    return planned(root)
+
+
+@case("OBJ cut short in its last line")
+def _(root):
+    return planned(root) if obj_instead(root, lambda text: text + "f 1 2") else ""
+
+
+@case("OBJ cut short between two lines")
+def _(root):
+    vertices, faces, _ = own.room_mesh()
+    extra = "".join(f"v {x} 0 1\n" for x in range(12))  # of faces that are not there
+    obj_instead(root, lambda text: extra + text, shift=12)
+    return noted(root, "cut short")
+
+
+def obj_instead(root, change, shift=0):
+    """A photographed scene whose mesh is an OBJ file that `change` has changed."""
+    path = root / "data/own"
+    own.photographed(path, count=3)
+    (path / "mesh.ply").unlink()
+    vertices, faces, _ = own.room_mesh()
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in vertices) + "".join(
+        f"f {a + 1 + shift} {b + 1 + shift} {c + 1 + shift}\n" for a, b, c in faces
+    )
+    (path / "mesh.obj").write_text(change(text))
+    return path
+
+
+case("settings: anchors that grow")(
+    lambda root: loaded(
+        root,
+        "a: &a [1, 1, 1, 1, 1, 1, 1, 1]\n"
+        + "".join(f"{b}: &{b} [{', '.join(['*' + a] * 8)}]\n" for a, b in zip("abcdefg", "bcdefgh", strict=True)),
+    )
+)
+case("settings: nested too deeply")(lambda root: loaded(root, "x: " + "[" * 100 + "]" * 100 + "\n"))
+case("settings: a number without meaning")(lambda root: loaded(root, "capture: {views: .inf}\n"))
+case("settings: a value of the wrong form")(lambda root: loaded(root, "capture: {views: !!int x}\n"))
+
+
 # ---------------------------------------------------------------------------------------------------------- other sources
 
 
@@ -698,6 +813,17 @@ def _(root):
 @case("COLMAP: mesh of another scale")
 def _(root):
     own.save_mesh(model(root) / "mesh.ply", miniature()[0].vertices * 1.3, miniature()[0].faces)
+    return captured(root)
+
+
+@case("COLMAP: counts that the file cannot hold")
+def _(root):
+    place = model(root) / "sparse/0"
+    test_colmap.to_binary(place)
+    for path in place.glob("*.txt"):
+        path.unlink()
+    data = (place / "points3D.bin").read_bytes()
+    (place / "points3D.bin").write_bytes(struct.pack("<Q", 10**9) + data[8:])
     return captured(root)
 
 

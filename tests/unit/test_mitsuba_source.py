@@ -13,6 +13,7 @@ import OpenEXR
 import pytest
 
 from iif_core.errors import InputError
+from tests.unit import own_scene as own
 from workflow.sources import mitsuba as source
 from workflow.sources.mitsuba_scene import document
 
@@ -70,8 +71,9 @@ def normals_of(mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_files_of_a_scene(tmp_path):
-    for name in ("a.ply", "part.xml", "tex.png", "deep.ply"):
-        (tmp_path / name).write_text("<scene version='3.0.0'/>")
+    for name in ("a.ply", "deep.ply"):
+        own.save_mesh(tmp_path / name, *own.room_mesh()[:2])
+    own.save_png(tmp_path / "tex.png", np.zeros((2, 2, 3)))
     (tmp_path / "part.xml").write_text(
         '<scene version="3.0.0"><shape type="ply"><string name="filename" value="deep.ply"/></shape></scene>'
     )

@@ -421,6 +421,30 @@ def test_emission_that_is_not_read_is_refused_and_the_rest_is_named(tmp_path):
         emissive_strengths(path)
 
 
+@pytest.mark.parametrize("strength", ["NaN", "1e10", "-1", '"bright"', "[]"])
+def test_strengths_of_emission_that_are_no_radiance_are_refused(tmp_path, strength):
+    material = f'{{"name": "a", "extensions": {{"KHR_materials_emissive_strength": {{"emissiveStrength": {strength}}}}}}}'
+    path = tmp_path / "one.gltf"
+    path.write_text(f'{{"asset": {{}}, "materials": [{material}]}}')
+    with pytest.raises(InputError, match=r"one.gltf: (the material 'a' shines with a strength of|not readable as glTF)"):
+        emissive_strengths(path)
+
+
+@pytest.mark.parametrize("factor", [[-1.0, 0.0, 0.0], [1e12, 0.0, 0.0], [float("nan"), 0.0, 0.0]])
+def test_emission_that_is_no_radiance_is_refused(tmp_path, factor):
+    mesh = replace(load_insert(plate(tmp_path / "plate.glb")), radiance=np.array([factor]))
+    put = entry(insert=[{"file": "plate.glb", "position": [0, 0, 0]}])["insert"][0]
+    with pytest.raises(InputError, match="plate.glb: a material emits light that is no number of 0 ... 1e"):
+        light_of(mesh, put)
+    assert light_of(mesh, {**put, "radiance": [0, 1, 0]}).tolist() == [[0, 1, 0]] * len(mesh.corners)
+
+
+def test_a_map_of_the_environment_that_is_no_picture_is_blamed_by_its_own_key(tmp_path):
+    (tmp_path / "sky.exr").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"^`relight.environment` of .*sky.exr: not a readable EXR image"):
+        relight_files([entry(environment=str(tmp_path / "sky.exr"))])
+
+
 def test_meshes_stand_where_they_are_put(tmp_path):
     mesh = load_insert(plate(tmp_path / "plate.glb", size=(0.8, 0.1, 0.4)))
     put = {"position": [1, 2, 3], "rotation": [0, 0, 90], "scale": 2.0}
@@ -463,7 +487,7 @@ def test_broken_meshes_are_refused(tmp_path):
     (tmp_path / "c.gltf").write_text(json.dumps({"asset": {"version": "2.0"}}))
     assert "no triangles" in said(tmp_path / "c.gltf") or "not readable as a mesh" in said(tmp_path / "c.gltf")
     (tmp_path / "d.ply").write_text("plyers")
-    assert "export it again" in said(tmp_path / "d.ply") or "no triangles" in said(tmp_path / "d.ply")
+    assert "cut short" in said(tmp_path / "d.ply")
     (tmp_path / "e.obj").write_text("mtllib nothing.mtl\nv 0 0 0\n")
     assert "file of materials" in said(tmp_path / "e.obj")
     assert "not found" in said(tmp_path / "plat.glb") and "Did you mean" in said(tmp_path / "plat.glb")

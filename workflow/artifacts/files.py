@@ -16,7 +16,10 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.intake.names import fault_of_name, shown
 
+LONGEST = 220
+"""Bytes of a name of a file that is written: the longest name of a view, what is added to it, and room for a temporary name."""
 _DTYPES = {"float16": np.float16, "float32": np.float32, "uint32": np.uint32}
 
 
@@ -30,13 +33,16 @@ def inside(folder: Path, name: str) -> Path:
     """Return `folder / name`, which must be a file below `folder`, also after symbolic links are followed.
 
     Raises:
-        InputError: `name` is empty or absolute, has a part `..`, or leads through a link out of the folder.
+        InputError: `name` is empty or absolute, has a part `..` or one that `fault_of_name` refuses, or leads through a link out
+            of the folder.
     """
-    path = folder / name
-    leaves = not Path(name).parts or Path(name).is_absolute() or ".." in Path(name).parts
-    if leaves or not path.parent.resolve().is_relative_to(folder.resolve()):
-        raise InputError(f"{folder}: the file name {name!r} would leave this folder; it is neither read nor written")
-    return path
+    parts = name.split("/")
+    fault = next(filter(None, (fault_of_name(part, LONGEST) for part in parts)), "")
+    if not fault and (folder / name).parent.resolve().is_relative_to(folder.resolve()):
+        return folder / name
+    inner = fault and name and not name.startswith("/") and ".." not in parts
+    problem = f"a part of it {fault}" if inner else "it would leave this folder"
+    raise InputError(f"{folder}: the file name {shown(name)}: {problem}; it is neither read nor written")
 
 
 def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True) -> None:

@@ -97,7 +97,33 @@ def parse(data: bytes, schema: str) -> dict[str, Any]:
         isinstance(facts, dict) and {"sha256", "bytes"} <= set(facts) for facts in files.values()
     ):
         raise Broken("it lists no files with their hashes")
+    if problem := _wrong_facts(document):
+        raise Broken(problem)
     return document
+
+
+def _wrong_facts(document: dict[str, Any]) -> str:
+    """Return which entry of a manifest is not of the form that stages write, which only somebody who forges it can change."""
+    for name, facts in document["files"].items():
+        shape = facts.get("shape", [])
+        if not isinstance(facts["sha256"], str) or not isinstance(facts["bytes"], int):
+            return f"its entry of {name!r} is no hash and size"
+        if not isinstance(shape, list) or not all(isinstance(size, int) and 0 <= size < 1 << 40 for size in shape):
+            return f"its entry of {name!r} has no shape"
+    inputs = document.get("inputs", {})
+    if not isinstance(inputs, dict) or not all(
+        isinstance(facts, dict) and isinstance(facts.get("scene"), str) and isinstance(facts.get("manifest_sha256"), str)
+        for facts in inputs.values()
+    ):
+        return "its inputs are not stages with their hashes"
+    for key in ("manifests", "fingerprints"):
+        listed = document.get(key, {})
+        if not isinstance(listed, dict) or not all(isinstance(value, str) for value in listed.values()):
+            return f"its {key} are no list of hashes"
+    for key in ("stage", "scene", "quality", "fingerprint"):
+        if not isinstance(document.get(key, ""), str | None):
+            return f"its {key} is no text"
+    return ""
 
 
 def read(path: Path, schema: str = STAGE_SCHEMA) -> dict[str, Any]:

@@ -260,19 +260,28 @@ class StageReader:
 
     def exr(self, name: str) -> dict[str, np.ndarray]:
         """Return the channels of a raster as (H, W) arrays."""
-        channels = io.read_exr(self.path(name))
-        facts = self.manifest["files"][name]
+        path, facts = self.path(name), self.manifest["files"][name]
+        try:
+            channels = io.read_exr(path)
+        except Exception as error:  # whatever the library makes of a file that only a forged manifest fits
+            _raise_if_of_disk(error)
+            raise self._damaged(path, f"not readable as EXR ({error})") from None
         for channel, array in channels.items():
             if array.dtype.kind == "f" and not np.isfinite(array).all():
                 raise self._damaged(self.directory / name, f"channel {channel} is not finite")
-            if list(array.shape) != facts["shape"]:
-                problem = f"channel {channel} has shape {array.shape}, manifest says {facts['shape']}"
+            if list(array.shape) != facts.get("shape"):
+                problem = f"channel {channel} has shape {array.shape}, manifest says {facts.get('shape')}"
                 raise self._damaged(self.directory / name, problem)
         return channels
 
     def table(self, name: str) -> dict[str, np.ndarray]:
         """Return the columns of a table as numpy arrays; fixed-size lists are (n, k)."""
-        return io.read_parquet(self.path(name))
+        path = self.path(name)
+        try:
+            return io.read_parquet(path)
+        except Exception as error:
+            _raise_if_of_disk(error)
+            raise self._damaged(path, f"not readable as Parquet ({error})") from None
 
     def rows(self, name: str) -> int:
         """Return the number of rows of a table from the manifest, without opening the file."""
@@ -280,7 +289,17 @@ class StageReader:
 
     def json(self, name: str) -> Any:
         """Return a small document."""
-        return json.loads(self.path(name).read_text())
+        path = self.path(name)
+        try:
+            return json.loads(path.read_text())
+        except (ValueError, RecursionError) as error:
+            raise self._damaged(path, f"not readable as JSON ({error})") from None
+
+
+def _raise_if_of_disk(error: Exception) -> None:
+    """Raise an error of the operating system again, which says nothing of the content of a file."""
+    if isinstance(error, OSError) and error.errno is not None:
+        raise error
 
 
 def _quality_in(path: Path) -> str | None:

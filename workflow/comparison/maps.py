@@ -23,6 +23,7 @@ from workflow.artifacts import StageReader
 from workflow.artifacts.files import read_exr, write_atomically
 from workflow.artifacts.store import rgb
 from workflow.comparison.named import QUANTITIES
+from workflow.intake.documents import reading
 from workflow.report import pictures
 from workflow.report.page import Picture, Strip, Table, template
 from workflow.runtime import fingerprint as fp
@@ -81,7 +82,7 @@ def find(folder: Path, colour: str, views: list[str]) -> Maps:
     files: dict[str, dict[str, Path]] = {}
     for path in sorted(p for p in folder.glob("*.exr") if p.is_file()):
         _known(path, views)
-        for quantity in (q for q in LAYERED if f"{q}.R" in (channels := read_exr(path)) or q in channels):
+        for quantity in (q for q in LAYERED if f"{q}.R" in (channels := _layers(path)) or q in channels):
             files.setdefault(quantity, {})[path.stem] = path
     for quantity in QUANTITIES:
         found = files.get(quantity, {})
@@ -98,6 +99,12 @@ def find(folder: Path, colour: str, views: list[str]) -> Maps:
     if not files:
         raise InputError(f"{folder}: no maps; {layout}")
     return Maps(folder, files, {ending: colour == "srgb" or (colour == "auto" and ending == ".png") for ending in EXTENSIONS})
+
+
+def _layers(path: Path) -> dict[str, np.ndarray]:
+    images.header(path)
+    with reading(path, "cannot be read"):
+        return read_exr(path)
 
 
 def _known(path: Path, views: list[str]) -> None:
@@ -130,7 +137,7 @@ def read_map(maps: Maps, quantity: str, view: View, srgb: bool | None = None) ->
             " yourself, as your method would: no resampling is right for every map"
         )
     if exr and path.parent == maps.folder:
-        channels = read_exr(path)
+        channels = _layers(path)
         values = rgb(channels, quantity) if three else channels[quantity].astype(np.float32)
     elif exr:
         values = images.load_map(path, 3 if three else 1)

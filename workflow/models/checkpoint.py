@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow.intake.documents import check_file
 
 PACKAGES = ("diffusers", "transformers", "safetensors", "torch")
 COMPONENTS = {
@@ -271,13 +272,17 @@ def weights_in(folder: Path, stem: str) -> Path:
     raise InputError(f"{folder}: no {' or '.join(names)}{why}; download the checkpoint with its safetensors files")
 
 
+LONGEST_HEADER = 100 << 20
+"""Bytes of the header of a safetensors file, as the format allows."""
+
+
 def tensor_header(path: Path) -> dict[str, Any]:
     """Return names, types and shapes of the tensors in a safetensors file, after checking its size against them."""
-    size = path.stat().st_size
+    size = check_file(path, 1 << 40, "weights (safetensors)")
     with path.open("rb") as file:
         start = file.read(8)
         length = struct.unpack("<Q", start)[0] if len(start) == 8 else math.inf
-        if length > size - 8:
+        if length > min(size - 8, LONGEST_HEADER):
             pointer = start.startswith(b"version ")
             lfs, damaged = "a pointer of git-lfs: run `git lfs pull` there", "cut short, or not safetensors: download it again"
             why = lfs if pointer else damaged
@@ -286,7 +291,7 @@ def tensor_header(path: Path) -> dict[str, Any]:
             tensors = json.loads(file.read(length))
             tensors.pop("__metadata__", None)
             needed = 8 + length + max(entry["data_offsets"][1] for entry in tensors.values())
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError):
             raise InputError(f"{path}: not a safetensors file; download it again") from None
     if size != needed:
         raise InputError(f"{path}: {size} bytes, its header says {needed}: cut short, download it again")
@@ -301,7 +306,7 @@ def read_json(path: Path, origin: Origin) -> dict[str, Any]:
         raise InputError(
             f"{path}: not found; `{origin.section}.checkpoint` needs a folder in {origin.layout} ({origin.page})"
         ) from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: not readable as JSON ({error}); download the checkpoint again") from None
     if not isinstance(document, dict):
         raise InputError(f"{path}: holds {type(document).__name__}, needed `key: value` pairs; download the checkpoint again")

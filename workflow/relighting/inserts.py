@@ -11,6 +11,10 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.color import linear_from_srgb
+from workflow.intake import limits
+from workflow.intake.documents import reading
+from workflow.intake.meshes import check_faces
+from workflow.intake.pictures import TEXTURES, check_pixels, check_texture
 from workflow.settings.mesh_files import emissive_strengths, files_of_mesh
 
 Array = np.ndarray
@@ -53,18 +57,17 @@ def load_insert(path: Path) -> InsertedMesh:
     Raises:
         InputError: the file cannot be read, has no surface, or numbers that are not finite.
     """
-    files_of_mesh(path)
+    for file in files_of_mesh(path)[1:]:
+        check_texture(file)
     strengths = emissive_strengths(path)
     import trimesh
 
     is_gltf = path.suffix.lower() in (".glb", ".gltf")
-    try:
+    with reading(path, "not readable as a mesh", "; export it again"):
         loaded = trimesh.load_scene(str(path), process=False)
-        parts = list(_parts(loaded, is_gltf))
-    except InputError:
-        raise
-    except Exception as error:  # whatever trimesh makes of a broken file
-        raise InputError(f"{path}: not readable as a mesh ({type(error).__name__}: {error}); export it again") from None
+        parts = list(_parts(path, loaded, is_gltf))
+        materials = [part[3] for part in parts]
+        emitted = np.array([_emission(material, strengths) for material in materials])
     if not parts:
         raise InputError(f"{path}: has no triangles; export a mesh with surface")
     corners = np.concatenate([part[0] for part in parts])
@@ -72,8 +75,6 @@ def load_insert(path: Path) -> InsertedMesh:
     if not (np.isfinite(corners).all() and np.isfinite(uv).all()):
         raise InputError(f"{path}: has corners or texture coordinates that are not finite; export the mesh again")
     number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
-    materials = [part[3] for part in parts]
-    emitted = np.array([_emission(material, strengths) for material in materials])
     double_sided = np.array([bool(getattr(material, "doubleSided", False)) for material in materials])
     textured = (getattr(material, "emissiveTexture", None) is not None for material in materials)
     glowing = {str(m.name) for m, light, has in zip(materials, emitted, textured, strict=True) if has and light.any()}
@@ -85,7 +86,7 @@ def light_of(mesh: InsertedMesh, insert: dict[str, Any]) -> Array:
     """Return the radiance (k, 3) float64 of the faces of a mesh: that of a dumped `insert`, or else that of its materials.
 
     Raises:
-        InputError: the emission of a material of the file, which would shine, has a texture.
+        InputError: the emission of a material of the file, which would shine, has a texture, or is no radiance.
     """
     given = insert["radiance"]
     if given is not None or insert["material"] is not None:
@@ -95,13 +96,18 @@ def light_of(mesh: InsertedMesh, insert: dict[str, Any]) -> Array:
             f"{insert['file']}: material {mesh.glowing[0]!r} has a texture of emission, which is not read; allowed: one colour"
             " (emissiveFactor). Export it so, or give `radiance` of the object under `insert`, where [0, 0, 0] is dark"
         )
+    if not ((mesh.radiance >= 0) & (mesh.radiance <= limits.RADIANCE)).all():
+        raise InputError(
+            f"{insert['file']}: a material emits light that is no number of 0 ... {limits.RADIANCE:g}; export it again, or give"
+            " `radiance` of the object under `insert`"
+        )
     return mesh.radiance[mesh.texture]
 
 
 def _emission(material: Any, strengths: dict[str, float]) -> Array:
     """Radiance (3,) that a material of trimesh emits."""
     factor = getattr(material, "emissiveFactor", None)
-    return np.zeros(3) if factor is None else np.asarray(factor, np.float64) * strengths.get(str(material.name), 1.0)
+    return np.zeros(3) if factor is None else np.asarray(factor, np.float64).reshape(3) * strengths.get(str(material.name), 1.0)
 
 
 def _left_out(materials: list[Any]) -> tuple[str, ...]:
@@ -111,27 +117,30 @@ def _left_out(materials: list[Any]) -> tuple[str, ...]:
     return ("transparency",) * see_through + ("normal maps",) * bumpy
 
 
-def _parts(scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array, Any]]:
+def _parts(path: Path, scene: Any, is_gltf: bool) -> Iterator[tuple[Array, Array, Array, Any]]:
     """(corners, uv, texture, material) of every mesh of a trimesh scene, in world axes of the file."""
+    count = 0
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         mesh = scene.geometry[name]
         if not len(getattr(mesh, "faces", ())):
             continue
+        count += len(mesh.faces)
+        check_faces(path, count, limits.INSERT_FACES)
         vertices = np.asarray(mesh.vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
-        uv, texture = _material(mesh, is_gltf)
+        uv, texture = _material(path, mesh, is_gltf)
         # A node that mirrors its mesh turns the order of the corners, and with it the side that an emitter shines to.
         order = slice(None, None, -1 if np.linalg.det(transform[:3, :3]) < 0 else 1)
         yield vertices[mesh.faces][:, order], uv[:, order], texture, getattr(mesh.visual, "material", None)
 
 
-def _material(mesh: Any, is_gltf: bool) -> tuple[Array, Array]:
+def _material(path: Path, mesh: Any, is_gltf: bool) -> tuple[Array, Array]:
     """Texture coordinates (k, 3, 2) and texture (h, w, 5) of a mesh. Colours of vertices are linear in glTF, sRGB elsewhere."""
     faces, visual = mesh.faces, mesh.visual
     uv = getattr(visual, "uv", None)
     decoded = np.asarray if is_gltf else linear_from_srgb
     if visual.kind == "texture":
-        texture = _texture(visual.material)
+        texture = _texture(path, visual.material)
         if uv is None or texture.shape[:2] == (1, 1):
             colours = (visual.vertex_attributes or {}).get("color")
             if colours is None or texture.shape[:2] != (1, 1):
@@ -156,18 +165,18 @@ def _face_by_face(count: int) -> Array:
     return np.repeat(np.stack([middle, np.full(count, 0.5)], 1)[:, None], 3, 1)
 
 
-def _texture(material: Any) -> Array:
+def _texture(path: Path, material: Any) -> Array:
     """Factors times pictures of a material of trimesh, as (h, w, 5)."""
     if not hasattr(material, "baseColorFactor"):  # of OBJ files: a colour or a picture, and nothing of gloss
         if not hasattr(material, "diffuse"):
             return PLAIN[None, None].copy()
-        picture = _pixels(getattr(material, "image", None))
+        picture = _pixels(path, getattr(material, "image", None))
         colour = linear_from_srgb(np.asarray(material.diffuse, np.float64)[:3] / 255.0) if picture is None else np.ones(3)
         albedo = np.ones((1, 1, 3)) if picture is None else linear_from_srgb(picture / 255.0)
         return _stacked(albedo * colour, PLAIN[3:])
     factor = material.baseColorFactor
     colour = np.ones(3) if factor is None else np.asarray(factor, np.float64)[:3] / 255.0
-    picture, gloss = _pixels(material.baseColorTexture), _pixels(material.metallicRoughnessTexture)
+    picture, gloss = _pixels(path, material.baseColorTexture), _pixels(path, material.metallicRoughnessTexture)
     albedo = np.ones((1, 1, 3)) if picture is None else linear_from_srgb(picture / 255.0)
     rough, metal = (1.0 if value is None else float(value) for value in (material.roughnessFactor, material.metallicFactor))
     if gloss is None:
@@ -183,10 +192,13 @@ def _stacked(albedo: Array, gloss: Array) -> Array:
     return np.concatenate([albedo, np.broadcast_to(gloss, (*albedo.shape[:2], 2))], -1).astype(np.float32)
 
 
-def _pixels(picture: Any) -> Array | None:
+def _pixels(path: Path, picture: Any) -> Array | None:
     """(h, w, 3) 0 ... 255 of a picture of PIL, reduced to `LARGEST_TEXTURE`; None without one."""
     if picture is None:
         return None
+    check_pixels(path, *picture.size)
+    if picture.format not in (None, "WEBP", *TEXTURES):  # of a file that is opened and not decoded yet
+        raise InputError(f"{path}: a texture of the format {picture.format}; allowed are {', '.join(TEXTURES)} and WEBP")
     picture = picture.convert("RGB")
     picture.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE))
     return np.asarray(picture, np.float64)

@@ -13,6 +13,8 @@ from iif_core.light.environment import as_map, resample
 from iif_core.light.relighting import axes_of_map, coloured, sphere_mesh
 from workflow.artifacts.files import read_exr
 from workflow.artifacts.store import rgb
+from workflow.intake.documents import reading
+from workflow.intake.pictures import exr_size
 from workflow.relighting.inserts import light_of, load_insert, placed
 from workflow.relighting.inventory import Inventory
 from workflow.runtime import device
@@ -234,7 +236,9 @@ def environment_of(state: dict[str, Any], room: Recovered, up: Array) -> Array:
 
 def read_environment(path: Path, up: Array, turn: float) -> Array:
     """(H, W, 3) map in world axes from a latitude-longitude picture: top row = up, to the right = clockwise seen from above."""
-    channels = read_exr(path)
+    exr_size(path)
+    with reading(path, "cannot be read"):
+        channels = read_exr(path)
     if not {"R", "G", "B"} <= set(channels):
         raise InputError(f"{path}: found the channels {', '.join(channels)}; an environment needs R, G and B")
     image = as_map(np.maximum(rgb(channels).astype(np.float32), 0))[:, ::-1]  # columns of a map run counter-clockwise

@@ -21,6 +21,7 @@ from typing import Any
 from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts.files import sha256_of, write_json
+from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
 from workflow.settings import study_files
@@ -207,8 +208,16 @@ def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     """Return the files from outside that a stage reads.
 
     Raises:
-        InputError: the module of the source, prior or segmentation, which lists the files, found something wrong with them.
+        InputError: the module of the source, prior or segmentation, which lists the files, found something wrong with them, or
+            they cannot be looked at: a name that is too long for the disk, a folder that may not be read.
     """
+    try:
+        return _raw_inputs(stage, document)
+    except OSError as error:
+        raise InputError(f"{shown(error.filename)}: {error.strerror}; correct the path, or let your account read it") from None
+
+
+def _raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
     wants_vgg = stage == "base_scores" or (stage == "metrics" and document["metrics"]["lpips_vgg"])
     out = [VGG] if wants_vgg and VGG.is_file() else []
     if stage in ("relight", "lamp_images"):

@@ -9,6 +9,9 @@ import numpy as np
 
 from iif_core.camera.response import Response, sampled_response
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.arrays import read_npy
+from workflow.intake.documents import check_file, read_text, reading
 from workflow.settings.names import did_you_mean_path
 
 COLUMNS = ("x", "R", "G", "B")
@@ -38,10 +41,9 @@ def read_response_file(path: Path) -> Response:
     readers = {".csv": _csv, ".parquet": _parquet, ".npy": _npy}
     if path.suffix.lower() not in readers:
         raise InputError(f"{path}: a response is .csv, .parquet (columns x, R, G, B) or .npy (3, samples)")
-    try:
+    check_file(path, limits.TABLE_BYTES, "a camera response")
+    with reading(path, "cannot be read as a response"):
         x, y = readers[path.suffix.lower()](path)
-    except (ValueError, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as a response: {error}") from None
     if len(x) < 2 or not (np.isfinite(x).all() and np.isfinite(y).all()):
         raise InputError(f"{path}: {len(x)} samples; a response needs at least 2, all numbers finite")
     if abs(x[0]) > 1e-6 or abs(x[-1] - 1) > 1e-6 or (np.diff(x) <= 0).any():
@@ -65,11 +67,13 @@ def _columns(table: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     if missing:
         raise ValueError(f"columns {', '.join(map(str, table))}; needed {', '.join(COLUMNS)}")
     x, *y = (np.asarray(table[name], np.float64) for name in COLUMNS)
+    if any(column.ndim != 1 for column in (x, *y)):
+        raise ValueError("columns of lists; needed is one number a row")
     return x, np.stack(y)
 
 
 def _csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    lines = [line.split(",") for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = [line.split(",") for line in read_text(path, limits.TABLE_BYTES).splitlines() if line.strip()]
     names = [name.strip() for name in lines[0]] if lines else []
     if any(len(line) != len(names) for line in lines):
         raise ValueError(f"lines of different length; the first has {len(names)} columns")
@@ -79,11 +83,18 @@ def _csv(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def _parquet(path: Path) -> tuple[np.ndarray, np.ndarray]:
     import pyarrow.parquet
 
-    return _columns(pyarrow.parquet.read_table(path).to_pydict())
+    with pyarrow.parquet.ParquetFile(path) as file:
+        rows, names = file.metadata.num_rows, file.schema_arrow.names
+        if rows > limits.TABLE_ROWS:
+            raise ValueError(f"{rows} rows; a response may have {limits.TABLE_ROWS}")
+        if lists := [name for name in COLUMNS if name in names and file.schema_arrow.field(name).type.num_fields]:
+            raise ValueError(f"column {lists[0]} holds lists; needed is one number a row")
+        table = file.read(columns=[name for name in COLUMNS if name in names]).to_pydict()
+    return _columns(table if len(table) == len(COLUMNS) else dict.fromkeys(names))
 
 
 def _npy(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    y = np.load(path, allow_pickle=False)
-    if y.ndim != 2 or y.shape[0] != 3:
+    y = read_npy(path)
+    if y.ndim != 2 or y.shape[0] != 3 or y.shape[1] > limits.TABLE_ROWS:
         raise ValueError(f"shape {y.shape}; needed (3, samples)")
     return np.linspace(0.0, 1.0, y.shape[1]), y.astype(np.float64)

@@ -16,8 +16,11 @@ from typing import Any
 import yaml
 
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.documents import read_bytes
+from workflow.intake.names import fault_of_name, shown
 from workflow.settings.names import RESERVED, SCENE_NAME, configuration, did_you_mean, scene_names, scene_path
-from workflow.settings.yaml_file import read_yaml
+from workflow.settings.yaml_file import parse_yaml, read_yaml
 
 TABLE = Path("config/batch.tsv")
 CHOSEN = ("config/quality/", "config/presets/")
@@ -100,7 +103,7 @@ def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
 
 def _text_of(path: Path) -> str:
     """Return the text of a UTF-8 file, with or without byte order mark, with any of the usual line ends."""
-    data = path.read_bytes()
+    data = read_bytes(path, limits.TABLE_BYTES, "the table of scenes")
     if b"\0" in data:
         raise InputError(f"{TABLE}: holds zero bytes (UTF-16, or no text at all); save it as UTF-8, columns separated by tabs")
     try:
@@ -114,11 +117,13 @@ def _text_of(path: Path) -> str:
 def _check_header(cells: list[str], number: int, text: str) -> None:
     where = f"{TABLE}, line {number}"
     if len(cells) == 1 and len(text.split()) > 1:
-        raise InputError(f"{where}: the header has one column, {text.strip()!r}; columns are separated by tabs, not by spaces")
+        raise InputError(
+            f"{where}: the header has one column, {shown(text.strip())}; columns are separated by tabs, not by spaces"
+        )
     for i, cell in enumerate(cells):
         if cell not in COLUMNS:
             hint = did_you_mean(cell, COLUMNS)
-            raise InputError(f"{where}: column {i + 1} is called {cell!r}.{hint} Allowed: {', '.join(COLUMNS)}")
+            raise InputError(f"{where}: column {i + 1} is called {shown(cell)}.{hint} Allowed: {', '.join(COLUMNS)}")
         if cell in cells[:i]:
             raise InputError(f"{where}: column {cell} stands twice; remove one")
     if "name" not in cells:
@@ -129,10 +134,10 @@ def _problem_of_cells(cells: list[str], header: list[str], text: str) -> str:
     if len(cells) > len(header):
         return (
             f", column {len(header) + 1}: found {len(cells)} cells, the header has {len(header)} columns"
-            f" ({', '.join(header)}); remove {cells[len(header)]!r} or a tab before it"
+            f" ({', '.join(header)}); remove {shown(cells[len(header)])} or a tab before it"
         )
     if "\t" not in text and len(text.split()) > 1:
-        return f", column name: found {text.strip()!r}; cells are separated by tabs, this line has spaces"
+        return f", column name: found {shown(text.strip())}; cells are separated by tabs, this line has spaces"
     return ""
 
 
@@ -140,8 +145,8 @@ def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
     where, name = ", column name: ", line.name
     if not name:
         return where + "empty; every scene needs a name"
-    if not _NAME.fullmatch(name) or "--" in name:
-        return where + f"found {name!r}; allowed are letters, digits, _ and single -, the first no sign"
+    if not _NAME.fullmatch(name) or "--" in name or fault_of_name(name):
+        return where + f"found {shown(name)}; allowed are letters, digits, _ and single -, the first no sign"
     if name in RESERVED:
         return where + f"found {name!r}, which results/ uses otherwise; choose another name"
     if name in earlier:
@@ -210,10 +215,10 @@ def blame(line: Line, among: list[tuple[str, dict[str, Any]]]) -> Callable[[str]
 def _base(line: Line, root: Path) -> tuple[str, dict[str, Any]]:
     name = Path(line.base).stem if line.base.startswith("config/scenes/") else line.base
     path = scene_path(name, root)
-    if not path.is_file():
+    if fault_of_name(name) or not path.is_file():
         names = scene_names(root)
         known = f"{did_you_mean(name, names)} Known: {', '.join(names) or 'none'}."
-        raise InputError(f"{line.at('base')}: config/scenes/{name}.yaml not found.{known}")
+        raise InputError(f"{line.at('base')}: config/scenes/{name:.80}.yaml not found.{known}")
     return f"config/scenes/{name}.yaml (base of {line.at()})", _read_base(path, path.stat().st_mtime_ns)
 
 
@@ -234,7 +239,7 @@ def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
         key, sign, value = (part.strip() for part in entry.partition("="))
         if not sign or not value or not _KEY.fullmatch(key):
             raise InputError(
-                f"{where}: found {entry!r}, needed key=value with a dotted key, such as capture.views=24;prior.samples=8"
+                f"{where}: found {shown(entry)}, needed key=value with a dotted key, such as capture.views=24;prior.samples=8"
             )
         if key in ("source.kind", "source.path"):
             raise InputError(f"{where}: {key!r} has a column of its own, {'source' if key.endswith('kind') else 'path'}")
@@ -245,9 +250,11 @@ def parse_overrides(text: str, where: str = "overrides") -> dict[str, Any]:
                 raise InputError(f"{where}: {other!r} and {key!r} set the same thing; keep one")
         seen.append(key)
         try:
-            parsed = yaml.safe_load(value)
+            parsed = parse_yaml(value)
         except yaml.YAMLError as error:
-            raise InputError(f"{where}: {key!r}: {value!r} is not a YAML value ({getattr(error, 'problem', error)})") from None
+            raise InputError(
+                f"{where}: {key!r}: {shown(value)} is not a YAML value ({getattr(error, 'problem', None) or error})"
+            ) from None
         *parents, leaf = key.split(".")
         node = out
         for part in parents:

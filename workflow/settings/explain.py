@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from workflow.intake.names import shown
 from workflow.settings.names import did_you_mean
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
@@ -17,6 +18,8 @@ REMOVED = {
     "affines.ridge": " It was removed, because it had no effect; delete it.",
 }
 """Keys of earlier versions: what to do about them."""
+SHOWN = 10
+"""Problems in one message."""
 NEEDED = {
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "Needed: a whole number"),
     **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
@@ -95,7 +98,8 @@ def _is_section(found: Any) -> bool:
 def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
     """Return one line per problem; `origin` maps a dotted key to its file."""
     lines = []
-    for problem in _one_of_each_choice(error.errors()):
+    problems = _one_of_each_choice(error.errors())
+    for problem in problems[:SHOWN]:
         where = problem["loc"]
         dotted = _dotted(where)
         found = problem.get("input")
@@ -107,25 +111,29 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             hint = REMOVED.get(dotted) or did_you_mean(where[-1], allowed, "`{}`") or TWINS.get(str(where[0]), "")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
-            lines.append(f"{path}: `{dotted}`: found {found!r}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`.")
+            lines.append(
+                f"{path}: `{dotted}`: found {shown(found)}, needed `key: value` pairs, e.g. `{where[0]}: {{kind: ...}}`."
+            )
         elif kind == "missing":
             example = EXAMPLES.get(str(where[0]), "config/scenes/kitchen.yaml")
             lines.append(f"{path}: `{dotted}`: missing. Add it; {example} is a complete example.")
         elif kind in ("union_tag_invalid", "union_tag_not_found"):
             union = UNIONS.get(str(where[0]), {})
             got = found.get("kind") if isinstance(found, dict) else found
-            said = "missing. Add it;" if got is None else f"found {got!r},"
+            said = "missing. Add it;" if got is None else f"found {shown(got)},"
             hint = did_you_mean(got, union) if got is not None else ""
             lines.append(f"{path}: `{dotted}.kind`: {said} allowed: {', '.join(union)}.{hint}")
         elif kind == "value_error" and _is_section(found):  # keys that do not go together: the message says which
             lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
         else:
-            shown = found if not isinstance(found, dict) else "a mapping"
+            said = shown(found, 200) if not isinstance(found, dict) else "'a mapping'"
             needed = NEEDED.get(kind) or problem["msg"].removeprefix("Value error, ")
             if kind == "string_type" and isinstance(found, int | float):
                 needed = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
             elif kind == "string_pattern_mismatch" and where[-1] == "name":
                 needed = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
             hint = did_you_mean(found, re.findall(r"'([^']*)'", needed)) if isinstance(found, str) else ""
-            lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed}.{hint}")
+            lines.append(f"{path}: `{dotted}`: found {said}. {needed}.{hint}")
+    if len(problems) > SHOWN:
+        lines.append(f"... and {len(problems) - SHOWN} more")
     return "\n".join(lines)

@@ -16,6 +16,10 @@ PRESETS = ("published", "published_repaired")
 """Methods other than ours that have a file in config/presets/."""
 SCENE_NAME = r"[A-Za-z0-9][A-Za-z0-9_-]*"
 """What a scene may be called: its name is a folder, a target of Snakemake and part of the names of variants."""
+LONG = 200
+"""Characters from which nothing similar is looked for."""
+MANY = 10_000
+"""Files of a folder among which a similar name is looked for."""
 RESERVED = ("batch", "studies", "weights")
 """Folders of results/ that do not belong to a scene."""
 
@@ -53,18 +57,20 @@ def did_you_mean(name: object, known: Iterable[str], form: str = "{}") -> str:
     >>> did_you_mean("kichen", ["kitchen", "hall"], "scenes/{}")
     ' Did you mean scenes/kitchen?'
     """
-    near = difflib.get_close_matches(str(name), list(known), 1)
+    near = difflib.get_close_matches(str(name), list(known), 1) if len(str(name)) < LONG else []
     return f" Did you mean {form.format(near[0])}?" if near else ""
 
 
 def did_you_mean_path(path: Path) -> str:
     """Return ` Did you mean X?` where the first missing part of `path` has a similar name beside it; otherwise empty."""
     missing = path
-    while not missing.parent.exists():
-        missing = missing.parent
     try:
-        beside = sorted(os.listdir(missing.parent))
-    except OSError:
+        while not missing.parent.exists():
+            missing = missing.parent
+        beside = sorted(os.listdir(missing.parent))[:MANY]
+    except (OSError, ValueError):
+        return ""
+    if len(missing.name) >= LONG:
         return ""
     near = difflib.get_close_matches(missing.name, beside, 1)
     if not near:

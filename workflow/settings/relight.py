@@ -10,13 +10,15 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, AliasChoices, BeforeValidator, Field, field_validator, model_validator
 
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.pictures import exr_size
 from workflow.settings.mesh_files import MESHES, files_of_mesh
 from workflow.settings.names import did_you_mean_path
 from workflow.settings.override import TEXT_KEYS
 from workflow.settings.section import Section
 
-Light = Annotated[float, Field(ge=0, le=1e9)]
-"""Radiance, or a factor on it; pictures are single floats, which end at 3e38."""
+Light = Annotated[float, Field(ge=0, le=limits.RADIANCE)]
+"""Radiance, or a factor on it."""
 Colour = tuple[Light, Light, Light]
 Reflectance = Annotated[float, Field(ge=0, le=1)]
 SWITCH = {"on": 1.0, "off": 0.0, True: 1.0, False: 0.0}
@@ -169,7 +171,7 @@ class RelightVideo(Section):
 class Relighting(Section):
     """One relighting of the recovered scene: `snakemake --cores 2 relight/<scene>` (docs/guide/relighting.md)."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=100)
     """Name of the folder of its pictures: letters, digits, `_` and `-`."""
     emitters: Annotated[Light, BeforeValidator(_switched)] = 1.0
     """Recovered emitters that `lamps` does not name: `on`, `off`, or a factor on their radiance."""
@@ -300,6 +302,8 @@ def relight_files(entries: list[dict[str, Any]]) -> list[Path]:
             inserted = any(Path(one["file"]) == path for one in entry["insert"])
             kinds = MESHES if inserted else (".exr",)
             if path.suffix.lower() in kinds and path.is_file():
+                if not inserted:
+                    _check_environment(path, entry["name"])
                 continue
             if inserted:
                 why = "not found" if path.suffix.lower() in kinds else f"found {path.suffix or 'no suffix'}"
@@ -318,6 +322,13 @@ def relight_files(entries: list[dict[str, Any]]) -> list[Path]:
         except InputError as error:
             raise InputError(f"`relight.insert.file` of {entry['name']}: {error}") from None
     return list(found)
+
+
+def _check_environment(path: Path, name: str) -> None:
+    try:
+        exr_size(path)
+    except InputError as error:
+        raise InputError(f"`relight.environment` of {name}: {error}") from None
 
 
 def all_files_of(entry: dict[str, Any]) -> list[Path]:

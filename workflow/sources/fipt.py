@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.intake.arrays import read_npy
+from workflow.intake.documents import read_text
 from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import images, mesh, transforms
@@ -153,8 +155,9 @@ def _triples(path: Path, what: str) -> np.ndarray:
     """Read (n, 3, 3) from a file that holds n, then three lines of three numbers per camera."""
     if not path.is_file():
         raise InputError(f"{path}: not found; a real FIPT scene needs cam.txt and K_list.txt")
+    text = read_text(path)
     try:
-        first, *rest = path.read_text().split("\n", 1)
+        first, *rest = text.split("\n", 1)
         count = int(first)
         numbers = np.array("".join(rest).split(), np.float64)
     except ValueError as error:
@@ -216,10 +219,10 @@ def _sensor(found: Listed, used: list[tuple[Path, int]]) -> tuple[tuple[float, .
 
 
 def _array(path: Path) -> np.ndarray:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False), np.float64)
-    except (ValueError, OSError, EOFError) as error:
-        raise InputError(f"{path}: not a readable array ({error})") from None
+    found = read_npy(path).astype(np.float64)
+    if found.size == 0:
+        raise InputError(f"{path}: holds no number")
+    return found
 
 
 # ----------------------------------------------------------------------------------------------------------------- truth
@@ -268,10 +271,10 @@ def _listed_ids(lists: list[Path]) -> dict[Path, list[np.ndarray]]:
     """Read object_ids.txt, a line of numbers per photograph: folder of id maps -> ids that occur in each photograph."""
     out = {}
     for path in lists:
+        lines = read_text(path).splitlines()
         try:
-            lines = path.read_text().splitlines()
             out[path.parent] = [np.array([int(float(v)) for v in line.split(",") if v.strip()], np.int64) for line in lines]
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             raise InputError(f"{path}: expected a line of ids, parted by commas, for every photograph ({error})") from None
     return out
 

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.intake.meshes import check_mesh
+from workflow.intake.pictures import check_texture
 from workflow.models.denoise import NOTE, denoise, require_denoiser
 from workflow.scene.normal_form import CaptureWriter, Truth, View
 from workflow.sources.mitsuba_scene.document import referenced_files
@@ -38,9 +40,15 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     """Return the XML and every file that it names.
 
     Raises:
-        InputError: a file is missing or malformed.
+        InputError: a file is missing or malformed, or larger than is allowed.
     """
-    return referenced_files(Path(document["source"]["path"]))
+    files = referenced_files(Path(document["source"]["path"]))
+    for path in files:
+        if path.suffix.lower() in (".ply", ".obj"):
+            check_mesh(path)
+        else:
+            check_texture(path)
+    return files
 
 
 def capture(job: Job) -> None:

@@ -9,7 +9,6 @@ the result is compared with colmap/, which is in the frame of the mesh.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.intake.documents import read_json, reading
 from workflow.runtime.job import Job
 from workflow.sources import folder
 from workflow.sources.folder_scene import colmap, mesh, transforms
@@ -112,10 +112,10 @@ def _entries(
 
 def _lists(path: Path) -> dict[str, str]:
     """Read train_test_lists.json: file name -> train or test."""
+    document = read_json(path, "a list of photographs")
     try:
-        document = json.loads(path.read_text())
         found = {key: [str(name) for name in document[key]] for key in ("train", "test")}
-    except (ValueError, KeyError, TypeError) as error:
+    except (KeyError, TypeError) as error:
         raise InputError(f'{path}: expected {{"train": [names], "test": [names]}} ({type(error).__name__}: {error})') from None
     both = sorted(set(found["train"]) & set(found["test"]))
     if both:
@@ -195,19 +195,15 @@ def vertex_ids(segments: Path, annotation: Path) -> mesh.VertexIds:
     Raises:
         InputError: files of another form.
     """
-    try:
-        index = np.asarray(json.loads(segments.read_text())["segIndices"], np.int64)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{segments}: expected `segIndices`, a segment of every vertex ({type(error).__name__}: {error})"
-        ) from None
-    try:
-        groups = json.loads(annotation.read_text())["segGroups"]
-        objects = [(int(g["objectId"]), str(g.get("label", "object")), np.asarray(g["segments"], np.int64)) for g in groups]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{annotation}: expected `segGroups` with objectId, label and segments ({type(error).__name__}: {error})"
-        ) from None
+    document = read_json(segments, "segments of the vertices")
+    with reading(segments, "expected `segIndices`, a segment of every vertex"):
+        index = np.asarray(document["segIndices"], np.int64)
+    document = read_json(annotation, "objects of the segments")
+    with reading(annotation, "expected `segGroups` with objectId, label and segments"):
+        objects = [
+            (int(g["objectId"]), str(g.get("label", "object")), np.asarray(g["segments"], np.int64).ravel())
+            for g in document["segGroups"]
+        ]
     if index.ndim != 1:
         raise InputError(f"{segments}: `segIndices` must be one list of numbers")
     kept, position, size = np.unique(index, return_inverse=True, return_counts=True)

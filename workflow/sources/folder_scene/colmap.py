@@ -16,6 +16,9 @@ import numpy as np
 
 from iif_core.camera.distortion import distort
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.documents import check_file, reading
+from workflow.intake.names import shown
 from workflow.sources.folder_scene import transforms
 from workflow.sources.folder_scene.images import EXTENSIONS
 from workflow.sources.folder_scene.transforms import Transforms
@@ -118,21 +121,34 @@ def read(path: Path, with_points: bool = True) -> Model:
         raise InputError(f"{files[1]}: no image is registered; the reconstruction failed or is another model (sparse/1?)")
     lost = next((image for image in images if image.camera not in cameras), None)
     if lost is not None:
-        raise InputError(f"{files[1]}: {lost.name} has camera {lost.camera}, which {files[0].name} does not hold")
+        raise InputError(f"{files[1]}: {shown(lost.name)} has camera {lost.camera}, which {files[0].name} does not hold")
     order = np.argsort(ids, kind="stable")
     return Model(files[1], cameras, images, ids[order], points[order], tuple(files[: 3 if with_points else 2]))
 
 
 def _guarded(path: Path, reader: Any) -> Any:
-    try:
+    check_file(path, limits.MODEL_BYTES, "a file of a COLMAP model")
+    with reading(path, "not a COLMAP file, or cut short"):
         return reader(path)
-    except (ValueError, IndexError, KeyError, struct.error, OverflowError) as error:
-        raise InputError(f"{path}: not a COLMAP file, or cut short ({type(error).__name__}: {error})") from None
+
+
+def _count(data: bytes, least: int) -> int:
+    """Return the number of entries that a binary file announces, each of which has at least `least` bytes.
+
+    Raises:
+        ValueError: the file is too short for them.
+    """
+    (count,) = struct.unpack_from("<Q", data)
+    if count * least > len(data) - 8:
+        raise ValueError(f"{count} entries announced, {len(data)} bytes in the file")
+    return int(count)
 
 
 def entry_of(model: Model, image: Image) -> dict[str, Any]:
     """Return an entry like those of transforms.json, but with camera-to-world of OpenCV axes."""
-    where = f"image {image.name}"
+    where = f"image {shown(image.name)}"
+    if fault := transforms.fault_of_path(image.name):
+        raise InputError(f"{model.path}: {where}: its name {fault}")
     return {
         **model.cameras[image.camera],
         "file_path": image.name,
@@ -205,10 +221,10 @@ def _check_reprojection(model: Model, listed: Transforms) -> None:
 def _camera(path: Path, number: int, model: str, width: int, height: int, values: list[float]) -> dict[str, Any]:
     if model not in MODELS or not MODELS[model][1]:
         allowed = ", ".join(name for name, (_, lens, _) in MODELS.items() if lens)
-        raise InputError(f"{path}: camera {number} is {model}; allowed: {allowed}. Run `colmap image_undistorter`")
+        raise InputError(f"{path}: camera {number} is {model:.40}; allowed: {allowed}. Run `colmap image_undistorter`")
     _, lens, names = MODELS[model]
     if len(values) != len(names):
-        raise ValueError(f"camera {number}, {model}: {len(values)} parameters instead of {len(names)}")
+        raise ValueError(f"camera {number}, {model:.40}: {len(values)} parameters instead of {len(names)}")
     out: dict[str, Any] = dict(zip(names, map(float, values), strict=True))
     if model == "FULL_OPENCV" and any([out.pop(key) for key in ("k4", "k5", "k6")]):
         raise InputError(f"{path}: camera {number} has k4, k5, k6, which are not read here. Run `colmap image_undistorter`")
@@ -247,7 +263,7 @@ def _image(name: str, camera: int, values: Any, xy: np.ndarray, ids: np.ndarray)
 
 def _lines(path: Path) -> Iterator[str]:
     """Yield the lines without comments, one at a time because these files hold every keypoint of every image."""
-    with open(path) as file:
+    with open(path, encoding="utf-8") as file:
         for line in file:
             if not line.startswith("#"):
                 yield line.strip()
@@ -289,7 +305,7 @@ def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _binary_cameras(path: Path) -> dict[int, dict[str, Any]]:
     data, out = path.read_bytes(), {}
-    (count,), at = struct.unpack_from("<Q", data), 8
+    count, at = _count(data, 24), 8
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         name = _NAME_OF.get(model, f"model {model}")
@@ -305,12 +321,14 @@ _KEYPOINT = np.dtype([("x", "<f8"), ("y", "<f8"), ("id", "<i8")])
 
 def _binary_images(path: Path, keypoints: bool) -> list[Image]:
     data, out = path.read_bytes(), []
-    (count,), at = struct.unpack_from("<Q", data), 8
+    count, at = _count(data, 73), 8
     for _ in range(count):
         fields = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode()
         (points,) = struct.unpack_from("<Q", data, end + 1)
+        if points * _KEYPOINT.itemsize > len(data) - end - 9:
+            raise ValueError(f"{name[:80]}: {points} keypoints announced, fewer in the file")
         found = np.frombuffer(data, _KEYPOINT, points if keypoints else 0, end + 9)
         out.append(_image(name, fields[8], fields[1:8], np.stack([found["x"], found["y"]], -1), found["id"].astype(np.int64)))
         at = end + 9 + _KEYPOINT.itemsize * points
@@ -319,7 +337,7 @@ def _binary_images(path: Path, keypoints: bool) -> list[Image]:
 
 def _binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     data = path.read_bytes()
-    (count,), at = struct.unpack_from("<Q", data), 8
+    count, at = _count(data, 51), 8
     ids, points = np.zeros(count, np.int64), np.zeros((count, 3))
     for i in range(count):
         ids[i], *points[i] = struct.unpack_from("<Q3d", data, at)

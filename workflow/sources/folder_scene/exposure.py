@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
@@ -12,6 +11,9 @@ from iif_core.camera.exposure import ExposureGains, estimate_gains
 from iif_core.camera.response import response
 from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin, pack_keys, voxel_indices
+from workflow.intake import limits
+from workflow.intake.documents import read_json
+from workflow.intake.names import shown
 
 MAX_PIXELS = 2_000_000  # of all views together
 MIN_CELL_EDGE = 0.02  # metres; finer cells would hold single pixels
@@ -24,10 +26,7 @@ def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
     Raises:
         InputError: unreadable, an entry missing, or not a positive number.
     """
-    try:
-        table = json.loads(path.read_text())
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+    table = read_json(path, "exposures")
     if not isinstance(table, dict):
         raise InputError(f"{path}: found a {type(table).__name__}; expected {{file_path or name: exposure}}")
     table = {key.removeprefix("./"): value for key, value in table.items()}
@@ -38,7 +37,9 @@ def read_given(path: Path, frames: list[tuple[str, str]]) -> list[float]:
             raise InputError(f"{path}: no entry for {file_path!r} (or {name!r}); every photograph needs one")
         number = isinstance(value, int | float) and not isinstance(value, bool)
         if not number or not (math.isfinite(value) and value > 0):
-            raise InputError(f"{path}: exposure of {name!r} is {value!r}; expected a positive number")
+            raise InputError(f"{path}: exposure of {name!r} is {shown(value)}; expected a positive number")
+        if not limits.GAIN[0] <= value <= limits.GAIN[1]:
+            raise InputError(f"{path}: exposure of {name!r} is {value:g}; expected {limits.GAIN[0]:g} to {limits.GAIN[1]:g}")
         out.append(float(value))
     return out
 

@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from workflow.intake.documents import reading
+from workflow.intake.pictures import exr_size, opened
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".exr")
+STRIP_PIXELS = 1 << 20
+"""Pixels that are converted or reduced at a time, so that a photograph takes little more memory than its result."""
 MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "I;16", "I;16B", "I")
 TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda a: a,
@@ -60,34 +64,23 @@ class Photo:
 @lru_cache(4096)
 def _header(path: Path, _stamp: tuple[int, int]) -> Header:
     if path.suffix.lower() == ".exr":
-        import OpenEXR
-
-        try:
-            with OpenEXR.File(str(path), header_only=True) as file:
-                low, high = file.header()["dataWindow"]
-        except Exception as error:
-            raise InputError(f"{path}: not a readable EXR image ({error})") from None
-        return Header((int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1))
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
+        return Header(exr_size(path))
+    with reading(path, "not a readable image"):
+        with opened(path) as image:
             if image.mode not in MODES:
                 raise InputError(f"{path}: colour mode {image.mode}; allowed: grey, RGB, RGBA of 8 or 16 bits. Convert it")
-            orientation = int(image.getexif().get(274, 1) or 1)
-            found = Header(image.size, orientation if 1 <= orientation <= 8 else 1)
+            orientation = image.getexif().get(274, 1) or 1
+            turned = isinstance(orientation, int) and 1 <= orientation <= 8
+            found = Header(image.size, orientation if turned else 1)
         if not _complete(path):
             raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
-        return found
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path}: not a readable image ({error})") from None
+    return found
 
 
 def header(path: Path) -> Header:
-    """Size and orientation from the file's header; an unreadable, CMYK or cut image is refused by name."""
-    status = path.stat()
+    """Size and orientation from the file's header; what is unreadable, CMYK, cut short or too large is refused by name."""
+    with reading(path, "not a readable image"):
+        status = path.stat()
     return _header(path, (status.st_size, status.st_mtime_ns))
 
 
@@ -116,42 +109,47 @@ def _is_16_bit_png(path: Path) -> bool:
 
 def _stored(path: Path) -> np.ndarray:
     """Read the pixels of a png or jpg, (H, W) or (H, W, C), integer; palettes are resolved."""
-    try:
+    header(path)
+    with reading(path, "cannot be read", "; the file is damaged or cut short"):
         if _is_16_bit_png(path):  # Pillow truncates 16-bit colour to 8 bits
             import mitsuba as mi
 
             return np.array(mi.Bitmap(str(path)))
-        from PIL import Image
-
-        with Image.open(path) as image:
+        with opened(path) as image:
             if image.mode in ("P", "PA"):
                 image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
             elif image.mode == "1":
                 image = image.convert("L")
             return np.asarray(image)
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read ({error}); the file is damaged or cut short") from None
 
 
 def _exr(path: Path) -> dict[str, np.ndarray]:
+    """Read the channels of an EXR, all of the size that its header states."""
     from workflow.artifacts.files import read_exr
 
-    try:
-        return read_exr(path)
-    except Exception as error:
-        raise InputError(f"{path}: cannot be read ({error}); the file is damaged, cut short or has several parts") from None
+    width, height = header(path).size
+    with reading(path, "cannot be read", "; the file is damaged, cut short or has several parts"):
+        channels = read_exr(path)
+        if any(values.shape != (height, width) for values in channels.values()):
+            raise InputError(f"{path}: channels of different sizes (subsampled?); write all of them at full size")
+        return channels
 
 
-def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Return (H, W, 3) or (H, W, 4) float32 of R G B [A], or of one grey channel [and A]."""
+def _colours(path: Path, channels: dict[str, np.ndarray]) -> list[str]:
+    """Return the names of R G B [A], or three times that of one grey channel [and A]."""
     if all(c in channels for c in "RGB"):
         names = list("RGB")
     else:
         names = [c for c in channels if c != "A"] * 3
         if len(names) != 3:
-            raise InputError(f"{path}: channels {', '.join(channels)}; expected R G B (and A), or one grey channel")
-    names += ["A"] if "A" in channels else []
-    return np.stack([channels[name].astype(np.float32) for name in names], -1)
+            shown = ", ".join(list(channels)[:8])
+            raise InputError(f"{path}: channels {shown}; expected R G B (and A), or one grey channel")
+    return names + (["A"] if "A" in channels else [])
+
+
+def _exr_colour(path: Path, channels: dict[str, np.ndarray]) -> np.ndarray:
+    """Return (H, W, 3) or (H, W, 4) float32 of R G B [A], or of one grey channel [and A]."""
+    return np.stack([channels[name].astype(np.float32) for name in _colours(path, channels)], -1)
 
 
 def load_photo(path: Path, turn: int = 1) -> Photo:
@@ -162,30 +160,40 @@ def load_photo(path: Path, turn: int = 1) -> Photo:
     """
     form = ""
     if path.suffix.lower() == ".exr":
-        values = _exr_colour(path, _exr(path))
-        alpha = values[..., 3] if values.shape[-1] == 4 else None
-        colour = values[..., :3]
-        if alpha is not None:
-            colour = colour / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None]
+        found = _exr(path)
+        names = _colours(path, found)
+        height, width = found[names[0]].shape
+
+        def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
+            values = np.stack([found[name][rows].astype(np.float32) for name in names], -1)
+            if len(names) < 4:
+                return values, None
+            alpha = values[..., 3]
+            return values[..., :3] / np.where(np.isfinite(alpha) & (alpha >= 0.5), np.minimum(alpha, 1), 1)[..., None], alpha
     else:
         stored = _stored(path)
         stored = stored[..., None] if stored.ndim == 2 else stored
-        values = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
-        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (values.shape[-1] < 3))
-        alpha = values[..., -1] if values.shape[-1] in (2, 4) else None
-        colour = values[..., :3] if values.shape[-1] >= 3 else np.repeat(values[..., :1], 3, -1)
-    finite = np.isfinite(colour).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
-    opaque = np.ones(finite.shape, bool) if alpha is None else np.nan_to_num(alpha) >= 0.5
-    colour = np.where(finite[..., None], colour, 0)
-    negative = colour.min(-1) < 0
-    photo = Photo(
-        np.maximum(colour, 0).astype(np.float32),
-        finite & opaque,
-        int((~finite).sum()),
-        int((finite & ~opaque).sum()),
-        int(negative.sum()),
-        form=form,
-    )
+        if stored.ndim != 3 or stored.dtype.kind not in "iu":
+            raise InputError(f"{path}: pixels of type {stored.dtype}, shape {stored.shape}; expected 8 or 16 bits")
+        height, width, channels = stored.shape
+        form = " ".join(["16-bit"] * (stored.dtype.itemsize > 1) + ["grey"] * (channels < 3))
+
+        def strip(rows: slice) -> tuple[np.ndarray, np.ndarray | None]:
+            values = stored[rows].astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+            colour = values[..., :3] if channels >= 3 else np.repeat(values[..., :1], 3, -1)
+            return colour, values[..., -1] if channels in (2, 4) else None
+
+    photo = Photo(np.empty((height, width, 3), np.float32), np.empty((height, width), bool), form=form)
+    step = max(1, STRIP_PIXELS // width)
+    for rows in (slice(top, top + step) for top in range(0, height, step)):
+        colour, alpha = strip(rows)
+        finite = np.isfinite(colour).all(-1) & (np.isfinite(alpha) if alpha is not None else True)
+        opaque = np.ones(finite.shape, bool) if alpha is None else np.nan_to_num(alpha) >= 0.5
+        colour = np.where(finite[..., None], colour, 0)
+        photo.pixels[rows], photo.valid[rows] = np.maximum(colour, 0), finite & opaque
+        photo.non_finite += int((~finite).sum())
+        photo.transparent += int((finite & ~opaque).sum())
+        photo.negative += int((colour.min(-1) < 0).sum())
     photo.pixels, photo.valid = TURNS[turn](photo.pixels), TURNS[turn](photo.valid)
     return photo
 
@@ -228,9 +236,8 @@ def load_ids(path: Path, turn: int = 1) -> np.ndarray:
     if path.suffix.lower() == ".exr":
         stored = _one_channel(path, _exr(path))
     else:
-        from PIL import Image
-
-        with Image.open(path) as image:
+        header(path)
+        with reading(path, "cannot be read", "; the file is damaged or cut short"), opened(path) as image:
             palette = image.mode == "P"
             stored = np.asarray(image) if palette else _stored(path)
         if stored.ndim == 3 and stored.shape[-1] == 1:
@@ -321,11 +328,15 @@ def reduce_area(image: np.ndarray, valid: np.ndarray, width: int, height: int) -
         return np.where(valid[..., None], image, 0), valid
     rows, columns = _overlap(image.shape[0], height), _overlap(image.shape[1], width)
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.asarray((columns @ (rows @ values).T).T)
+    step = max(1, STRIP_PIXELS // image.shape[0])
+    parts = [slice(left, left + step) for left in range(0, image.shape[1], step)]
 
-    covered = mean(valid.astype(np.float64))
-    total = np.stack([mean(np.where(valid, image[..., c], 0).astype(np.float64)) for c in range(image.shape[2])], -1)
+    def mean(values: Callable[[slice], np.ndarray]) -> np.ndarray:
+        upright = np.concatenate([rows @ values(part).astype(np.float64) for part in parts], 1)
+        return np.asarray((columns @ upright.T).T)
+
+    covered = mean(lambda part: valid[:, part])
+    total = np.stack([mean(lambda part, c=c: np.where(valid[:, part], image[:, part, c], 0)) for c in range(image.shape[2])], -1)
     kept = covered >= 0.5 - 1e-9
     out = np.where(kept[..., None], total / np.maximum(covered, 1e-9)[..., None], 0)
     return out.astype(np.float32), kept

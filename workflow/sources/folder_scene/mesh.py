@@ -11,6 +11,10 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.surface.triangles import face_geometry
+from workflow.intake import limits
+from workflow.intake.documents import check_file, reading
+from workflow.intake.meshes import AGAIN, check_faces, check_mesh
+from workflow.settings.mesh_files import files_of_mesh
 from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene.transforms import METRES
 
@@ -18,7 +22,6 @@ NAMES = ("mesh.ply", "mesh.obj", "mesh.glb")
 SUFFIXES = (".ply", ".obj", ".glb")
 MIN_AREA = 1e-12  # m^2; smaller triangles are removed (docs/method/numerics.md#degenerate-faces)
 DIAGONAL = (0.5, 200.0)  # metres; a room outside of this range is in another unit (docs/method/numerics.md#unit-of-the-mesh)
-AGAIN = "export the mesh again, or copy it again"
 FACTORS = (0.1, 0.01, 0.001)
 """Factors on camera positions far away that are tried: decimetres, centimetres and millimetres beside metres."""
 LEAST_SPREAD = 0.05  # of the scene's size; cameras nearer to one another lie in the mesh by any small factor
@@ -28,6 +31,9 @@ TURNS = {
     "z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
 }
 """`source.mesh_up` -> rotation from the axes of the mesh file to those of the poses."""
+MAX_UNUSED = 0.05
+"""Share of the vertices of an OBJ file that may belong to no face; one that is cut short has vertices first, and then part of the
+faces."""
 TYPICAL_DIAGONAL = 7.0  # metres; the unit that comes nearest to it is proposed
 
 
@@ -75,6 +81,7 @@ def find(folder: Path, name: str | None) -> Path:
         if not path.is_file():
             raise InputError(f"{path}: not found (`source.mesh: {name}`).{did_you_mean_path(path)}")
         _refuse_empty(path)
+        check_mesh(path)
         return path
     found = [folder / n for n in NAMES if (folder / n).is_file()]
     if len(found) > 1:
@@ -84,11 +91,13 @@ def find(folder: Path, name: str | None) -> Path:
         hint = f" Found {', '.join(meshes[:3])}: name it with `source.mesh`." if meshes else ""
         raise InputError(f"{folder}: no {', '.join(NAMES)}; a mesh of the scene is needed (docs/guide/own-data.md).{hint}")
     _refuse_empty(found[0])
+    check_mesh(found[0])
     return found[0]
 
 
 def _refuse_empty(path: Path) -> None:
     """Refuse what its first bytes show to be no mesh."""
+    check_file(path, limits.MESH_BYTES, "a mesh")
     with open(path, "rb") as file:
         start = file.read(64)
     if not start:
@@ -102,9 +111,7 @@ def _refuse_cut(path: Path) -> None:
     if path.suffix.lower() != ".ply":
         return
     with open(path, "rb") as file:
-        head, mark, _ = file.read(1 << 20).partition(b"end_header")
-    if not mark:
-        raise InputError(f"{path}: cut short (its header has no end); {AGAIN}")
+        head = file.read(1 << 20).partition(b"end_header")[0]
     if b"format ascii" not in head:
         return  # the reader itself compares the length of binary files with the header
     data = path.read_bytes()
@@ -114,7 +121,7 @@ def _refuse_cut(path: Path) -> None:
     found = body.count(b"\n") + 1 if body else 0
     if found == promised and re.search(rb"element\s+face\s+[1-9]\d*\s+property\s+list[^\n]*\s*$", head):
         corners, *last = body[body.rfind(b"\n") + 1 :].split()  # of a header that ends with faces, and these with their vertices
-        found -= len(last) < int(corners)
+        found -= not corners.isdigit() or len(last) < int(corners)
     if found < promised:
         said = ", ".join(f"{int(count)} of {name.decode()}" for name, count in counts)
         raise InputError(f"{path}: cut short (its header announces {said}; {found} lines of {promised} follow); {AGAIN}")
@@ -175,19 +182,27 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[s
     import trimesh
 
     _refuse_empty(path)
+    check_mesh(path)
     _refuse_cut(path)
-    try:
+    if path.suffix.lower() == ".glb":
+        files_of_mesh(path)
+    with reading(path, "cannot be read as a mesh", f"; it is damaged or cut short: {AGAIN}"):
         scene = trimesh.load_scene(path, process=False, maintain_order=True)
-    except Exception as error:
-        raise InputError(
-            f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); it is damaged or cut short: {AGAIN}"
-        ) from None
-    vertices, faces, nodes, names, offset = [], [], [], [], 0
+        return _merged(path, scene)
+
+
+def _merged(path: Path, scene: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None, list[str] | None]:
+    """Return vertices, faces, the objects of the faces and their names of a scene of trimesh."""
+    import trimesh
+
+    vertices, faces, nodes, names, offset, count = [], [], [], [], 0, 0
     for node in scene.graph.nodes_geometry:
         transform, key = scene.graph[node]
         part = scene.geometry[key]
         if not isinstance(part, trimesh.Trimesh) or len(part.faces) == 0:
             continue
+        count += len(part.faces)
+        check_faces(path, count)
         v = np.asarray(part.vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
         f = np.asarray(part.faces, np.int64)
         if np.linalg.det(transform[:3, :3]) < 0:  # a mirrored node would have its front inside
@@ -239,6 +254,9 @@ def _cleaned(path: Path, vertices: np.ndarray, faces: np.ndarray, ids: np.ndarra
             " is larger than `source.unit` says"
         )
     used, faces = np.unique(faces[kept], return_inverse=True)
+    if path.suffix.lower() == ".obj" and len(used) < (1 - MAX_UNUSED) * len(vertices):
+        share = 1 - len(used) / len(vertices)
+        notes.append(f"WARNING {share:.0%} of the vertices of {path.name} belong to no face: is the file cut short?")
     return Mesh(vertices[used], faces.reshape(-1, 3).astype(np.int32), None if ids is None else ids[kept], notes=notes)
 
 

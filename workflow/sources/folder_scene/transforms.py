@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
-import json
 import math
 import os
 from dataclasses import dataclass, replace
@@ -19,6 +18,9 @@ import numpy as np
 
 from iif_core.camera.distortion import Distortion, Pinhole
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.documents import read_json
+from workflow.intake.names import fault_of_name, same_name, shown
 from workflow.settings.names import did_you_mean_path
 from workflow.sources.folder_scene import images
 
@@ -241,11 +243,12 @@ def _applied(path: Path, document: dict[str, Any]) -> np.ndarray:
     stated = document.get("applied_transform")
     try:
         rows = np.array(stated, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         rows = np.zeros(0)
     if rows.shape not in ((3, 4), (4, 4)) or not np.isfinite(rows).all():
+        found = "missing" if stated is None else shown(stated)
         raise InputError(
-            f"{path}: `source.applied_transform: undo`, but `applied_transform` is {'missing' if stated is None else stated};"
+            f"{path}: `source.applied_transform: undo`, but `applied_transform` is {found};"
             " it must be 3 rows of 4 numbers, as ns-process-data writes it. Set `source.applied_transform: keep`"
         )
     matrix = np.eye(4)
@@ -296,10 +299,7 @@ def load(path: Path) -> dict[str, Any]:
     if not path.is_file():
         hint = did_you_mean_path(path)
         raise InputError(f"{path}: not found; a `folder` scene needs it (docs/guide/own-data.md shows how to make one){hint}")
-    try:
-        document = json.loads(path.read_text())
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from None
+    document = read_json(path, "a list of cameras")
     if not isinstance(document, dict):
         raise InputError(f"{path}: found a {type(document).__name__}, expected an object with `frames`")
     return document
@@ -310,11 +310,15 @@ def _refuse_misspelt(path: Path, document: dict[str, Any]) -> None:
     frames = document.get("frames")
     places = [("", document)]
     places += [(f"frames[{i}]: ", f) for i, f in enumerate(frames if isinstance(frames, list) else []) if isinstance(f, dict)]
+    near: dict[str, list[str]] = dict.fromkeys((*KEYS, "pixel_centers_at"), [])
     for where, place in places:
         for key in place:
-            near = difflib.get_close_matches(key, KEYS, 1, MISSPELT) if key not in KEYS and key != "pixel_centers_at" else []
-            if near and near[0] not in place:
-                raise InputError(f"{path}: {where}`{key}`: unknown key. Did you mean `{near[0]}`? Rename or remove it")
+            if key not in near:
+                if len(near) > limits.KEYS:
+                    raise InputError(f"{path}: more than {limits.KEYS} different keys; this is no list of cameras")
+                near[key] = difflib.get_close_matches(key, KEYS, 1, MISSPELT) if len(key) < 64 else []
+            if near[key] and near[key][0] not in place:
+                raise InputError(f"{path}: {where}`{key}`: unknown key. Did you mean `{near[key][0]}`? Rename or remove it")
 
 
 def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
@@ -322,6 +326,8 @@ def _frames(path: Path, document: dict[str, Any], key: str) -> list[Any]:
     if not isinstance(frames, list) or not frames:
         found = f"no `{key}`" if frames is None else f"`{key}` is empty" if frames == [] else f"`{key}` is not a list"
         raise InputError(f"{path}: {found}; at least one photograph with file_path and transform_matrix is needed")
+    if len(frames) > limits.FRAMES:
+        raise InputError(f"{path}: {len(frames)} entries in `{key}`; allowed are {limits.FRAMES}")
     return frames
 
 
@@ -329,8 +335,27 @@ def _entry(path: Path, index: int, entry: Any, key: str) -> dict[str, Any]:
     if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str) or not entry["file_path"]:
         raise InputError(f"{path}: {key}[{index}]: needs a `file_path` (text) and a `transform_matrix`")
     file_path = entry["file_path"].removeprefix("./")
+    if fault := fault_of_path(file_path):
+        raise InputError(f"{path}: {key}[{index}]: `file_path` {shown(file_path)} {fault}")
+    for other in ("mask_path", "depth_file_path"):
+        if entry.get(other) and (fault := fault_of_path(entry[other])):
+            raise InputError(f"{path}: {key}[{index}]: `{other}` {shown(entry[other])} {fault}")
     stated = {name: value for name, value in entry.items() if not name.startswith("_")}  # reserved for the readers
     return {**stated, "file_path": file_path, "_where": f"{key}[{index}] ({file_path})"}
+
+
+def fault_of_path(stated: Any) -> str:
+    """Return why a path in a list of cameras names no file, or an empty text. Where it leads is left open: it is read alone."""
+    if not isinstance(stated, str):
+        return "is no text"
+    if len(stated) > limits.TEXT:
+        return f"has {len(stated)} characters (allowed {limits.TEXT})"
+    *folders, name = Path(stated).parts or ("",)
+    for part in folders:
+        if fault := fault_of_name(part.lstrip("./") or "root", 255):
+            return f"goes through no folder ({part!r:.40} {fault})"
+    fault = fault_of_name(name)
+    return f"names no file ({name!r:.40} {fault})" if fault else ""
 
 
 def _matching(path: Path, entries: list[dict[str, Any]], pattern: str | None) -> list[dict[str, Any]]:
@@ -347,13 +372,20 @@ def _unique_names(path: Path, entries: list[dict[str, Any]]) -> None:
     seen: dict[str, dict[str, Any]] = {}
     for entry in entries:
         name = _name(entry)
-        other = seen.setdefault(name, entry)
+        if fault := fault_of_name(name):
+            raise InputError(f"{path}: {entry['_where']}: the name of a view {fault}; rename the photograph")
+        other = seen.setdefault(same_name(name), entry)
         if other is entry:
             continue
         if _one_photograph(other["file_path"], entry["file_path"]):
             raise InputError(
                 f"{path}: {other['_where']} and {entry['_where']} are the same photograph, which is listed twice; remove one of"
                 " the two frames"
+            )
+        if _name(other) != name:
+            raise InputError(
+                f"{path}: views {_name(other)!r} and {name!r} are one where capital letters do not count; rename one of the"
+                " photographs"
             )
         raise InputError(
             f"{path}: {other['file_path']!r} and {entry['file_path']!r} would both be view {name!r}; file names without"
@@ -430,7 +462,7 @@ def _pixel_offset(path: Path, document: dict[str, Any], setting: str) -> float:
     if text.startswith("half") or text == "0.5":
         return 0.0
     raise InputError(
-        f"{path}: `pixel_centres_at` is {stated!r}; allowed: 'integer coordinates', 'half-integer coordinates'."
+        f"{path}: `pixel_centres_at` is {shown(stated)}; allowed: 'integer coordinates', 'half-integer coordinates'."
         " Or set `source.pixel_centre: half` or `integer`"
     )
 
@@ -463,7 +495,9 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
         return default
     value = values[key]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{path}: {where}: `{key}` is {value!r}; expected a finite number")
+        raise InputError(f"{path}: {where}: `{key}` is {shown(value)}; expected a finite number")
+    if abs(value) > limits.NUMBER:
+        raise InputError(f"{path}: {where}: `{key}` is {value:g}; expected a number up to {limits.NUMBER:g}")
     return float(value)
 
 
@@ -559,6 +593,12 @@ def _camera(
         raise InputError(f"{path}: {where}: no focal length; give `fl_x` (pixels) or `camera_angle_x` (radians)")
     if not (fx > 0 and fy > 0):
         raise InputError(f"{path}: {where}: focal lengths fl_x = {fx:g}, fl_y = {fy:g}; must be positive pixels")
+    low, high = (share * max(width, height) for share in limits.FOCAL)
+    if not (low <= min(fx, fy) and max(fx, fy) <= high):
+        raise InputError(
+            f"{path}: {where}: focal lengths fl_x = {fx:g}, fl_y = {fy:g} of a {width}x{height} image; expected"
+            f" {low:g} to {high:g} pixels"
+        )
     cx = _number(path, where, values, "cx", width / 2 - offset) + offset
     cy = _number(path, where, values, "cy", height / 2 - offset) + offset
     reach = 0.25 if strict else 1.0  # without w and h, only the principal point can reveal another resolution
@@ -591,7 +631,7 @@ def _lens(path: Path, where: str, values: dict[str, Any]) -> Distortion:
     fisheye = model in FISHEYE or bool(values.get("is_fisheye", False))
     if not fisheye and model not in PERSPECTIVE:
         allowed = ", ".join((*PERSPECTIVE, *FISHEYE))
-        raise InputError(f"{path}: {where}: `camera_model` {values['camera_model']!r}: unknown; allowed: {allowed}")
+        raise InputError(f"{path}: {where}: `camera_model` {shown(values['camera_model'])}: unknown; allowed: {allowed}")
     k = tuple(_number(path, where, values, f"k{i}", 0.0) for i in (1, 2, 3, 4))
     p = tuple(_number(path, where, values, f"p{i}", 0.0) for i in (1, 2))
     if model in ("PINHOLE", "SIMPLE_PINHOLE") and not fisheye and (any(k) or any(p)):
@@ -619,13 +659,15 @@ def _fault_of_pose(entry: dict[str, Any], key: str) -> str:
     """Return why `entry[key]` is not a rigid camera-to-world matrix, or an empty text if it is."""
     try:
         matrix = np.array(entry.get(key), np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (4, 4):
         found = "missing" if key not in entry else f"has shape {'x'.join(map(str, matrix.shape)) or 'of a scalar'}"
         return f"{found}; expected 4 rows of 4 numbers, camera-to-world"
     if not np.isfinite(matrix).all():
         return "holds NaN or infinity: this image has no pose; remove the frame"
+    if np.abs(matrix).max() > limits.NUMBER:
+        return f"holds {np.abs(matrix).max():g}; expected numbers up to {limits.NUMBER:g}"
     rotation, last = matrix[:3, :3], matrix[3]
     determinant = float(np.linalg.det(rotation))
     if np.abs(last - [0, 0, 0, 1]).max() > 1e-6:

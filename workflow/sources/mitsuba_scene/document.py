@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ET
+from dataclasses import dataclass
 from pathlib import Path
 from xml.parsers import expat
 
 from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.documents import check_file, reading
+from workflow.intake.names import shown
 from workflow.settings.names import did_you_mean_path
 
 WHERE_FROM = (
@@ -32,7 +35,7 @@ def referenced_files(xml: Path) -> list[Path]:
     found: dict[Path, None] = {}
     missing: dict[str, None] = {}
     tags: set[str] = set()
-    _collect(xml, [xml.parent], {}, found, missing, tags, 0)
+    _Search(found, missing, tags).collect(xml, [xml.parent], {}, 0)
     if missing:
         names = list(missing)
         more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
@@ -47,55 +50,90 @@ def referenced_files(xml: Path) -> list[Path]:
     return sorted(found)
 
 
-def _collect(
-    xml: Path,
-    folders: list[Path],
-    defaults: dict[str, str],
-    found: dict[Path, None],
-    missing: dict[str, None],
-    tags: set[str],
-    depth: int,
-) -> None:
+@dataclass
+class _Search:
+    """What is found in the XML files of a scene: files, names of missing ones, tags; and how many elements there are."""
+
+    found: dict[Path, None]
+    missing: dict[str, None]
+    tags: set[str]
+    elements: int = 0
+    documents: int = 0
+
+    def collect(self, xml: Path, folders: list[Path], defaults: dict[str, str], depth: int) -> None:
+        """Add what one XML file names, and what the files name that it includes."""
+        self.documents += 1
+        if self.documents > limits.XML_FILES:
+            raise InputError(
+                f"{xml}: more than {limits.XML_FILES} XML files with all that are included; does a file include itself?"
+            )
+        root = _root(xml)
+        if depth == 0 and root.tag != "scene":
+            raise InputError(f"{xml}: the outermost element is <{root.tag:.40}>, expected <scene version='3.0.0'>")
+        self.found[xml] = None
+        folders = list(folders)
+        for element in root.iter():
+            self.elements += 1
+            if self.elements > limits.XML_ELEMENTS or len(defaults) > limits.XML_DEFAULTS:
+                raise InputError(
+                    f"{xml}: more than {limits.XML_ELEMENTS} elements, or {limits.XML_DEFAULTS} <default> values, with what is"
+                    " included"
+                )
+            self.tags.add(element.tag)
+            if element.tag == "default":
+                defaults.setdefault(element.get("name", ""), element.get("value", ""))
+            elif element.tag == "path":
+                folders.insert(0, xml.parent / _substitute(xml, element.get("value", "."), defaults))
+                continue
+            name = element.get("filename")
+            if element.tag == "string" and element.get("name") == "filename":
+                name = element.get("value")
+            if not name:
+                continue
+            name = _substitute(xml, name, defaults)
+            with reading(xml, f"the file name {shown(name)} cannot be used"):
+                path = next((folder / name for folder in folders if (folder / name).is_file()), None)
+            if path is None:
+                self.missing[name] = None
+            elif element.tag == "include":
+                if depth >= _DEEPEST:
+                    raise InputError(f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?")
+                self.collect(path, folders, defaults, depth + 1)
+            else:
+                self.found[path] = None
+
+
+def _root(xml: Path) -> ET.Element:
+    """Return the outermost element of an XML file, after checking how deep its elements are nested."""
+    check_file(xml, limits.XML_BYTES, "a Mitsuba scene")
+    depth, root = 0, None
     try:
-        root = ET.parse(xml).getroot()
+        for event, element in ET.iterparse(xml, ("start", "end")):
+            root = element if root is None else root
+            depth += 1 if event == "start" else -1
+            if depth > limits.XML_DEPTH:
+                raise InputError(f"{xml}: elements are nested more than {limits.XML_DEPTH} levels deep")
     except ET.ParseError as error:
         line, column = error.position
         raise InputError(
             f"{xml}, line {line}, column {column + 1}: not well-formed XML ({expat.ErrorString(error.code)})."
             " Mend that line; `mitsuba` refuses the file too"
         ) from None
-    except UnicodeDecodeError as error:
+    except InputError:
+        raise
+    except (ValueError, LookupError, OSError) as error:  # an encoding that is unknown, or bytes that are none of its letters
         raise InputError(f"{xml}: not text ({error}); expected a Mitsuba 3 scene") from None
-    if depth == 0 and root.tag != "scene":
-        raise InputError(f"{xml}: the outermost element is <{root.tag}>, expected <scene version='3.0.0'>")
-    found[xml] = None
-    folders = list(folders)
-    for element in root.iter():
-        tags.add(element.tag)
-        if element.tag == "default":
-            defaults.setdefault(element.get("name", ""), element.get("value", ""))
-        elif element.tag == "path":
-            folders.insert(0, xml.parent / _substitute(element.get("value", "."), defaults))
-            continue
-        name = element.get("filename")
-        if element.tag == "string" and element.get("name") == "filename":
-            name = element.get("value")
-        if not name:
-            continue
-        name = _substitute(name, defaults)
-        path = next((folder / name for folder in folders if (folder / name).is_file()), None)
-        if path is None:
-            missing[name] = None
-        elif element.tag == "include":
-            if depth >= _DEEPEST:
-                raise InputError(f"{xml}: <include> goes {_DEEPEST} levels deep at {path}; does a file include itself?")
-            _collect(path, folders, defaults, found, missing, tags, depth + 1)
-        else:
-            found[path] = None
+    if root is None:
+        raise InputError(f"{xml}: empty; expected a Mitsuba 3 scene")
+    return root
 
 
-def _substitute(text: str, defaults: dict[str, str]) -> str:
+def _substitute(xml: Path, text: str, defaults: dict[str, str]) -> str:
     """Replace every $name by its default, longest name first, as Mitsuba does."""
-    for name in sorted(defaults, key=len, reverse=True):
-        text = re.sub(re.escape("$" + name), lambda _, value=defaults[name]: value, text)
+    for name in sorted(defaults, key=len, reverse=True) if "$" in text else ():
+        text = text.replace("$" + name, defaults[name])
+        if len(text) > limits.TEXT:
+            break
+    if len(text) > limits.TEXT:
+        raise InputError(f"{xml}: a file name has more than {limits.TEXT} characters ({shown(text)})")
     return text

@@ -1,0 +1,112 @@
+"""Headers of pictures from strangers: what they ask for is known, and refused, before a pixel is decoded."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from iif_core.errors import InputError
+from workflow.intake import limits
+from workflow.intake.documents import check_file, reading
+
+FORMATS = ("PNG", "JPEG", "MPO")
+"""Formats of Pillow that photographs may have, whatever their name: other readers, such as that of PostScript, stay shut. MPO is
+what telephones write as .jpg."""
+TEXTURES = (*FORMATS, "BMP", "TGA", "PPM")
+"""The same for textures of Mitsuba scenes and of meshes."""
+PNG_MAGIC = b"\x89PNG"
+EXR_MAGIC = b"\x76\x2f\x31\x01"
+_LARGEST_FILE = 4 << 30
+
+
+def check_pixels(path: Path, width: int, height: int, channels: int = 1) -> None:
+    """Refuse a picture of more than `limits.PICTURE_PIXELS`, or without any."""
+    if width < 1 or height < 1:
+        raise InputError(f"{path}: {width}x{height} pixels; a picture needs at least one")
+    if width * height > limits.PICTURE_PIXELS or width * height * channels > limits.PICTURE_VALUES:
+        more = f" of {channels} channels" if channels > 1 else ""
+        raise InputError(
+            f"{path}: {width}x{height} pixels{more}, {width * height / 1e6:.4g} million; allowed are"
+            f" {limits.PICTURE_PIXELS / 1e6:.0f} million (SECURITY.md). Reduce it, and the intrinsics with it"
+        )
+
+
+def check_chunks(path: Path) -> None:
+    """Refuse a PNG whose chunks do not end in the file: Pillow would ask for as much memory as the length of one says."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        at, kind = 8, b"" if file.read(4) == PNG_MAGIC else b"IEND"
+        while kind != b"IEND":
+            file.seek(at)
+            head = file.read(8)
+            kind, length = head[4:], int.from_bytes(head[:4], "big")
+            if at == 8 and kind != b"IHDR":
+                raise InputError(f"{path}: not a readable image (a PNG without a header)")
+            at += 12 + length
+            if len(head) < 8 or at > size:
+                raise InputError(f"{path}: cut short (no end mark: an interrupted copy or download?); copy the file again")
+
+
+@contextmanager
+def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
+    """Open a picture by Pillow, with its size checked; raises InputError for a size that is not allowed."""
+    from PIL import Image
+
+    check_file(path, _LARGEST_FILE, "a picture")
+    check_chunks(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the size is checked here, against our own limit
+        try:
+            image = Image.open(path, formats=formats)
+        except Image.DecompressionBombError as error:
+            raise InputError(f"{path}: too many pixels ({error}); allowed are {limits.PICTURE_PIXELS}") from None
+        with image:
+            check_pixels(path, *image.size)
+            yield image
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return width and height of an EXR from its header.
+
+    Raises:
+        InputError: no EXR, several parts, deep pixels, or more pixels or channels than are allowed.
+    """
+    import OpenEXR
+
+    check_file(path, _LARGEST_FILE, "an EXR image")
+    with path.open("rb") as file:
+        if file.read(4) != EXR_MAGIC:
+            raise InputError(f"{path}: not a readable EXR image (it does not begin like one)")
+    with reading(path, "not a readable EXR image"), OpenEXR.File(str(path), header_only=True) as file:
+        if len(file.parts) != 1:
+            raise InputError(f"{path}: {len(file.parts)} parts; an EXR of one part is needed")
+        header = file.header()
+        low, high = header["dataWindow"]
+        width, height = int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+        channels = len(header["channels"])
+        kind = header.get("type")
+    if "deep" in str(kind).lower():
+        raise InputError(f"{path}: deep pixels; flat ones are needed")
+    if not 1 <= channels <= limits.PICTURE_CHANNELS:
+        raise InputError(f"{path}: {channels} channels; allowed are 1 to {limits.PICTURE_CHANNELS}")
+    check_pixels(path, width, height, channels)
+    return width, height
+
+
+def check_texture(path: Path) -> None:
+    """Refuse a texture with more pixels than are allowed; what is no picture that we know is left to who reads it."""
+    kind = path.suffix.lower()
+    if kind == ".exr":
+        exr_size(path)
+    elif kind in (".hdr", ".rgbe"):
+        with path.open("rb") as file:
+            found = re.search(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})", file.read(4096))
+        if found:
+            check_pixels(path, int(found[2]), int(found[1]))
+    elif kind in (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm", ".pgm", ".pfm"):
+        with reading(path, "not a readable picture"), opened(path, TEXTURES):
+            pass
