@@ -33,6 +33,8 @@ BRIGHT = 0.9
 """Value on the screen, linear, of the brightest pixel but one in 500."""
 CLIPPED = 254
 """Pixels with a channel of at least this are left out."""
+EDGE = 0.01
+"""Points whose distance from the eye differs from that of the photographs' mesh by more than this share are left out."""
 SLIDES = 12
 """Movements of a slider that are timed."""
 
@@ -111,8 +113,13 @@ def _stops(page: Any, chosen: list[int], places: list[Any], look: str) -> float:
     return stops
 
 
-def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], samples: int) -> list[np.ndarray]:
-    """Diffuse light (n, 3) of each lamp at the points under the pixels."""
+def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], samples: int) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Which points (n,) are those of the photographs' mesh, and the diffuse light (n, 3) of each lamp there.
+
+    Points are where rays from the eye meet the mesh: those of the page lie up to a millimetre behind it, because it stores
+    positions in 16 bits, and what begins there sees the other side of a wall.
+    """
+    from iif_core.light.transport.geometry import trace
     from iif_core.light.transport.scene import PathOptions, Scene
     from iif_core.light.transport.shading import shading_caches
     from workflow.scene.recovered import read_recovered
@@ -120,7 +127,12 @@ def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], sam
     recovered = read_recovered(job)
     geometry, material = recovered.surface.traceable(recovered.light.emits)
     turn = np.reshape(document["worldFromRoom"], (3, 3))
-    points, normals, eye = (facts[name] @ turn for name in ("point", "normal", "eye"))
+    points, eye = (facts[name] @ turn for name in ("point", "eye"))
+    distance = np.linalg.norm(points - eye, axis=1)
+    way = (points - eye) / distance[:, None]
+    face, reach = trace(geometry, eye, way)
+    same = np.abs(reach / distance - 1) < EDGE
+    points, normals = eye + np.where(same, reach, distance)[:, None] * way, geometry.normals[np.maximum(face, 0)]
     out = []
     for number, lamp in enumerate(document["lamps"]):
         lit = np.isin(recovered.emitter_id, lamp["emitters"])
@@ -132,7 +144,7 @@ def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], sam
         )
         world = Scene(geometry, material, light.emitters(geometry))
         out.append(shading_caches(world, points, normals, eye - points, [], PathOptions(samples, 16, 31 + number))[0])
-    return out
+    return same, out
 
 
 def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
@@ -148,12 +160,12 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     uv = found["facts"]["uv"]
     base = bilinear(linear_from_srgb(stored.pictures["base"] / 255), uv)
     kd = base * (1 - bilinear(stored.pictures["surface"] / 255, uv)[:, 2:])
-    row: dict[str, Any] = {"scene": scene, "mb": path.stat().st_size / 1e6, "points": len(uv)}
+    row: dict[str, Any] = {"scene": scene, "mb": path.stat().st_size / 1e6, "points": len(uv), "samples": asked.samples}
     row |= {"opened_s": found["opened"], "slide_ms": found["slide"], "lamps": []}
-    paths = traced(job, stored.document, found["facts"], asked.samples)
+    same, paths = traced(job, stored.document, found["facts"], asked.samples)
     for number, (lamp, light) in enumerate(zip(stored.document["lamps"], paths, strict=True)):
         pixels = found["pixels"][number]
-        kept = pixels.max(1) < CLIPPED
+        kept = (pixels.max(1) < CLIPPED) & same
         gain = stored.document["exposure"] * 2.0 ** found["stops"][number]
         shown = linear_from_srgb(pixels / 255) / gain
         mapped = kd * bilinear(stored.picture_of(stored.light[:, number] * np.array(lamp["color"])), uv)
@@ -163,10 +175,10 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
             {
                 "lamp": lamp["name"],
                 "stops": found["stops"][number],
-                "clipped": float(1 - kept.mean()),
+                "clipped": float((pixels.max(1) >= CLIPPED).mean()),
                 "pixels": float(shown[kept].sum() / total),
                 "maps": float(mapped[kept].sum() / total),
-                "maps_of_all": float(mapped.sum() / expected.sum()),
+                "maps_of_all": float(mapped[same].sum() / expected[same].sum()),
                 "median": float(np.median(np.abs(shown - expected)[kept].mean(1)) / expected[kept].mean()),
             }
         )
