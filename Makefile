@@ -12,7 +12,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
+.PHONY: help setup scenes verify test test-all test-slurm fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -28,6 +28,7 @@ help:
 	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
 	@echo 'make test-all         every test, also those on large scenes'
 	@echo 'make fuzz             read changed files of every kind (CASES=100000 SEED=0 JOBS=2)'
+	@echo 'make test-slurm       the Slurm profiles on a Slurm of one node, which is started and stopped'
 	@echo 'make doctor           what this machine offers and lacks'
 	@echo 'make setup            only the environment, .venv'
 	@echo 'make lint | format    check | rewrite the style of Python and Snakemake files'
@@ -92,6 +93,10 @@ SEED ?= 0
 JOBS ?= $(shell nproc 2>/dev/null || echo 2)
 fuzz: setup
 	$(PYTHON_BIN) -m tests.fuzz.runner --cases $(CASES) --seed $(SEED) --jobs $(JOBS)
+
+# The Slurm profiles on a Slurm of one node, in namespaces that end with it: needs root, slurm-wlm and munge; minutes.
+test-slurm: setup
+	bash tests/slurm/run.sh $(PYTEST_ARGS)
 
 # What tests take from npm: Khronos' validator of glTF, axe-core, which looks for what hinders people with disabilities, and three.js,
 # which opens scene.glb as viewers on the web do. Machines without npm test the structure of the files alone. Pages need Chromium as well, which comes with the machine.
