@@ -110,9 +110,8 @@ def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
 
 def test_overhead_of_one_job_for_a_scene(batch, local):
     folder, start = batch("undisturbed"), time.monotonic()
-    done = subprocess.run(
-        command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "scenes"), env=environment(), capture_output=True, text=True
-    )
+    whole = command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "scenes")
+    done = subprocess.run(whole, env=environment(), capture_output=True, text=True)
     seconds = time.monotonic() - start
     assert done.returncode == 0, done.stderr[-3000:]
     assert manifests(folder) == manifests(local[0])

@@ -11,6 +11,7 @@ import pytest
 
 from iif_core.errors import InputError
 from workflow.artifacts import StageReader
+from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import write_exr
 from workflow.artifacts.store import rgb, split_rgb
 from workflow.comparison.maps import find, own_maps, read_map
@@ -96,7 +97,7 @@ def test_a_result_beside_itself_and_beside_another(workflow):
     from workflow.artifacts.files import sha256_of
 
     document["files"]["cells.parquet"] |= {"sha256": sha256_of(path), "bytes": path.stat().st_size}
-    manifest.write_text(json.dumps(document))
+    manifests.write(manifest, document)
     result = workflow.run("compare/tiny,other")
     assert result.returncode == 0, result.stderr[-2000:]
     rows = pd.read_parquet(folder / "compare/tiny,other/compare.parquet")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,7 +62,8 @@ def open_result(name: str, quality: str = "draft") -> Result:
     for stage in STAGES:
         home = _home(stage, name, folders, quality)
         if home:
-            stages[stage] = StageReader(Path("results") / home / stage, stage, home)
+            folder = Path("results") / home / stage
+            stages[stage] = StageReader(folder, stage, _scene_in(folder) or home)
     missing = [stage for stage in NEEDED if stage not in stages]
     if not stages:
         raise InputError(
@@ -74,6 +76,15 @@ def open_result(name: str, quality: str = "draft") -> Result:
             f" `snakemake --cores 2 scenes/{name}`"
         )
     return Result(name, stages)
+
+
+def _scene_in(folder: Path) -> str | None:
+    """Return the scene that a manifest names: a result that was copied to keep it under another name can be compared."""
+    try:
+        found = json.loads((folder / MANIFEST).read_bytes())["scene"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return found if isinstance(found, str) else None
 
 
 def _home(stage: str, name: str, folders: list[str], quality: str) -> str:
