@@ -269,6 +269,9 @@ def ready(targets: dict[str, Target] = TARGETS) -> Iterator[Run]:
     """Build the valid inputs; gives a function (cases, seed) -> results in the same order."""
     with tempfile.TemporaryDirectory(prefix="iif-fuzz-") as folder:
         scratch = Path(folder).resolve()
+        import mitsuba
+
+        before = mitsuba.variant(), sys.dont_write_bytecode
         warm()
         pristine = Pristine(scratch / "pristine", targets)
         gc.collect()
@@ -281,6 +284,9 @@ def ready(targets: dict[str, Target] = TARGETS) -> Iterator[Run]:
 
         yield run
         gc.unfreeze()
+        sys.dont_write_bytecode = before[1]
+        if before[0]:  # that of other tests in this process
+            mitsuba.set_variant(before[0])
 
 
 def _worker(cases: list[tuple[str, int]], seed: int, run: Run, out: Path, until: float) -> None:

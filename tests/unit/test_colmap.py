@@ -108,7 +108,7 @@ def test_capture_of_a_model_matches_the_room(room, views, tmp_path):
     [
         (lambda v: v * 1.3, "No usual convention fits"),
         (lambda v: v * 1000, "mesh and poses are in different units"),
-        (lambda v: np.stack([v[:, 0], v[:, 2], -v[:, 1]], 1), "turning the mesh from y-up to z-up (x, -z, y) fits"),
+        (lambda v: np.stack([v[:, 0], v[:, 2], -v[:, 1]], 1), "turns the mesh from y-up to z-up (x, -z, y), fits"),
     ],
 )
 def test_sparse_points_tell_a_wrong_mesh(room, views, tmp_path, change, words):

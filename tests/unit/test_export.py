@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -599,7 +600,8 @@ def test_a_browser_shows_what_was_written(tmp_path):
         missing("no Chromium, or no three.js, which `make node` installs")
     camera = view(cx=19.0, cy=21.0)
     path, values, depth = written_glb(tmp_path, camera)
-    opened = gltf_viewer.open_in_browser(path, [camera])
+    with ThreadPoolExecutor(1) as other:  # Playwright wants a thread for itself, and other tests keep a browser open in this one
+        opened = other.submit(gltf_viewer.open_in_browser, path, [camera]).result()
     assert opened.complaints == [] and all(name == "" or name.startswith(("three/", "scene.glb")) for name in opened.requests)
     same_pixels(opened.values[0], opened.depth[0], values, depth)
     assert opened.facts["lamps"].keys() == {"lamp.emitter0"} and opened.facts["cameras"] == 1

@@ -17,7 +17,7 @@ def everything(root):
     """Bytes of every file of the stages but manifests and the held-out photograph itself."""
     folder = Path(root) / "results/own"
     files = sorted(
-        p for p in folder.rglob("*") if p.is_file() and p.name != "manifest.json" and p.parts[-2] not in ("benchmarks",)
+        p for p in folder.rglob("*") if p.is_file() and p.name != "manifest.json" and p.parts[-2] not in ("benchmarks", "stamps")
     )
     return {str(p.relative_to(folder)): p.read_bytes() for p in files if p != folder / f"capture/photos/{HELD_OUT}.exr"}
 
