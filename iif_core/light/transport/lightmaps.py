@@ -31,10 +31,36 @@ from iif_core.reflectance import brdf
 
 Array = np.ndarray
 
+DRAWS = 2
+"""Emitters that are drawn at a point of the map for each direction."""
 CELLS = 1 << 14
 """Squares of which the surface would consist if it were cut evenly; their edge is that of the voxels of known light."""
 LEARNED = 0.5
 """Rays for each point of a map that find the surface from which it gets reflected light."""
+
+
+class _Given:
+    """Random numbers of which the first is given."""
+
+    def __init__(self, first: Any, rng: Any):
+        self._first, self._rng = [first], rng
+
+    def next_float32(self) -> Any:
+        return self._first.pop() if self._first else self._rng.next_float32()
+
+    def next_uint32(self) -> Any:
+        return self._rng.next_uint32()
+
+
+def _drawn_light(world: World, rng: Any, origin: Any, normal: Any, number: Any, count: Any) -> Any:
+    """Collect the light of the emitter that draw `number` of `count` finds. Which emitter it is, is drawn once in each of `count`
+    strata, so that every lamp has its share of the draws at every point. Returns the gain, 0."""
+    if not world.emitters.can_be_sampled:
+        return mi.Color3f(0)
+    light = sample_light(world, _Given((number + uniform(rng)) / count, rng), origin, normal, mi.Bool(True))
+    cosine = dr.maximum(dr.dot(normal, light.wi), 0) * dr.inv_pi
+    share = dr.select(light.valid, cosine * power_weight(DRAWS * light.pdf, cosine) / (DRAWS * light.pdf), 0)
+    return light.gain(world, mi.Color3f(share))
 
 
 @dr.syntax
@@ -53,11 +79,8 @@ def _trace_points(
     nothing = mi.Color3f(0)
     origin = offset_from(point, normal)
     while sample < end:
-        if world.emitters.can_be_sampled:
-            light = sample_light(world, rng, origin, normal, mi.Bool(True))
-            cosine = dr.maximum(dr.dot(normal, light.wi), 0) * dr.inv_pi
-            share = dr.select(light.valid, cosine * power_weight(light.pdf, cosine) / light.pdf, 0)
-            nothing += light.gain(world, mi.Color3f(share))
+        for draw in range(DRAWS):
+            nothing += _drawn_light(world, rng, origin, normal, DRAWS * mi.Float(sample) + draw, DRAWS * mi.Float(samples))
         # The first number of a direction is drawn once in each of as many strata as there are samples.
         u1 = dr.minimum((mi.Float(sample) + uniform(rng)) / mi.Float(samples), 1 - 2**-24)
         u2 = uniform(rng)
@@ -73,9 +96,10 @@ def _arriving(
     world: World, known: LampCache | None, rng: Any, origin: Any, direction: Any, pdf: Any, max_bounces: Any
 ) -> tuple[Any, Any]:
     """Collect what arrives along a ray that leaves a point of the map. Returns the gain, 0, and the random stream."""
+    one = pdf / DRAWS  # against the density of one draw of an emitter, of which there are DRAWS for each direction
     if known is None:
-        return incoming(world, rng, origin, direction, pdf, 1, max_bounces, pdf > 0)
-    emitted, rng = incoming(world, rng, origin, direction, pdf, 1, 1, pdf > 0)
+        return incoming(world, rng, origin, direction, one, 1, max_bounces, pdf > 0)
+    emitted, rng = incoming(world, rng, origin, direction, one, 1, 1, pdf > 0)
     reflected, rng = _reflected(world, known, rng, origin, direction, max_bounces, (pdf > 0) & (max_bounces > 1))
     return emitted + reflected, rng
 
