@@ -1,12 +1,13 @@
 """Whether room.html shows the light of every lamp as paths find it, how fast it opens, and how fast a slider answers.
 
-    python tests/benchmarks/room_light.py kitchen modern-hall [--quality draft] [--views 8] [--samples 1024]
+    python tests/benchmarks/room_light.py kitchen modern-hall [--quality draft] [--views 6] [--samples 256]
 
 Run it in a working folder where stage room of the scenes is finished. For each it opens the page in Chromium, which draws by
 software, walks to the cameras of some photographs, and looks at a grid of pixels with one lamp on at a time, without gloss. The
 exposure is chosen for each lamp so that few pixels are clipped; those are left out. The light of the lamp at the points under
 the pixels is traced anew, on the mesh of the photographs and by the integrator of stage shading, times the diffuse reflectance
-that the page has there. Rows are kept in docs/results/data/room_light.json, and the tables of docs/results/exports.md are new.
+that the page has there. Single texels are compared with many whole paths. Rows are kept in docs/results/data/room_light.json,
+and the tables of docs/results/exports.md are made anew.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ CLIPPED = 254
 """Pixels with a channel of at least this are left out."""
 EDGE = 0.01
 """Points whose distance from the eye differs from that of the photographs' mesh by more than this share are left out."""
+DIM = 0.05
+"""Errors of texels are relative to their light, or to this share of the mean if that is more."""
 SLIDES = 12
 """Movements of a slider that are timed."""
 
@@ -147,6 +150,36 @@ def traced(job: Any, document: dict[str, Any], facts: dict[str, np.ndarray], sam
     return same, out
 
 
+def texel_errors(job: Any, stored: Any, asked: argparse.Namespace) -> list[dict[str, float]]:
+    """For each lamp, how far the stored light of single texels that photographs show is from that of many whole paths there."""
+    from iif_core.light.transport.lightmaps import light_maps
+    from iif_core.light.transport.scene import PathOptions
+    from workflow.exporters.atlas import bake, read_parts, texels_of
+    from workflow.room.light import find_lamps, inside_solids, lit_scene, lit_texels
+    from workflow.scene.recovered import read_recovered
+
+    recovered = read_recovered(job)
+    parts = read_parts(job.read("unwrap"), recovered)
+    lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment)
+    texels = lit_texels(parts, stored.document["light"]["size"])
+    atlas = bake(parts, recovered, job.read("affines").table("cells.parquet")["uncertainty"], stored.document["light"]["size"])
+    lit = lit_scene(parts, recovered.surface, lamps)
+    two_sided = np.array([part.double_sided for part in parts])
+    free = ~two_sided[texels.part] & ~inside_solids(lit.scene.geometry, texels, two_sided[lit.part_of_face], 1)
+    free &= atlas.seen.ravel()[texels.index] & np.isin(texels.index, texels_of(parts, texels.size).index)
+    rng = np.random.default_rng(5)
+    some = np.sort(rng.choice(np.flatnonzero(free), min(asked.texels, int(free.sum())), replace=False))
+    paths = PathOptions(asked.texel_samples, 16, 17)
+    of = lit.lamp_of_face, len(lamps.lamps), paths, lamps.environment, some.astype(np.uint32)
+    truth = light_maps(lit.scene, texels.points[some], texels.normals[some], *of).mean(2, dtype=np.float64)
+    found = stored.light[np.searchsorted(stored.arrays["texels"][:, 0], texels.index[some])].mean(2)
+    area = texels.edge[texels.part[some]][:, None] ** 2
+    error = (found - truth) / np.maximum(truth, DIM * truth.mean(0))
+    ratio = (area * found).sum(0) / (area * truth).sum(0)
+    rms, rare = np.sqrt((error**2).mean(0)), np.quantile(np.abs(error), 0.999, axis=0)
+    return [dict(zip(("ratio", "rms", "rare"), map(float, one), strict=True)) for one in zip(ratio, rms, rare, strict=True)]
+
+
 def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     """The row of one scene."""
     from iif_core.numerics.color import linear_from_srgb
@@ -162,6 +195,7 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     kd = base * (1 - bilinear(stored.pictures["surface"] / 255, uv)[:, 2:])
     row: dict[str, Any] = {"scene": scene, "mb": path.stat().st_size / 1e6, "points": len(uv), "samples": asked.samples}
     row |= {"opened_s": found["opened"], "slide_ms": found["slide"], "lamps": []}
+    texels = texel_errors(job, stored, asked)
     same, paths = traced(job, stored.document, found["facts"], asked.samples)
     for number, (lamp, light) in enumerate(zip(stored.document["lamps"], paths, strict=True)):
         pixels = found["pixels"][number]
@@ -180,9 +214,18 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
                 "maps": float(mapped[kept].sum() / total),
                 "maps_of_all": float(mapped[same].sum() / expected[same].sum()),
                 "median": float(np.median(np.abs(shown - expected)[kept].mean(1)) / expected[kept].mean()),
+                "texels": texels[number],
             }
         )
-        print(scene, {name: value if isinstance(value, str) else round(value, 4) for name, value in row["lamps"][-1].items()})
+        print(
+            scene,
+            {
+                name: value if isinstance(value, str) else round(value, 4)
+                for name, value in row["lamps"][-1].items()
+                if name != "texels"
+            },
+        )
+        print(texels[number])
     print(scene, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
     return row
 
@@ -192,18 +235,22 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
     from workflow.report.blocks import markdown
 
     pages = [[row["scene"], f"{row['mb']:.1f}", f"{row['opened_s']:.1f}", f"{row['slide_ms']:.0f}"] for row in rows]
-    lamps = []
+    lamps, texels = [], []
     for row in rows:
         for lamp in row["lamps"]:
             ratios = (f"{lamp[name]:.3f}" for name in ("pixels", "maps", "maps_of_all"))
             lamps.append([row["scene"], lamp["lamp"], *ratios, f"{100 * lamp['clipped']:.1f} %", f"{100 * lamp['median']:.1f} %"])
+            errors = (f"{lamp['texels'][name]:.3f}" for name in ("ratio", "rms", "rare"))
+            texels.append([row["scene"], lamp["lamp"], *errors])
     heads = {
         "room": ["scene", "room.html, MB", "opens, s", "slider, ms"],
         "room_lamps": ["scene", "lamp", "pixels", "maps", "maps, clipped too", "clipped", "median difference"],
+        "room_texels": ["scene", "lamp", "ratio of the means", "relative RMS error", "99.9th percentile"],
     }
     return {
         "room": "\n".join(markdown(heads["room"], pages, 1)),
         "room_lamps": "\n".join(markdown(heads["room_lamps"], lamps, 2)),
+        "room_texels": "\n".join(markdown(heads["room_texels"], texels, 2)),
     }
 
 
@@ -211,8 +258,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--quality", default="draft")
-    parser.add_argument("--views", type=int, default=8)
-    parser.add_argument("--samples", type=int, default=1024)
+    parser.add_argument("--views", type=int, default=6)
+    parser.add_argument("--samples", type=int, default=256)
+    parser.add_argument("--texels", type=int, default=2000)
+    parser.add_argument("--texel-samples", type=int, default=2048)
     asked = parser.parse_args()
     native.process_environment()
     native.prepare()

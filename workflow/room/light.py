@@ -218,7 +218,7 @@ def trace_lamps(
         return np.zeros((len(texels.index), len(lamps.lamps), 3), np.float32)
     lit = lit_scene(parts, surface, lamps)
     two_sided = np.array([part.double_sided for part in parts], bool)
-    inside = _inside(lit.scene.geometry, texels, two_sided[lit.part_of_face], seed)
+    inside = inside_solids(lit.scene.geometry, texels, two_sided[lit.part_of_face], seed)
     inside &= ~two_sided[texels.part]
     open_ = np.flatnonzero(~inside)
     back = np.flatnonzero(two_sided[texels.part])
@@ -274,7 +274,7 @@ def _trace(
     return out
 
 
-def _inside(geometry: Geometry, texels: LitTexels, two_sided: Array, seed: int) -> Array:
+def inside_solids(geometry: Geometry, texels: LitTexels, two_sided: Array, seed: int) -> Array:
     """(n,) bool: more than INSIDE of the rays from a texel meet a face, which is not shown from both sides, from behind."""
     from iif_core.light.transport.geometry import cosine_directions, trace
 
