@@ -38,6 +38,18 @@ def test_two_lamps_have_their_form_factors(T, light_maps):
     np.testing.assert_array_equal(alone[:, 0], maps[:, 0])
 
 
+def test_every_lamp_has_its_share_of_the_draws_at_every_point(T, light_maps):
+    """Of two equal lamps, each is drawn once for a single path: independent draws would leave one of them dark at half the points."""
+    lamps = [quad((x, -0.1, 2), (0, 0.2, 0), (0.2, 0, 0)) for x in (-0.4, 0.2)]
+    vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), *lamps])
+    geometry = T.build_geometry(vertices, faces, ids)
+    emitters = T.Emitters(geometry, np.where(ids[:, None] > 0, 1.0, 0.0) * np.ones(3), np.where(ids > 0, 1, 0))
+    scene = T.Scene(geometry, T.FaceMaterials(np.tile([0, 0, 0, 1, 1.0], (len(faces), 1))), emitters)
+    maps = light_maps(scene, repeated((0, 0, 0), 200), repeated((0, 0, 1), 200), ids - 1, 2, T.PathOptions(1, 1, 5))
+    assert (maps[..., 0] > 0).all()
+    assert maps[..., 0].std(0).max() < 0.1 * maps.mean()
+
+
 def test_lamps_of_a_furnace_add_up_to_the_geometric_series(T, light_maps):
     """Walls of a closed grey box that all shine with L: the lamps, two walls each, add up to D = L / (1 - rho)."""
     vertices, faces = box((0, 0, 0), (1, 2, 1.5), inward=True)
