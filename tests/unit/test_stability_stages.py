@@ -146,7 +146,15 @@ def test_extremes_are_scored_and_what_is_lost_is_counted(room):
     assert twice.light == pytest.approx(np.log(2), abs=0.05)
 
 
-@pytest.mark.parametrize("case", [case for case in extremes.CASES if not case.settings], ids=lambda case: case.name)
+SLOW = ("20 million faces hidden",)
+CASES = [
+    pytest.param(case, id=case.name, marks=[pytest.mark.long] if case.name in SLOW else [])
+    for case in extremes.CASES
+    if not case.settings
+]
+
+
+@pytest.mark.parametrize("case", CASES)
 def test_extreme_captures_are_captures(room, case):
     capture, _, folder = room
     changed = case.change(capture)

@@ -3,6 +3,7 @@
 import json
 import re
 
+import pytest
 from support import planned
 
 
@@ -28,6 +29,7 @@ def test_what_cannot_be_had_ends_before_any_job_with_one_error(workflow):
         assert "Traceback" not in result.stderr and "Select jobs" not in result.stderr
 
 
+@pytest.mark.long
 def test_a_bench_runs_three_points_in_the_room_and_targets_follow_it(workflow):
     result = workflow.run("bench/tiny")
     assert result.returncode == 0, result.stderr[-4000:]
