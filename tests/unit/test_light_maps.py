@@ -39,7 +39,7 @@ def test_two_lamps_have_their_form_factors(T, light_maps):
 
 
 def test_every_lamp_has_its_share_of_the_draws_at_every_point(T, light_maps):
-    """Of two equal lamps, each is drawn once for a single path: independent draws would leave one of them dark at half the points."""
+    """Of two equal lamps, each is drawn once for a path: independent draws would leave one of them dark at half the points."""
     lamps = [quad((x, -0.1, 2), (0, 0.2, 0), (0.2, 0, 0)) for x in (-0.4, 0.2)]
     vertices, faces, ids = merge([quad((-5, -5, 0), (10, 0, 0), (0, 10, 0)), *lamps])
     geometry = T.build_geometry(vertices, faces, ids)
