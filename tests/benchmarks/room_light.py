@@ -1,6 +1,6 @@
 """Whether room.html shows the light of every lamp as paths find it, how fast it opens, and how fast a slider answers.
 
-    python tests/benchmarks/room_light.py kitchen modern-hall [--quality draft] [--views 6] [--samples 256]
+    python tests/benchmarks/room_light.py kitchen modern-hall [--quality draft] [--views 12] [--samples 256]
 
 Run it in a working folder where stage room of the scenes is finished. For each it opens the page in Chromium, which draws by
 software, walks to the cameras of some photographs, and looks at a grid of pixels with one lamp on at a time, without gloss. The
@@ -195,7 +195,7 @@ def measured(scene: str, asked: argparse.Namespace) -> dict[str, Any]:
     kd = base * (1 - bilinear(stored.pictures["surface"] / 255, uv)[:, 2:])
     row: dict[str, Any] = {"scene": scene, "mb": path.stat().st_size / 1e6, "points": len(uv), "samples": asked.samples}
     row |= {"opened_s": found["opened"], "slide_ms": found["slide"], "lamps": []}
-    texels = texel_errors(job, stored, asked)
+    texels = texel_errors(Job("room", scene, asked.quality, 2), stored, asked)
     same, paths = traced(job, stored.document, found["facts"], asked.samples)
     for number, (lamp, light) in enumerate(zip(stored.document["lamps"], paths, strict=True)):
         pixels = found["pixels"][number]
@@ -258,7 +258,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*")
     parser.add_argument("--quality", default="draft")
-    parser.add_argument("--views", type=int, default=6)
+    parser.add_argument("--views", type=int, default=12)
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--texels", type=int, default=2000)
     parser.add_argument("--texel-samples", type=int, default=2048)
