@@ -238,18 +238,22 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--samples", type=int, default=64)
     parser.add_argument("--replicates", type=int, default=12)
-    asked = parser.parse_args()
+    measure(parser.parse_args(), ROWS, measured)
+
+
+def measure(asked: argparse.Namespace, place: Path, measured: Callable[[str, argparse.Namespace], dict[str, Any]]) -> None:
+    """Measure each scene, keep its row in `place` as soon as it is there, and make the page anew."""
     native.process_environment()
     native.prepare()
     native.limit_threads(os.cpu_count() or 1)
     from workflow.runtime import device
 
     device.mitsuba()
-    rows = json.loads(ROWS.read_text()) if ROWS.is_file() else []
+    rows = json.loads(place.read_text()) if place.is_file() else []
     for scene in asked.scenes:
         row = measured(scene, asked)
         rows = sorted([other for other in rows if other["scene"] != scene] + [row], key=lambda row: row["scene"])
-        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
+        place.write_text(json.dumps(rows, indent=1) + "\n")
     write_page()
 
 

@@ -13,8 +13,6 @@ and the tables of docs/results/exports.md are made anew.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import sys
 import time
 from dataclasses import replace
@@ -24,8 +22,6 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
-
-from workflow.runtime import native
 
 ROWS = Path("docs/results/data/room_light.json")
 STEP = 24
@@ -276,20 +272,9 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=256)
     parser.add_argument("--texels", type=int, default=2000)
     parser.add_argument("--texel-samples", type=int, default=2048)
-    asked = parser.parse_args()
-    native.process_environment()
-    native.prepare()
-    native.limit_threads(os.cpu_count() or 1)
-    from tests.benchmarks.exported import write_page
-    from workflow.runtime import device
+    from tests.benchmarks.exported import measure
 
-    device.mitsuba()
-    rows = json.loads(ROWS.read_text()) if ROWS.is_file() else []
-    for scene in asked.scenes:
-        row = measured(scene, asked)
-        rows = sorted([other for other in rows if other["scene"] != scene] + [row], key=lambda row: row["scene"])
-        ROWS.write_text(json.dumps(rows, indent=1) + "\n")
-    write_page()
+    measure(parser.parse_args(), ROWS, measured)
 
 
 if __name__ == "__main__":
