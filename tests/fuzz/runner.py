@@ -41,6 +41,8 @@ CPU_SECONDS = 10
 WALL_SECONDS = 60
 LONGEST_MESSAGE = 4_000
 ROW = Path("docs/results/data/reliability_fuzz.json")
+PORTION = 5_000
+"""Cases after which the counts are written down, so that a run that is stopped can go on (`--continue`)."""
 TOGETHER = 10
 """Cases that one forked process reads, one after the other: to fork takes longer than to read most of them."""
 GOOD = ("accepted", "refused")
@@ -289,18 +291,15 @@ def ready(targets: dict[str, Target] = TARGETS) -> Iterator[Run]:
             mitsuba.set_variant(before[0])
 
 
-def _worker(cases: list[tuple[str, int]], seed: int, run: Run, out: Path, until: float) -> None:
+def _worker(cases: list[tuple[str, int]], seed: int, run: Run, out: Path) -> None:
     with out.open("w") as file:
         for result in run(cases, seed):
-            if time.monotonic() > until:
-                return
             file.write(json.dumps(asdict(result)) + "\n")
             file.flush()
 
 
-def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, minutes: float = 0.0, tell: float = 60.0) -> list[Result]:
-    """Run cases in `jobs` processes beside each other, for at most `minutes` (0: until all are done)."""
-    until = time.monotonic() + 60 * minutes if minutes else float("inf")
+def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, tell: float = 60.0) -> list[Result]:
+    """Run cases in `jobs` processes beside each other."""
     with ready() as run, tempfile.TemporaryDirectory(prefix="iif-fuzz-results-") as folder:
         places = [Path(folder) / f"{i}.jsonl" for i in range(jobs)]
         children = []
@@ -309,7 +308,7 @@ def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, minutes: float = 0.
             if child == 0:
                 code = 1
                 try:
-                    _worker(cases[i::jobs], seed, run, place, until)
+                    _worker(cases[i::jobs], seed, run, place)
                     code = 0
                 finally:
                     os._exit(code)
@@ -327,7 +326,7 @@ def fuzz(cases: list[tuple[str, int]], seed: int, jobs: int, minutes: float = 0.
                 done = sum(place.read_bytes().count(b"\n") for place in places if place.is_file())
                 print(f"{done} of {len(cases)} cases", file=sys.stderr, flush=True)
         results = [Result(**json.loads(line)) for place in places for line in place.read_text().splitlines()]
-    if failed or (len(results) != len(cases) and not minutes):
+    if failed or len(results) != len(cases):
         raise SystemExit(f"{failed} workers stopped; {len(results)} of {len(cases)} cases were run")
     return results
 
@@ -339,6 +338,25 @@ def table(results: list[Result], seed: int) -> dict[str, Any]:
     total = {key: sum(row[key] for row in rows.values()) for key in ("cases", *GOOD, *BAD)}
     limits = {"memory_mb": MEMORY >> 20, "cpu_seconds": CPU_SECONDS, "wall_seconds": WALL_SECONDS}
     return {"seed": seed, "limits": limits, "kinds": rows, "all": total}
+
+
+def added(earlier: dict[str, Any], later: dict[str, Any]) -> dict[str, Any]:
+    """Return the counts of two parts of one run together.
+
+    Raises:
+        SystemExit: they are of different seeds or limits.
+    """
+    if any(earlier[key] != later[key] for key in ("seed", "limits")):
+        raise SystemExit("the counts that are kept are of another seed or other limits; leave out --continue")
+
+    def sums(one: dict[str, int], other: dict[str, int]) -> dict[str, int]:
+        return {key: one.get(key, 0) + other.get(key, 0) for key in {**one, **other}}
+
+    kinds = {
+        kind: sums(earlier["kinds"].get(kind, {}), later["kinds"].get(kind, {}))
+        for kind in {**earlier["kinds"], **later["kinds"]}
+    }
+    return {**later, "kinds": dict(sorted(kinds.items())), "all": sums(earlier["all"], later["all"])}
 
 
 def shown(document: dict[str, Any]) -> str:
@@ -355,7 +373,9 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--minutes", type=float, default=0.0, help="stop after this time and count what was done")
+    parser.add_argument(
+        "--continue", action="store_true", dest="go_on", help="leave out the cases that --keep has counted already"
+    )
     parser.add_argument("--kinds", default="", help="kinds of files, parted by commas; default: all")
     parser.add_argument("--case", type=int, help="run this case of one kind, and show what became of it")
     parser.add_argument("--keep", type=Path, default=ROW, help="JSON file of the counts")
@@ -367,20 +387,27 @@ def main() -> int:
             (result,) = run([(arguments.kinds, arguments.case)], arguments.seed)
         print(f"{result.verdict}: {result.change}\n{result.message}")
         return int(result.verdict not in GOOD)
-    started = time.monotonic()
-    results = fuzz(kinds_of(arguments.cases, targets), arguments.seed, arguments.jobs, arguments.minutes)
-    document = table(results, arguments.seed)
-    print(shown(document))
-    print(f"{len(results)} cases in {time.monotonic() - started:.0f} s")
-    bad = [result for result in results if result.verdict in BAD]
-    for result in bad[:50]:
-        print(result.line)
-    if arguments.failures:
-        with arguments.failures.open("a") as file:
-            file.writelines(result.line + "\n" for result in bad)
-    if not arguments.kinds:
-        arguments.keep.write_text(json.dumps(document, indent=1) + "\n")
-    return int(bool(bad))
+    started, failed = time.monotonic(), 0
+    document = json.loads(arguments.keep.read_text()) if arguments.go_on and arguments.keep.is_file() else None
+    cases = kinds_of(arguments.cases, targets)
+    todo = cases[document["all"]["cases"] if document else 0 :]
+    for first in range(0, len(todo), PORTION):
+        results = fuzz(todo[first : first + PORTION], arguments.seed, arguments.jobs)
+        part = table(results, arguments.seed)
+        document = added(document, part) if document else part
+        bad = [result for result in results if result.verdict in BAD]
+        failed += len(bad)
+        for result in bad[:50]:
+            print(result.line, flush=True)
+        if arguments.failures:
+            with arguments.failures.open("a") as file:
+                file.writelines(result.line + "\n" for result in bad)
+        if not arguments.kinds:
+            arguments.keep.write_text(json.dumps(document, indent=1) + "\n")
+    if document:
+        print(shown(document))
+    print(f"{len(todo)} cases in {time.monotonic() - started:.0f} s")
+    return int(bool(failed))
 
 
 if __name__ == "__main__":
