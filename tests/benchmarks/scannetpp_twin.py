@@ -24,42 +24,12 @@ from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from iif_core.camera.distortion import Distortion, Pinhole, pinhole_inside, undistort, undistort_image
+from iif_core.camera.distortion import Distortion, Pinhole, pinhole_inside, undistort_image
 from tests.unit import own_scene as own
 from tests.unit import scannetpp_scene as mini
 from workflow.runtime import native
 
 STAGES = ("capture", "prior", "segmentation", "base", "emission", "shading", "affines")
-
-
-def directions(camera: Pinhole, lens: Distortion, pose: np.ndarray) -> np.ndarray:
-    """(H W, 3) float32 world directions of the pixel centres."""
-    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
-    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
-    at = np.stack(np.meshgrid(u, v), -1)
-    at = at if lens.is_identity else undistort(lens, at)[0]
-    local = np.concatenate([at, np.ones((*at.shape[:2], 1))], -1)
-    return (local @ pose[:3, :3].T).reshape(-1, 3).astype(np.float32)
-
-
-def photographs(room, count: int, camera: Pinhole, lens: Distortion, samples: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """(pose, picture in [0, 1]) with one exposure for all views."""
-    from iif_core.camera.simulation import expose, response_curve
-    from iif_core.light.transport.emitters import Emitters
-    from iif_core.light.transport.render import render
-    from iif_core.light.transport.scene import PathOptions, Scene
-
-    geometry = mini.geometry(room)
-    native.limit_threads(1)
-    emitters = Emitters(geometry, room.emission, np.ones(len(room.faces), np.int8))
-    material, curve = room.materials.drjit(), response_curve("filmic")
-    out = []
-    for i, pose in enumerate(room.cameras(count)):
-        rays = directions(camera, lens, pose)
-        radiance = render(Scene(geometry, material, emitters), pose[:3, 3], rays, PathOptions(samples, 12, 1000 + i))
-        picture = expose(radiance, 0.6, curve).reshape(camera.height, camera.width, 3)
-        out.append((pose, picture))
-    return out
 
 
 def pinhole_folder(path: Path, room, views, camera: Pinhole) -> None:
@@ -138,13 +108,13 @@ def main() -> None:
 
     mi.set_variant("llvm_ad_rgb")
     room, capture = mini.room(), {"width": 128, "height": 128, "views": options.views}
-    views = photographs(room, options.views, mini.CAMERA, mini.LENS, options.samples)
+    views = mini.traced(room, options.views, options.samples)
     home = mini.release(options.work / "data/release", room, views)
     own.project(options.work / "a", {"kind": "scannetpp", "path": str(home)}, capture, {"kind": "given"})
     path = own.project(options.work / "b", None, capture, {"kind": "given"})
     mini.twin(home, path, room, views)
     camera = pinhole_inside(mini.LENS, mini.CAMERA)
-    ideal = photographs(room, options.views, camera, Distortion("radial_tangential"), options.samples)
+    ideal = mini.traced(room, options.views, options.samples, camera, Distortion("radial_tangential"))
     path = own.project(options.work / "c", None, capture, {"kind": "given"})
     mini.twin(home, path, room, views)
     pinhole_folder(path, room, ideal, camera)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from iif_core.camera.distortion import Distortion, Pinhole
+from iif_core.camera.distortion import Distortion, Pinhole, undistort
 from tests.unit import own_scene as own
 
 CAMERA = Pinhole(65.8, 66.1, 72.4, 48.9, 146, 97)
@@ -77,10 +77,41 @@ def save_jpeg(path, picture):
 
 
 def photographs(of_room, count=6):
-    """(pose, picture) of every view, a smooth pattern on the surfaces."""
+    """(pose, picture) of every view: a smooth pattern on the surfaces, without light."""
     shape = geometry(of_room)
     poses = of_room.cameras(count)
     return [(pose, own.shoot(shape, pose, CAMERA, LENS)[0]) for pose in poses]
+
+
+def directions(camera, lens, pose):
+    """(H W, 3) float32 world directions of the pixel centres."""
+    u = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
+    v = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    at = np.stack(np.meshgrid(u, v), -1)
+    at = at if lens.is_identity else undistort(lens, at)[0]
+    local = np.concatenate([at, np.ones((*at.shape[:2], 1))], -1)
+    return (local @ pose[:3, :3].T).reshape(-1, 3).astype(np.float32)
+
+
+def traced(room, count, samples, camera=CAMERA, lens=LENS):
+    """(pose, picture in [0, 1]) of every view: path traced, with one exposure for all."""
+    from iif_core.camera.simulation import expose, response_curve
+    from iif_core.light.transport.emitters import Emitters
+    from iif_core.light.transport.render import render
+    from iif_core.light.transport.scene import PathOptions, Scene
+    from workflow.runtime import native
+
+    shape = geometry(room)
+    native.limit_threads(1)
+    emitters = Emitters(shape, room.emission, np.ones(len(room.faces), np.int8))
+    material, curve = room.materials.drjit(), response_curve("filmic")
+    out = []
+    for i, pose in enumerate(room.cameras(count)):
+        rays = directions(camera, lens, pose)
+        radiance = render(Scene(shape, material, emitters), pose[:3, 3], rays, PathOptions(samples, 12, 1000 + i))
+        picture = expose(radiance, 0.6, curve).reshape(camera.height, camera.width, 3)
+        out.append((pose, picture))
+    return out
 
 
 def release(home, of_room, views, garbage=1.0):

@@ -33,7 +33,7 @@ class Score(NamedTuple):
 
 SCORES = (
     Score("rgb_psnr", "re-rendering PSNR", "rgb", "psnr", "raw", "train"),
-    Score("rgb_psnr_held_out", "held-out PSNR", "rgb", "psnr", "raw", "test"),
+    Score("rgb_psnr_held_out", "held-out PSNR", "rgb_held_out", "psnr", "raw"),
     Score("albedo_psnr", "albedo PSNR", "albedo", "psnr", "raw"),
     Score("albedo_psnr_scaled", "albedo PSNR, scaled", "albedo", "psnr", "scaled"),
     Score("roughness_l2", "roughness L2", "roughness", "l2", "raw"),
