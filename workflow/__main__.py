@@ -103,6 +103,7 @@ def _arguments() -> argparse.Namespace:
     stability.add_argument("--log", type=Path)
     costs = commands.add_parser("costs")
     costs.add_argument("--log", type=Path)
+    costs.add_argument("--sizes", action="store_true", help="the jobs ran beside others: take memory and disk, but no times")
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
@@ -367,7 +368,7 @@ def main() -> int:
     if arguments.command == "costs":
         from workflow.costs.refit import refit
 
-        return _guarded("costs", lambda: print("\n".join(refit(arguments.results))))
+        return _guarded("costs", lambda: print("\n".join(refit(arguments.results, sizes=arguments.sizes))))
     raise AssertionError(f"command {arguments.command} is not written")
 
 

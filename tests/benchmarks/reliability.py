@@ -3,7 +3,7 @@
     python tests/benchmarks/reliability.py                  the page alone
     python tests/benchmarks/reliability.py --damage folder  also damages a copy of its results/, file by file
 
-Other rows: `python tests/benchmarks/soundness.py`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
+Other rows: `python tests/benchmarks/soundness.py`, `python tests/benchmarks/memory.py`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
 """
 
 from __future__ import annotations
@@ -148,10 +148,27 @@ def tables() -> dict[str, str]:
     cost = rows("soundness")
     body = [[cost["scenes"], cost["stages"], cost["files"], cost["stamps"], cost["hashes"]]] if cost else []
     out["cost"] = table(["scenes", "stages", "files", "seconds, stamps", "seconds, contents hashed"], body)
+    out["memory"] = _memory()
     slurm = rows("reliability_slurm")
     body = [[name, ", ".join(f"{key}: {value}" for key, value in row.items())] for name, row in slurm.items()]
     out["slurm"] = table(["trial", "result"], body)
     return out
+
+
+def _memory() -> str:
+    """Return the table of memory: what each rule asked for over what its job took, a column a scene."""
+    scenes = list(rows("reliability_memory"))
+    stages = list(dict.fromkeys(stage for scene in scenes for stage in scene["stages"]))
+    body = []
+    for stage in stages:
+        cells = []
+        for scene in scenes:
+            asked, taken = scene["stages"].get(stage, (0, 0))
+            cells.append(f"{asked} / {taken} = {asked / taken:.2f}" if taken else "")
+        body.append([stage, *cells])
+    size = "{scene}: {views} photographs, {millions:.2g} Mpx, {faces:.3g} faces"
+    heads = [size.format(**scene, millions=scene["pixels"] / 1e6) for scene in scenes]
+    return table(["rule", *heads], body)
 
 
 def main() -> None:

@@ -23,6 +23,8 @@ from workflow.costs.work import SceneSize, Work, work_of
 
 SHIPPED = Path(__file__).with_name("coefficients.json")
 MEASURES = ("cpu_seconds", "memory_mb", "disk_mb")
+OF_MEMORY = ("a_view",)
+"""Counts that memory alone follows: what is held at once, and not what is gone through."""
 TIMES = ("cpu_seconds", "seconds")
 """Columns that follow the speed of the machine."""
 FEWEST_ROOMS = 3
@@ -32,7 +34,9 @@ LEAST_RATIO = 2.0
 LEAST_SHARE = 1e-4
 """Share of the cost below which a count is left out."""
 UNMEASURED = (0.5, 2.0)
-"""Range of a cost of which nothing better is known, as factors on it."""
+"""Range of a time of which nothing better is known, as factors on it."""
+UNMEASURED_SIZE = (0.75, 1.35)
+"""The same of memory and disk, which differ less from room to room."""
 HUBER = 0.4
 """Logarithm of actual over predicted cost from which on an error counts by its size instead of its square."""
 ROUNDS = 40
@@ -131,11 +135,13 @@ def fit_rows(rows: Iterable[dict[str, Any]]) -> Fits:
 def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
     fixed = {"scene", "stage", "kind", "threads", "machine", "fingerprint", *MEASURES, *TIMES}
     names = [name for name in rows[0] if name not in fixed]
+    if measure != "memory_mb":
+        names = [name for name in names if name not in OF_MEMORY]
     if measure in TIMES and not _sizes_differ(rows, names):
         names.remove("job")
     coefficients = _coefficients(rows, names, measure)
     rooms = sorted({row["scene"] for row in rows})
-    low, high = UNMEASURED
+    low, high = UNMEASURED if measure in TIMES else UNMEASURED_SIZE
     if len(rooms) >= FEWEST_ROOMS:
         errors = {}
         for room in rooms:
@@ -154,7 +160,7 @@ def _divided(rows: list[dict[str, Any]]) -> float:
 def _sizes_differ(rows: list[dict[str, Any]], names: list[str]) -> bool:
     """Return whether the jobs tell what starting one costs from what its work costs. Where they do not, all of its time is taken
     to grow with the work: a larger scene that is promised the time of a small one would be ended by a scheduler."""
-    sizes = ([row.get(name, 0.0) for row in rows] for name in names if name not in ("job", "faces"))
+    sizes = ([row.get(name, 0.0) for row in rows] for name in names if name not in ("job", "faces", *OF_MEMORY))
     return names == ["job"] or any(max(values) > LEAST_RATIO * min(values) > 0 for values in sizes)
 
 

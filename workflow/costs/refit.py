@@ -16,7 +16,7 @@ TABLE = Path("docs/results/data/costs.csv")
 """The rows that the shipped coefficients were fitted to."""
 
 
-def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED) -> list[str]:
+def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED, sizes: bool = False) -> list[str]:
     """Add the finished jobs under `folders` to the table, fit all costs again, and return lines that say how well they fit.
 
     Args:
@@ -24,14 +24,19 @@ def refit(folders: Iterable[Path], table: Path = TABLE, fits: Path = SHIPPED) ->
             jobs of a folder are of one machine, whose factor is found by what the table says of such jobs.
         table: CSV file of rows (`workflow.costs.records.write_rows`).
         fits: JSON file that is written.
+        sizes: the jobs of the folders ran beside others: take their memory and disk, and times only of kinds of which there are
+            none.
     """
     rows = list(read_rows(table)) if table.is_file() else []
     before, lines = len(rows), []
     for folder in folders:
         known = {_identity(row) for row in rows}
         new = [row for row in gather([folder]) if _identity(row) not in known]
-        factor = _factor(new, fit_rows(rows)) if rows else 1.0
-        rows += [{**row, "machine": factor} for row in new]
+        factor = _factor(new, fit_rows(rows)) if rows and not sizes else 1.0
+        timed = {(row["stage"], row["kind"]) for row in rows if row.get("cpu_seconds")}
+        for row in new:
+            untimed = sizes and (row["stage"], row["kind"]) in timed
+            rows.append({**row, "machine": factor, **({"cpu_seconds": 0.0} if untimed else {})})
         lines.append(f"{folder}: {len(new)} new jobs of a machine that takes {factor:.3g} times as long")
     if len(rows) > before:
         write_rows(table, rows)

@@ -55,10 +55,12 @@ def work_of(stage: str, settings: dict[str, Any], size: SceneSize) -> Work:
         size: of the scene.
 
     Returns:
-        The kind, such as `direct`, and the counts. Every job has the count `job` of 1, for what it costs to start.
+        The kind, such as `direct`, and the counts. Every job has the count `job` of 1, for what it costs to start, and `a_view`,
+        the pixels of one photograph, which is what stages hold that work on one after the other.
     """
     kind, counts = _STAGES[stage](settings, size)
-    return Work(kind, {"job": 1.0, **{name: float(value) for name, value in counts.items()}})
+    a_view = size.pixels / max(size.views, 1) / MILLION
+    return Work(kind, {"job": 1.0, "a_view": a_view, **{name: float(value) for name, value in counts.items()}})
 
 
 def _capture(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
@@ -199,7 +201,8 @@ def _metrics(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
 
 
 def _export(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
-    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
+    texels = settings["export"]["texture_size"] ** 2 / MILLION
+    return "all", {"faces": size.faces / MILLION, "cells": _base_cells(settings, size), "texels": texels}
 
 
 def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
