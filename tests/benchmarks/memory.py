@@ -3,8 +3,8 @@
     python tests/benchmarks/memory.py <working folder> <scene> [<scene> ...]
 
 What is asked for is what a plan says that knows nothing but the files of the scene (as on a cluster, before its capture is
-there). Peak memory is that of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`), which the load of the machine does not
-change. The rows go to docs/results/data/reliability_memory.json; `reliability.py` makes the table of them.
+there). Peak memory is that of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`), which the load of the machine does
+not change. The rows go to docs/results/data/reliability_memory.json; `reliability.py` makes the table of them.
 """
 
 from __future__ import annotations
@@ -17,14 +17,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from workflow.costs.size import size_of_capture
 from workflow.registry import STAGES
 from workflow.runtime import forecast, native
 
-ROW = ROOT / "docs/results/data/reliability_memory.json"
+ROW = Path(__file__).resolve().parents[2] / "docs/results/data/reliability_memory.json"
 
 
 def asked(scene: str, quality: str) -> dict[str, int]:

@@ -3,7 +3,8 @@
     python tests/benchmarks/reliability.py                  the page alone
     python tests/benchmarks/reliability.py --damage folder  also damages a copy of its results/, file by file
 
-Other rows: `python tests/benchmarks/soundness.py`, `python tests/benchmarks/memory.py`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
+Other rows: `python tests/benchmarks/soundness.py`, `python tests/benchmarks/memory.py`,
+`python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
 """
 
 from __future__ import annotations

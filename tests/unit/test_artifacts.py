@@ -15,12 +15,14 @@ from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files,
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import sha256_of, write_parquet
 from workflow.artifacts.manifest import SCENE_SCHEMA
-from workflow.artifacts.store import ids_from_disk, ids_to_disk, rgb, split_rgb
+from workflow.artifacts.store import PARTS, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
+
+MARK = "0" * 16
 
 
 def provenance():
-    return {"scene": "s", "stage": "base", "fingerprint": "0" * 16, "settings": {}, "inputs": {}, "versions": {}}
+    return {"scene": "s", "stage": "base", "fingerprint": MARK, "settings": {}, "inputs": {}, "versions": {}}
 
 
 @pytest.fixture
@@ -159,6 +161,33 @@ def test_parts_that_the_same_job_finished_are_kept(tmp_path):
     assert again.files == {"a.json": writer.files["a.json"]}
     again.finish()
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.json", "manifest.json"]
+
+
+FORGED = (
+    {},
+    {"by": MARK, "files": [], "facts": {}},
+    {"by": 7, "files": {}, "facts": {}},
+    {"by": MARK, "files": {"a.json": {"bytes": 3}}, "facts": {}},
+    {"by": MARK, "files": {"a.json": {"sha256": 5, "bytes": 3}}, "facts": {}},
+    {"by": MARK, "files": {"a.json": {"sha256": "0", "bytes": 3, "shape": [-1]}}, "facts": {}},
+    {"by": MARK, "files": {"../evil": {"sha256": "0", "bytes": 3}}, "facts": {}},
+    {"by": MARK, "files": {}},
+)
+"""Notes of parts as no stage writes them, under a seal that fits."""
+
+
+@pytest.mark.parametrize("note", FORGED)
+def test_forged_notes_of_parts_are_made_again(tmp_path, note):
+    """Somebody who can write there can seal what he writes: such a part is made again, and nothing is raised."""
+    writer = StageWriter(tmp_path, provenance())
+    manifests.write(tmp_path / "unfinished/a.json", note, settled=False)
+    assert writer.part_kept("a") is None and writer.part_kept("a", MARK) is None and not writer.files
+    manifests.write(tmp_path / PARTS, {"parts": {"a": note, "../b": note}}, settled=False)
+    assert StageWriter(tmp_path, provenance()).part_kept("b") is None and not (tmp_path / "b.json").exists()
+    for parts in (None, [], {"a": None}, {"../evil": {"by": MARK, "files": {}, "facts": {}}}):
+        manifests.write(tmp_path / PARTS, {"parts": parts}, settled=False)
+        StageWriter(tmp_path, provenance())
+    assert not (tmp_path / "evil.json").exists() and not (tmp_path.parent / "evil.json").exists()
 
 
 def test_the_state_of_a_killed_job_comes_back_to_the_same_job_alone(tmp_path):

@@ -45,6 +45,15 @@ def inside(folder: Path, name: str) -> Path:
     raise InputError(f"{folder}: the file name {shown(name)}: {problem}; it is neither read nor written")
 
 
+def is_inside(folder: Path, name: str) -> bool:
+    """Return whether `inside` takes this name."""
+    try:
+        inside(folder, name)
+    except InputError:
+        return False
+    return True
+
+
 def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True) -> None:
     """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file, and
     after a power cut `path` has its old content or the new one.

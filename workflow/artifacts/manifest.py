@@ -102,14 +102,36 @@ def parse(data: bytes, schema: str) -> dict[str, Any]:
     return document
 
 
-def _wrong_facts(document: dict[str, Any]) -> str:
-    """Return which entry of a manifest is not of the form that stages write, which only somebody who forges it can change."""
-    for name, facts in document["files"].items():
+def _wrong_files(files: dict[str, Any]) -> str:
+    for name, facts in files.items():
         shape = facts.get("shape", [])
         if not isinstance(facts["sha256"], str) or not isinstance(facts["bytes"], int):
             return f"its entry of {name!r} is no hash and size"
         if not isinstance(shape, list) or not all(isinstance(size, int) and 0 <= size < 1 << 40 for size in shape):
             return f"its entry of {name!r} has no shape"
+    return ""
+
+
+def part(document: Any) -> dict[str, Any]:
+    """Return the note of a finished part of a stage: `by`, `files` as in a manifest, and `facts`.
+
+    Raises:
+        Broken: it is not of the form that stages write.
+    """
+    if not isinstance(document, dict) or not isinstance(document.get("by"), str) or "facts" not in document:
+        raise Broken("it is no note of a part")
+    files = document.get("files")
+    if not isinstance(files, dict) or not all(isinstance(f, dict) and {"sha256", "bytes"} <= set(f) for f in files.values()):
+        raise Broken("it lists no files with their hashes")
+    if problem := _wrong_files(files):
+        raise Broken(problem)
+    return document
+
+
+def _wrong_facts(document: dict[str, Any]) -> str:
+    """Return which entry of a manifest is not of the form that stages write, which only somebody who forges it can change."""
+    if problem := _wrong_files(document["files"]):
+        return problem
     inputs = document.get("inputs", {})
     if not isinstance(inputs, dict) or not all(
         isinstance(facts, dict) and isinstance(facts.get("scene"), str) and isinstance(facts.get("manifest_sha256"), str)

@@ -126,12 +126,14 @@ class StageWriter:
         """
         note = io.inside(self.directory, f"{UNFINISHED}/{part}.json")
         try:
-            done = manifests.sealed(note.read_bytes())
+            done = manifests.part(manifests.sealed(note.read_bytes()))
         except (OSError, manifests.Broken):
             return None
         if done["by"] != (by or self.provenance["fingerprint"]):
             return None
         for name, facts in done["files"].items():
+            if not io.is_inside(self.directory, name):  # a forged note
+                return None
             path = io.inside(self.directory, name)
             if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
                 return None
@@ -196,8 +198,10 @@ def _noted_parts(directory: Path) -> dict[str, Any]:
     """Return the notes that a finished job left of parts of its stage; none if there are none, or they cannot be read. They are
     not in the manifest, which Snakemake removes before it starts a job."""
     try:
-        return dict(manifests.sealed((directory / PARTS).read_bytes())["parts"])
-    except (OSError, manifests.Broken, KeyError):
+        noted = manifests.sealed((directory / PARTS).read_bytes()).get("parts")
+        parts = {name: manifests.part(note) for name, note in noted.items()} if isinstance(noted, dict) else {}
+        return parts if all(io.is_inside(directory, name) for name in parts) else {}
+    except (OSError, manifests.Broken):
         return {}
 
 
