@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
+import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -405,6 +407,23 @@ def read_mitsuba_scene() -> None:
     mitsuba.raw_inputs({"source": {"path": "scene.xml"}})
 
 
+def load_mitsuba_scene() -> None:
+    """As stage `capture` does: in a process of its own first, which Mitsuba may end, and then in this one."""
+    from workflow.sources.mitsuba_scene import scene, trial
+
+    read_mitsuba_scene()
+    child = os.fork()
+    if child == 0:
+        with contextlib.suppress(Exception):
+            scene.load(Path("scene.xml"))
+        os._exit(0)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if code == -signal.SIGXCPU:
+        os.kill(os.getpid(), signal.SIGXCPU)  # it hangs, which is no crash
+    trial.judge(Path("scene.xml"), code)
+    scene.load(Path("scene.xml"))
+
+
 def masks(home: Path) -> None:
     folder_scene(home)
     (home / "data/masks").mkdir()
@@ -507,6 +526,7 @@ TARGETS: dict[str, Target] = {
     "relight plans": Target(("config/relight/evening.yaml",), settings_files, read_settings),
     "batch.tsv": Target(("config/batch.tsv",), settings_files, read_table),
     "Mitsuba XML": Target(("scene.xml", "more.xml", "parts/m.ply", "parts/t.png"), mitsuba_scene, read_mitsuba_scene),
+    "Mitsuba scene": Target(("scene.xml", "parts/m.ply", "parts/t.png"), mitsuba_scene, load_mitsuba_scene, 0.5),
     "masks": Target(("data/masks/000.png", "data/masks/001.png"), masks, read_masks, 0.5),
     "safetensors": Target(("model.safetensors",), weights, read_weights, 0.5),
 }

@@ -115,6 +115,15 @@ def test_a_file_that_includes_itself_is_refused(tmp_path):
         document.referenced_files(write(tmp_path, '<include filename="scene.xml"/>'))
 
 
+def test_a_file_on_which_mitsuba_crashes_is_refused_by_name(tmp_path):
+    from workflow.sources.mitsuba_scene import trial
+
+    trial.check(write(tmp_path, '<shape type="cube"/>'), "scalar_rgb")
+    bad = write(tmp_path, '<texture type="bitmap" id="t"/>')
+    with pytest.raises(InputError, match="scene.xml: Mitsuba crashes when it loads this file .SIGSEGV."):
+        trial.check(bad, "scalar_rgb")
+
+
 def test_what_mitsuba_refuses_is_said_in_its_words(llvm, tmp_path):
     from workflow.sources.mitsuba_scene import scene
 

@@ -48,7 +48,8 @@ def _check_ply(path: Path, size: int) -> None:
             elements.append((words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
             kinds = words[2:4] if words[1:2] == ["list"] else words[1:2]
-            if not elements or len(words) != 2 + len(kinds) + (len(kinds) > 1) - (len(kinds) == 0) or set(kinds) - set(_SIZES):
+            words_needed = 5 if words[1:2] == ["list"] else 3
+            if not elements or len(words) != words_needed or set(kinds) - set(_SIZES):
                 raise InputError(f"{where}: expected a property of an element, of a type of PLY; {AGAIN}")
             elements[-1][2].append(_SIZES[kinds[0]])  # of a list, its count is there at least
     least = 0

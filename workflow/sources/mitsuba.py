@@ -71,9 +71,12 @@ class _Capture:
         self.writer = CaptureWriter(job.writer)
 
     def run(self) -> None:
-        from workflow.sources.mitsuba_scene import flatten, materials, scene
+        import mitsuba as mi
+
+        from workflow.sources.mitsuba_scene import flatten, materials, scene, trial
 
         xml = Path(self.source.path)
+        trial.check(xml, mi.variant())
         self.loaded = scene.load(xml)
         everything = flatten.flatten(self.loaded)
         self.table = materials.MaterialTable(everything.shapes)

@@ -87,6 +87,9 @@ def load(xml: Path) -> LoadedScene:
             if not isinstance(scene, mi.Scene):
                 raise InputError(f"{xml}: holds a {type(scene).__name__}, expected a scene")
             shapes = _shapes(scene, entries)
+    except UnicodeDecodeError as error:  # of a message of Mitsuba that repeats bytes of a damaged file
+        said = error.object.decode("utf-8", "backslashreplace")
+        raise InputError(f"{xml}: Mitsuba cannot load it: {' '.join(said.split())[:1000]}") from None
     except RuntimeError as error:
         raise InputError(f"{xml}: Mitsuba cannot load it: {' '.join(str(error).split())}") from None
     finally:
