@@ -34,6 +34,6 @@ def judge(xml: Path, code: int) -> None:
     """Raise InputError if a process that loaded a scene ended by a signal; `code` is its exit code, below 0 for a signal."""
     if code < 0:
         raise InputError(
-            f"{xml}: Mitsuba crashes when it loads this file ({signal.Signals(-code).name}); a bitmap without a file can cause that,"
-            " and so can a damaged mesh or texture. Remove or repair what it names, part by part, until `mitsuba` loads it"
+            f"{xml}: Mitsuba crashes when it loads this file ({signal.Signals(-code).name}); a bitmap without a file can cause"
+            " that, and so can a damaged mesh or texture. Remove or repair what it names, part by part, until `mitsuba` loads it"
         )
