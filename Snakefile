@@ -35,6 +35,13 @@ rule scenes:
         batch_targets,
 
 
+rule status:
+    """Where every scene of config/batch.tsv stands, also while a run goes on."""
+    input:
+        status_alone,
+    localrule: True
+
+
 rule verify:
     """Hash every artefact again and name what differs from its manifest."""
     log:

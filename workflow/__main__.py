@@ -1,15 +1,15 @@
 """`python -m workflow <stage> <scene>` runs one stage: the rules call it, and so does a person with a debugger.
 
-`python -m workflow verify [scene ...]` checks files against their manifests, `python -m workflow upgrade [scene ...]` brings
-manifests of an earlier version up to date, `python -m workflow study <study>` and `python -m
-workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of jobs again, `python -m workflow
-design <study>` chooses the runs of a screening, `python -m workflow points` takes points of speed and accuracy from a study,
-`python -m workflow relit <scene>` copies pictures of relightings to relight/,
-`python -m workflow bench <scene>` shows what three of them did in a room, `python -m workflow planned <scene>` what a room was
-found to require, `python -m workflow claims` takes from the study `regret` what is expected of that, `python -m workflow compare
-<a> <b>` puts two results side by side, `python -m workflow score <scene> <folder>` scores anyone's maps, `python -m workflow
-grid <study>` draws a sheet of pictures, `python -m workflow relighting` keeps the rows of that study and makes its page, and
-`python -m workflow lpips_vgg` fetches weights.
+`python -m workflow status [scene ...]` tells where scenes stand, `python -m workflow verify [scene ...]` checks files against
+their manifests, `python -m workflow upgrade [scene ...]` brings manifests of an earlier version up to date, `python -m workflow
+study <study>` and `python -m workflow batch` collect what jobs have left so far, `python -m workflow costs` fits the cost of
+jobs again, `python -m workflow design <study>` chooses the runs of a screening, `python -m workflow points` takes points of
+speed and accuracy from a study, `python -m workflow relit <scene>` copies pictures of relightings to relight/, `python -m
+workflow bench <scene>` shows what three of them did in a room, `python -m workflow planned <scene>` what a room was found to
+require, `python -m workflow claims` takes from the study `regret` what is expected of that, `python -m workflow compare <a> <b>`
+puts two results side by side, `python -m workflow score <scene> <folder>` scores anyone's maps, `python -m workflow grid
+<study>` draws a sheet of pictures, `python -m workflow relighting` keeps the rows of that study and makes its page, and `python
+-m workflow lpips_vgg` fetches weights.
 """
 
 from __future__ import annotations
@@ -105,6 +105,10 @@ def _arguments() -> argparse.Namespace:
     costs.add_argument("--log", type=Path)
     costs.add_argument("--sizes", action="store_true", help="the jobs ran beside others: take memory and disk, but no times")
     costs.add_argument("results", nargs="*", type=Path, help="folders like results/ whose finished jobs are added to the table")
+    status = commands.add_parser("status")
+    status.add_argument("scenes", nargs="*")
+    status.add_argument("--quality", default="draft")
+    status.add_argument("--json", action="store_true", help="one JSON object for each scene, each on a line")
     verify = commands.add_parser("verify")
     verify.add_argument("scenes", nargs="*")
     upgrade = commands.add_parser("upgrade")
@@ -152,6 +156,14 @@ def _verify(scenes: list[str]) -> int:
         print(line)
     print(f"{len(problems)} damaged" if problems else "all artefacts are as they were written")
     return 1 if problems else 0
+
+
+def _status(scenes: list[str], quality: str, as_json: bool) -> int:
+    from workflow.status.standing import quality_of
+    from workflow.status.table import tell
+
+    tell(scenes, partial(quality_of, quality=quality), as_json)
+    return 0
 
 
 CAUSES = {
@@ -284,6 +296,8 @@ def _planned(scene: str, quality: str) -> None:
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
+    if arguments.command == "status":
+        return _status(arguments.scenes, arguments.quality, arguments.json)
     if arguments.command == "verify":
         return _verify(arguments.scenes)
     if arguments.command == "upgrade":

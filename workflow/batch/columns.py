@@ -10,7 +10,8 @@ STATUSES = {
     "done": "published, as the settings, inputs and code of now would make it",
     "refused": "its settings or data cannot be used; no job was started",
     "failed": "a job ended with an error",
-    "killed": "a job was started and did not end: killed (memory, time limit), or still running",
+    "killed": "a job was started, did not end, and its process is gone (memory, time limit, node)",
+    "running": "a job of it runs",
     "not run": "jobs are missing and none of them has run as it would now",
 }
 

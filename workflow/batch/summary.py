@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import logging
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -19,9 +20,8 @@ from workflow.artifacts.files import read_parquet, remove, write_atomically
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
 from workflow.batch.page import render
-from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import read_state
+from workflow.runtime.job_state import noted, state_file
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
@@ -35,6 +35,9 @@ COLUMNS = {
     **dict.fromkeys(("seconds", "cpu_seconds", "max_rss_mb"), "float64"),
     **dict.fromkeys(_TEXT[7:], "string"),
 }
+
+UNENDED = {"running": "it runs", "killed": "started and did not end, and its process is gone"}
+"""Reasons of jobs that wrote none."""
 
 Row = dict[str, Any]
 
@@ -116,26 +119,19 @@ def _fingerprint_in(manifest: Path) -> str:
 
 def _why_not(scene: str, quality: str) -> Row:
     """Return status, stage, reason and log of the first job that did not end well, or of the first missing one if none ran."""
-    missing = [
-        stage.name
-        for stage in STAGES.values()
-        if not stage.on_demand and _fingerprint_in(_manifest(scene, stage.name)) != fp.fingerprint(stage.name, scene, quality)
-    ]
-    killed: Row = {}
+    missing = fp.missing_stages(scene, quality)
+    others: dict[str, Row] = {}
     for stage in missing:
-        state = read_state(scene, stage, fp.fingerprint(stage, scene, quality))
-        if not state:
+        job = noted(state_file(scene, stage), time.time())
+        if not job or job.document.get("fingerprint") != fp.fingerprint(stage, scene, quality):
             continue
-        found = {"stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
-        if state.get("state") == "failed":
-            return found | {"status": "failed", "reason": str(state.get("reason", ""))}
-        killed = killed or found | {"status": "killed", "reason": "started and did not end: killed, or still running"}
+        found = {"status": job.state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
+        if job.state == "failed":
+            return found | {"reason": str(job.document.get("reason", ""))}
+        others.setdefault(job.state, found | {"reason": UNENDED[job.state]})
     stage = missing[0] if missing else "publish"
-    return killed or {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
-
-
-def _manifest(scene: str, stage: str) -> Path:
-    return Path("results") / scene / stage / "manifest.json"
+    idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
+    return others.get("running") or others.get("killed") or idle
 
 
 def _costs(scene: str) -> Row:

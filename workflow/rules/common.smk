@@ -7,7 +7,10 @@ import shlex
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
+
+from snakemake.cli import get_argument_parser
 
 sys.path.insert(0, workflow.basedir)
 
@@ -17,9 +20,10 @@ from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import forecast, input_digests, native
+from workflow.runtime import events, forecast, input_digests, native
 from workflow.runtime.job_state import reasons
 from workflow.scene.named import check_overrides
+from workflow.status import table as status
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings.names import did_you_mean_path
@@ -74,19 +78,12 @@ def inputs_again(asked):
         print(f"{path}: its content changed", file=sys.stderr)
 
 
-for place in (".", "results", "scenes", ".snakemake"):
-    if os.path.exists(place) and not os.access(place, os.W_OK):
-        stop(
-            f"{os.path.realpath(place)}: not writable for you; results and records are written there."
-            " Give yourself the right, or work in a copy of the checkout."
-        )
-
-
 OTHERS = (
     "maps",
     "colour",
     "inputs",
-)  # keys of `--config` beside those that choose a quality: of score/<scene>, and how inputs are compared
+    "events",
+)  # keys of `--config` beside those that choose a quality: of score/<scene>, how inputs are compared, where jobs tell of themselves
 
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
 REQUEST = or_stop(
@@ -96,8 +93,45 @@ REQUEST = or_stop(
     workflow.resource_settings.cores,
 )
 QUALITY = REQUEST.quality  # of studies and batches
-or_stop(inputs_again, config.get("inputs"))
 CHOSEN = {}
+
+
+def tell_status():
+    """Answer `snakemake status` and end: here, while rules are read, because afterwards Snakemake would wait for the lock that a run
+    holds, or refuse to go on. The file that Snakemake has opened for the log of this call is removed, since no job will write to it.
+    """
+    # Internals of Snakemake, and nothing that the answer needs.
+    with suppress(Exception):
+        for handler, path in list(workflow.logger_manager.logfile_handlers.items()):
+            if os.path.isfile(path) and Path(path).parent.name == "log":
+                workflow.logger_manager.logger.removeHandler(handler)
+                handler.close()
+                os.unlink(path)
+    status.tell([], lambda scene: choose.choice(REQUEST, scene).quality)
+    sys.exit(0)
+
+
+def targets():
+    """Targets of the command line; Snakemake itself knows them only when all rules are read."""
+    return list(get_argument_parser().parse_args().targets)
+
+
+if workflow.is_main_process and "status" in sys.argv and targets() == ["status"]:
+    tell_status()
+
+
+for place in (".", "results", "scenes", ".snakemake"):
+    if os.path.exists(place) and not os.access(place, os.W_OK):
+        stop(
+            f"{os.path.realpath(place)}: not writable for you; results and records are written there."
+            " Give yourself the right, or work in a copy of the checkout."
+        )
+
+
+or_stop(inputs_again, config.get("inputs"))
+if config.get("events"):
+    # Jobs inherit it, also those that Snakemake starts on other machines, because it hands `--config` on to them.
+    os.environ[events.VARIABLE] = or_stop(events.checked, str(config["events"]))
 
 
 def quality_of(scene):
@@ -413,6 +447,13 @@ def unknown(wildcards):
         or_stop(scene_file, name)
     rules = [rule.name for rule in workflow.rules if rule.name != "unknown_target"]
     or_stop(refuse_target, wildcards.target, rules)
+
+
+def status_alone(wildcards):
+    """Input of `status`, which is answered before any rule is looked at, unless something else is asked for beside it."""
+    stop(
+        "status: ask for it alone, `snakemake status`; of some scenes, `python -m workflow status <scene> ...`"
+    )
 
 
 # ---------------------------------------------------------------------------------------------------------- studies

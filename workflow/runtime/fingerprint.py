@@ -14,6 +14,8 @@ import importlib.util
 import json
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -53,6 +55,8 @@ FILE_MODULES = {
     "room": ("workflow.room.sources",),
     "relit_truth": ("workflow.sources.relit",),
 }
+NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
+"""Stages that every scene needs, in order."""
 VGG = Path("results/weights/lpips_vgg.npz")
 
 
@@ -73,6 +77,7 @@ def is_infrastructure(module: str) -> bool:
 _CODE = Path("results/.code-digests.json")
 _remembered: dict[str, list[Any]] = {}  # module -> [sha256 of its source, digest of its code, names that it imports]
 _unsaved = False
+_held = False
 _lock = threading.Lock()  # stages read their upstream from several threads
 
 
@@ -94,9 +99,21 @@ def _reader_of_code() -> str:
 def _save() -> None:
     global _unsaved
     with _lock:
-        if _unsaved:
+        if _unsaved and not _held:
             write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
             _unsaved = False
+
+
+@contextmanager
+def unsaved() -> Iterator[None]:
+    """Write nothing within the block: neither what was found of code nor of input files."""
+    global _held
+    _held = True
+    try:
+        with input_digests.unsaved():
+            yield
+    finally:
+        _held = False
 
 
 @lru_cache(None)
@@ -271,3 +288,21 @@ def home(stage: str, scene: str, quality: str) -> str:
         if fingerprint(stage, shared, quality) == fingerprint(stage, scene, quality):
             return shared
     return scene
+
+
+def missing_stages(scene: str, quality: str) -> list[str]:
+    """Return the stages that a run would make, in order: their manifest is not there, or of other settings, inputs or code.
+
+    Raises:
+        InputError: the settings or the raw files of the scene cannot be used.
+    """
+    return [stage for stage in NEEDED if _made(stage, scene, quality) != fingerprint(stage, scene, quality)]
+
+
+def _made(stage: str, scene: str, quality: str) -> str:
+    """Return the fingerprint under which a stage was made; empty if it was not, or its manifest cannot be read."""
+    try:
+        document = json.loads(Path(f"results/{home(stage, scene, quality)}/{stage}/manifest.json").read_bytes())
+        return str(document.get("fingerprint", ""))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""

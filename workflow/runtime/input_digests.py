@@ -101,6 +101,17 @@ def saved_once() -> Iterator[None]:
         _save()
 
 
+@contextmanager
+def unsaved() -> Iterator[None]:
+    """Write nothing within the block; what was found is saved by whatever looks next."""
+    global _held
+    _held = True
+    try:
+        yield
+    finally:
+        _held = False
+
+
 def _digest(path: Path) -> str:
     stamp, entry = _stamp(path), _known.get(str(path))
     if entry is None or entry.stamp != stamp:

@@ -1,16 +1,23 @@
 """How the last run of a job ended, kept beside its log, so that the end of a run and the summary of a batch can give the reason.
 
 `results/<scene>/logs/<stage>.state.json` exists from the start of a job until it ends well. The file of a job that was killed
-says `started`; that of a job that failed says `failed` and why.
+says `started`; that of a job that failed says `failed` and why. `since` is when it came into that state, `host` and `pid` say
+where it runs; with these and the time stamp of the file, which a running job renews, a running job is told from a killed one.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import threading
+import time
+from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from workflow.artifacts.files import write_json
+from workflow.runtime import alive, events
 
 
 class JobState:
@@ -24,18 +31,38 @@ class JobState:
 
     def __init__(self, owner: str, name: str, fingerprint: str | None = None):
         self.path, self.fingerprint = state_file(owner, name), fingerprint or ""
+        self._job = (owner, name, self.fingerprint)
+        self._begun, self._ended = time.monotonic(), threading.Event()
 
     def started(self) -> None:
+        self._begun = time.monotonic()
         self._write("started", "")
+        threading.Thread(target=self._beat, daemon=True).start()
+        events.tell("started", *self._job)
 
     def failed(self, reason: str) -> None:
+        self._ended.set()
+        events.tell("failed", *self._job, seconds=self._seconds(), reason=reason, **events.taken())
         self._write("failed", reason)
 
     def done(self) -> None:
+        self._ended.set()
         self.path.unlink(missing_ok=True)
+        events.tell("finished", *self._job, seconds=self._seconds(), **events.taken())
+
+    def _seconds(self) -> float:
+        return round(time.monotonic() - self._begun, 3)
+
+    def _beat(self) -> None:
+        """Renew the time stamp of the file as long as the job runs, for those who cannot ask for its process."""
+        while not self._ended.wait(alive.BEAT):
+            with suppress(OSError):
+                os.utime(self.path)
 
     def _write(self, state: str, reason: str) -> None:
-        write_json(self.path, {"state": state, "reason": reason, "fingerprint": self.fingerprint})
+        since = datetime.now(UTC).isoformat(timespec="seconds")
+        facts = {"since": since, **alive.identity()}
+        write_json(self.path, {"state": state, "reason": reason, "fingerprint": self.fingerprint, **facts})
 
 
 def state_file(owner: str, name: str, root: Path = Path(".")) -> Path:
@@ -43,19 +70,40 @@ def state_file(owner: str, name: str, root: Path = Path(".")) -> Path:
     return root / "results" / owner / "logs" / f"{name}.state.json"
 
 
-def read_state(scene: str, stage: str, fingerprint: str, root: Path = Path(".")) -> dict[str, Any]:
-    """Return how a job ended.
+class Noted(NamedTuple):
+    """The state of a job that has not ended well.
 
-    Args:
-        scene, stage: which job.
-        fingerprint: what the job would be planned as now.
-        root: the working folder.
-
-    Returns:
-        `state` and `reason` of a job that did not end well; empty if it did, or if it ran under another fingerprint.
+    Attributes:
+        state: `running`, `failed` or `killed`.
+        since: when it came into this state, in seconds as `time.time`.
+        document: what the file says.
     """
-    document = _read(state_file(scene, stage, root))
-    return document if document.get("fingerprint") == fingerprint else {}
+
+    state: str
+    since: float
+    document: dict[str, Any]
+
+
+def noted(path: Path, now: float) -> Noted | None:
+    """Return what a state file says; None if there is none, or nothing that can be read. Never raises, whatever it holds."""
+    try:
+        touched = os.stat(path).st_mtime
+    except OSError:  # its job has just ended well
+        return None
+    document = _read(path)
+    state = document.get("state")
+    if state not in ("started", "failed"):
+        return None
+    if state == "started":
+        state = "running" if alive.runs(document, touched, now) else "killed"
+    return Noted(state, _moment(document.get("since"), touched), document)
+
+
+def _moment(text: Any, otherwise: float) -> float:
+    try:
+        return datetime.fromisoformat(text).timestamp()
+    except (TypeError, ValueError, OverflowError, OSError):
+        return otherwise
 
 
 def reasons(since: float, root: Path = Path(".")) -> list[str]:
@@ -67,7 +115,11 @@ def reasons(since: float, root: Path = Path(".")) -> list[str]:
         except OSError:  # its job has just ended well
             continue
         document = _read(path)
-        if changed < since or not document:
+        if document.get("state") == "started":
+            if alive.lives(document):
+                continue  # of another run
+            changed = _moment(document.get("since"), changed)  # it was touched since
+        if changed < int(since) or not document:
             continue
         owner, name = path.parents[1].name, path.name.removesuffix(".state.json")
         log = path.with_name(f"{name}.log")
@@ -79,6 +131,6 @@ def reasons(since: float, root: Path = Path(".")) -> list[str]:
 def _read(path: Path) -> dict[str, Any]:
     try:
         document = json.loads(path.read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
