@@ -234,10 +234,16 @@ def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
 # -------------------------------------------------------------------------------------------------------------- summary
 
 
+def _of_a_process_that_is_gone(path):
+    """Give the process of a state another time of start, as after its number was given again."""
+    document = json.loads(path.read_text())
+    write_json(path, document | {"start": document["start"] - 1})
+
+
 @pytest.fixture
-def five(project, monkeypatch):
-    """Five scenes that ended differently, without running them."""
-    names = ("done", "refused", "failed", "killed", "idle")
+def ended(project, monkeypatch):
+    """Scenes that ended differently, without running them."""
+    names = ("done", "refused", "failed", "killed", "running", "idle")
     lines = tuple(batch_table.Line(i + 2, name, "builtin") for i, name in enumerate(names))
     monkeypatch.setattr(fp, "fingerprint", lambda stage, scene, quality: f"{stage} of {scene}")
     monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps({"source": {"kind": "builtin"}}))
@@ -262,15 +268,18 @@ def five(project, monkeypatch):
     write_json(Path("results/idle/capture/manifest.json"), {"fingerprint": "capture of idle"})
     JobState("idle", "prior", "prior of other settings").failed("long ago")
     JobState("killed", "capture", "capture of killed").started()
+    _of_a_process_that_is_gone(Path("results/killed/logs/capture.state.json"))
+    JobState("running", "capture", "capture of running").started()  # by this process
     JobState("failed", "capture", "capture of failed").started()
     JobState("failed", "capture", "capture of failed").done()
     write_json(Path("results/failed/capture/manifest.json"), {"fingerprint": "capture of failed"})
     JobState("failed", "prior", "prior of failed").started()  # both were running when one failed
+    _of_a_process_that_is_gone(Path("results/failed/logs/prior.state.json"))
     JobState("failed", "segmentation", "segmentation of failed").failed("mesh: no faces")
     return plan
 
 
-def test_every_scene_has_a_row_that_says_how_it_ended(five):
+def test_every_scene_has_a_row_that_says_how_it_ended(ended):
     summary.write_summary("draft")
     with open("results/batch/summary.tsv", newline="") as file:
         rows = {row["scene"]: row for row in csv.DictReader(file, delimiter="\t")}
@@ -279,6 +288,7 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
         "refused": "refused",
         "failed": "failed",
         "killed": "killed",
+        "running": "running",
         "idle": "not run",
     }
     done = rows["done"]
@@ -288,11 +298,12 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
     assert (rows["failed"]["stage"], rows["failed"]["reason"]) == ("segmentation", "mesh: no faces")
     assert rows["failed"]["log"] == "results/failed/logs/segmentation.log"
     assert (rows["killed"]["stage"], rows["idle"]["stage"]) == ("capture", "plan")
+    assert (rows["running"]["stage"], rows["running"]["reason"]) == ("capture", "it runs")
     import pyarrow.parquet as pq
 
     table = pq.read_table("results/batch/summary.parquet")
     assert table.column_names == list(summary.COLUMNS)
-    assert table["rgb_psnr"].to_pylist() == [30.0, None, None, None, None]
+    assert table["rgb_psnr"].to_pylist() == [30.0, *[None] * 5]
 
 
 class _Addresses(HTMLParser):
@@ -306,7 +317,7 @@ class _Addresses(HTMLParser):
         self.found += [value for name, value in attrs if name in ("src", "href")]
 
 
-def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
+def test_the_page_stands_alone_and_escapes_what_it_is_told(ended):
     summary.write_summary("draft")
     text = Path("results/batch/report.html").read_text()
     page = _Addresses(text)
@@ -315,13 +326,14 @@ def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
         "../../scenes/done/report.html",
         "../../results/failed/logs/segmentation.log",
         "../../results/killed/logs/capture.log",
+        "../../results/running/logs/capture.log",
     }
-    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 not run", "mesh: no faces", "held-out PSNR"):
+    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 running", "1 not run", "mesh: no faces", "held-out PSNR"):
         assert words in text
     assert "roughness L2" not in text  # no scene has it
 
 
-def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
+def test_a_damaged_deliverable_is_a_row_and_not_the_end(ended):
     Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
     summary.write_summary("draft")
     assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
@@ -354,14 +366,14 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
     assert thumbnails("a") == []
 
 
-def test_only_a_finished_plan_counts_as_complete(five):
+def test_only_a_finished_plan_counts_as_complete(ended):
     summary.write_summary("draft", "mark")
     assert Path("results/batch/complete").read_text() == "mark\n"
     summary.write_summary("draft")
     assert not Path("results/batch/complete").exists()
 
 
-def test_refusing_names_every_scene(five):
+def test_refusing_names_every_scene(ended):
     with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
         summary.refuse("draft")
 

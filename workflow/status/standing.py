@@ -27,7 +27,7 @@ STATES = {
     "stale": "made under other settings or other code; the next run makes it again",
     "unknown": "what is there cannot be read",
 }
-LOOKED_INTO = 100
+LOOKED_INTO = 40
 """So many scenes are looked into as a plan does, which reads headers of their photographs: those that have not begun, for
 mistakes; all that are not done, for what they will take. The others count like their mean."""
 TAIL = 4096
@@ -185,8 +185,8 @@ def _remaining(found: Standing, now: float) -> float:
 
 
 def _published(scene: str) -> tuple[dict[str, Any], float]:
-    path = Path("scenes") / scene / "manifest.json"
-    return _document(path), _touched(str(path)) or 0.0
+    path = f"scenes/{scene}/manifest.json"
+    return _document(path), _touched(path) or 0.0
 
 
 def _is_current(document: dict[str, Any], touched: float, scene: str, quality: str) -> bool:
@@ -262,7 +262,7 @@ def _taken(scene: str, running: dict[str, dict[str, Any]]) -> dict[str, float]:
         stage, _, rest = name.partition(".")
         if rest != "parts.json" or stage not in STAGES or stage in running:
             continue
-        job = _document(Path(f"results/{scene}/benchmarks/{name}")).get("job")
+        job = _document(f"results/{scene}/benchmarks/{name}").get("job")
         if isinstance(job, dict):
             cpu += _number(job.get("cpu_seconds"))
             memory = max(memory, _number(job.get("max_rss_mb")))
@@ -301,9 +301,10 @@ def printable(text: str) -> str:
     return "".join(character if character.isprintable() else " " for character in text)
 
 
-def _document(path: Path) -> dict[str, Any]:
+def _document(path: str) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_bytes())
+        with open(path, "rb") as file:
+            document = json.loads(file.read())
     except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}

@@ -22,8 +22,8 @@ from workflow.status.standing import STATES, Standing, printable
 
 UNBOUNDED = 400
 """Columns of a line where no terminal bounds it."""
-LEAST = 24
-"""Columns that the last of them has at least, on a narrow terminal."""
+LEAST = 12
+"""Columns below which the last of them is left out, on a narrow terminal."""
 COLOURS = {"done": 32, "running": 36, "failed": 31, "killed": 31, "refused": 31, "unknown": 31, "stale": 33}
 GAP = "  "
 
@@ -96,8 +96,8 @@ def text(found: Sequence[Standing], now: float, width: int, coloured: bool) -> l
     out = []
     for row in rows:
         cells = [row[i].rjust(widths[i]) if i in (4, 5) else row[i].ljust(widths[i]) for i in range(6)]
-        room = max(LEAST, width - sum(widths) - 6 * len(GAP))
-        last = row[6] if len(row[6]) <= room else f"{row[6][: room - 3]}..."
+        room = width - sum(widths) - 6 * len(GAP)
+        last = row[6] if len(row[6]) <= room else f"{row[6][: room - 3]}..." if room >= LEAST else ""
         if coloured and row[1] in COLOURS:
             cells[1] = f"\x1b[{COLOURS[row[1]]}m{cells[1]}\x1b[0m"
         out.append(GAP.join([*cells, last]).rstrip())
@@ -128,19 +128,15 @@ def _words(one: Standing) -> str:
 
 
 def total(found: Sequence[Standing]) -> str:
-    """Return the last line: how many scenes there are in each state, CPU hours so far, and those that are expected."""
+    """Return the last line: how many scenes there are in each state, CPU time so far, and what is expected to be left."""
     counts = {state: sum(one.state == state for one in found) for state in STATES}
     parts = [f"{count} {state}" for state, count in counts.items() if count]
     spent = sum(one.cpu_seconds for one in found)
     unfinished = [one for one in found if one.state not in ("done", "refused", "unknown")]
     known = [one.remaining_cpu_seconds for one in unfinished if one.remaining_cpu_seconds is not None]
-    left = f", about {_hours(sum(known) / len(known) * len(unfinished))} to go" if known else ""
+    left = f", about {duration(sum(known) / len(known) * len(unfinished))} to go" if known else ""
     name = "scene" if len(found) == 1 else "scenes"
-    return f"{len(found)} {name}: {', '.join(parts)}; {_hours(spent)} so far{left}"
-
-
-def _hours(seconds: float) -> str:
-    return f"{seconds / 3600:.2f} CPU hours" if seconds < 36_000 else f"{seconds / 3600:.0f} CPU hours"
+    return f"{len(found)} {name}: {', '.join(parts)}; {duration(spent)} of CPU time so far{left}"
 
 
 def _width() -> int:
