@@ -12,7 +12,7 @@ CONFIG = $(if $(QUALITY),--config quality=$(QUALITY))
 # A run starts some hundred processes; without kept byte code each of them would compile every module anew.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup scenes verify test test-all test-slurm fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
+.PHONY: help setup scenes status verify test test-all test-slurm fuzz node doctor lint format lock lock-torch licences sbom docs clean always plan relight bench compare score results \
   config envs iif_core profiles tests workflow
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo 'make score/<name>     scores of the maps in MAPS=<folder> against a scene with truth'
 	@echo 'make scenes           every scene of the batch table'
 	@echo '                      QUALITY=draft|standard|paper  CORES=2  SNAKEMAKE_ARGS="--dry-run"'
+	@echo 'make status           where every scene stands, also while a run goes on'
 	@echo 'make verify           re-hash every artefact against its manifest'
 	@echo 'make test             all tests but the long ones (PYTEST_ARGS="-k laplace" for a part)'
 	@echo 'make test-all         every test, also those on large scenes'
@@ -75,6 +76,11 @@ config envs iif_core profiles tests workflow:
 
 scenes verify: setup
 	$(SNAKEMAKE) --cores $(CORES) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
+
+# Changes nothing, so it installs nothing.
+status:
+	@test -x $(SNAKEMAKE) || { echo 'status: nothing is installed yet; make scenes/<name> installs what is missing' >&2; exit 1; }
+	@$(SNAKEMAKE) $@ $(CONFIG) $(SNAKEMAKE_ARGS)
 
 always:
 

@@ -209,6 +209,16 @@ def test_states_under_other_settings_do_not_count(project):
     assert stand().state == "waiting"
 
 
+def test_a_stage_that_several_jobs_make_runs_as_long_as_one_does(project):
+    made("capture")
+    for part in ("1-of-3", "2-of-3", "3-of-3"):
+        JobState("a", f"prior.{part}", fp.fingerprint("prior", "a", "draft")).started()
+    JobState("a", "prior.1-of-3", "").failed("no weights")
+    path = Path("results/a/logs/prior.3-of-3.state.json")
+    write_json(path, json.loads(path.read_text()) | {"start": 1})
+    assert (stand().state, stand().stage, stand().running) == ("running", "prior", ("prior",))
+
+
 def test_a_scene_that_cannot_be_used_is_refused(project):
     Path("config/scenes/b.yaml").write_text("source: {kind: folder, path: no/where}\nprior: {kind: retinex}\n")
     Path("config/scenes/c.yaml").write_text(TINY + "sede: 4\n")

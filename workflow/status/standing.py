@@ -236,32 +236,33 @@ def _source_is_there(scene: str, quality: str) -> None:
 
 
 def _jobs(scene: str, now: float) -> dict[str, Noted]:
-    """Return the states of the jobs of a scene that run or have not ended well."""
-    found = {}
-    try:
-        names = os.listdir(f"results/{scene}/logs")
-    except OSError:
-        return {}
-    for name in names:
-        stage, _, rest = name.partition(".")
-        if rest == "state.json" and stage in STAGES:
-            job = noted(Path(f"results/{scene}/logs/{name}"), now)
-            if job:
-                found[stage] = job
+    """Return the states of the jobs of a scene that run or have not ended well; of a stage that several jobs make, one that runs."""
+    found: dict[str, Noted] = {}
+    for stage, name in _files(scene, "logs", ".state.json"):
+        job = noted(Path(f"results/{scene}/logs/{name}"), now)
+        if job and (stage not in found or job.state == "running"):
+            found[stage] = job
     return found
+
+
+def _files(scene: str, folder: str, ending: str) -> Iterator[tuple[str, str]]:
+    """Return (stage, name) of the files of a folder of a scene that belong to a stage: `base.state.json`, `prior.3-of-8.state.json`."""
+    try:
+        names = os.listdir(f"results/{scene}/{folder}")
+    except OSError:
+        return
+    for name in sorted(names):
+        stage = name.partition(".")[0]
+        if name.endswith(ending) and stage in STAGES:
+            yield stage, name
 
 
 def _taken(scene: str, running: dict[str, dict[str, Any]]) -> dict[str, float]:
     """Return CPU seconds and peak memory of the jobs on record, and so far of those that run here."""
     cpu = memory = 0.0
-    try:
-        names = os.listdir(f"results/{scene}/benchmarks")
-    except OSError:
-        names = []
-    for name in names:
-        stage, _, rest = name.partition(".")
-        if rest != "parts.json" or stage not in STAGES or stage in running:
-            continue
+    for stage, name in _files(scene, "benchmarks", ".parts.json"):
+        if name == f"{stage}.parts.json" and stage in running:
+            continue  # of an earlier run
         job = _document(f"results/{scene}/benchmarks/{name}").get("job")
         if isinstance(job, dict):
             cpu += _number(job.get("cpu_seconds"))
@@ -280,8 +281,7 @@ def _number(value: Any) -> float:
 
 def _logged(scene: str, stage: str) -> dict[str, str]:
     path = f"results/{scene}/logs/{stage}.log"
-    line = last_line(path)
-    return {"log": path, "line": line.removeprefix(f"{stage}: ")} if line else {}
+    return {"log": path, "line": last_line(path).removeprefix(f"{stage}: ")} if os.path.isfile(path) else {}
 
 
 def last_line(path: str) -> str:
