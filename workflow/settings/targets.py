@@ -32,7 +32,8 @@ def refuse_target(target: str, rules: Iterable[str], root: Path = Path(".")) -> 
         " name of one scene (letters, digits, _ and -), relight/<name>/<plan> with a plan of config/relight/, score/<name>,"
         " compare/<a>,<b> with the names of two results,"
         " results/<name>/<stage>/manifest.json, results/studies/<study>.parquet and .grid.pdf,"
-        " `scenes`, `status` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that `--forcerun` takes."
+        " `scenes`, `status` and `verify`; docs/reference/commands.md lists them, and `snakemake --list` the rules that"
+        " `--forcerun` takes."
     )
 
 

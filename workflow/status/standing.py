@@ -236,7 +236,8 @@ def _source_is_there(scene: str, quality: str) -> None:
 
 
 def _jobs(scene: str, now: float) -> dict[str, Noted]:
-    """Return the states of the jobs of a scene that run or have not ended well; of a stage that several jobs make, one that runs."""
+    """Return the states of the jobs of a scene that run or have not ended well; of a stage that several jobs make, that of one
+    that runs, if any does."""
     found: dict[str, Noted] = {}
     for stage, name in _files(scene, "logs", ".state.json"):
         job = noted(Path(f"results/{scene}/logs/{name}"), now)
@@ -246,7 +247,8 @@ def _jobs(scene: str, now: float) -> dict[str, Noted]:
 
 
 def _files(scene: str, folder: str, ending: str) -> Iterator[tuple[str, str]]:
-    """Return (stage, name) of the files of a folder of a scene that belong to a stage: `base.state.json`, `prior.3-of-8.state.json`."""
+    """Return (stage, name) of the files of a folder of a scene that belong to a stage, such as `base.state.json` and
+    `prior.3-of-8.state.json`."""
     try:
         names = os.listdir(f"results/{scene}/{folder}")
     except OSError:

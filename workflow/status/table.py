@@ -134,9 +134,10 @@ def total(found: Sequence[Standing]) -> str:
     spent = sum(one.cpu_seconds for one in found)
     unfinished = [one for one in found if one.state not in ("done", "refused", "unknown")]
     known = [one.remaining_cpu_seconds for one in unfinished if one.remaining_cpu_seconds is not None]
+    so_far = f"{duration(spent)} of CPU time so far" if spent else "nothing done so far"
     left = f", about {duration(sum(known) / len(known) * len(unfinished))} to go" if known else ""
     name = "scene" if len(found) == 1 else "scenes"
-    return f"{len(found)} {name}: {', '.join(parts)}; {duration(spent)} of CPU time so far{left}"
+    return f"{len(found)} {name}: {', '.join(parts)}; {so_far}{left}"
 
 
 def _width() -> int:
