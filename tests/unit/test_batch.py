@@ -234,16 +234,16 @@ def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):
 # -------------------------------------------------------------------------------------------------------------- summary
 
 
-def _of_a_process_that_is_gone(path):
+def gone(state):
     """Give the process of a state another time of start, as after its number was given again."""
-    document = json.loads(path.read_text())
-    write_json(path, document | {"start": document["start"] - 1})
+    document = json.loads(state.path.read_text())
+    write_json(state.path, document | {"start": document["start"] - 1})
 
 
 @pytest.fixture
-def ended(project, monkeypatch):
-    """Scenes that ended differently, without running them."""
-    names = ("done", "refused", "failed", "killed", "running", "idle")
+def five(project, monkeypatch):
+    """Five scenes that ended differently, without running them."""
+    names = ("done", "refused", "failed", "killed", "idle")
     lines = tuple(batch_table.Line(i + 2, name, "builtin") for i, name in enumerate(names))
     monkeypatch.setattr(fp, "fingerprint", lambda stage, scene, quality: f"{stage} of {scene}")
     monkeypatch.setattr(fp, "resolved", lambda scene, quality: json.dumps({"source": {"kind": "builtin"}}))
@@ -253,7 +253,7 @@ def ended(project, monkeypatch):
 
     write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
     view = ["000", "001", "000", "000"]
-    columns = {"view": view, "quantity": ["rgb", "rgb", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
+    columns = {"view": view, "quantity": ["rgb", "rgb_held_out", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
     columns |= {"protocol": ["raw"] * 4, "value": np.array([30.0, 20.0, 25.0, 9.0])}
     write_parquet(Path("scenes/done/metrics.parquet"), columns, {})
     cameras = {"name": ["000", "001"], "split": ["train", "test"]}
@@ -267,19 +267,19 @@ def ended(project, monkeypatch):
     write_json(Path("scenes/idle/manifest.json"), {"fingerprint": "publish of other settings"})
     write_json(Path("results/idle/capture/manifest.json"), {"fingerprint": "capture of idle"})
     JobState("idle", "prior", "prior of other settings").failed("long ago")
-    JobState("killed", "capture", "capture of killed").started()
-    _of_a_process_that_is_gone(Path("results/killed/logs/capture.state.json"))
-    JobState("running", "capture", "capture of running").started()  # by this process
+    killed, cancelled = JobState("killed", "capture", "capture of killed"), JobState("failed", "prior", "prior of failed")
+    killed.started()
+    gone(killed)
     JobState("failed", "capture", "capture of failed").started()
     JobState("failed", "capture", "capture of failed").done()
     write_json(Path("results/failed/capture/manifest.json"), {"fingerprint": "capture of failed"})
-    JobState("failed", "prior", "prior of failed").started()  # both were running when one failed
-    _of_a_process_that_is_gone(Path("results/failed/logs/prior.state.json"))
+    cancelled.started()  # both were running when one failed
+    gone(cancelled)
     JobState("failed", "segmentation", "segmentation of failed").failed("mesh: no faces")
     return plan
 
 
-def test_every_scene_has_a_row_that_says_how_it_ended(ended):
+def test_every_scene_has_a_row_that_says_how_it_ended(five):
     summary.write_summary("draft")
     with open("results/batch/summary.tsv", newline="") as file:
         rows = {row["scene"]: row for row in csv.DictReader(file, delimiter="\t")}
@@ -288,7 +288,6 @@ def test_every_scene_has_a_row_that_says_how_it_ended(ended):
         "refused": "refused",
         "failed": "failed",
         "killed": "killed",
-        "running": "running",
         "idle": "not run",
     }
     done = rows["done"]
@@ -298,12 +297,18 @@ def test_every_scene_has_a_row_that_says_how_it_ended(ended):
     assert (rows["failed"]["stage"], rows["failed"]["reason"]) == ("segmentation", "mesh: no faces")
     assert rows["failed"]["log"] == "results/failed/logs/segmentation.log"
     assert (rows["killed"]["stage"], rows["idle"]["stage"]) == ("capture", "plan")
-    assert (rows["running"]["stage"], rows["running"]["reason"]) == ("capture", "it runs")
     import pyarrow.parquet as pq
 
     table = pq.read_table("results/batch/summary.parquet")
     assert table.column_names == list(summary.COLUMNS)
-    assert table["rgb_psnr"].to_pylist() == [30.0, *[None] * 5]
+    assert table["rgb_psnr"].to_pylist() == [30.0, None, None, None, None]
+
+
+def test_a_job_that_runs_is_told_from_a_killed_one(five):
+    JobState("idle", "prior", "prior of idle").started()  # by this process
+    summary.write_summary("draft")
+    assert "\trunning\tprior\tit runs\t" in Path("results/batch/summary.tsv").read_text()
+    assert "1 running" in Path("results/batch/report.html").read_text()
 
 
 class _Addresses(HTMLParser):
@@ -317,7 +322,7 @@ class _Addresses(HTMLParser):
         self.found += [value for name, value in attrs if name in ("src", "href")]
 
 
-def test_the_page_stands_alone_and_escapes_what_it_is_told(ended):
+def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
     summary.write_summary("draft")
     text = Path("results/batch/report.html").read_text()
     page = _Addresses(text)
@@ -326,14 +331,13 @@ def test_the_page_stands_alone_and_escapes_what_it_is_told(ended):
         "../../scenes/done/report.html",
         "../../results/failed/logs/segmentation.log",
         "../../results/killed/logs/capture.log",
-        "../../results/running/logs/capture.log",
     }
-    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 running", "1 not run", "mesh: no faces", "held-out PSNR"):
+    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 not run", "mesh: no faces", "held-out PSNR"):
         assert words in text
     assert "roughness L2" not in text  # no scene has it
 
 
-def test_a_damaged_deliverable_is_a_row_and_not_the_end(ended):
+def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
     Path("scenes/done/metrics.parquet").write_bytes(b"PAR1 rubbish")
     summary.write_summary("draft")
     assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
@@ -366,14 +370,14 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
     assert thumbnails("a") == []
 
 
-def test_only_a_finished_plan_counts_as_complete(ended):
+def test_only_a_finished_plan_counts_as_complete(five):
     summary.write_summary("draft", "mark")
     assert Path("results/batch/complete").read_text() == "mark\n"
     summary.write_summary("draft")
     assert not Path("results/batch/complete").exists()
 
 
-def test_refusing_names_every_scene(ended):
+def test_refusing_names_every_scene(five):
     with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
         summary.refuse("draft")
 
