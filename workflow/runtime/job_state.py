@@ -55,9 +55,10 @@ class JobState:
 
     def _beat(self) -> None:
         """Renew the time stamp of the file as long as the job runs, for those who cannot ask for its process."""
+        path = self.path.absolute()
         while not self._ended.wait(alive.BEAT):
             with suppress(OSError):
-                os.utime(self.path)
+                os.utime(path)
 
     def _write(self, state: str, reason: str) -> None:
         since = datetime.now(UTC).isoformat(timespec="seconds")
