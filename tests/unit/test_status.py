@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from iif_core.errors import InputError
+from workflow.artifacts import stamps
 from workflow.artifacts.files import write_json
 from workflow.runtime import alive, events
 from workflow.runtime import fingerprint as fp
@@ -72,8 +74,9 @@ def made(stage, scene="a", mark=None):
 
 def published(scene="a", **changed):
     document = {"settings": json.loads(fp.resolved(scene, "draft")), "quality": "draft"}
-    document["fingerprint"] = fp.fingerprint("publish", scene, "draft")
-    write_json(Path(f"scenes/{scene}/manifest.json"), document | changed)
+    document |= {"fingerprint": fp.fingerprint("publish", scene, "draft"), "files": {}} | changed
+    write_json(Path(f"scenes/{scene}/manifest.json"), document)
+    stamps.note(stamps.place(Path("results"), scene, stamps.DELIVERABLE), Path("scenes") / scene, document)
 
 
 # ------------------------------------------------------------------------------------------------------- running or killed
@@ -190,6 +193,17 @@ def test_other_settings_are_found_without_a_look_at_inputs(project, monkeypatch)
     assert stand().state == "done"
     published(settings={}, fingerprint="of other settings")
     assert stand().state == "stale"
+
+
+def test_a_copy_is_compared_by_its_fingerprint(project, monkeypatch):
+    monkeypatch.setattr(standing, "_code_changed", lambda: 0.0)
+    published(fingerprint="of other code")
+    shutil.copy("scenes/a/manifest.json", "scenes/a/copy.json")
+    os.replace("scenes/a/copy.json", "scenes/a/manifest.json")
+    assert stand().state == "stale"
+    published()
+    stamps.place(Path("results"), "a", stamps.DELIVERABLE).unlink()
+    assert stand().state == "done"
 
 
 def test_a_changed_file_of_the_code_is_seen(repository, project, monkeypatch):

@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow.artifacts import stamps
+from workflow.artifacts.manifest import MANIFEST
 from workflow.registry import STAGES
 from workflow.runtime import alive, forecast
 from workflow.runtime import fingerprint as fp
@@ -192,13 +194,23 @@ def _published(scene: str) -> tuple[dict[str, Any], float]:
 def _is_current(document: dict[str, Any], touched: float, scene: str, quality: str) -> bool:
     """Return whether a deliverable is what settings and code of now would make.
 
-    Fingerprints read headers of all photographs, so they are computed only where settings differ or a file of the code was
-    changed since.
+    Fingerprints read headers of all photographs, so they are computed only where settings differ, a file of the code was changed
+    since, or the deliverable is a copy, whose time stamp says nothing.
     """
     same = document.get("settings") == json.loads(fp.resolved(scene, quality))
-    if same and "fingerprint" in document and touched > _code_changed():
+    if same and "fingerprint" in document and touched > _code_changed() and _is_original(scene):
         return True
     return bool(document.get("fingerprint") == fp.fingerprint("publish", scene, quality))
+
+
+def _is_original(scene: str) -> bool:
+    """Return whether the manifest of a deliverable has the time stamps that were noted when it was published."""
+    noted_of = stamps.load(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
+    try:
+        now = stamps.stamp_of(os.stat(f"scenes/{scene}/{MANIFEST}"))
+    except OSError:
+        return False
+    return noted_of is not None and noted_of.files.get(MANIFEST) == now
 
 
 @lru_cache(None)
