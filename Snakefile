@@ -58,7 +58,9 @@ onstart:
 onsuccess:
     tell_target()
     tell_pages()
+    tell_attempts()
 
 
 onerror:
     tell_reasons()
+    tell_attempts()

@@ -21,6 +21,7 @@ from workflow.batch.columns import SCORES, STATUSES
 from workflow.batch.page import render
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
+from workflow.runtime.job_state import killed as why_killed
 from workflow.runtime.job_state import read_state
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
@@ -128,8 +129,8 @@ def _why_not(scene: str, quality: str) -> Row:
             continue
         found = {"stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
         if state.get("state") == "failed":
-            return found | {"status": "failed", "reason": str(state.get("reason", ""))}
-        killed = killed or found | {"status": "killed", "reason": "started and did not end: killed, or still running"}
+            return found | {"status": "failed", "reason": "; ".join([str(state.get("reason", "")), *state.get("earlier", [])])}
+        killed = killed or found | {"status": "killed", "reason": why_killed(state)}
     stage = missing[0] if missing else "publish"
     return killed or {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
 

@@ -18,7 +18,7 @@ from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import forecast, input_digests, native
-from workflow.runtime.job_state import reasons
+from workflow.runtime.job_state import reasons, retold
 from workflow.scene.named import check_overrides
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
@@ -531,6 +531,12 @@ def tell_reasons():
         command = [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY]
         atexit.register(subprocess.run, command, cwd=os.getcwd(), check=False)
     elif found := reasons(STARTED) or damages():
+        atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
+
+
+def tell_attempts():
+    """Say which jobs needed several attempts in this run, and how the attempts ended that did not do it."""
+    if workflow.is_main_process and (found := retold(STARTED)):
         atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
 
 
