@@ -53,6 +53,7 @@ include: "workflow/rules/unknown.smk"
 onstart:
     choose.keep(REQUEST, CHOSEN)
     tell_costs()
+    refuse_too_large()
 
 
 onsuccess:

@@ -17,7 +17,7 @@ from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import forecast, input_digests, native
+from workflow.runtime import forecast, input_digests, native, slurm
 from workflow.runtime.job_state import reasons, retold
 from workflow.scene.named import check_overrides
 from workflow.relighting.check import check_relightings
@@ -499,6 +499,45 @@ def tell_costs_of_dry_run():
 
 
 atexit.register(tell_costs_of_dry_run)
+
+
+# ----------------------------------------------------------------------------------------------------------- cluster
+
+
+def by_slurm():
+    """Whether jobs go to Slurm: by its own executor, or by sbatch."""
+    plugin = workflow.executor_plugin
+    submit = getattr(workflow.executor_settings, "submit_cmd", None) or ""
+    return plugin is not None and (plugin.name == "slurm" or "sbatch" in submit)
+
+
+def asked_of_a_node(job):
+    """What a job, or the group of jobs that is submitted as one, asks of a node."""
+    group = workflow.dag.get_job_group(job)
+    unit = group or job
+    rules = {one.rule.name: one.threads for one in (group.jobs if group else [job])}
+    memory, partitions = unit.resources.get("mem_mb"), unit.resources.get("slurm_partition")
+    scene = job.wildcards.get("scene", "")
+    what = f"the job of {len(rules)} stages" if len(rules) > 1 else job.rule.name
+    named = tuple(filter(None, re.split(r"[,\s]+", str(partitions or os.environ.get("SBATCH_PARTITION", "")))))
+    return slurm.Asked(
+        f"{what} of {scene}" if scene else what,
+        rules,
+        unit.threads,
+        memory if isinstance(memory, int) else None,
+        named,
+        not named and bool(getattr(workflow.executor_settings, "partition_config", None)),
+    )
+
+
+def refuse_too_large():
+    """Stop before anything is submitted if a job asks for more than any node has: Slurm would let it wait for ever."""
+    if not by_slurm():
+        return
+    jobs = workflow.dag.needrun_jobs(exclude_finished=False)
+    asked = [asked_of_a_node(job) for job in jobs if not job.is_local]
+    if asked and (found := slurm.too_large(asked, slurm.nodes())):
+        stop("\n       ".join(found))
 
 
 # ------------------------------------------------------------------------------------------------------------ errors

@@ -138,8 +138,9 @@ def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
     state = slurm.state_of(own["job"])
     if state in slurm.ALIVE:
         return f"has not ended: Slurm says {state}"
-    if state in slurm.KILLED:
-        return slurm.KILLED[state] + (f": {had}" if had else "")
+    cause = state if state in slurm.KILLED and state != "CANCELLED" else slurm.said_in(own["log"], own["job"]) or state
+    if cause in slurm.KILLED:
+        return slurm.KILLED[cause] + (f": {had}" if had else "")
     full = own.get("memory_mb") and peak and peak > 0.8 * own["memory_mb"]
     guess = "for its memory?" if full else GUESS
     says = f"; Slurm says {state}" if state else ""

@@ -10,6 +10,7 @@ import math
 import os
 import re
 import subprocess
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -50,6 +51,7 @@ class Own(NamedTuple):
         node: name of the node.
         memory_mb, minutes: what the job asked for; None where Slurm does not say, or sets no limit.
         restarts: how often Slurm itself has put the job back into its queue.
+        log: file to which Slurm writes what it says about the job; empty where it does not tell.
     """
 
     job: str
@@ -57,6 +59,7 @@ class Own(NamedTuple):
     memory_mb: int | None
     minutes: int | None
     restarts: int
+    log: str
 
 
 def own(environment: Mapping[str, str] = os.environ) -> Own | None:
@@ -67,7 +70,8 @@ def own(environment: Mapping[str, str] = os.environ) -> Own | None:
     shown = _shown(job)
     node = environment.get("SLURMD_NODENAME") or shown.get("BatchHost") or environment.get("SLURM_JOB_NODELIST", "")
     restarts = shown.get("Restarts", environment.get("SLURM_RESTART_COUNT", "0"))
-    return Own(job, node, _memory_of(shown), _minutes(shown.get("TimeLimit", "")), int(restarts) if restarts.isdigit() else 0)
+    count = int(restarts) if restarts.isdigit() else 0
+    return Own(job, node, _memory_of(shown), _minutes(shown.get("TimeLimit", "")), count, shown.get("StdErr", ""))
 
 
 def _memory_of(shown: Mapping[str, str]) -> int | None:
@@ -113,6 +117,33 @@ def state_of(job: str) -> str:
     return words[-1].rstrip("+") if words else ""
 
 
+SAID = (
+    (r"exceeded (?:job )?memory limit|oom[-_]kill", "OUT_OF_MEMORY"),
+    (r"DUE TO TIME LIMIT", "TIMEOUT"),
+    (r"DUE TO NODE FAILURE", "NODE_FAIL"),
+    (r"DUE TO PREEMPTION", "PREEMPTED"),
+    (r"\*\*\* (?:JOB|STEP) \S+ ON \S+ CANCELLED AT \S+ \*\*\*", "CANCELLED"),
+)
+"""What Slurm writes into the log of a job that it ends, the strongest first: a job over its memory is cancelled, too."""
+TAIL = 65536
+"""Bytes at the end of such a log that are read."""
+
+
+def said_in(log: str, job: str) -> str:
+    """Return how Slurm says in the log of a job that it ended it, in the words of `state_of`; empty if it does not say.
+
+    This is the only witness of memory where Slurm measures it itself and not the kernel: the state is FAILED then.
+    """
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL))
+            lines = file.read().decode(errors="replace").splitlines()
+    except OSError:
+        return ""
+    own_words = "\n".join(line for line in lines if line.startswith("slurmstepd") and re.search(rf"\b{re.escape(job)}\b", line))
+    return next((state for pattern, state in SAID if re.search(pattern, own_words)), "")
+
+
 class Node(NamedTuple):
     """What one kind of node offers."""
 
@@ -156,6 +187,10 @@ class Asked(NamedTuple):
     anywhere: bool = False
 
 
+AT_ONCE = 3
+"""Stages of a scene that can run at the same time."""
+
+
 def too_large(asked: Iterable[Asked], offered: list[Node]) -> list[str]:
     """Return one message for each kind of job that no node can run; none if nothing is known of the nodes.
 
@@ -184,7 +219,9 @@ def _too_large(job: Asked, among: list[Node]) -> str:
     offers = " or ".join(f"{node.cores} cores and {node.memory_mb:,} MB" for node in kinds)
     cures = []
     if job.cores > widest.cores:
-        lower = [f"{rule}={min(cores, max(1, widest.cores * cores // job.cores))}" for rule, cores in sorted(job.rules.items())]
+        beside = min(len(job.rules), AT_ONCE) - 1  # each of them keeps one core
+        fitting = {rule: max(1, (widest.cores - beside) * cores // job.cores) for rule, cores in sorted(job.rules.items())}
+        lower = [f"{rule}={cores}" for rule, cores in fitting.items() if cores < job.rules[rule]]
         cures.append(f"lower the cores: --set-threads {' '.join(lower)} (or `set-threads` of the profile)")
     if (job.memory_mb or 0) > largest.memory_mb or not cures:
         resources = " ".join(f"{rule}:mem_mb={largest.memory_mb}" for rule in sorted(job.rules))
@@ -195,3 +232,21 @@ def _too_large(job: Asked, among: list[Node]) -> str:
     return f"{job.what} asks for {asks} on one node, and no node{where} has that; the largest has {offers}. " + "; ".join(
         cure[0].upper() + cure[1:] if not number else cure for number, cure in enumerate(cures)
     )
+
+
+def answer_to_snakemake(job: str) -> str:
+    """Return `running`, `success` or `failed`, as the executor cluster-generic asks for.
+
+    A job that Slurm does not know any more counts as finished: Snakemake looks for its files and tries again if they lack. While
+    the controller does not answer, jobs count as running.
+    """
+    state = state_of(job)
+    if not state:
+        return "success" if _answer("scontrol", "ping").count(" UP") else "running"
+    if state == "COMPLETED":
+        return "success"
+    return "running" if state in ALIVE else "failed"
+
+
+if __name__ == "__main__":  # `cluster-generic-status-cmd` of workflow/profiles/slurm-scenes
+    print(answer_to_snakemake(sys.argv[1]))
