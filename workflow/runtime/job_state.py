@@ -48,7 +48,7 @@ class JobState:
         if self.fingerprint:
             self._facts = _facts(_read(self.path), self.fingerprint)
             self._tell()
-            threading.Thread(target=self._watch, daemon=True).start()
+            threading.Thread(target=self._watch, name="memory", daemon=True).start()
         self._write("started", "")
 
     def failed(self, reason: str) -> None:

@@ -112,7 +112,7 @@ def state_of(job: str) -> str:
     shown = _shown(job).get("JobState", "")
     if shown:
         return shown
-    lines = _answer("sacct", "-n", "-X", "-P", "-D", "-j", job, "-o", "State").split("\n")
+    lines = _answer("sacct", "-n", "-X", "-P", "-D", "-o", "State", "-j", job).split("\n")
     words = [line.split()[0] for line in lines if line.strip()]
     return words[-1].rstrip("+") if words else ""
 
