@@ -64,7 +64,8 @@ chmod 400 "$state/munge.key"
 memory=$(awk '/MemTotal/ {print int($2 / 1024 * 0.9)}' /proc/meminfo)
 accounting='AccountingStorageType=accounting_storage/none' # `sacct` is there and knows nothing, as on clusters without a database
 if [ -n "${IIF_SLURM_ACCOUNTING:-}" ]; then
-  accounting=$(printf '%s\n' AccountingStorageType=accounting_storage/slurmdbd AccountingStorageHost=127.0.0.1)
+  accounting=$(printf '%s\n' AccountingStorageType=accounting_storage/slurmdbd AccountingStorageHost=127.0.0.1 \
+    AccountingStoreFlags=job_comment)
   mkdir -p /run/mysqld
   mariadb-install-db --no-defaults --user=root --datadir="$state/database" --skip-test-db >"$state/log/mariadb-install.log" 2>&1
   mariadbd --no-defaults --user=root --datadir="$state/database" --socket=/run/mysqld/mysqld.sock --skip-networking \

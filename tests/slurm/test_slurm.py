@@ -1,9 +1,10 @@
 """The Slurm profiles on a real Slurm of one node, with or without accounting: tests/slurm/run.sh starts it (`make test-slurm`).
 
-`IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs beside its stages, and keeps the
-row for docs/results/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
+`IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs beside its stages, and keeps
+the row for docs/results/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
 """
 
+import csv
 import json
 import os
 import re
@@ -136,8 +137,8 @@ def keep(**facts):
 
 
 def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
-    """One job for each scene. Every manifest equals that of the run without Slurm, the run says what happened to the cancelled job,
-    and nothing is left in the queue."""
+    """One job for each scene. Every manifest equals that of the run without Slurm, the run says what happened to the cancelled
+    job, and nothing is left in the queue."""
     folder = batch("slurm")
     process = subprocess.Popen(
         command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "--jobs", 2, "scenes"),
@@ -182,7 +183,7 @@ def beside_stages(folder, scene, seconds):
 def test_overhead_of_one_job_for_a_scene(batch):
     """Submitting, waiting, starting Snakemake on the node and noticing the end, against a run of the same scene without Slurm.
 
-    It is measured within each run, as the time in which no stage is at work, because how long stages take differs from run to run.
+    It is measured within each run, as the time in which no stage is at work: what stages take differs from run to run.
     """
     scene, found = os.environ.get("IIF_SLURM_SCENE", "a"), {}
     for kind in ("slurm", "local"):
@@ -199,7 +200,7 @@ def test_overhead_of_one_job_for_a_scene(batch):
             seconds = time.time() - start
         assert done.returncode == 0, done.stderr[-3000:]
         found[kind] = beside_stages(folder, scene, seconds)
-    (beside, busy), (usual, work) = found["slurm"], found["local"]
+    (beside, _), (usual, work) = found["slurm"], found["local"]
     assert beside < 3 * usual + 15, found  # not a start of Snakemake for each of its stages, as the jobstep executor has
     if scene != "a":
         share = (beside - usual) / work
@@ -209,18 +210,14 @@ def test_overhead_of_one_job_for_a_scene(batch):
 
 
 def test_one_job_for_each_stage(batch, local):
-    """The other profile, whose threads are those of its file; the prior as two jobs. With accounting, jobs are asked of `sacct`, and
-    a report says what was wasted."""
+    """The other profile, whose threads are those of its file; the prior as two jobs. With accounting, `sacct` is asked, and a
+    report says what was wasted."""
     folder = batch("stages")
     options = ["--set-threads", "capture=2", "prior=1", "prior_part=1", "segmentation=1", "--set-scatter", "prior=2"]
     if ACCOUNTING:
-        options += [
-            "--slurm-status-command",
-            "sacct",
-            "--slurm-efficiency-report",
-            "--slurm-efficiency-report-path",
-            folder / "report",
-        ]
+        options += ["--slurm-status-command", "sacct", "--slurm-efficiency-report"]
+    (folder / "partitions.yaml").write_text("partitions:\n  main: {max_runtime: 10000, max_threads: 12, max_mem_mb: 10000}\n")
+    options += ["--slurm-partition-config", folder / "partitions.yaml"]
     done, _ = run(folder, "slurm", "results/a/prior/manifest.json", *options)
     assert done.returncode == 0, done.stderr[-3000:]
     noted = {path.stem: path.read_text().strip() for path in folder.glob("results/a/benchmarks/*.threads")}
@@ -229,12 +226,10 @@ def test_one_job_for_each_stage(batch, local):
         own, other = (root / f"results/a/{stage}/manifest.json" for root in (folder, local))
         assert own.read_bytes() == other.read_bytes()
     if ACCOUNTING:
-        (report,) = [
-            path
-            for path in folder.rglob("*")
-            if path.is_file() and "efficiency" in path.read_text(errors="replace").lower()[:400]
-        ]
-        assert "prior" in report.read_text() and "Memory Usage" in report.read_text()
+        (report,) = folder.glob("efficiency_report_*.csv")
+        rows = list(csv.DictReader(report.read_text().splitlines()))
+        assert {row["RuleName"].split("_wildcards")[0] for row in rows} == {"rule_capture", "rule_prior_part", "rule_prior"}
+        assert any(float(row["CPU Efficiency (%)"]) > 0 and float(row["Memory Usage (%)"]) > 0 for row in rows), rows
 
 
 def test_a_job_that_no_node_can_run_is_refused_before_any_is_submitted(batch):
@@ -257,7 +252,8 @@ def test_the_next_attempt_says_that_memory_was_not_enough(tmp_path):
     wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
     second = submit(tmp_path, "hungry", 1, 0, "--mem=600")
     log = tmp_path / f"hungry-{second}.out"
-    told = rf"attempt 2, which asks for 600 MB.*: attempt 1 \(Slurm job {first} on \S+\) was killed for its memory: it had asked for 300 MB"
+    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was killed for its memory: it had asked for 300 MB"
+    told = rf"attempt 2, which asks for 600 MB.*: {ended}"
     wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)
 
 
@@ -266,6 +262,6 @@ def test_the_next_attempt_says_that_time_was_not_enough(overdue):
     wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
     second = submit(folder, "late", 1, 0, "--time=2", "--mem=300")
     log = folder / f"late-{second}.out"
-    told = rf"attempt 2, .*: attempt 1 \(Slurm job {first} on \S+\) was ended at its time limit: it had asked for 300 MB and 1 minutes"
+    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was ended at its time limit: it had asked for 300 MB and 1 minute"
+    told = rf"attempt 2, .*: {ended}"
     wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)
-    subprocess.run(["scontrol", "requeue", first], check=False, capture_output=True)

@@ -113,7 +113,8 @@ def _place(document: dict[str, Any]) -> str:
 def _asks(own: dict[str, Any]) -> str:
     """Return in words what a Slurm job asks for; empty outside of Slurm."""
     memory, minutes = own.get("memory_mb"), own.get("minutes")
-    return " and ".join(filter(None, (memory and f"{memory:,} MB", minutes and f"{minutes} minutes")))
+    time = minutes and f"{minutes:,} minute{'s' if minutes > 1 else ''}"
+    return " and ".join(filter(None, (memory and f"{memory:,} MB", time)))
 
 
 def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
