@@ -48,7 +48,7 @@ class JobState:
         if self.fingerprint:
             self._facts = _facts(_read(self.path), self.fingerprint)
             self._tell()
-            threading.Thread(target=self._watch, name="memory", daemon=True).start()
+            threading.Thread(target=self._watch, name="watch", daemon=True).start()
         self._write("started", "")
 
     def failed(self, reason: str) -> None:
@@ -113,8 +113,8 @@ def _place(document: dict[str, Any]) -> str:
 def _asks(own: dict[str, Any]) -> str:
     """Return in words what a Slurm job asks for; empty outside of Slurm."""
     memory, minutes = own.get("memory_mb"), own.get("minutes")
-    time = minutes and f"{minutes:,} minute{'s' if minutes > 1 else ''}"
-    return " and ".join(filter(None, (memory and f"{memory:,} MB", time)))
+    limit = minutes and f"{minutes:,} minute{'s' if minutes > 1 else ''}"
+    return " and ".join(filter(None, (memory and f"{memory:,} MB", limit)))
 
 
 def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
