@@ -48,9 +48,8 @@ def attempt(peak=None):
     state = JobState("a", "base", "mark")
     state.started()
     state._ended.set()
-    if peak:
-        document = json.loads(state.path.read_text())
-        state.path.write_text(json.dumps(document | {"peak_mb": peak}))
+    document = json.loads(state.path.read_text()) | {"start": 1}  # of a process that is gone
+    state.path.write_text(json.dumps(document | ({"peak_mb": peak} if peak else {})))
     return json.loads(state.path.read_text())
 
 

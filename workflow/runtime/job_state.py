@@ -78,17 +78,17 @@ class JobState:
 
     def _watch(self) -> None:
         """Note the largest memory of this process whenever it has grown, for the case that it is killed without a word."""
-        noted = 0.0
+        noted, path = 0.0, self.path.absolute()
         while not self._ended.wait(LOOK):
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
             if peak < noted * GROWTH:
                 continue
             noted = peak
             with self._lock, suppress(OSError):  # a full disk will be told of by the stage
-                if not self._ended.is_set():
+                if not self._ended.is_set() and path.exists():  # it is removed with its results
                     self._facts["peak_mb"] = round(peak)
                     document = {"state": "started", "reason": "", "fingerprint": self.fingerprint, **self._facts}
-                    write_json(self.path, document, settled=False)
+                    write_json(path, document, settled=False)
 
 
 def _facts(before: dict[str, Any], fingerprint: str) -> dict[str, Any]:
