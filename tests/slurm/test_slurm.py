@@ -20,7 +20,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "tests/workflow"))
 
 from conftest import TINY  # noqa: E402
-from support import manifests  # noqa: E402
+from support import manifests, planned  # noqa: E402
 
 pytestmark = pytest.mark.skipif("IIF_SLURM_STATE" not in os.environ, reason="no Slurm here; `make test-slurm` starts one")
 ACCOUNTING = bool(os.environ.get("IIF_SLURM_ACCOUNTING"))
@@ -165,6 +165,22 @@ def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
     assert told, output[-4000:]
     key = f"batch, {'with' if ACCOUNTING else 'without'} accounting"
     keep(**{key: {"scenes": len(SCENES), "cancelled": 1, "controller killed": 1, "equal to local": "yes"}})
+
+
+def test_a_scene_that_failed_goes_on_where_it_stopped(batch):
+    """Although its stages were one job, which Snakemake takes for failed as a whole."""
+    folder = batch("failed")
+    blocked = folder / "results/b/render/maps"
+    blocked.parent.mkdir(parents=True)
+    blocked.write_text("in the way")
+    failed, _ = run(folder, "slurm-scenes", "--retries", "0", "--", "scenes/b")
+    last = failed.stderr.strip().splitlines()[-1]
+    assert failed.returncode == 1 and last.startswith("error: b: render failed (results/b/logs/render.log)"), failed.stderr[
+        -3000:
+    ]
+    blocked.unlink()
+    again = subprocess.run(command(folder, "--cores", 2, "-n", "scenes/b"), capture_output=True, text=True)
+    assert planned(again) == {"render", "metrics", "report", "publish"}
 
 
 def beside_stages(folder, scene, seconds):
