@@ -551,11 +551,23 @@ atexit.register(tell_costs_of_dry_run)
 # ----------------------------------------------------------------------------------------------------------- cluster
 
 
-def by_slurm():
-    """Whether jobs go to Slurm: by its own executor, or by sbatch."""
+def submission():
+    """The command that submits jobs to Slurm, empty where Slurm's own executor does it; None where jobs do not go to Slurm."""
     plugin = workflow.executor_plugin
-    submit = getattr(workflow.executor_settings, "submit_cmd", None) or ""
-    return plugin is not None and (plugin.name == "slurm" or "sbatch" in submit)
+    command = getattr(workflow.executor_settings, "submit_cmd", None) or ""
+    if plugin is not None and plugin.name == "slurm":
+        return ""
+    return command if "sbatch" in command else None
+
+
+def partitions_of(unit):
+    """Names of the partitions that a job is submitted to, as far as anything names them."""
+    named = unit.resources.get("slurm_partition")
+    if command := submission():
+        options = command.partition("sbatch")[2]
+        option = re.search(r"(?:--partition[= ]|-p )(\S+)", options)
+        named = option[1] if option else os.environ.get("SBATCH_PARTITION")
+    return tuple(filter(None, re.split(r"[,\s]+", str(named or ""))))
 
 
 def asked_of_a_node(job):
@@ -563,33 +575,23 @@ def asked_of_a_node(job):
     group = workflow.dag.get_job_group(job)
     unit = group or job
     rules = {one.rule.name: one.threads for one in (group.jobs if group else [job])}
-    memory, partitions = unit.resources.get("mem_mb"), unit.resources.get(
-        "slurm_partition"
-    )
+    memory, partitions = unit.resources.get("mem_mb"), partitions_of(unit)
     scene = job.wildcards.get("scene", "")
     what = f"the job of {len(rules)} stages" if len(rules) > 1 else job.rule.name
-    named = tuple(
-        filter(
-            None,
-            re.split(
-                r"[,\s]+", str(partitions or os.environ.get("SBATCH_PARTITION", ""))
-            ),
-        )
-    )
+    described = getattr(workflow.executor_settings, "partition_config", None)
     return slurm.Asked(
         f"{what} of {scene}" if scene else what,
         rules,
         unit.threads,
         memory if isinstance(memory, int) else None,
-        named,
-        not named
-        and bool(getattr(workflow.executor_settings, "partition_config", None)),
+        partitions,
+        not partitions and bool(described),
     )
 
 
 def refuse_too_large():
     """Stop before anything is submitted if a job asks for more than any node has: Slurm would let it wait for ever."""
-    if not by_slurm():
+    if submission() is None:
         return
     jobs = workflow.dag.needrun_jobs(exclude_finished=False)
     asked = [asked_of_a_node(job) for job in jobs if not job.is_local]
