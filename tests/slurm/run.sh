@@ -47,13 +47,12 @@ fi
 export PATH=$PATH:/usr/sbin
 mount --make-rprivate /
 mkdir -p /etc/slurm
-mount -t tmpfs tmpfs /run
+mount -t tmpfs -o mode=755 tmpfs /run
 mount -t tmpfs tmpfs /etc/slurm
 ip link set lo up
 ip address add 10.99.0.1/24 dev lo # names are looked up only where an address beside 127.0.0.1 is configured
-state=$(mktemp -d)
-trap 'rm -rf "$state" 2>/dev/null || { sleep 1; rm -rf "$state"; }' EXIT
-chmod 755 "$state"
+state=/run/iif-slurm # in memory that ends with the namespace, so that nothing is left however this script ends
+mkdir "$state"
 host=$(hostname -s)
 grep -qw "$host" /etc/hosts || { cp /etc/hosts "$state/hosts" && echo "127.0.0.1 $host" >>"$state/hosts" && mount --bind "$state/hosts" /etc/hosts; }
 mkdir -p /run/munge "$state"/{state,spool,log}
