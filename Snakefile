@@ -60,12 +60,15 @@ include: "workflow/rules/unknown.smk"
 onstart:
     choose.keep(REQUEST, CHOSEN)
     tell_costs()
+    refuse_too_large()
 
 
 onsuccess:
     tell_target()
     tell_pages()
+    tell_attempts()
 
 
 onerror:
     tell_reasons()
+    tell_attempts()

@@ -31,6 +31,8 @@ from workflow.registry import STAGES
 if TYPE_CHECKING:
     from workflow.runtime.job_state import JobState
 
+SCATTERED = ("prior",)
+"""Stages whose views can be dealt out to several jobs."""
 INTERRUPTED = "it was interrupted; the same command continues"
 
 
@@ -44,6 +46,8 @@ def _arguments() -> argparse.Namespace:
         sub.add_argument("--threads", type=int, default=2)
         sub.add_argument("--fingerprint", help="refuse to run when it differs")
         sub.add_argument("--log", type=Path)
+        if stage in SCATTERED:
+            sub.add_argument("--part", help="only the views of this part, such as 3-of-8; the stage stays unfinished")
     study = commands.add_parser("study")
     study.add_argument("study")
     study.add_argument("--quality", default="draft")
@@ -229,27 +233,33 @@ def _guarded(what: str, run: Callable[[], object], state: JobState | None = None
 def _run_stage(arguments: argparse.Namespace) -> int:
     from workflow.artifacts import locks
     from workflow.artifacts.files import write_atomically
-    from workflow.runtime.job import configure_logging, run_stage
+    from workflow.runtime.job import configure_logging, read_part, run_stage
     from workflow.runtime.job_state import JobState
     from workflow.scene.named import check_overrides
     from workflow.settings import scene_origin
 
     stage, scene = arguments.command, arguments.scene
-    what, state = f"{stage} of {scene}", JobState(scene, stage, arguments.fingerprint)
+    try:
+        part = read_part(arguments.part) if getattr(arguments, "part", None) else None
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    name = f"{stage}.{part}" if part else stage
+    what, state = f"{name} of {scene}", JobState(scene, name, arguments.fingerprint)
     if _guarded(what, lambda: scene_origin(scene)):
         return 1  # no folder is made for a scene that does not exist
 
     def run() -> None:
-        note = Path("results") / scene / "benchmarks" / f"{stage}.threads"
+        note = Path("results") / scene / "benchmarks" / f"{name}.threads"
         write_atomically(note, lambda path: path.write_text(f"{arguments.threads}\n"))
         check_overrides(stage, scene, arguments.quality)
-        run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint)
+        run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint, part)
 
     with ExitStack() as held:
 
         def claim() -> None:
             try:
-                held.enter_context(locks.alone(Path("results"), scene, stage))
+                held.enter_context(locks.alone(Path("results"), scene, name))
             except InputError as error:
                 state.failed(str(error))
                 raise

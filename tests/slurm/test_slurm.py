@@ -1,5 +1,10 @@
-"""The Slurm profiles on a real Slurm of one node without accounting: `make test-slurm` (tests/slurm/run.sh) starts it."""
+"""The Slurm profiles on a real Slurm of one node, with or without accounting: tests/slurm/run.sh starts it (`make test-slurm`).
 
+`IIF_SLURM_SCENE=kitchen bash tests/slurm/run.sh -k overhead` measures what a job for a scene costs beside its stages, and keeps
+the row for docs/results/reliability.md; it wants a machine that does nothing else, and takes two drafts of the scene.
+"""
+
+import csv
 import json
 import os
 import re
@@ -15,12 +20,24 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(REPOSITORY / "tests/workflow"))
 
 from conftest import TINY  # noqa: E402
-from support import manifests  # noqa: E402
+from support import manifests, planned  # noqa: E402
 
 pytestmark = pytest.mark.skipif("IIF_SLURM_STATE" not in os.environ, reason="no Slurm here; `make test-slurm` starts one")
+ACCOUNTING = bool(os.environ.get("IIF_SLURM_ACCOUNTING"))
 SCENES = "abc"
 PROFILES = REPOSITORY / "workflow/profiles"
 ROW = REPOSITORY / "docs/results/data/reliability_slurm.json"
+HOG = """
+import sys, time
+from workflow.runtime.job_state import JobState
+from workflow.runtime.job import configure_logging
+configure_logging(None)
+JobState("a", sys.argv[1], "mark").started()
+memory = [bytearray(b"x" * (8 << 20)) for _ in range(int(sys.argv[2]))]
+time.sleep(float(sys.argv[3]))
+JobState("a", sys.argv[1], "mark").done()
+"""
+"""A job that takes memory (8 MB each) and time, and tells of itself as a stage does."""
 
 
 def command(folder, *arguments):
@@ -31,6 +48,14 @@ def command(folder, *arguments):
 
 def environment():
     return {**os.environ, "PYTHONPATH": os.environ["IIF_SLURM"]}
+
+
+def run(folder, profile, *arguments):
+    """Snakemake with a profile, to its end; the seconds that it took."""
+    start = time.time()
+    whole = command(folder, "--workflow-profile", PROFILES / profile, *arguments)
+    done = subprocess.run(whole, env=environment(), capture_output=True, text=True)
+    return done, time.time() - start
 
 
 @pytest.fixture(scope="module")
@@ -50,17 +75,46 @@ def batch(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def local(batch):
-    """The same batch without Slurm, and the seconds that it took."""
-    folder, start = batch("local"), time.monotonic()
+    """The same batch without Slurm."""
+    folder = batch("local")
     done = subprocess.run(command(folder, "--cores", 2, "scenes"), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    return folder, time.monotonic() - start
+    return folder
+
+
+def submit(folder, name, blocks, seconds, *options):
+    """Submit a job that takes memory and time as told; its id."""
+    log = folder / f"{name}-%j.out"
+    program = f"{REPOSITORY}/.venv/bin/python"
+    (folder / "hog.py").write_text(HOG)
+    return subprocess.run(
+        [
+            "sbatch",
+            "--parsable",
+            f"--chdir={folder}",
+            f"--output={log}",
+            *options,
+            "--wrap",
+            f"{program} hog.py {name} {blocks} {seconds}",
+        ],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.strip()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def overdue(tmp_path_factory):
+    """A job that goes over its time limit, while the other tests run: Slurm counts in minutes."""
+    folder = tmp_path_factory.mktemp("overdue")
+    return folder, submit(folder, "late", 1, 600, "--time=1", "--mem=300")
 
 
 def jobs():
-    """Slurm's jobs: id -> (state, rule or group)."""
-    lines = subprocess.run(["squeue", "-h", "-o", "%A %T %k"], capture_output=True, text=True, check=True).stdout.splitlines()
-    return {line.split()[0]: line.split()[1:] for line in lines}
+    """Slurm's jobs of Snakemake: id -> state."""
+    lines = subprocess.run(["squeue", "-h", "-o", "%A %T %j"], capture_output=True, text=True, check=True).stdout.splitlines()
+    return {line.split()[0]: line.split()[1] for line in lines if not line.endswith("wrap")}
 
 
 def wait_for(condition, seconds=300):
@@ -74,7 +128,7 @@ def wait_for(condition, seconds=300):
 
 
 def running():
-    return [number for number, (state, *_) in jobs().items() if state == "RUNNING"]
+    return [number for number, state in jobs().items() if state == "RUNNING"]
 
 
 def keep(**facts):
@@ -83,7 +137,8 @@ def keep(**facts):
 
 
 def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
-    """One job for each scene. Every manifest equals that of the run without Slurm, and nothing is left in the queue."""
+    """One job for each scene. Every manifest equals that of the run without Slurm, the run says what happened to the cancelled
+    job, and nothing is left in the queue."""
     folder = batch("slurm")
     process = subprocess.Popen(
         command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "--jobs", 2, "scenes"),
@@ -102,36 +157,127 @@ def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
     subprocess.run(["slurmctld"], check=True)
     output, _ = process.communicate(timeout=1500)
     assert process.returncode == 0, output[-4000:]
-    assert manifests(folder) == manifests(local[0])
-    assert not running()
-    assert re.search(rf"{first}.*(?:cancel|fail|CANCELLED)", output, re.I), output[-4000:]
-    keep(batch={"scenes": len(SCENES), "cancelled": 1, "controller killed": 1, "equal to local": True})
+    assert manifests(folder) == manifests(local)
+    assert not jobs()
+    told = re.search(
+        rf"^\w: \w+: attempt 2, which asks for .*: attempt 1 \(Slurm job {first} on \S+\) was cancelled", output, re.M
+    )
+    assert told, output[-4000:]
+    key = f"batch, {'with' if ACCOUNTING else 'without'} accounting"
+    keep(**{key: {"scenes": len(SCENES), "cancelled": 1, "controller killed": 1, "equal to local": "yes"}})
 
 
-def test_overhead_of_one_job_for_a_scene(batch, local):
-    folder, start = batch("undisturbed"), time.monotonic()
-    whole = command(folder, "--workflow-profile", PROFILES / "slurm-scenes", "scenes")
-    done = subprocess.run(whole, env=environment(), capture_output=True, text=True)
-    seconds = time.monotonic() - start
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert manifests(folder) == manifests(local[0])
-    assert not subprocess.run(["squeue", "-h"], capture_output=True, text=True).stdout.strip()
-    keep(overhead={"local seconds": round(local[1], 1), "slurm seconds": round(seconds, 1), "scenes": len(SCENES)})
+def test_a_scene_that_failed_goes_on_where_it_stopped(batch):
+    """Although its stages were one job, which Snakemake takes for failed as a whole."""
+    folder = batch("failed")
+    blocked = folder / "results/b/render/maps"
+    blocked.parent.mkdir(parents=True)
+    blocked.write_text("in the way")
+    failed, _ = run(folder, "slurm-scenes", "--retries", "0", "--", "scenes/b")
+    last = failed.stderr.strip().splitlines()[-1]
+    assert failed.returncode == 1 and last.startswith("error: b: render failed (results/b/logs/render.log)"), failed.stderr[
+        -3000:
+    ]
+    blocked.unlink()
+    again = subprocess.run(command(folder, "--cores", 2, "-n", "scenes/b"), capture_output=True, text=True)
+    assert planned(again) == {"render", "metrics", "report", "publish"}
+
+
+def beside_stages(folder, scene, seconds):
+    """Seconds of a run in which no stage was at work, and the seconds in which at least one was."""
+    spans = []
+    for benchmark in folder.glob(f"results/{scene}/benchmarks/*.jsonl"):
+        end = benchmark.with_name(f"{benchmark.stem}.parts.json").stat().st_mtime  # Snakemake touches the benchmark itself
+        spans.append((end - json.loads(benchmark.read_text().splitlines()[-1])["s"], end))
+    busy = until = 0.0
+    for start, end in sorted(spans):
+        busy += max(0.0, end - max(start, until))
+        until = max(until, end)
+    return seconds - busy, busy
+
+
+def test_overhead_of_one_job_for_a_scene(batch):
+    """Submitting, waiting, starting Snakemake on the node and noticing the end, against a run of the same scene without Slurm.
+
+    It is measured within each run, as the time in which no stage is at work: what stages take differs from run to run.
+    """
+    scene, found = os.environ.get("IIF_SLURM_SCENE", "a"), {}
+    for kind in ("slurm", "local"):
+        folder = batch(f"overhead-{kind}")
+        if scene != "a":
+            for place in ("config", "data"):
+                subprocess.run(["rm", "-rf", folder / place], check=True)
+            (folder / "data").symlink_to(REPOSITORY / "data")
+        if kind == "slurm":
+            done, seconds = run(folder, "slurm-scenes", f"scenes/{scene}")
+        else:
+            start = time.time()
+            done = subprocess.run(command(folder, "--cores", 2, f"scenes/{scene}"), capture_output=True, text=True)
+            seconds = time.time() - start
+        assert done.returncode == 0, done.stderr[-3000:]
+        found[kind] = beside_stages(folder, scene, seconds)
+    (beside, _), (usual, work) = found["slurm"], found["local"]
+    assert beside < 3 * usual + 15, found  # not a start of Snakemake for each of its stages, as the jobstep executor has
+    if scene != "a":
+        share = (beside - usual) / work
+        row = {"scene": scene, "seconds of its stages": round(work), "seconds beside them": round(beside, 1)}
+        keep(overhead=row | {"without Slurm": round(usual, 1), "more than without Slurm": f"{100 * share:.1f} %"})
+        assert share < 0.1, found
 
 
 def test_one_job_for_each_stage(batch, local):
-    """The other profile, whose threads are those of its file: as many as the node has."""
+    """The other profile, whose threads are those of its file; the prior as two jobs. With accounting, `sacct` is asked, and a
+    report says what was wasted."""
     folder = batch("stages")
-    threads = ["--set-threads", "capture=2", "prior=1", "segmentation=1"]
-    done = subprocess.run(
-        command(folder, "--workflow-profile", PROFILES / "slurm", "results/a/prior/manifest.json", *threads),
-        env=environment(),
-        capture_output=True,
-        text=True,
-    )
+    options = ["--set-threads", "capture=2", "prior=1", "prior_part=1", "segmentation=1", "--set-scatter", "prior=2"]
+    if ACCOUNTING:
+        options += ["--slurm-status-command", "sacct", "--slurm-efficiency-report"]
+    (folder / "partitions.yaml").write_text("partitions:\n  main: {max_runtime: 10000, max_threads: 12, max_mem_mb: 10000}\n")
+    options += ["--slurm-partition-config", folder / "partitions.yaml"]
+    done, _ = run(folder, "slurm", "results/a/prior/manifest.json", *options)
     assert done.returncode == 0, done.stderr[-3000:]
     noted = {path.stem: path.read_text().strip() for path in folder.glob("results/a/benchmarks/*.threads")}
-    assert noted["capture"] == "2" and noted["prior"] == "1"
+    assert noted["capture"] == "2" and noted["prior"] == noted["prior.2-of-2"] == "1"
     for stage in ("capture", "prior"):
-        own, other = (root / f"results/a/{stage}/manifest.json" for root in (folder, local[0]))
+        own, other = (root / f"results/a/{stage}/manifest.json" for root in (folder, local))
         assert own.read_bytes() == other.read_bytes()
+    if ACCOUNTING:
+        (report,) = folder.glob("efficiency_report_*.csv")
+        rows = list(csv.DictReader(report.read_text().splitlines()))
+        assert {row["RuleName"].split("_wildcards")[0] for row in rows} == {"rule_capture", "rule_prior_part", "rule_prior"}
+        assert any(float(row["CPU Efficiency (%)"]) > 0 and float(row["Memory Usage (%)"]) > 0 for row in rows), rows
+
+
+def test_a_job_that_no_node_can_run_is_refused_before_any_is_submitted(batch):
+    folder = batch("too large")
+    cases = (
+        ("slurm", "base=99", "base of a asks for 99 cores", "--set-threads base=12"),
+        ("slurm-scenes", "room=99", "the job of 14 stages of a asks for", "--set-threads "),
+    )
+    for profile, threads, found, cure in cases:
+        small = ["capture=2", "emission=2", "shading=2", "render=2"] if profile == "slurm" else []
+        done, _ = run(folder, profile, "--set-threads", threads, *small, "--", "scenes/a")
+        last = done.stderr.strip().splitlines()[-1]
+        assert done.returncode == 1 and last.startswith(f"error: {found}") and cure in last, done.stderr[-3000:]
+        assert not jobs() and not (folder / "results/a/capture").exists()
+        assert not list(folder.glob(".snakemake/locks/*"))
+
+
+def test_the_next_attempt_says_that_memory_was_not_enough(tmp_path):
+    first = submit(tmp_path, "hungry", 100, 60, "--mem=300")
+    wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
+    second = submit(tmp_path, "hungry", 1, 0, "--mem=600")
+    log = tmp_path / f"hungry-{second}.out"
+    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was killed for its memory: it had asked for 300 MB"
+    told = rf"attempt 2, which asks for 600 MB.*: {ended}"
+    wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)
+
+
+def test_the_next_attempt_says_that_time_was_not_enough(overdue):
+    folder, first = overdue
+    wait_for(lambda: first not in subprocess.run(["squeue", "-h", "-o", "%A"], capture_output=True, text=True).stdout.split())
+    second = submit(folder, "late", 1, 0, "--time=2", "--mem=300")
+    log = folder / f"late-{second}.out"
+    ended = rf"attempt 1 \(Slurm job {first} on \S+\) was ended at its time limit: it had asked for 300 MB and 1 minute"
+    told = rf"attempt 2, .*: {ended}"
+    wait_for(lambda: log.is_file() and re.search(told, log.read_text()), 60)

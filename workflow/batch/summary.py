@@ -21,7 +21,8 @@ from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
 from workflow.batch.page import render
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import noted, state_file
+from workflow.runtime.job_state import killed as why_killed
+from workflow.runtime.job_state import noted, slurm_ended, state_file
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
@@ -35,9 +36,6 @@ COLUMNS = {
     **dict.fromkeys(("seconds", "cpu_seconds", "max_rss_mb"), "float64"),
     **dict.fromkeys(_TEXT[7:], "string"),
 }
-
-UNENDED = {"running": "it runs", "killed": "started and did not end, and its process is gone"}
-"""Reasons of jobs that wrote none."""
 
 Row = dict[str, Any]
 
@@ -125,10 +123,11 @@ def _why_not(scene: str, quality: str) -> Row:
         job = noted(state_file(scene, stage), time.time())
         if not job or job.document.get("fingerprint") != fp.fingerprint(stage, scene, quality):
             continue
-        found = {"status": job.state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
-        if job.state == "failed":
-            return found | {"reason": str(job.document.get("reason", ""))}
-        others.setdefault(job.state, found | {"reason": UNENDED[job.state]})
+        state = "killed" if job.state == "running" and slurm_ended(job.document) else job.state
+        found = {"status": state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
+        if state == "failed":
+            return found | {"reason": "; ".join([str(job.document.get("reason", "")), *job.document.get("earlier", [])])}
+        others.setdefault(state, found | {"reason": "it runs" if state == "running" else why_killed(job.document)})
     stage = missing[0] if missing else "publish"
     idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
     return others.get("running") or others.get("killed") or idle

@@ -20,13 +20,14 @@ from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
-from workflow.runtime import events, forecast, input_digests, native
-from workflow.runtime.job_state import reasons
+from workflow.runtime import events, forecast, input_digests, native, slurm
+from workflow.runtime.job_state import reasons, retold
 from workflow.scene.named import check_overrides
 from workflow.status import table as status
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings.names import did_you_mean_path
+from workflow.settings import prior as prior_settings
 from workflow.settings import refuse_target, study_files
 from workflow.studies import grid as study_sheet
 from workflow.studies import table as study_table
@@ -205,6 +206,52 @@ def manifest(stage, scene):
     """Manifest of a stage, in the folder of the scene that computes it."""
     home = fingerprints.home(stage, scene, quality_of(scene))
     return f"results/{home}/{stage}/manifest.json"
+
+
+told_of_scatter = set()
+
+
+def with_parts(inputs_of):
+    """Inputs of stage prior: those of any stage and, where it is scattered, the jobs that make its parts."""
+
+    def inputs(wildcards):
+        found = inputs_of(wildcards)
+        parts = parts_of_prior(wildcards.scene)
+        return found | {"parts": parts} if parts else found
+
+    return inputs
+
+
+def parts_of_prior(scene):
+    """Marks of the parts into which the prior of a scene is scattered (`--set-scatter prior=8`); none by default.
+
+    A finished prior keeps the inputs that it was made from, so that it is not made again because it is asked for in more parts, in
+    fewer, or in none: Snakemake compares the names of inputs.
+    """
+    output = workflow.get_rule("prior").output.manifest
+    name = output.apply_wildcards({"scene": scene})  # of Snakemake's own type
+    quality = quality_of(scene)
+    mark = or_stop(fingerprints.fingerprint, "prior", scene, quality)
+    made = os.path.isfile(name) and "prior" not in workflow.dag_settings.forcerun
+    if made and not or_stop(sound.stage_faults, Path("results"), scene, "prior", mark):
+        made_from = workflow.persistence.input(name) or []
+        return [
+            path for path in made_from if path.startswith(f"results/{scene}/parts/")
+        ]
+    parts = gather.prior("results/{scene}/parts/prior.{scatteritem}", scene=scene)
+    if len(parts) < 2:
+        return []
+    kind = resolved(scene)["prior"]["kind"]
+    grouped = workflow.group_settings.overwrite_groups
+    why = ""
+    if not prior_settings.by_view(kind):
+        why = f"prior {kind} first gathers the light of all photographs, and every part would do that again"
+    elif grouped.get("prior") != grouped.get("prior_part"):
+        why = "in this profile the stages of a scene are one job; use workflow/profiles/slurm"
+    if why and scene not in told_of_scatter and workflow.is_main_process:
+        print(f"{scene}: --set-scatter prior has no effect: {why}", file=sys.stderr)
+    told_of_scatter.add(scene)
+    return [] if why else parts
 
 
 def job(stage):
@@ -542,6 +589,57 @@ def tell_costs_of_dry_run():
 atexit.register(tell_costs_of_dry_run)
 
 
+# ----------------------------------------------------------------------------------------------------------- cluster
+
+
+def submission():
+    """The command that submits jobs to Slurm, empty where Slurm's own executor does it; None where jobs do not go to Slurm."""
+    plugin = workflow.executor_plugin
+    command = getattr(workflow.executor_settings, "submit_cmd", None) or ""
+    if plugin is not None and plugin.name == "slurm":
+        return ""
+    return command if "sbatch" in command else None
+
+
+def partitions_of(unit):
+    """Names of the partitions that a job is submitted to, as far as anything names them."""
+    named = unit.resources.get("slurm_partition")
+    if command := submission():
+        options = command.partition("sbatch")[2]
+        option = re.search(r"(?:--partition[= ]|-p )(\S+)", options)
+        named = option[1] if option else os.environ.get("SBATCH_PARTITION")
+    return tuple(filter(None, re.split(r"[,\s]+", str(named or ""))))
+
+
+def asked_of_a_node(job):
+    """What a job, or the group of jobs that is submitted as one, asks of a node."""
+    group = workflow.dag.get_job_group(job)
+    unit = group or job
+    rules = {one.rule.name: one.threads for one in (group.jobs if group else [job])}
+    memory, partitions = unit.resources.get("mem_mb"), partitions_of(unit)
+    scene = job.wildcards.get("scene", "")
+    what = f"the job of {len(rules)} stages" if len(rules) > 1 else job.rule.name
+    described = getattr(workflow.executor_settings, "partition_config", None)
+    return slurm.Asked(
+        f"{what} of {scene}" if scene else what,
+        rules,
+        unit.threads,
+        memory if isinstance(memory, int) else None,
+        partitions,
+        not partitions and bool(described),
+    )
+
+
+def refuse_too_large():
+    """Stop before anything is submitted if a job asks for more than any node has: Slurm would let it wait for ever."""
+    if submission() is None:
+        return
+    jobs = workflow.dag.needrun_jobs(exclude_finished=False)
+    asked = [asked_of_a_node(job) for job in jobs if not job.is_local]
+    if asked and (found := slurm.too_large(asked, slurm.nodes())):
+        stop("\n       ".join(found))
+
+
 # ------------------------------------------------------------------------------------------------------------ errors
 
 
@@ -572,6 +670,12 @@ def tell_reasons():
         command = [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY]
         atexit.register(subprocess.run, command, cwd=os.getcwd(), check=False)
     elif found := reasons(STARTED) or damages():
+        atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
+
+
+def tell_attempts():
+    """Say which jobs needed several attempts in this run, and how the attempts ended that did not do it."""
+    if workflow.is_main_process and (found := retold(STARTED)):
         atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
 
 

@@ -49,7 +49,7 @@ use rule stage as plan with:
 
 use rule stage as prior with:
     input:
-        unpack(reads("prior", "capture")),
+        unpack(with_parts(reads("prior", "capture"))),
     pathvars:
         stage="prior",
     resources:
@@ -58,6 +58,31 @@ use rule stage as prior with:
         job=job("prior"),
     message:
         "{wildcards.scene}: K material predictions for every photograph"
+
+
+# Only with `--set-scatter prior=8` (docs/guide/batch.md#the-prior-on-several-nodes). Stage prior takes over what the parts have left.
+scattergather:
+    prior=1,
+
+
+rule prior_part:
+    """Predict the materials of a part of the photographs, for stage prior; made with --set-scatter prior=8."""
+    input:
+        unpack(reads("prior", "capture")),
+    output:
+        part=temp("results/{scene}/parts/prior.{scatteritem}"),
+    log:
+        "results/{scene}/logs/prior.{scatteritem}.log",
+    threads: 2
+    resources:
+        **needs("prior"),
+    params:
+        job=job("prior"),
+    message:
+        "{wildcards.scene}: K material predictions, part {wildcards.scatteritem}"
+    shell:
+        "python3 -m workflow {params.job} --threads {threads} --log {log:q} --part {wildcards.scatteritem}"
+        " && touch {output.part:q}"
 
 
 use rule stage as segmentation with:

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import logging
 import platform
+import re
 import resource
 import sys
 import time
@@ -15,7 +16,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
@@ -179,9 +180,14 @@ class Job:
         self._earlier = kept[1]["spent"]
         return kept[0], kept[1]["facts"]
 
-    def write_timings(self) -> None:
-        """Write what `timed` recorded, and as `job` the seconds, CPU seconds, peak memory (MB) and threads of the whole job."""
+    def write_timings(self, part: str = "") -> None:
+        """Write what `timed` recorded, and as `job` the seconds, CPU seconds, peak memory (MB) and threads of the whole job.
+
+        Those of a part of a stage are added to what the stage itself took, when that is written.
+        """
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts in kB
+        if not part:
+            memory = max([memory, *self._of_parts()])
         whole = {
             "seconds": time.monotonic() - self._started + self._earlier["seconds"],
             "cpu_seconds": time.process_time() - self._cpu_started + self._earlier["cpu_seconds"],
@@ -192,7 +198,25 @@ class Job:
         expected = forecast.expected(cost)
         parts = {name: {key: round(value, 3) for key, value in part.items()} for name, part in self._parts.items()}
         document = {**parts, "job": {key: round(value, 3) for key, value in whole.items()}, "expected": expected}
-        write_json(Path("results") / self.scene / "benchmarks" / f"{self.stage.name}.parts.json", document)
+        if part:
+            document["fingerprint"] = self.fingerprint
+        write_json(Path("results") / self.scene / "benchmarks" / f"{part or self.stage.name}.parts.json", document)
+
+    def _of_parts(self) -> list[float]:
+        """Add what the parts of this stage took that ran as jobs of their own to its seconds, and return their peak memories."""
+        memories = []
+        for path in (Path("results") / self.scene / "benchmarks").glob(f"{self.stage.name}.*-of-*.parts.json"):
+            try:
+                document = json.loads(path.read_text())
+                spent = {key: float(document["job"][key]) for key in (*self._earlier, "max_rss_mb")}
+                mine = document["fingerprint"] == self.fingerprint
+            except (OSError, ValueError, KeyError, TypeError):
+                mine = False
+            if mine:
+                memories.append(spent.pop("max_rss_mb"))
+                self._earlier = {key: value + spent[key] for key, value in self._earlier.items()}
+            path.unlink(missing_ok=True)
+        return memories
 
     def progress(self, done: int, total: int, what: str) -> None:
         """Log how far the job is, at most every five seconds and at the end."""
@@ -223,7 +247,32 @@ def library_versions() -> dict[str, str]:
     return out
 
 
-def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, expected: str | None = None) -> None:
+class Part(NamedTuple):
+    """One of the parts into which the views of a stage are dealt out to several jobs, from 1."""
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}-of-{self.count}"
+
+
+def read_part(text: str) -> Part:
+    """Read `3-of-8` or `3/8`.
+
+    Raises:
+        InputError: it is something else.
+    """
+    found = re.fullmatch(r"(\d{1,6})(?:-of-|/)(\d{1,6})", text)
+    part = Part(int(found[1]), int(found[2])) if found else Part(0, 0)
+    if not 1 <= part.number <= part.count:
+        raise InputError(f"--part {text}: not a part; give a number and the count of parts, such as 3-of-8 or 3/8")
+    return part
+
+
+def run_stage(
+    stage: str, scene: str, quality: str = "draft", threads: int = 2, expected: str | None = None, part: Part | None = None
+) -> None:
     """Run one stage of one scene in this process.
 
     Args:
@@ -232,6 +281,7 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
         quality: preset of the settings.
         threads: number of cores that the job may use.
         expected: fingerprint under which the job was planned; None = any.
+        part: make this part alone and leave the stage unfinished; None = the stage.
 
     Raises:
         InputError: the input cannot be used, or settings, code or input files changed since the job was planned.
@@ -244,6 +294,10 @@ def run_stage(stage: str, scene: str, quality: str = "draft", threads: int = 2, 
         )
     if job.device.kind != "cpu":
         job.log.info("rays are traced on %s", job.device)
+    if part:
+        importlib.import_module(f"{job.stage.module}_part").run(job, *part)
+        job.write_timings(f"{stage}.{part}")
+        return
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, get_args
 
 from pydantic import Field
 
@@ -11,6 +11,9 @@ from workflow.settings.section import Section
 
 
 class PriorBase(Section):
+    BY_VIEW: ClassVar[bool] = True
+    """Whether a prediction of a view takes no work that would be repeated for each part of the views, so that
+    `--set-scatter prior=8` pays."""
     samples: int = Field(8, ge=1, le=256)
     """Predictions per photograph, K."""
     seed: int | None = Field(None, ge=0, lt=2**31)
@@ -43,6 +46,7 @@ class RetinexPrior(PriorBase):
     """A baseline that needs no weights, not a learned prior: photographs divided by the light gathered from all of them, then
     colour retinex (docs/method/priors.md#retinex-baseline)."""
 
+    BY_VIEW: ClassVar[bool] = False  # the light is estimated from all photographs
     kind: Literal["retinex"]
     mean_albedo: float = Field(0.4, gt=0, lt=1)
     """Mean albedo to which each prediction is scaled."""
@@ -92,3 +96,8 @@ class MarigoldPrior(DiffusionPrior):
 
 
 Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior | RgbxPrior | MarigoldPrior, Field(discriminator="kind")]
+
+
+def by_view(kind: str) -> bool:
+    """Return whether a kind of prior predicts each view by itself, without work that all views share."""
+    return next(one.BY_VIEW for one in get_args(get_args(Prior)[0]) if get_args(one.model_fields["kind"].annotation) == (kind,))

@@ -1,0 +1,32 @@
+"""A part of stage prior: predictions of some of the views, made by a job of its own, perhaps on another node.
+
+Stage prior takes over what is on disk, as it does after a kill, so its result does not depend on whether there were parts. This
+module is apart from that of the stage so that fingerprints know nothing of it.
+"""
+
+from __future__ import annotations
+
+import importlib
+
+from workflow.runtime.job import Job
+from workflow.scene.normal_form import CaptureReader
+from workflow.stages.prior import _predicted
+
+
+def run(job: Job, number: int, count: int) -> None:
+    """Write maps/<view>.exr of the views of one part that are not there yet, and a note for each that it is finished.
+
+    Args:
+        job: of stage prior; its folder is left unfinished.
+        number: of the part, from 1.
+        count: of parts. Views are dealt out in turn, so that parts differ by one view at most.
+    """
+    capture = CaptureReader(job.read("capture"))
+    prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
+    views = capture.used[number - 1 :: count]
+    seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
+    for done, view in enumerate(views):
+        job.progress(done, len(views), "views predicted")
+        if job.writer.part_kept(view.name) is None:
+            _predicted(job, prior, capture, view, seed)
+    job.progress(len(views), len(views), "views predicted")
