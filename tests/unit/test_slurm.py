@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from workflow.runtime import job_state, slurm
-from workflow.runtime.job_state import JobState, killed, reasons, retold
+from workflow.runtime import attempts, job_state, slurm
+from workflow.runtime.attempts import killed
+from workflow.runtime.job_state import JobState, reasons, retold
 
 NODES = [slurm.Node(12, 24_000, "main", True), slurm.Node(4, 256_000, "main", True), slurm.Node(64, 512_000, "large", False)]
 SHOWN = (
@@ -99,13 +100,13 @@ def test_a_job_that_slurm_forgot_is_asked_of_accounting_and_of_its_log(cluster, 
     own = slurm.own({"SLURM_JOB_ID": "1"})._asdict()
     (cluster.programs / "scontrol.1").unlink()
     document = {"state": "started", "slurm": own}
-    assert job_state.ending(document).startswith("was killed without a word (out of memory, or over its time limit?")
+    assert attempts.ending(document).startswith("was killed without a word (out of memory, or over its time limit?")
     cluster(1, "TIMEOUT", program="sacct")
-    assert job_state.ending(document).startswith("was ended at its time limit")
+    assert attempts.ending(document).startswith("was ended at its time limit")
     cluster(1, "CANCELLED by 0", program="sacct")
-    assert job_state.ending(document).startswith("was cancelled")
+    assert attempts.ending(document).startswith("was cancelled")
     log.write_text("slurmstepd-vm: error: StepId=1.0 exceeded memory limit (697028608 > 314572800), being killed\n")
-    assert job_state.ending(document).startswith("was killed for its memory")
+    assert attempts.ending(document).startswith("was killed for its memory")
 
 
 @pytest.mark.parametrize(
@@ -154,7 +155,7 @@ def test_without_slurm_attempts_are_counted_until_one_ends_well(tmp_path, monkey
     for number in range(2, 7):
         document = attempt()
         assert document["attempt"] == number
-    assert len(document["earlier"]) == job_state.REMEMBERED and "was killed without a word" in document["earlier"][-1]
+    assert len(document["earlier"]) == attempts.REMEMBERED and "was killed without a word" in document["earlier"][-1]
     JobState("a", "base", "mark").done()
     document = attempt()
     assert document["attempt"] == 1 and not {"earlier", "slurm", "peak_mb"} & document.keys()

@@ -21,7 +21,6 @@ from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
 from workflow.batch.page import render
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import killed as why_killed
 from workflow.runtime.job_state import noted, slurm_ended, state_file
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
@@ -127,7 +126,7 @@ def _why_not(scene: str, quality: str) -> Row:
         found = {"status": state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
         if state == "failed":
             return found | {"reason": "; ".join([str(job.document.get("reason", "")), *job.document.get("earlier", [])])}
-        others.setdefault(state, found | {"reason": "it runs" if state == "running" else why_killed(job.document)})
+        others.setdefault(state, found | {"reason": "it runs" if state == "running" else why_attempts.killed(job.document)})
     stage = missing[0] if missing else "publish"
     idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
     return others.get("running") or others.get("killed") or idle
