@@ -1,7 +1,7 @@
 """Scenes that count as finished without having been computed: copies of one finished scene, each under its own fingerprints.
 
-What a stage wrote is linked, so a thousand scenes take little more than the disk of one. Manifests, the digests by which each names
-what it was made from, seals, stamps, the deliverable and Snakemake's records are those that a run of that scene would have left.
+What a stage wrote is linked, so a thousand scenes take little more than the disk of one. Manifests, the digests by which each
+names what it was made from, seals, stamps, the deliverable and Snakemake's records are those that a run would have left.
 Contents are not those of its settings: a page says the name of the scene that was copied.
 """
 
@@ -28,7 +28,7 @@ OF_JOBS = ("benchmarks", "logs", "locks")
 RESULTS, SCENES = Path("results"), Path("scenes")
 
 
-def prepare(scenes: Sequence[str], template: str, quality: str = "draft", said: Callable[[str], None] = lambda text: None) -> None:
+def prepare(scenes: Sequence[str], template: str, quality: str = "draft", said: Callable[[str], object] = len) -> None:
     """Make finished scenes in the working folder, whose settings are there already.
 
     Args:
