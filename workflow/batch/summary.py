@@ -16,9 +16,10 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts.files import read_parquet, remove, write_atomically
+from workflow.batch import causes
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
-from workflow.batch.page import render
+from workflow.batch.page import render, write_pictures
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import read_state
@@ -52,7 +53,8 @@ def write_summary(quality: str, complete: str | None = None) -> None:
     rows = [row_of(line, plan, quality) for line in plan.lines]
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
     write_atomically(FOLDER / "summary.tsv", lambda path: path.write_text(_tsv(rows), encoding="utf-8"))
-    page = render(rows, quality, SCORES, STATUSES)
+    pictures = write_pictures([row["scene"] for row in rows if row["status"] == "done"], FOLDER)
+    page = render(rows, quality, SCORES, STATUSES, pictures)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
     if complete:
         write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
@@ -60,14 +62,14 @@ def write_summary(quality: str, complete: str | None = None) -> None:
 
 
 def refuse(quality: str) -> None:
-    """Fail with the reasons of all scenes that cannot be run.
+    """Fail with the reasons of the scenes that cannot be run.
 
     Raises:
-        InputError: always; one line per scene.
+        InputError: always; a line for each scene, or for each cause where there are many.
     """
     refused = batch_plan.plan(quality).refused
     if refused:
-        raise InputError(f"{len(refused)} of the batch cannot be run:\n" + "\n".join(refused.values()))
+        raise InputError(f"{len(refused)} of the batch cannot be run:\n" + "\n".join(causes.refusals(refused)))
     raise InputError("settings or data changed while the workflow was running. Run the same command again.")
 
 
@@ -75,11 +77,7 @@ def closing(rows: Sequence[Row]) -> str:
     """Return the last message of a run: how many scenes are done, and what the others lack."""
     done = sum(row["status"] == "done" for row in rows)
     lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
-    for row in rows:
-        if row["status"] != "done":
-            where = f" in {row['stage']}" if row["stage"] else ""
-            lines.append(f"{row['scene']}: {row['status']}{where}: {row['reason']}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *causes.lines(rows)])
 
 
 # ------------------------------------------------------------------------------------------------------------ one scene

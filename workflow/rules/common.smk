@@ -13,6 +13,7 @@ sys.path.insert(0, workflow.basedir)
 
 from iif_core.errors import InputError
 from workflow.artifacts import sound
+from workflow.batch import causes
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
@@ -447,7 +448,7 @@ def batch_plan():
     plan = or_stop(batch_table.plan, QUALITY)
     if not batch_asked:
         batch_asked.append(True)
-        for reason in plan.refused.values():
+        for reason in causes.refusals(plan.refused):
             print(f"batch: left out: {reason}", file=sys.stderr)
         if (
             workflow.execution_settings is not None
