@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parents[2]
 ROWS = ROOT / "docs/results/data/reliability_batch.json"
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
 SMALL = (
-    "prior.kind=retinex;segmentation.kind=geometry;capture.width=48;capture.height=48;capture.views=3;emission.rows=2000;"
+    "prior.kind=retinex;segmentation.kind=geometry;capture.width=48;capture.height=48;capture.views=4;emission.rows=2000;"
     "emission.samples=8;shading.samples=8;shading.levels=6;affines.pixels=8000;affines.iterations=5;render.samples=8;"
     "room.lightmap_size=128;room.samples=256"
 )
@@ -154,7 +154,7 @@ def _spoil(name: str) -> Callable[[str], bool]:
 
     def watch(scene: str) -> bool:
         path, note = Path("results") / scene / name, Path(f"spoilt.{scene}")
-        if not (path.parent / "manifest.json").is_file() or not path.is_file():
+        if not (Path("results") / scene / Path(name).parts[0] / "manifest.json").is_file():
             return False
         stamp = str(path.stat().st_ino)
         if note.is_file() and note.read_text() == stamp:
