@@ -474,16 +474,17 @@ def batch_targets(wildcards):
 
 def tell_costs():
     """Say which quality was chosen, and what the jobs that are needed will take."""
-    jobs = [
-        forecast.Planned(
-            job.rule.name,
-            job.wildcards.scene,
-            job.threads,
-            quality_of(job.wildcards.scene),
-        )
-        for job in workflow.dag.needrun_jobs(exclude_finished=False)
-        if job.rule.name in fingerprints.STAGES
-    ]
+    jobs, threads = [], {}
+    for job in workflow.dag.needrun_jobs(exclude_finished=False):
+        stage = job.rule.name
+        if stage in fingerprints.STAGES:
+            # All jobs of a stage have the same, and Snakemake works out all resources of a job to tell them.
+            if stage not in threads:
+                threads[stage] = job.threads
+            scene = job.wildcards.scene
+            jobs.append(
+                forecast.Planned(stage, scene, threads[stage], quality_of(scene))
+            )
     for line in forecast.forecast(jobs, workflow.cores):
         print(line, file=sys.stderr)
     scenes = {job.scene for job in jobs if choose.fits(job.stage, job.scene)}
