@@ -246,7 +246,7 @@ def five(project, monkeypatch):
 
     write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
     view = ["000", "001", "000", "000"]
-    columns = {"view": view, "quantity": ["rgb", "rgb", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
+    columns = {"view": view, "quantity": ["rgb", "rgb_held_out", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
     columns |= {"protocol": ["raw"] * 4, "value": np.array([30.0, 20.0, 25.0, 9.0])}
     write_parquet(Path("scenes/done/metrics.parquet"), columns, {})
     cameras = {"name": ["000", "001"], "split": ["train", "test"]}

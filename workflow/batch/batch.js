@@ -47,9 +47,13 @@
   };
   form.addEventListener("input", () => { filter(); write(); });
   form.addEventListener("submit", (event) => event.preventDefault());
-  form.addEventListener("reset", () => {
+  form.addEventListener("reset", (event) => {
+    event.preventDefault();  // which would empty the fields only after this
+    for (const name of fields) form.elements[name].value = "";
     sorted = "";
-    setTimeout(() => { unsorted(); filter(); write(); });  // after the fields are empty
+    unsorted();
+    filter();
+    write();
   });
   for (const link of document.querySelectorAll("a.state")) {
     link.addEventListener("click", () => setTimeout(() => document.getElementById("scenes").scrollIntoView()));
