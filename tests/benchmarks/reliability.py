@@ -4,7 +4,7 @@
     python tests/benchmarks/reliability.py --damage folder  also damages a copy of its results/, file by file
 
 Other rows: `python tests/benchmarks/soundness.py`, `python tests/benchmarks/memory.py`,
-`python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
+`python tests/benchmarks/batch.py --keep`, `python -m tests.workflow.crash --all`, `make fuzz`, `make test-slurm`.
 """
 
 from __future__ import annotations
@@ -121,9 +121,10 @@ def _count(row: dict[str, int], root: Path, stage: Path, mark: str, path: Path) 
 # ---------------------------------------------------------------------------------------------------------------- tables
 
 
-def table(heads: list[str], body: list[list[Any]]) -> str:
-    """Return a table in Markdown, integers with commas."""
-    return "\n".join(markdown(heads, ([f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in line] for line in body)))
+def table(heads: list[str], body: list[list[Any]], words: int = 1) -> str:
+    """Return a table in Markdown, integers with commas; the first `words` columns hold words."""
+    cells = ([f"{cell:,}" if isinstance(cell, int) else str(cell) for cell in line] for line in body)
+    return "\n".join(markdown(heads, cells, words))
 
 
 def tables() -> dict[str, str]:
@@ -150,6 +151,7 @@ def tables() -> dict[str, str]:
     body = [[cost["scenes"], cost["stages"], cost["files"], cost["stamps"], cost["hashes"]]] if cost else []
     out["cost"] = table(["scenes", "stages", "files", "seconds, stamps", "seconds, contents hashed"], body)
     out["memory"] = _memory()
+    out |= batch_tables(rows("reliability_batch"))
     slurm = rows("reliability_slurm")
     body = [[name, ", ".join(f"{key}: {value}" for key, value in row.items())] for name, row in slurm.items()]
     out["slurm"] = table(["trial", "result"], body)
@@ -170,6 +172,38 @@ def _memory() -> str:
     size = "{scene}: {views} photographs, {millions:.2g} Mpx, {faces:.3g} faces"
     heads = [size.format(**scene, millions=scene["pixels"] / 1e6) for scene in scenes]
     return table(["rule", *heads], body)
+
+
+BATCH = {
+    "real": "scenes that are computed",
+    "prepared": "scenes that are finished before",
+    "faulty": "of the computed ones with a fault",
+    "damaged": "of the finished ones with a damaged artefact",
+    "plan_seconds": "plan (`snakemake -n scenes`), seconds",
+    "plan_cpu": "plan, CPU seconds",
+    "plan_mb": "plan, memory in MB",
+    "run_minutes": "run with faults, minutes",
+    "scenes_an_hour": "scenes delivered an hour",
+    "page_cpu_first": "summary and page, CPU seconds, all pictures made",
+    "page_cpu": "summary and page, CPU seconds, pictures there",
+    "page_mb": "page, MB",
+    "pictures_mb": "pictures of the page, MB",
+}
+"""Row of reliability_batch.json -> its name in the table."""
+
+
+def batch_tables(found: dict[str, Any]) -> dict[str, str]:
+    """Return the tables of a batch: what was measured, and what the summary said of each kind of fault."""
+    body = [[words, found[key]] for key, words in BATCH.items() if found.get(key) is not None]
+    body += [["wrong in the end", len(found["wrong"])]] if found else []
+    faults = [
+        [words, " in ".join(filter(None, (status, stage))), reason.replace("|", "/")[:160]]
+        for words, (status, stage, reason) in found.get("faults", {}).items()
+    ]
+    return {
+        "batch": table(["what", "measured"], body),
+        "batch_faults": table(["fault", "status", "reason in summary.tsv, its beginning"], faults, 3),
+    }
 
 
 def main() -> None:

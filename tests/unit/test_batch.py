@@ -1,7 +1,6 @@
 """The batch table: what it makes of its lines, how it names mistakes, and what the summary says of each scene."""
 
 import csv
-import io
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -12,8 +11,8 @@ import pytest
 from iif_core.errors import InputError
 from workflow import settings
 from workflow.artifacts.files import write_exr, write_json, write_parquet
+from workflow.batch import causes, summary
 from workflow.batch import plan as batch_plan
-from workflow.batch import summary
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import JobState, reasons
 from workflow.settings import batch_table
@@ -322,17 +321,19 @@ class _Addresses(HTMLParser):
         self.found += [value for name, value in attrs if name in ("src", "href")]
 
 
-def test_the_page_stands_alone_and_escapes_what_it_is_told(five):
+def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
     summary.write_summary("draft")
     text = Path("results/batch/report.html").read_text()
     page = _Addresses(text)
-    assert "script" not in page.tags and "&lt;script&gt;" in text
-    assert {a for a in page.found if not a.startswith("data:")} == {
+    assert "<script>bad" not in text and "&lt;script&gt;bad" in text
+    assert set(page.found) == {
+        "#scenes",
+        *(f"#status={status}" for status in ("done", "refused", "failed", "killed", "not%20run")),
         "../../scenes/done/report.html",
         "../../results/failed/logs/segmentation.log",
         "../../results/killed/logs/capture.log",
     }
-    for words in ("1 done", "1 refused", "1 failed", "1 killed", "1 not run", "mesh: no faces", "held-out PSNR"):
+    for words in ("<b>1</b>", "mesh: no faces", "held-out PSNR"):
         assert words in text
     assert "roughness L2" not in text  # no scene has it
 
@@ -346,11 +347,9 @@ def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
 @pytest.mark.parametrize(("dynamic_range", "photograph", "rendered"), [("ldr", 102, 51), ("hdr", 188, 124)])
 def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph, rendered):
     """sRGB code of 0.4 and 0.2 as they are (LDR), of linear 0.4 x exposure 1.25 = 0.5 and linear 0.2 (HDR); albedo linear 0.5."""
-    import base64
-
     from PIL import Image
 
-    from workflow.batch.page import thumbnails
+    from workflow.batch.page import GAP, write_pictures
 
     flat = {c: np.full((4, 300), 0.4, np.float32) for c in "RGB"}
     channels = {f"ldr.{c}": np.full((4, 300), 0.2, np.float32) for c in "RGB"}
@@ -361,13 +360,21 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
     write_json(Path("results/a/capture/capture.json"), {"dynamic_range": dynamic_range})
     cameras = {"name": ["000", "001", "002"], "exposure": np.array([9.0, 1.25, 9.0])}
     write_parquet(Path("results/a/capture/cameras.parquet"), cameras, {})
-    shown = thumbnails("a")
-    assert [title for title, _ in shown] == [f"{what}, view 001" for what in ("photograph", "re-rendering", "albedo")]
-    for (_, address), value in zip(shown, (photograph, rendered, 188), strict=True):
-        picture = np.array(Image.open(io.BytesIO(base64.b64decode(address.partition(",")[2]))))
-        assert picture.shape == (1, 100, 3) and np.abs(picture.astype(int) - value).max() <= 2
+    write_json(Path("scenes/a/manifest.json"), {"fingerprint": "first"})
+    folder = Path("results/batch")
+    (first,) = write_pictures(["a"], folder).values()
+    picture = np.array(Image.open(folder / first)).astype(int)
+    assert picture.shape == (1, 3 * 100 + 2 * GAP, 3)
+    for i, value in enumerate((photograph, rendered, 188)):
+        assert np.abs(picture[:, i * (100 + GAP) :][:, 8:92] - value).max() <= 3
+    write_exr(Path("scenes/a/maps/001.exr"), {**channels, "ldr.R": np.full((4, 300), 0.9, np.float32)})
+    assert write_pictures(["a"], folder) == {"a": first}  # that of the same result is not made again
+    write_json(Path("scenes/a/manifest.json"), {"fingerprint": "second"})
+    (second,) = write_pictures(["a"], folder).values()
+    assert [path.name for path in (folder / "pictures").iterdir()] == [Path(second).name] and second != first
+    write_json(Path("scenes/a/manifest.json"), {"fingerprint": "third"})
     Path("scenes/a/maps/001.exr").write_bytes(b"rubbish")
-    assert thumbnails("a") == []
+    assert write_pictures(["a"], folder) == {} and not list((folder / "pictures").iterdir())
 
 
 def test_only_a_finished_plan_counts_as_complete(five):
@@ -380,6 +387,69 @@ def test_only_a_finished_plan_counts_as_complete(five):
 def test_refusing_names_every_scene(five):
     with pytest.raises(InputError, match=r"(?s)1 of the batch cannot be run:.*line 3: .*second line"):
         summary.refuse("draft")
+
+
+# --------------------------------------------------------------------------------------------------------------- causes
+
+
+def _failures(reasons_by_scene, status="failed", stage="capture"):
+    return [{"scene": name, "status": status, "stage": stage, "reason": why} for name, why in reasons_by_scene.items()]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("view DSC012, DSC4: pictures of different sizes 640 x 480 and 32 x 24", "view f_7: pictures of different sizes 1 x 2"),
+        ("data/NAME/mesh.ply: 5590.5 m across, `source.unit: m`", "/abs/NAME/b.ply: 1e-3 m across, `source.unit: m`"),
+        (
+            "results/NAME/base/a.exr: changed. Run: snakemake scenes/NAME",
+            "results/NAME/b/b.exr: changed. Run: snakemake scenes/NAME",
+        ),
+        ("config/batch.tsv, line 3: no mesh in scene NAME", "config/batch.tsv, line 12: no mesh in scene NAME"),
+        ("no faces\nsecond line 1", "no faces\nanother line"),
+    ],
+)
+def test_one_cause_has_one_group(one, other):
+    rows = _failures({"a-1": one.replace("NAME", "a-1"), "office": other.replace("NAME", "office")})
+    (group,) = causes.groups(rows)
+    assert [row["scene"] for row in group.rows] == ["a-1", "office"] and group.heading == "2 scenes failed in capture"
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("`capture.veiws`: unknown key", "`capture.widht`: unknown key"),
+        ("no mesh", "no photographs"),
+        ("mesh: no faces", "mesh: no vertices"),
+    ],
+)
+def test_different_causes_stay_apart(one, other):
+    assert len(causes.groups(_failures({"mesh": one, "b": other}))) == 2
+
+
+def test_the_same_words_of_another_stage_or_status_are_another_cause():
+    rows = [*_failures({"a": "no"}), *_failures({"b": "no"}, stage="base"), *_failures({"c": "no"}, status="killed")]
+    assert [group.heading for group in causes.groups(rows)] == [
+        "1 scene failed in capture",
+        "1 scene failed in base",
+        "1 scene killed in capture",
+    ]
+
+
+def test_few_failures_have_a_line_each_and_many_a_line_a_cause():
+    few = _failures({f"s{i}": f"data/s{i}: no mesh" for i in range(causes.FEW)})
+    assert summary.closing(few).splitlines()[1:] == [f"s{i}: failed in capture: data/s{i}: no mesh" for i in range(causes.FEW)]
+    many = [*few, *_failures({f"t{i}": f"line {i}: bad key" for i in range(19)}, "refused", None), *_failures({"u": "alone"})]
+    assert summary.closing([*many, {"scene": "v", "status": "done"}]).splitlines()[1:] == [
+        "19 scenes refused, such as t0: line 0: bad key",
+        "10 scenes failed in capture, such as s0: data/s0: no mesh",
+        "u: failed in capture: alone",
+    ]
+    words = "abcdefghijklmnop"
+    told = causes.lines(_failures({f"s{i}": f"cause {word}" for i, word in enumerate(words)}))
+    assert len(told) == causes.FEW + 1 and told[-1] == "and 6 scenes for 6 other causes"
+    assert causes.refusals({f"s{i}": f"line {i}: bad" for i in range(30)}) == ["30 scenes refused, such as s0: line 0: bad"]
+    assert causes.refusals({"a": "line 2: bad"}) == ["line 2: bad"]
 
 
 def test_the_shipped_table_can_be_read(repository):

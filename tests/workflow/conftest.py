@@ -3,19 +3,7 @@
 import fcntl
 
 import pytest
-from support import Workflow
-
-TINY = """\
-source: {kind: builtin, scene: tiny}
-capture: {dynamic_range: hdr, views: 4, width: 48, height: 48, samples: 32}
-prior: {kind: simulated, samples: 3, strength: 0.5}
-emission: {rows: 2000, samples: 8}
-shading: {samples: 8, levels: 6}
-affines: {pixels: 8000, iterations: 5}
-render: {samples: 8}
-report: {views: 2}
-room: {lightmap_size: 128, samples: 256}
-"""
+from support import TINY, Workflow
 
 
 @pytest.fixture(scope="session")

@@ -7,6 +7,18 @@ import subprocess
 import sys
 from pathlib import Path
 
+TINY = """\
+source: {kind: builtin, scene: tiny}
+capture: {dynamic_range: hdr, views: 4, width: 48, height: 48, samples: 32}
+prior: {kind: simulated, samples: 3, strength: 0.5}
+emission: {rows: 2000, samples: 8}
+shading: {samples: 8, levels: 6}
+affines: {pixels: 8000, iterations: 5}
+render: {samples: 8}
+report: {views: 2}
+room: {lightmap_size: 128, samples: 256}
+"""
+
 
 def planned(result: subprocess.CompletedProcess) -> set[str]:
     """Rules in the job table of a dry run."""

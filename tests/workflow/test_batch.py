@@ -1,11 +1,13 @@
 """`snakemake scenes`: bad scenes are named and do not stop the others, and what is done is not done again."""
 
 import csv
+import json
 
 import pytest
 from support import planned
 
 from tests.unit import own_scene as own
+from tests.workflow.prepared import prepare
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
 SMALL = "prior.kind=retinex;segmentation.kind=geometry;capture.width=64;capture.height=48"
@@ -50,7 +52,7 @@ def test_the_good_scene_is_done_and_the_bad_ones_are_named(ended):
     assert said.index("is 5590 m across") < said.index("publishing scenes/tiny"), "the failure was to come first"
     assert "1 of 4 scenes done" in said and "Traceback" not in said
     page = (ended.folder / "results/batch/report.html").read_text()
-    assert page.count('src="data:image/jpeg') == 3 and '"../../scenes/tiny/report.html"' in page
+    assert page.count('src="pictures/tiny.') == 1 and '"../../scenes/tiny/report.html"' in page
 
 
 def test_what_is_left_runs_when_the_table_is_mended_and_then_nothing_does(ended):
@@ -78,3 +80,39 @@ def test_a_named_scene_of_the_table_stops_with_its_mistake(workflow):
     result = workflow.run("scenes/tiny", "scenes/key")
     assert result.returncode == 1 and "error: config/batch.tsv, line 3, column overrides: `capture.veiws`" in result.stderr
     assert not (workflow.folder / "results/key").exists()
+
+
+@pytest.fixture(scope="module")
+def copied(finished, tmp_path_factory):
+    """The finished scene, and two that were prepared from it, in a table."""
+    workflow = finished.copy(tmp_path_factory.mktemp("prepared") / "run")
+    (workflow.folder / "config/batch.tsv").write_text(HEADER + "tiny\na\t\t\ttiny\tseed=5\nb\t\t\ttiny\tseed=6\n")
+    with own.working_in(workflow.folder):
+        prepare(["a", "b"], "tiny")
+    return workflow
+
+
+def test_prepared_scenes_are_sound_and_finished(copied):
+    """What benchmarks of large batches rest on: such a scene is to everybody what a computed one would be."""
+    verified = copied.run("verify")
+    assert verified.returncode == 0 and "all artefacts are as they were written" in verified.stdout, verified.stdout
+    assert planned(copied.run("scenes", "-n")) == {"batch"}  # nothing but the summary
+    assert "Nothing to be done" in copied.run("scenes/a", "scenes/b", "scenes/tiny", "-n").stdout
+    found = (copied.folder / f"scenes/{name}/manifest.json" for name in ("a", "b", "tiny"))
+    marks = {json.loads(path.read_text())["fingerprint"] for path in found}
+    assert len(marks) == 3
+
+
+def test_a_prepared_scene_is_made_again_where_it_is_edited_or_damaged(copied):
+    table = copied.folder / "config/batch.tsv"
+    kept = table.read_text()
+    table.write_text(kept.replace("seed=5", "seed=5;render.samples=9"))
+    assert planned(copied.run("scenes", "-n")) == {"render", "metrics", "report", "publish", "batch"}
+    table.write_text(kept)
+    path = copied.folder / "results/b/metrics/metrics.parquet"
+    data = bytearray(path.read_bytes())
+    path.unlink()  # a link to the file of all
+    path.write_bytes(data[:-1] + b"x")
+    result = copied.run("scenes", "-n")
+    assert planned(result) == {"metrics", "report", "publish", "batch"}
+    assert "results/b/metrics/metrics.parquet: its content changed" in result.stderr

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 from iif_core.errors import InputError
 from workflow.artifacts.files import sha256_of
-from workflow.batch.page import TEMPLATE
+from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import input_digests
 from workflow.settings.batch_table import Line, read_table
@@ -53,6 +53,6 @@ def plan(quality: str) -> Plan:
 def fingerprint(quality: str) -> str:
     """Return a digest that changes with the scenes, their results, the refused scenes and the code of the summary."""
     found = plan(quality)
-    code = [fp.modules_digest(fp.modules_of("workflow.batch")), sha256_of(TEMPLATE)]
+    code = [fp.modules_digest(fp.modules_of("workflow.batch")), *map(sha256_of, FILES)]
     facts = [[line.number, line.name] for line in found.lines], found.ready, found.refused, quality, code
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:16]

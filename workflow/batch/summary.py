@@ -17,11 +17,13 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts.files import read_parquet, remove, write_atomically
+from workflow.batch import causes
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES
-from workflow.batch.page import render
+from workflow.batch.page import render, write_pictures
+from workflow.runtime import attempts
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import noted, slurm_ended, state_file
+from workflow.runtime.job_state import noted, state_file
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
@@ -52,7 +54,8 @@ def write_summary(quality: str, complete: str | None = None) -> None:
     rows = [row_of(line, plan, quality) for line in plan.lines]
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
     write_atomically(FOLDER / "summary.tsv", lambda path: path.write_text(_tsv(rows), encoding="utf-8"))
-    page = render(rows, quality, SCORES, STATUSES)
+    pictures = write_pictures([row["scene"] for row in rows if row["status"] == "done"], FOLDER)
+    page = render(rows, quality, SCORES, STATUSES, pictures)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
     if complete:
         write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
@@ -60,14 +63,14 @@ def write_summary(quality: str, complete: str | None = None) -> None:
 
 
 def refuse(quality: str) -> None:
-    """Fail with the reasons of all scenes that cannot be run.
+    """Fail with the reasons of the scenes that cannot be run.
 
     Raises:
-        InputError: always; one line per scene.
+        InputError: always; a line for each scene, or for each cause where there are many.
     """
     refused = batch_plan.plan(quality).refused
     if refused:
-        raise InputError(f"{len(refused)} of the batch cannot be run:\n" + "\n".join(refused.values()))
+        raise InputError(f"{len(refused)} of the batch cannot be run:\n" + "\n".join(causes.refusals(refused)))
     raise InputError("settings or data changed while the workflow was running. Run the same command again.")
 
 
@@ -75,11 +78,7 @@ def closing(rows: Sequence[Row]) -> str:
     """Return the last message of a run: how many scenes are done, and what the others lack."""
     done = sum(row["status"] == "done" for row in rows)
     lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
-    for row in rows:
-        if row["status"] != "done":
-            where = f" in {row['stage']}" if row["stage"] else ""
-            lines.append(f"{row['scene']}: {row['status']}{where}: {row['reason']}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *causes.lines(rows)])
 
 
 # ------------------------------------------------------------------------------------------------------------ one scene
@@ -122,11 +121,11 @@ def _why_not(scene: str, quality: str) -> Row:
         job = noted(state_file(scene, stage), time.time())
         if not job or job.document.get("fingerprint") != fp.fingerprint(stage, scene, quality):
             continue
-        state = "killed" if job.state == "running" and slurm_ended(job.document) else job.state
+        state = "killed" if job.state == "running" and attempts.ended_for_slurm(job.document) else job.state
         found = {"status": state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
         if state == "failed":
             return found | {"reason": "; ".join([str(job.document.get("reason", "")), *job.document.get("earlier", [])])}
-        others.setdefault(state, found | {"reason": "it runs" if state == "running" else why_attempts.killed(job.document)})
+        others.setdefault(state, found | {"reason": "it runs" if state == "running" else attempts.killed(job.document)})
     stage = missing[0] if missing else "publish"
     idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
     return others.get("running") or others.get("killed") or idle

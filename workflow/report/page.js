@@ -60,32 +60,8 @@
   addEventListener("scroll", beside, { passive: true, capture: true });  // focus may scroll the number into view
   addEventListener("keydown", (event) => { if (event.key === "Escape") hide(); });
 
-  // Tables that sort by a click on their heads, and find rows.
   const text = (cell) => cell.textContent.trim().toLowerCase();
-  const key = (row, column) => {
-    const cell = row.cells[column];
-    const value = cell.dataset.sort ?? text(cell);
-    return value !== "" && Number.isFinite(Number(value)) ? Number(value) : value;
-  };
-  const order = (a, b) => {
-    if (typeof a === typeof b) return typeof a === "number" ? a - b : a.localeCompare(b);
-    return typeof a === "number" ? -1 : 1;
-  };
-  for (const table of all("table.sortable")) {
-    const heads = all("thead th", table);
-    heads.forEach((head, column) => {
-      const button = element("button", { type: "button" }, ...head.childNodes);
-      head.append(button);
-      button.addEventListener("click", () => {
-        const up = head.getAttribute("aria-sort") !== "ascending";
-        for (const other of heads) other.removeAttribute("aria-sort");
-        head.setAttribute("aria-sort", up ? "ascending" : "descending");
-        const rows = [...table.tBodies[0].rows].map((row) => [key(row, column), row]);
-        rows.sort((a, b) => (up ? order(a[0], b[0]) : order(b[0], a[0])));
-        table.tBodies[0].append(...rows.map(([, row]) => row));
-      });
-    });
-  }
+  for (const table of all("table.sortable")) sortable(table, table.tBodies[0]);  // tables.js
   const find = byId("find");
   if (find) {
     const rows = [...byId("objects").tBodies[0].rows];

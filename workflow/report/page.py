@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from iif_core.evaluation.catalogue import METRICS, PROTOCOLS
 from workflow.report import pictures as pic
 from workflow.report.downloads import Command, Download
-from workflow.report.sources import SCRIPT, STYLE, TEMPLATE
+from workflow.report.sources import SCRIPT, STYLE, TABLES, TEMPLATE
 from workflow.report.verdict import Verdict
 from workflow.report.wording import prose
 
@@ -168,7 +168,7 @@ def render_page(page: Page) -> str:
     hero = page.hero.width / max(page.hero.height, 1)  # a style of one element would not be allowed by the policy
     wide = max(HERO_LEAST, HERO_ENLARGED * page.hero.width)
     style = f"{STYLE.read_text()}{bars}:root{{--hero:min({wide:.0f}px,80vh*{hero:.4f})}}\n"
-    script = SCRIPT.read_text()
+    script = TABLES.read_text() + SCRIPT.read_text()
     return template(TEMPLATE).render(
         page=page,
         style=style,

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-TEMPLATE, STYLE, SCRIPT = (HERE / name for name in ("page.html.j2", "page.css", "page.js"))
+TEMPLATE, STYLE, TABLES, SCRIPT = (HERE / name for name in ("page.html.j2", "page.css", "tables.js", "page.js"))
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
     """Return the files, which are the same for all settings."""
-    return [TEMPLATE, STYLE, SCRIPT]
+    return [TEMPLATE, STYLE, TABLES, SCRIPT]

@@ -16,6 +16,7 @@ sys.path.insert(0, workflow.basedir)
 
 from iif_core.errors import InputError
 from workflow.artifacts import sound
+from workflow.batch import causes
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
 from workflow.registry import SHARED
@@ -535,7 +536,7 @@ def batch_plan():
     plan = or_stop(batch_table.plan, QUALITY)
     if not batch_asked:
         batch_asked.append(True)
-        for reason in plan.refused.values():
+        for reason in causes.refusals(plan.refused):
             print(f"batch: left out: {reason}", file=sys.stderr)
         if (
             workflow.execution_settings is not None
@@ -561,16 +562,17 @@ def batch_targets(wildcards):
 
 def tell_costs():
     """Say which quality was chosen, and what the jobs that are needed will take."""
-    jobs = [
-        forecast.Planned(
-            job.rule.name,
-            job.wildcards.scene,
-            job.threads,
-            quality_of(job.wildcards.scene),
-        )
-        for job in workflow.dag.needrun_jobs(exclude_finished=False)
-        if job.rule.name in fingerprints.STAGES
-    ]
+    jobs, threads = [], {}
+    for job in workflow.dag.needrun_jobs(exclude_finished=False):
+        stage = job.rule.name
+        if stage in fingerprints.STAGES:
+            # All jobs of a stage have the same, and Snakemake works out all resources of a job to tell them.
+            if stage not in threads:
+                threads[stage] = job.threads
+            scene = job.wildcards.scene
+            jobs.append(
+                forecast.Planned(stage, scene, threads[stage], quality_of(scene))
+            )
     for line in forecast.forecast(jobs, workflow.cores):
         print(line, file=sys.stderr)
     scenes = {job.scene for job in jobs if choose.fits(job.stage, job.scene)}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from workflow.runtime import slurm
+from workflow.runtime import alive, slurm
 
 REMEMBERED = 3
 """Earlier attempts that are told of."""
@@ -92,6 +92,15 @@ def killed(document: dict[str, Any]) -> str:
         peak = document.get("peak_mb")
         return f"it was killed ({GUESS}{f' It had {peak:,} MB when last seen' if peak else ''})"
     return "; ".join([*earlier, f"attempt {number}{_place(document)} {ending(document)}"])
+
+
+def ended_for_slurm(document: dict[str, Any]) -> bool:
+    """Return whether Slurm says of a job on another machine that it has ended, which its state file tells minutes later."""
+    own = document.get("slurm")
+    if not own or alive.lives(document):
+        return False
+    state = slurm.state_of(own["job"])
+    return bool(state) and state not in slurm.ALIVE
 
 
 def _place(document: dict[str, Any]) -> str:

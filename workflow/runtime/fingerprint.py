@@ -255,6 +255,13 @@ def resolved(scene: str, quality: str) -> str:
     return json.dumps(settings_module.dump(settings_module.load(scene, quality)), sort_keys=True)
 
 
+@lru_cache(4)
+def parsed(text: str) -> dict[str, Any]:
+    """Return what `resolved` returned as a tree, which all callers share: do not change it. A plan asks for the same scene dozens
+    of times in a row."""
+    return json.loads(text)
+
+
 @lru_cache(None)
 def fingerprint(stage: str, scene: str, quality: str) -> str:
     """Return sixteen hexadecimal characters that change when, and only when, the result of the stage may change.
@@ -262,7 +269,7 @@ def fingerprint(stage: str, scene: str, quality: str) -> str:
     Raises:
         InputError: the settings or the raw files of the scene cannot be used.
     """
-    document = json.loads(resolved(scene, quality))
+    document = parsed(resolved(scene, quality))
     try:
         raw = raw_digest(raw_inputs(stage, document)) if STAGES[stage].reads_raw else ""
     except InputError as error:

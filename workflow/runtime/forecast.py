@@ -46,7 +46,7 @@ def scene_size(scene: str, quality: str) -> SceneSize:
             return size_of_capture(manifest)
     except (OSError, ValueError, KeyError, TypeError, IndexError):
         pass  # not there, or damaged: it will be made
-    document = json.loads(fingerprints.resolved(scene, quality))
+    document = fingerprints.parsed(fingerprints.resolved(scene, quality))
     return estimate(document, fingerprints.raw_inputs("capture", document))
 
 
@@ -56,7 +56,7 @@ def job_work(stage: str, scene: str, quality: str) -> Work:
     Raises:
         InputError: the settings or files of the scene cannot be used.
     """
-    return work_of(stage, json.loads(fingerprints.resolved(scene, quality)), scene_size(scene, quality))
+    return work_of(stage, fingerprints.parsed(fingerprints.resolved(scene, quality)), scene_size(scene, quality))
 
 
 def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: float | None = None) -> Cost:
@@ -98,7 +98,7 @@ def wall(scene: str, quality: str, cores: int) -> Wall:
     Raises:
         InputError: the settings or files of the scene cannot be used, or a stage is of a kind that was never measured.
     """
-    settings = json.loads(fingerprints.resolved(scene, quality))
+    settings = fingerprints.parsed(fingerprints.resolved(scene, quality))
     rendered = settings["source"]["kind"] in ("builtin", "mitsuba")
     total = [START, START, START]
     for stage in STAGES.values():

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -148,6 +150,12 @@ def parse_yaml(text: str) -> Any:
     return document
 
 
+@lru_cache(32)
+def _parsed(text: str) -> Any:
+    """Return `parse_yaml(text)`: every scene of a batch lies over the same few files."""
+    return parse_yaml(text)
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """Return the content of a file of `key: value` lines.
 
@@ -157,7 +165,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     text = read_text(path, limits.SETTINGS_BYTES, "a file of settings")
     try:
-        document = parse_yaml(text)
+        document = copy.deepcopy(_parsed(text))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""

@@ -1,0 +1,112 @@
+"""Scenes that failed for the same cause, in one group: reasons that differ only in names, paths and numbers say the same."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+FEW = 10
+"""So many scenes are told one by one; of more, the causes are told."""
+ELLIPSIS = "…"
+_PATH = re.compile(r"[^\s'\"`(),;:=]*/[^\s'\"`(),;:]*")
+_FILE = re.compile(r"(?<![\w`.])[\w-]+(?:\.[\w-]+)*\.(?:exr|png|jpe?g|json|parquet|ply|obj|glb|yaml|tsv|npz|txt|xml|bin)\b", re.I)
+_COORDINATE = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.I)
+_WITH_DIGITS = re.compile(rf"[\w-]*{ELLIPSIS}[\w-]*(?:{ELLIPSIS}[\w-]*)*")
+_SEVERAL = re.compile(rf"{ELLIPSIS}(?:(?:, and |, | and | x | to | ){ELLIPSIS})+")
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Scenes that are not done for one cause.
+
+    Attributes:
+        status, stage: of all of them; the stage is empty for scenes that were refused.
+        cause: the reason, without what differs between scenes.
+        rows: the scenes in the order of the table, with `scene`, `status`, `stage` and `reason`.
+    """
+
+    status: str
+    stage: str
+    cause: str
+    rows: tuple[Row, ...]
+
+    @property
+    def heading(self) -> str:
+        """Count and state, such as `3 scenes failed in capture`."""
+        count = f"{len(self.rows)} scene{'s' if len(self.rows) > 1 else ''}"
+        return f"{count} {self.status}{f' in {self.stage}' if self.stage else ''}"
+
+    @property
+    def example(self) -> Row:
+        return self.rows[0]
+
+
+def cause_of(reason: str, scene: str) -> str:
+    """Return the reason without paths, names of files, views and scenes, and numbers: an ellipsis stands for each.
+
+    Keys of settings and other words stay. Of a reason of several lines the first counts.
+
+    >>> cause_of("data/a-1/mesh.ply is 5590 m across; allowed: 1 to 300", "a-1")
+    '… is … m across; allowed: …'
+    """
+    text = reason.strip().partition("\n")[0]
+    text = _PATH.sub(ELLIPSIS, text)
+    text = _FILE.sub(ELLIPSIS, text)
+    text = re.sub(rf"(?<=scene )['\"]?{re.escape(scene)}\b['\"]?|(?<=['\"]){re.escape(scene)}(?=['\"])", ELLIPSIS, text)
+    if not scene.isalpha():  # a scene called `mesh` must not hide the word
+        text = re.sub(rf"(?<![\w-]){re.escape(scene)}(?![\w-])", ELLIPSIS, text)
+    text = _COORDINATE.sub(ELLIPSIS, text)
+    text = _WITH_DIGITS.sub(ELLIPSIS, text)
+    return _SEVERAL.sub(ELLIPSIS, text)
+
+
+def groups(rows: Iterable[Row]) -> list[Group]:
+    """Return the scenes that are not done by cause, the largest group first; equal ones in the order of the table.
+
+    Args:
+        rows: of the summary, also of scenes that are done.
+    """
+    found: dict[tuple[str, str, str], list[Row]] = {}
+    for row in rows:
+        if row["status"] != "done":
+            key = row["status"], row["stage"] or "", cause_of(row["reason"] or "", row["scene"])
+            found.setdefault(key, []).append(row)
+    return [Group(*key, tuple(of)) for key, of in sorted(found.items(), key=lambda item: -len(item[1]))]
+
+
+def lines(rows: Sequence[Row]) -> list[str]:
+    """Return a line for each scene that is not done; where there are more than `FEW`, one for each cause, with an example."""
+    others = [row for row in rows if row["status"] != "done"]
+    if len(others) <= FEW:
+        return [_line(row) for row in others]
+    found = groups(others)
+    out = [_told(group) for group in found[:FEW]]
+    if rest := found[FEW:]:
+        out.append(f"and {sum(len(group.rows) for group in rest)} scenes for {len(rest)} other causes")
+    return out
+
+
+def refusals(refused: Mapping[str, str]) -> list[str]:
+    """Return the reasons of the scenes that cannot be run, or a line for each cause where there are more than `FEW` of them.
+
+    Args:
+        refused: scene -> reason.
+    """
+    if len(refused) <= FEW:
+        return list(refused.values())
+    return lines([{"scene": scene, "status": "refused", "stage": "", "reason": reason} for scene, reason in refused.items()])
+
+
+def _line(row: Row) -> str:
+    where = f" in {row['stage']}" if row["stage"] else ""
+    return f"{row['scene']}: {row['status']}{where}: {row['reason']}"
+
+
+def _told(group: Group) -> str:
+    if len(group.rows) == 1:
+        return _line(group.example)
+    return f"{group.heading}, such as {group.example['scene']}: {group.example['reason']}"
