@@ -59,8 +59,9 @@ def test_a_device_that_cannot_trace_rays(monkeypatch, caplog):
     assert device.use("cpu").kind == "cpu" and not caplog.text
 
 
-CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py"}
-"""The last two are programs of their own: a probe in a child process, and what is exported beside scene.xml."""
+CHOOSERS = {"runtime/device.py", "runtime/doctor.py", "exporters/mitsuba_render.py", "sources/mitsuba_scene/trial.py"}
+"""The last three are programs of their own: a probe in a child process, what is exported beside scene.xml, and the loading of a
+scene that may end its process."""
 
 
 def test_nothing_else_chooses_a_variant():

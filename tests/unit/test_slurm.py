@@ -45,7 +45,7 @@ def cluster(tmp_path, monkeypatch):
 
 
 def attempt(peak=None):
-    """Start a job that will say nothing more; `peak` is the memory that it was last seen with."""
+    """Start a job whose process says nothing more and is gone; `peak` is the memory that it was last seen with."""
     state = JobState("a", "base", "mark")
     state.started()
     state._ended.set()
@@ -176,6 +176,7 @@ def test_a_state_that_was_tampered_with_is_no_obstacle(tmp_path, monkeypatch):
 def test_the_memory_of_a_running_job_is_noted(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(job_state, "LOOK", 0.01)
+    before = set(threading.enumerate())  # other tests start jobs that never end
     state = JobState("a", "base", "mark")
     state.started()
     deadline = time.monotonic() + 20
@@ -186,7 +187,7 @@ def test_the_memory_of_a_running_job_is_noted(tmp_path, monkeypatch):
     assert json.loads(state.path.read_text())["state"] == "failed"
     state.done()
     time.sleep(0.1)
-    assert not state.path.exists() and "watch" not in {one.name for one in threading.enumerate()}
+    assert not state.path.exists() and "watch" not in {one.name for one in set(threading.enumerate()) - before}
 
 
 # ----------------------------------------------------------------------------------------------------------------- nodes

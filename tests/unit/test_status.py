@@ -14,7 +14,7 @@ import pytest
 from iif_core.errors import InputError
 from workflow.artifacts import stamps
 from workflow.artifacts.files import write_json
-from workflow.runtime import alive, events
+from workflow.runtime import alive, events, job_state
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import JobState, noted, reasons, state_file
 from workflow.status import standing, table
@@ -120,6 +120,7 @@ def test_a_job_of_another_machine_is_judged_by_its_touches(project, change):
 
 def test_a_running_job_touches_its_state_and_a_finished_one_does_not(project, monkeypatch):
     monkeypatch.setattr(alive, "BEAT", 0.01)
+    monkeypatch.setattr(job_state, "LOOK", 0.01)
     state, path = JobState("a", "base", "mark"), state_file("a", "base")
     state.started()
     os.utime(path, (0, 0))
