@@ -160,6 +160,12 @@ plot: {kind: pareto}
 """
 
 
+def test_variants_of_other_photographs_are_planned_with_what_they_share(study):
+    study.write("config/studies/sizes.yaml", SHARED)
+    assert planned(study.run("-n", "results/studies/sizes.parquet")) >= {"capture", "affines", "metrics", "common_scores", "study"}
+
+
+@pytest.mark.long
 def test_variants_of_other_photographs_are_scored_at_the_views_that_they_share(study):
     study.write("config/studies/sizes.yaml", SHARED)
     result = study.run("results/studies/sizes.parquet")
