@@ -15,7 +15,7 @@ MESH_BYTES = 4 << 30
 """Size of a mesh file. A scan of 30 million triangles has 0.6 GB in binary form."""
 MESH_ELEMENTS = 50_000_000
 """Vertices of a mesh, or faces of it."""
-INSERT_FACES = 5_000_000
+INSERT_FACES = 2_000_000
 """Faces of a mesh that is put into a room."""
 DOCUMENT_BYTES = 128 << 20
 """Size of a JSON or text document. The segments of a large scan have 20 MB."""

@@ -110,7 +110,7 @@ def metres_per_unit(unit: str | float) -> float:
     factor = METRES.get(unit, unit) if isinstance(unit, str) else unit
     try:
         factor = float(factor)
-    except ValueError:
+    except (ValueError, OverflowError):
         factor = math.nan
     if not (math.isfinite(factor) and factor > 0):
         raise InputError(f"`source.unit`: found {unit!r}; allowed: {', '.join(METRES)} or metres per unit (a number > 0)")
@@ -494,10 +494,10 @@ def _number(path: Path, where: str, values: dict[str, Any], key: str, default: f
     if key not in values:
         return default
     value = values[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != value or abs(value) == math.inf:
         raise InputError(f"{path}: {where}: `{key}` is {shown(value)}; expected a finite number")
-    if abs(value) > limits.NUMBER:
-        raise InputError(f"{path}: {where}: `{key}` is {value:g}; expected a number up to {limits.NUMBER:g}")
+    if abs(value) > limits.NUMBER:  # compared before it is converted: an integer may be larger than any float
+        raise InputError(f"{path}: {where}: `{key}` is {shown(value)}; expected a number up to {limits.NUMBER:g}")
     return float(value)
 
 
