@@ -31,6 +31,7 @@ rule publish:
         ),
     log:
         "results/{scene}/logs/publish.log",
+    priority: 100
     localrule: True
     params:
         job=job("publish"),

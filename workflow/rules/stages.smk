@@ -431,5 +431,7 @@ descriptions = {
     "relit_scores": "Render the result under new light and score it against the source; made on demand by studies.",
     "common_scores": "Score the result at views that all variants of a study share; made on demand by studies.",
 }
-for name, text in descriptions.items():
+# Later stages go first, so that the scenes of a batch are finished one after the other, and not all of them stage by stage.
+for number, (name, text) in enumerate(descriptions.items()):
     workflow.get_rule(name).docstring = text
+    workflow.get_rule(name).priority = number
