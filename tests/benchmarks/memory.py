@@ -1,6 +1,6 @@
 """The memory that each rule asks for against what its job took, for finished scenes of several sizes.
 
-    python tests/benchmarks/memory.py <working folder> <scene> [<scene> ...]
+    python tests/benchmarks/memory.py <working folder> <scene>[=<name in the table>] ...
 
 What is asked for is what a plan says that knows nothing but the files of the scene (as on a cluster, before its capture is
 there). Peak memory is that of the process (`max_rss_mb` of `benchmarks/<stage>.parts.json`), which the load of the machine does
@@ -49,11 +49,12 @@ def rows(folder: Path, scenes: list[str], quality: str) -> list[dict[str, Any]]:
             if (folder / name).exists():
                 os.symlink((folder / name).resolve(), Path(place) / name)
         os.chdir(place)
-        for scene in scenes:
+        for scene, _, name in (text.partition("=") for text in scenes):
             manifest = json.loads((folder / "results" / scene / "capture/manifest.json").read_text())
             size, found, wanted = size_of_capture(manifest), taken(folder / "results", scene), asked(scene, quality)
-            stages = {name: [wanted[name], round(found[name])] for name in wanted if name in found}
-            out.append({"scene": scene, "views": size.views, "pixels": size.pixels, "faces": size.faces, "stages": stages})
+            stages = {stage: [wanted[stage], round(found[stage])] for stage in wanted if stage in found}
+            sizes = {"views": size.views, "pixels": size.pixels, "faces": size.faces}
+            out.append({"scene": name or scene, **sizes, "stages": stages})
     return out
 
 

@@ -169,8 +169,8 @@ def _memory() -> str:
             asked, taken = scene["stages"].get(stage, (0, 0))
             cells.append(f"{asked} / {taken} = {asked / taken:.2f}" if taken else "")
         body.append([stage, *cells])
-    size = "{scene}: {views} photographs, {millions:.2g} Mpx, {faces:.3g} faces"
-    heads = [size.format(**scene, millions=scene["pixels"] / 1e6) for scene in scenes]
+    size = "{scene}: {views} photographs, {millions:.2g} Mpx, {thousands:,.0f} thousand faces"
+    heads = [size.format(**scene, millions=scene["pixels"] / 1e6, thousands=scene["faces"] / 1e3) for scene in scenes]
     return table(["rule", *heads], body)
 
 

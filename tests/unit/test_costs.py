@@ -81,6 +81,23 @@ def test_the_range_is_that_of_rooms_that_were_not_seen():
     assert 0.7 < np.mean(inside) < 0.9
 
 
+def test_memory_follows_one_photograph_and_is_judged_by_sizes_that_were_not_seen():
+    """What is held at once is a photograph, whatever their number; times know nothing of that count. A room whose largest size alone
+    tells what pixels cost is left out size by size, so that the range is that of its sizes."""
+    rows = planted(rooms=4)
+    for i, row in enumerate(rows):
+        row["a_view"] = (0.1, 0.4)[i % 2]
+        row["memory_mb"] = 300 + 1000 * row["a_view"]
+    fits = model.fit_rows(rows)
+    memory, cpu = (fits["render", "all", name] for name in ("memory_mb", "cpu_seconds"))
+    assert memory.coefficients == pytest.approx({"job": 300, "a_view": 1000}, rel=1e-3)
+    assert "a_view" not in cpu.coefficients and (memory.low, memory.high) == pytest.approx((1, 1), abs=1e-3)
+    alone = [row for row in rows if row["scene"] == "r0" or row["a_view"] < 0.2]
+    assert model.fit_rows(alone)["render", "all", "memory_mb"].high == pytest.approx(1, abs=1e-3)
+    few = [row for row in rows if row["scene"] in ("r0", "r1")]
+    assert model.fit_rows(few)["render", "all", "memory_mb"].high == model.UNMEASURED_SIZE[1]
+
+
 def test_few_rooms_say_little():
     fit = model.fit_rows(planted(rooms=2))["render", "all", "cpu_seconds"]
     assert (fit.low, fit.high) == model.UNMEASURED

@@ -25,6 +25,8 @@ SHIPPED = Path(__file__).with_name("coefficients.json")
 MEASURES = ("cpu_seconds", "memory_mb", "disk_mb")
 OF_MEMORY = ("a_view",)
 """Counts that memory alone follows: what is held at once, and not what is gone through."""
+SIZES = ("a_view", "pixels", "faces")
+"""Counts that tell one size of a room from another."""
 TIMES = ("cpu_seconds", "seconds")
 """Columns that follow the speed of the machine."""
 FEWEST_ROOMS = 3
@@ -144,11 +146,17 @@ def _fit(rows: list[dict[str, Any]], measure: str) -> Fit:
     low, high = UNMEASURED if measure in TIMES else UNMEASURED_SIZE
     if len(rooms) >= FEWEST_ROOMS:
         errors = {}
-        for room in rooms:
-            others = _coefficients([row for row in rows if row["scene"] != room], names, measure)
-            errors[room] = [_error(row, others, measure) for row in rows if row["scene"] == room]
+        for case in dict.fromkeys(_case(row, measure) for row in rows):
+            others = _coefficients([row for row in rows if _case(row, measure) != case], names, measure)
+            errors[case] = [_error(row, others, measure) for row in rows if _case(row, measure) == case]
         low, high = _quantiles(errors)
     return Fit(coefficients, low, high, len(rows), len(rooms), _divided(rows) if measure == "cpu_seconds" else 0.0)
+
+
+def _case(row: dict[str, Any], measure: str) -> tuple[Any, ...]:
+    """Return what a fit must not have seen for its error at this job to count: the room, for memory the room at this size. Memory
+    follows the size far more than the room, and without all sizes of a room a fit may lack the largest ones."""
+    return (row["scene"], *(row.get(name, 0.0) for name in SIZES)) if measure == "memory_mb" else (row["scene"],)
 
 
 def _divided(rows: list[dict[str, Any]]) -> float:
@@ -194,7 +202,7 @@ def _error(row: dict[str, Any], coefficients: dict[str, float], measure: str) ->
     return math.log(row[measure] / predicted) if predicted > 0 else 0.0
 
 
-def _quantiles(errors: dict[str, list[float]]) -> tuple[float, float]:
+def _quantiles(errors: dict[Any, list[float]]) -> tuple[float, float]:
     """Return the factors of 10 and 90 per cent; rooms count as in the fit."""
     import numpy as np
 

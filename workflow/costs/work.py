@@ -211,12 +211,13 @@ def _unwrap(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, f
 
 def _room(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     texels = settings["room"]["lightmap_size"] ** 2 / MILLION
-    return "all", {"paths": texels * settings["room"]["samples"], "pixels": texels, "faces": size.faces / MILLION}
+    counts = {"paths": texels * settings["room"]["samples"], "texels": texels, "pixels": size.pixels / MILLION}
+    return "all", {**counts, "faces": size.faces / MILLION, "cells": _base_cells(settings, size)}
 
 
 def _report(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     shown = min(settings["report"]["views"], size.views) * size.pixels / max(size.views, 1) / MILLION
-    return "all", {"shown": shown, "pixels": size.pixels / MILLION}
+    return "all", {"shown": shown, "pixels": size.pixels / MILLION, "faces": size.faces / MILLION}
 
 
 def _publish(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:

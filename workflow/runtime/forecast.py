@@ -17,7 +17,7 @@ from workflow.costs.work import SceneSize, Work, work_of
 from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fingerprints
 
-MEMORY_MARGIN = 1.25
+MEMORY_MARGIN = 1.1
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
@@ -66,7 +66,7 @@ def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: fl
 
 
 def memory_mb(cost: Cost) -> int:
-    """Return the memory to ask for: a quarter above what nine of ten such jobs took."""
+    """Return the memory to ask for: a tenth above what nine of ten such jobs took. The next attempt asks for twice that."""
     return _rounded(cost.memory_mb.high * MEMORY_MARGIN) if cost.memory_mb else UNKNOWN_MEMORY
 
 
