@@ -82,8 +82,8 @@ def test_the_range_is_that_of_rooms_that_were_not_seen():
 
 
 def test_memory_follows_one_photograph_and_is_judged_by_sizes_that_were_not_seen():
-    """What is held at once is a photograph, whatever their number; times know nothing of that count. A room whose largest size alone
-    tells what pixels cost is left out size by size, so that the range is that of its sizes."""
+    """What is held at once is a photograph, whatever their number; times know nothing of that count. A room that alone tells what
+    pixels cost is left out size by size, so that the range is that of its sizes."""
     rows = planted(rooms=4)
     for i, row in enumerate(rows):
         row["a_view"] = (0.1, 0.4)[i % 2]
