@@ -201,7 +201,7 @@ def vertex_ids(segments: Path, annotation: Path) -> mesh.VertexIds:
     document = read_json(annotation, "objects of the segments")
     with reading(annotation, "expected `segGroups` with objectId, label and segments"):
         objects = [
-            (int(g["objectId"]), str(g.get("label", "object")), np.asarray(g["segments"], np.int64).ravel())
+            (int(np.int64(g["objectId"])), str(g.get("label", "object")), np.asarray(g["segments"], np.int64).ravel())
             for g in document["segGroups"]
         ]
     if index.ndim != 1:
