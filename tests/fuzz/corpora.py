@@ -408,20 +408,27 @@ def read_mitsuba_scene() -> None:
 
 
 def load_mitsuba_scene() -> None:
-    """As stage `capture` does: in a process of its own first, which Mitsuba may end, and then in this one."""
+    """As stage `capture` first does, in a process of its own, which Mitsuba may end; what it raised there is raised here."""
     from workflow.sources.mitsuba_scene import scene, trial
 
     read_mitsuba_scene()
+    told, tell = os.pipe()
     child = os.fork()
     if child == 0:
-        with contextlib.suppress(Exception):
+        try:
             scene.load(Path("scene.xml"))
+        except BaseException as error:
+            os.write(tell, f"{type(error).__name__}\n{error}".encode(errors="replace")[:2000])
         os._exit(0)
+    os.close(tell)
+    with os.fdopen(told, "rb") as file:
+        kind, _, said = file.read().decode(errors="replace").partition("\n")
     code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if code == -signal.SIGXCPU:
         os.kill(os.getpid(), signal.SIGXCPU)  # it hangs, which is no crash
     trial.judge(Path("scene.xml"), code)
-    scene.load(Path("scene.xml"))
+    if kind:
+        raise {"InputError": InputError, "MemoryError": MemoryError}.get(kind, RuntimeError)(said)
 
 
 def masks(home: Path) -> None:

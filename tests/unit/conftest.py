@@ -1,6 +1,7 @@
 """Fixtures that several unit tests share."""
 
 import socket
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import pytest
@@ -33,3 +34,16 @@ def offline(monkeypatch):
 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
+
+
+@pytest.fixture
+def opened(page_for):
+    """`opened(path, ...)`: a page, with what it said and asked for in `page.seen`."""
+    with ExitStack() as stack:
+
+        def open_page(*arguments, **options):
+            seen = stack.enter_context(page_for(*arguments, **options))
+            seen.page.seen = seen
+            return seen.page
+
+        yield open_page

@@ -1,7 +1,6 @@
 """The page of a batch in a browser: sorting, finding, addresses that show the same again, causes, and no JavaScript."""
 
 import re
-from contextlib import ExitStack
 
 import pytest
 from PIL import Image
@@ -53,19 +52,6 @@ def write(folder, table):
 @pytest.fixture(scope="module")
 def batch(tmp_path_factory):
     return write(tmp_path_factory.mktemp("batch"), rows())
-
-
-@pytest.fixture
-def opened(page_for):
-    """`opened(path, ...)`: a page, with what it said and asked for in `page.seen`."""
-    with ExitStack() as stack:
-
-        def open_page(*arguments, **options):
-            seen = stack.enter_context(page_for(*arguments, **options))
-            seen.page.seen = seen
-            return seen.page
-
-        yield open_page
 
 
 def names(page):

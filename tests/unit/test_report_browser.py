@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -76,19 +75,6 @@ def report(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
     path.write_text(render_page(content()))
     return path
-
-
-@pytest.fixture
-def opened(page_for):
-    """`opened(path, ...)`: a page, with what it said and asked for in `page.seen`."""
-    with ExitStack() as stack:
-
-        def open_page(*arguments, **options):
-            seen = stack.enter_context(page_for(*arguments, **options))
-            seen.page.seen = seen
-            return seen.page
-
-        yield open_page
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

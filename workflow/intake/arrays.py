@@ -25,6 +25,9 @@ def read_npy(path: Path) -> np.ndarray:
             raise InputError(f"{path}: an .npz archive under the name of an .npy file; save one array with `np.save`")
         if start != b"\x93NUMPY":
             raise InputError(f"{path}: not a readable array (no .npy file); save it with `np.save`")
+        version, length = file.read(2), int.from_bytes(file.read(4), "little")
+        if version[:1] != b"\x01" and length > size:  # NumPy would ask for as much memory; version 1 has two bytes for it
+            raise InputError(f"{path}: cut short ({size} bytes; its header announces that it has {length} itself)")
         file.seek(0)
         with reading(path, "not a readable array"):
             version = np.lib.format.read_magic(file)

@@ -92,12 +92,10 @@ def rehash() -> list[Path]:
 @contextmanager
 def saved_once() -> Iterator[None]:
     """Save the digests only once, at the end of the block: the file has an entry for every photograph of a batch."""
-    global _held
-    _held = True
     try:
-        yield
+        with unsaved():
+            yield
     finally:
-        _held = False
         _save()
 
 
