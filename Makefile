@@ -91,7 +91,7 @@ test: setup node
 	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -m "not long" $(PYTEST_ARGS)
 
 test-all: setup node
-	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) $(PYTEST_ARGS)
+	$(PYTHON_BIN) -m pytest $(IN_PARALLEL) -o faulthandler_timeout=0 $(PYTEST_ARGS)
 
 # The counts are kept in docs/results/data/reliability_fuzz.json.
 CASES ?= 100000

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Generator
 from pathlib import Path
 
 import pytest
 
 from iif_core.errors import InputError
+from tests import hanging
 from tests.browser import browser, page_for  # noqa: F401  fixtures
 from workflow.runtime import device, native
 
@@ -16,6 +18,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 THREADS = 2
 # As in every job, before anything imports NumPy: threads that wait for one another make small matrices several times as slow.
 os.environ[native.SMALL_MATRICES] = "1"
+os.environ["PYTHONFAULTHANDLER"] = "1"  # a process that a test started tells where it hung
 
 try:
     native.prepare()
@@ -29,6 +32,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     kitchen of the snapshot, and the other meanwhile makes the tiny scene that the rest of `tests/workflow` shares."""
     long = REPOSITORY / "tests/workflow"
     items.sort(key=lambda item: (long not in item.path.parents, item.path != long / "test_snapshot.py"))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """End whatever a test waits for in vain; tests marked `long` may take their time."""
+    if item.get_closest_marker("long"):
+        return (yield)
+
+    def end() -> None:
+        item.add_report_section(
+            "call", "hanging", f"after {hanging.LIMIT:.0f} s these were killed:\n{hanging.end_all(os.getpid())}"
+        )
+
+    timer = threading.Timer(hanging.LIMIT, end)
+    timer.daemon = True
+    timer.start()
+    try:
+        return (yield)
+    finally:
+        timer.cancel()
 
 
 @pytest.fixture(scope="session")

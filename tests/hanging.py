@@ -1,0 +1,39 @@
+"""A test that hangs is ended and named. What it started is told and killed after `LIMIT` seconds, which lets a test that waits
+for it go on, and fail; a test that hangs itself is ended by `faulthandler_timeout` of pyproject.toml, which ends its process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+
+LIMIT = 300.0
+"""Seconds, of a test with the fixtures that it is the first to use; the longest takes 100 on two free cores."""
+COLUMNS = "pid,ppid,stat,etimes,cputimes,wchan:30,args"
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the processes that a process started, and those that these started, parents first."""
+    children = []
+    for place in Path(f"/proc/{pid}/task").glob("*/children"):
+        with suppress(OSError):  # that thread has just ended
+            children += [int(word) for word in place.read_text().split()]
+    return children + [one for child in children for one in descendants(child)]
+
+
+def end_all(pid: int, patience: float = 5.0) -> str:
+    """Kill all that a process started, and return a table of it. With SIGABRT at first, by which Python tells where it was if the
+    variable PYTHONFAULTHANDLER is set."""
+    found = descendants(pid)
+    if not found:
+        return "it has started no process"
+    table = subprocess.run(["ps", "-ww", "-o", COLUMNS, "-p", ",".join(map(str, found))], capture_output=True, text=True).stdout
+    for number, wait in ((signal.SIGABRT, patience), (signal.SIGKILL, 0.0)):
+        for one in found:
+            with suppress(ProcessLookupError):
+                os.kill(one, number)
+        time.sleep(wait)
+    return table

@@ -1,0 +1,30 @@
+"""What a test waits for in vain is told and killed."""
+
+import subprocess
+import sys
+
+IN_VAIN = """
+import subprocess, sys
+def in_vain():
+    child = subprocess.Popen([sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(1000)"])
+    child.wait()
+in_vain()
+"""
+TEST = f"""
+import os, subprocess, sys
+from tests import hanging
+process = subprocess.Popen([sys.executable, "-c", {IN_VAIN!r}], stdout=subprocess.PIPE)
+assert process.stdout.readline() == b"ready\\n"
+assert process.pid in hanging.descendants(os.getpid()) and len(hanging.descendants(os.getpid())) == 2
+print(hanging.end_all(os.getpid(), patience=0.2))
+assert process.wait(30) < 0 and process.stdout.read() == b""  # which ends when its child has ended, too
+print(hanging.end_all(os.getpid()))
+"""
+
+
+def test_a_process_and_its_child_are_told_and_killed():
+    """In a process of its own, because this one may have a browser."""
+    said = subprocess.run([sys.executable, "-c", TEST], capture_output=True, text=True, timeout=60)
+    assert said.returncode == 0, said.stderr
+    assert "time.sleep(1000)" in said.stdout and said.stdout.endswith("it has started no process\n")
+    assert "in in_vain" in said.stderr  # where it hung, by PYTHONFAULTHANDLER, which conftest.py sets
