@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -48,6 +49,9 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     timer = threading.Timer(hanging.LIMIT, end)
     timer.daemon = True
     timer.start()
+    drjit = sys.modules.get("drjit")  # with one thread, left by another test, Mitsuba waits for ever when it writes an EXR file
+    if drjit and not _llvm_problem and drjit.thread_count() != THREADS:
+        drjit.set_thread_count(THREADS)
     try:
         return (yield)
     finally:

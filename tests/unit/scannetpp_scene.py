@@ -99,10 +99,8 @@ def traced(room, count, samples, camera=CAMERA, lens=LENS):
     from iif_core.light.transport.emitters import Emitters
     from iif_core.light.transport.render import render
     from iif_core.light.transport.scene import PathOptions, Scene
-    from workflow.runtime import native
 
     shape = geometry(room)
-    native.limit_threads(1)
     emitters = Emitters(shape, room.emission, np.ones(len(room.faces), np.int8))
     material, curve = room.materials.drjit(), response_curve("filmic")
     out = []

@@ -66,6 +66,7 @@ def rendered(scene: Any, sensor: Any, samples: int) -> Any:
 
 
 def main() -> None:
+    import drjit as dr
     import mitsuba as mi
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -78,6 +79,9 @@ def main() -> None:
     parser.add_argument("--variant", default="llvm_ad_rgb", help="of Mitsuba")
     asked = parser.parse_args()
     mi.set_variant(asked.variant)
+    dr.set_thread_count(
+        max(dr.thread_count(), 2)
+    )  # with one, as on one core, Mitsuba waits for ever for the blocks of an EXR file
     size = dict(zip(("resx", "resy"), asked.size.lower().split("x"), strict=True)) if asked.size else {}
     scene = load(Path(__file__).resolve().parent, **size)
     sensors = {sensor.id().removeprefix("view-"): sensor for sensor in scene.sensors()}

@@ -10,8 +10,9 @@ from pathlib import Path
 from iif_core.errors import InputError
 
 _LOADING = """
-import sys, mitsuba as mi
+import sys, drjit, mitsuba as mi
 mi.set_variant(sys.argv[1])
+drjit.set_thread_count(max(drjit.thread_count(), 2))  # with one, Mitsuba waits for ever for the blocks of an EXR file
 config = mi.parser.ParserConfig(sys.argv[1])
 mi.file_resolver().prepend(sys.argv[2].rpartition("/")[0] or ".")
 state = mi.parser.parse_file(config, sys.argv[2])
