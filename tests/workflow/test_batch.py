@@ -103,6 +103,19 @@ def test_prepared_scenes_are_sound_and_finished(copied):
     assert len(marks) == 3
 
 
+def test_one_scene_is_delivered_before_the_next_goes_on(copied):
+    """So that a batch that is stopped has delivered what it could."""
+    made = {name: [copied.folder / f"results/{name}/{stage}/manifest.json" for stage in ("metrics", "report")] for name in "ab"}
+    for name, paths in made.items():
+        paths.append(copied.folder / f"scenes/{name}/manifest.json")
+        for path in paths:
+            path.unlink()
+    result = copied.run("scenes/a", "scenes/b", "--cores", "1")
+    assert result.returncode == 0, result.stderr[-2000:]
+    first, second = sorted([path.stat().st_mtime_ns for path in paths] for paths in made.values())
+    assert first[0] < first[1] < first[2] < second[0] < second[1] < second[2]
+
+
 def test_a_prepared_scene_is_made_again_where_it_is_edited_or_damaged(copied):
     table = copied.folder / "config/batch.tsv"
     kept = table.read_text()
