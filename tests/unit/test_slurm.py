@@ -225,7 +225,14 @@ def test_nodes_that_sinfo_does_not_tell_refuse_nothing(cluster):
 
 @pytest.mark.parametrize(
     ("state", "answer"),
-    [("COMPLETED", "success"), ("PENDING", "running"), ("COMPLETING", "running"), ("TIMEOUT", "failed"), ("CANCELLED", "failed")],
+    [
+        ("COMPLETED", "success"),
+        ("PENDING", "running"),
+        ("COMPLETING", "running"),
+        ("STAGE_OUT", "running"),
+        ("TIMEOUT", "failed"),
+        ("CANCELLED", "failed"),
+    ],
 )
 def test_what_snakemake_is_told(cluster, state, answer):
     cluster(3, state)

@@ -74,7 +74,7 @@ def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:
     asked = _asks(own)
     had = "; ".join(filter(None, (asked and f"it had asked for {asked}", seen)))
     state = slurm.state_of(own["job"])
-    if state in slurm.ALIVE:
+    if state and state not in slurm.ENDED:
         return f"has not ended: Slurm says {state}"
     cause = state if state in slurm.KILLED and state != "CANCELLED" else slurm.said_in(own["log"], own["job"]) or state
     if cause in slurm.KILLED:
@@ -100,7 +100,7 @@ def ended_for_slurm(document: dict[str, Any]) -> bool:
     if not own or alive.lives(document):
         return False
     state = slurm.state_of(own["job"])
-    return bool(state) and state not in slurm.ALIVE
+    return state in slurm.ENDED
 
 
 def _place(document: dict[str, Any]) -> str:

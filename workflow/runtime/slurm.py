@@ -26,7 +26,8 @@ KILLED = {
     "CANCELLED": "was cancelled (scancel, or Snakemake was stopped)",
 }
 """How Slurm ends jobs that say nothing themselves."""
-ALIVE = ("RUNNING", "PENDING", "COMPLETING", "CONFIGURING", "REQUEUED", "REQUEUE_HOLD", "SUSPENDED")
+ENDED = (*KILLED, "COMPLETED", "FAILED", "REVOKED")
+"""States that a job does not leave by itself; in any other, such as STAGE_OUT or RESV_DEL_HOLD, it is still Slurm's."""
 
 
 def _answer(*command: str) -> str:
@@ -245,7 +246,7 @@ def answer_to_snakemake(job: str) -> str:
         return "success" if _answer("scontrol", "ping").count(" UP") else "running"
     if state == "COMPLETED":
         return "success"
-    return "running" if state in ALIVE else "failed"
+    return "failed" if state in ENDED else "running"
 
 
 if __name__ == "__main__":  # `cluster-generic-status-cmd` of workflow/profiles/slurm-scenes
