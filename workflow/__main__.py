@@ -181,7 +181,7 @@ CAUSES = {
     errno.ESTALE: "the network disk lost the file; run the same command again",
     errno.EINTR: "a call was interrupted; run the same command again",
     errno.EFBIG: "the file would be larger than is allowed; raise the limit (`ulimit -f unlimited`), or use another disk",
-    errno.ENOMEM: "not enough memory; end other programs, then run the same command again",
+    errno.ENOMEM: "not enough memory; end other programs or give the job more, then run the same command again",
     errno.ENOTDIR: "a file is in the place of a folder; move it away, then run the same command again",
     errno.EEXIST: "a file is in the place of a folder; move it away, then run the same command again",
     errno.EISDIR: "a folder is in the place of a file; move it away, then run the same command again",
@@ -216,6 +216,9 @@ def _guarded(what: str, run: Callable[[], object], state: JobState | None = None
     except OSError as error:
         reason = _of_the_machine(error)
         logging.getLogger("error").error("%s", reason, exc_info=error.errno not in CAUSES)
+    except MemoryError as error:
+        reason = f"{what}: {CAUSES[errno.ENOMEM]}{f' ({error})' if str(error) else ''}"
+        logging.getLogger("error").error("%s", reason)
     except Exception as error:
         logging.getLogger("error").exception("%s stopped on an unexpected error (a bug: please report it with this log)", what)
         reason = f"{type(error).__name__}: {error} (a bug: please report it with the log)"

@@ -468,3 +468,16 @@ def test_an_interrupted_job_does_not_look_like_one_without_memory(tmp_path, monk
     monkeypatch.chdir(tmp_path)
     assert _guarded("base of x", interrupted, JobState("x", "base")) == 130
     assert [message.endswith("it was interrupted; the same command continues") for message in reasons(0.0)] == [True]
+
+
+def test_a_job_without_memory_says_so(tmp_path, monkeypatch, caplog):
+    from workflow.__main__ import _guarded
+
+    def greedy():
+        raise MemoryError("Unable to allocate 9 TiB")
+
+    monkeypatch.chdir(tmp_path)
+    assert _guarded("base of x", greedy, JobState("x", "base")) == 1
+    (reason,) = reasons(0.0)
+    assert "base of x: not enough memory; " in reason and reason.endswith("(Unable to allocate 9 TiB)")
+    assert "Traceback" not in caplog.text and "bug" not in caplog.text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -122,6 +123,8 @@ def test_a_file_on_which_mitsuba_crashes_is_refused_by_name(tmp_path):
     bad = write(tmp_path, '<texture type="bitmap" id="t"/>')
     with pytest.raises(InputError, match="scene.xml: Mitsuba crashes when it loads this file .SIGSEGV."):
         trial.check(bad, "scalar_rgb")
+    with pytest.raises(MemoryError, match="a process that loaded .*scene.xml was killed"):
+        trial.judge(bad, -signal.SIGKILL)  # as by the kernel, where memory runs out
 
 
 def test_what_mitsuba_refuses_is_said_in_its_words(llvm, tmp_path):

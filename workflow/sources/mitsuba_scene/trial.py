@@ -25,14 +25,21 @@ def check(xml: Path, variant: str) -> None:
     """Load a scene in another process, with a variant of Mitsuba. Errors that Mitsuba tells are left to whoever loads it next.
 
     Raises:
-        InputError: Mitsuba ends that process.
+        InputError, MemoryError: as `judge`.
     """
     command = [sys.executable, "-c", _LOADING, variant, str(xml.resolve())]
     judge(xml, subprocess.run(command, capture_output=True).returncode)
 
 
 def judge(xml: Path, code: int) -> None:
-    """Raise InputError if a process that loaded a scene ended by a signal; `code` is its exit code, below 0 for a signal."""
+    """Raise what a process that loaded a scene died of; `code` is its exit code, below 0 for a signal.
+
+    Raises:
+        MemoryError: somebody else killed it, as the kernel does where memory runs out.
+        InputError: it crashed.
+    """
+    if code == -signal.SIGKILL:
+        raise MemoryError(f"a process that loaded {xml} was killed")
     if code < 0:
         raise InputError(
             f"{xml}: Mitsuba crashes when it loads this file ({signal.Signals(-code).name}); a bitmap without a file can cause"
