@@ -1,6 +1,8 @@
 """What Snakemake's own commands say about the workflow, in a folder that has nothing but one scene. No job is run."""
 
+import os
 import shutil
+from pathlib import Path
 
 import pytest
 from support import Workflow
@@ -55,13 +57,25 @@ def test_the_template_is_no_stage(fresh):
     )
 
 
-def test_a_checkout_may_have_a_space_in_its_path(repository, tmp_path):
-    """Snakemake refuses the path of an image that has one, even where no image is used."""
-    checkout = tmp_path / "a copy"
+def copy_of(repository, checkout):
+    """What of a checkout is needed to run."""
     checkout.mkdir()
     shutil.copy(repository / "Snakefile", checkout)
     for part in ("config", "iif_core", "profiles", "workflow"):
         shutil.copytree(repository / part, checkout / part, ignore=shutil.ignore_patterns("__pycache__"))
+    return checkout
+
+
+def test_results_do_not_depend_on_where_the_checkout_lies_and_how_it_is_named(repository, finished, tmp_path):
+    moved = finished.copy(tmp_path / "run")
+    moved.repository = Path(os.path.relpath(copy_of(repository, tmp_path / "checkout")))
+    assert not moved.repository.is_absolute()
+    assert "Nothing to be done" in succeeded(moved.run("scenes/tiny", "-n"))
+
+
+def test_a_checkout_may_have_a_space_in_its_path(repository, tmp_path):
+    """Snakemake refuses the path of an image that has one, even where no image is used."""
+    checkout = copy_of(repository, tmp_path / "a copy")
     spaced = Workflow(checkout, checkout)
     assert "publishing scenes/kitchen" in succeeded(spaced.run("scenes/kitchen", "-n"))
     succeeded(spaced.run("verify"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 TEMPLATE, STYLE, TABLES, SCRIPT = (HERE / name for name in ("page.html.j2", "page.css", "tables.js", "page.js"))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 TEMPLATE, STYLE, VIEWER, LIBRARY = (HERE / name for name in ("page.html.j2", "room.css", "viewer.js", "vendor/three.min.js"))
 VENDORED = HERE / "vendor/README.md"
 

@@ -55,6 +55,8 @@ FILE_MODULES = {
     "room": ("workflow.room.sources",),
     "relit_truth": ("workflow.sources.relit",),
 }
+_HERE = f"{REPOSITORY}/"
+_OWN = tuple(f"{_HERE}{package}/" for package in PACKAGES)
 NEEDED = tuple(stage.name for stage in STAGES.values() if not stage.on_demand)
 """Stages that every scene needs, in order."""
 VGG = Path("results/weights/lpips_vgg.npz")
@@ -218,7 +220,13 @@ def modules_digest(modules: list[str]) -> str:
 
 def raw_digest(paths: list[Path]) -> str:
     """Return the digest of the contents of input files; large ones are treated as in workflow/runtime/input_digests.py."""
-    return hashlib.sha256("\n".join(input_digests.digests(paths)).encode()).hexdigest()[:16]
+    return hashlib.sha256("\n".join(input_digests.digests(paths, _name_of)).encode()).hexdigest()[:16]
+
+
+def _name_of(path: Path) -> str:
+    """Return the path; of a file of the program its place in the checkout, so that results do not depend on where that lies."""
+    name = str(path)
+    return name[len(_HERE) :] if name.startswith(_OWN) else name
 
 
 def raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -52,10 +52,10 @@ _read_at: tuple[Path, int] | None = None  # which file, and its time stamp, `_kn
 _held = False
 
 
-def digests(paths: Iterable[Path]) -> list[str]:
-    """Return `path:digest` of every file, sorted by path."""
+def digests(paths: Iterable[Path], named: Callable[[Path], str] = str) -> list[str]:
+    """Return `name:digest` of every file, sorted by path; `named` gives the name, which is the path without it."""
     _recall()
-    out = [f"{path}:{_digest(path)}" for path in sorted(paths)]
+    out = [f"{named(path)}:{_digest(path)}" for path in sorted(paths)]
     _save()
     return out
 
