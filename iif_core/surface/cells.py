@@ -99,7 +99,7 @@ def coarse_cells(ijk: ArrayLike, object_id: ArrayLike, values: ArrayLike) -> tup
     Coarse cells give values to surface between fine cells, which few views leave empty. The coarse index of a point is its
     fine index shifted by two bits, so both grids share one origin.
     """
-    ijk, values = np.asarray(ijk).reshape(-1, 3), np.asarray(values, np.float64)
+    ijk, values = np.asarray(ijk).reshape(-1, 3), np.asarray(values)
     keys, row = np.unique(pack_keys(ijk >> COARSE_SHIFT, object_id), return_inverse=True)
     count = np.bincount(row, minlength=len(keys))[:, None]
     sums = np.stack([np.bincount(row, values[:, c], len(keys)) for c in range(values.shape[1])], 1)

@@ -64,7 +64,7 @@ def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, rea
     """What a library says of the content of a file is damage."""
 
     def fails(error):
-        def read(path):
+        def read(path, *_):
             raise error
 
         monkeypatch.setattr(files, reader, read)
@@ -75,6 +75,14 @@ def test_an_error_of_the_disk_is_not_called_damage(stage, monkeypatch, name, rea
         fails(OSError(5, "Input/output error"))(name)
     with pytest.raises(DamagedArtefact, match=r"not readable as (EXR|Parquet) \(no end\)"):
         fails(OSError("no end"))(name)
+
+
+def test_some_columns_of_a_table(stage):
+    folder, _, columns = stage
+    reader, some = StageReader(folder, "base", "s"), sorted(columns)[:2]
+    found = reader.table("cells.parquet", some)
+    assert sorted(found) == some and all(np.array_equal(found[name], reader.table("cells.parquet")[name]) for name in some)
+    assert reader.table("cells.parquet", ("none of them",)) == {}
 
 
 def test_same_content_same_bytes(stage, tmp_path):

@@ -8,7 +8,7 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -242,14 +242,14 @@ def _encoding(table: Any) -> dict[str, Any]:
     return {"compression": "zstd", "use_dictionary": rest, "use_byte_stream_split": floats}
 
 
-def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of a table as numpy arrays; fixed-size lists become (n, k)."""
+def read_parquet(path: Path, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """Return the columns of a table as numpy arrays; fixed-size lists become (n, k). Of `columns`, those there; None = all."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     out: dict[str, np.ndarray] = {}
     with pq.ParquetFile(path) as file:  # pq.read_table imports pyarrow.dataset, which takes longer than most tables
-        table = file.read()
+        table = file.read(None if columns is None else list(columns))
     for name in table.column_names:
         column = table[name].combine_chunks()
         if isinstance(column, pa.ChunkedArray):

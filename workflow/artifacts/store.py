@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -278,11 +278,11 @@ class StageReader:
                 raise self._damaged(self.directory / name, problem)
         return channels
 
-    def table(self, name: str) -> dict[str, np.ndarray]:
-        """Return the columns of a table as numpy arrays; fixed-size lists are (n, k)."""
+    def table(self, name: str, columns: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """Return the columns of a table as numpy arrays; fixed-size lists are (n, k). Of `columns`, those there; None = all."""
         path = self.path(name)
         try:
-            return io.read_parquet(path)
+            return io.read_parquet(path, columns)
         except Exception as error:
             _raise_if_of_disk(error)
             raise self._damaged(path, f"not readable as Parquet ({error})") from None

@@ -21,7 +21,7 @@ from workflow.settings.affines import textures_cells
 
 def _points(job: Job) -> np.ndarray:
     """Return the mean observed position of each cell, (C, 3), m."""
-    cells = job.read("base").table("cells.parquet")
+    cells = job.read("base").table("cells.parquet", (*"xyz",))
     return np.stack([cells[c] for c in "xyz"], 1)
 
 

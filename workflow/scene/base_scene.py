@@ -109,7 +109,7 @@ def read_base_scene(job: Job) -> BaseScene:
     object_id = segmentation.table("faces.parquet")["object_id"].astype(np.int32)
     known = segmentation.table("objects.parquet")["object_id"]
     n_objects = int(max(object_id.max(initial=-1), known.max(initial=-1))) + 1
-    cells, facts = base.table("cells.parquet"), base.json("base.json")
+    cells, facts = base.table("cells.parquet", (*"ijk", "object_id", *CHANNELS)), base.json("base.json")
     means = base.table("objects.parquet")
     object_values = np.tile(np.float32(NEUTRAL), (n_objects, 1))
     seen = means["cells"] > 0

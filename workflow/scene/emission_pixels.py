@@ -160,6 +160,11 @@ class Photographs:
         points, radiance, bound, face = (np.concatenate(part) for part in zip(*parts, strict=True))
         return VoxelPixels.of(edge, cache_origin(self.scene, edge), points, radiance, bound), face
 
+    def forget(self) -> None:
+        """Let go of `world` and `cache_pixels`, which are as large as the scene and are made again when they are asked for."""
+        for name in ("world", "cache_pixels"):
+            self.__dict__.pop(name, None)
+
     def number(self, view: View) -> int:
         """Return the place of a view in the capture."""
         return next(i for i, other in enumerate(self.capture.views) if other.view_id == view.view_id)

@@ -54,7 +54,8 @@ def read_recovered(job: Job) -> Recovered:
     base, light = read_lit_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
     names = object_names(job, base.n_objects)
-    cells, fitted = job.read("base").table("cells.parquet"), affines.table("cells.parquet")
+    cells = job.read("base").table("cells.parquet", ("cell_id", *"xyz"))
+    fitted = affines.table("cells.parquet", ("cell_id", *CHANNELS))
     if not np.array_equal(cells["cell_id"], fitted["cell_id"]):
         raise InputError(
             f"{affines.directory / 'cells.parquet'}: {len(fitted['cell_id'])} cells that are not the"

@@ -353,9 +353,10 @@ def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray
 
 def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     """Write cells.parquet: corrected materials, with the given albedo (C, 3) instead if there is one."""
-    cells = job.read("base").table("cells.parquet")
+    deviations = [f"uncertainty_albedo_{c}" for c in "rgb"]
+    cells = job.read("base").table("cells.parquet", ("cell_id", "object_id", *CHANNELS, *deviations))
     base = np.stack([cells[name] for name in CHANNELS], 1)
-    deviation = np.stack([cells[f"uncertainty_albedo_{c}"] for c in "rgb"], 1)
+    deviation = np.stack([cells[name] for name in deviations], 1)
     object_id = cells["object_id"].astype(np.int64)
     fitted = apply_affines(fit.affine, object_id, base)
     spread = albedo_uncertainty(fit.affine, fit.covariance, object_id, base, deviation)

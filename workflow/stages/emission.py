@@ -119,6 +119,7 @@ def run(job: Job) -> None:
     if sheer.any():
         names = ", ".join(object_names(job, scene.n_objects)[o] for o in np.flatnonzero(sheer))
         job.log.info("%s: does it shine, or does light pass through it?", names)
+        photos.forget()  # so that both assumptions need no more memory than one
         through, _ = _light(seen_through(photos, sheer), adjacency)
         same_kind = through.outside is not None and through.is_open <= light.is_open
         decision = decisions.transmission(names, light.misfit(sheer), through.misfit(sheer), same_kind)

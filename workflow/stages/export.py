@@ -33,7 +33,7 @@ def run(job: Job) -> None:
     recovered = read_recovered(job)
     unwrapped = job.read("unwrap").json("unwrap.json")
     parts = read_parts(job.read("unwrap"), recovered)
-    atlas = bake(parts, recovered, job.read("affines").table("cells.parquet")["uncertainty"], unwrapped["size"])
+    atlas = bake(parts, recovered, job.read("affines").table("cells.parquet", ("uncertainty",))["uncertainty"], unwrapped["size"])
     up = _up(capture)
     provenance = {"scene": job.scene, "fingerprint": job.fingerprint, "units": "metres, linear radiance"}
     environment = recovered.light.environment

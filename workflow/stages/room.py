@@ -38,7 +38,7 @@ def run(job: Job) -> None:
         require_denoiser()
     with job.timed("textures"):
         parts = read_parts(job.read("unwrap"), recovered)
-        uncertainty = job.read("affines").table("cells.parquet")["uncertainty"]
+        uncertainty = job.read("affines").table("cells.parquet", ("uncertainty",))["uncertainty"]
         atlas = bake(parts, recovered, uncertainty, job.read("unwrap").json("unwrap.json")["size"])
         lamps = find_lamps(parts, recovered.emitter_radiance, recovered.light.environment)
         size = build.lightmap_size(wanted.lightmap_size, len(lamps.lamps), FILL, wanted.max_mb)

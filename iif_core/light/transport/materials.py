@@ -27,9 +27,10 @@ class _Rows:
     def __init__(self, values: ArrayLike, name: str):
         values = np.asarray(values, np.float32)
         values = rows_of(values, len(values), 5, name)
-        clamped = np.clip(values, LOWEST, 1)
         self.count = len(values)
-        self._table = on_device(np.pad(clamped, [(0, 0), (0, 3)])) if len(values) else mi.Float(np.zeros(8, np.float32))
+        padded = np.zeros((max(self.count, 1), 8), np.float32)
+        np.clip(values, LOWEST, 1, out=padded[: self.count, :5])
+        self._table = on_device(padded)
 
     def read(self, row: Any, active: Any) -> tuple[Any, Any, Any]:
         first = dr.gather(mi.Vector4f, self._table, row * 2, active)
