@@ -19,6 +19,7 @@ from workflow.intake import limits
 from workflow.intake.arrays import read_npy
 from workflow.intake.documents import parse_json, read_json, read_text, reading
 from workflow.intake.names import LONGEST, fault_of_name, same_name, shown
+from workflow.intake.pictures import check_texture, opened
 from workflow.relighting.inserts import load_insert
 from workflow.runtime.fingerprint import raw_inputs
 from workflow.scene.response_file import read_response_file
@@ -291,6 +292,28 @@ def test_colmap_counts(tmp_path):
 def test_scenes_that_grow(tmp_path, body, words):
     write(tmp_path, ROOM + body)
     refused(lambda: mitsuba.raw_inputs({"source": {"path": str(tmp_path / "scene.xml")}}), words)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg", "bmp", "tga", "ppm"])
+def test_textures_of_every_kind_are_opened(tmp_path, kind):
+    path = tmp_path / f"t.{kind}"
+    Image.new("RGB", (4, 4), (9, 90, 200)).save(path)
+    check_texture(path)
+
+
+def test_two_pictures_in_one_file_of_a_telephone_are_a_photograph(tmp_path):
+    first, second = (Image.new("RGB", (4, 4), (value, 0, 0)) for value in (9, 200))
+    path = tmp_path / "t.jpg"
+    first.save(path, "MPO", save_all=True, append_images=[second])
+    with opened(path) as image:
+        assert image.format == "MPO" and image.size == (4, 4)
+
+
+def test_a_picture_of_another_format_than_it_says_is_named(tmp_path):
+    path = tmp_path / "t.jpg"
+    path.write_bytes(b"\0\0\0\x18ftypheic" + bytes(100))
+    with pytest.raises(InputError, match=r"t\.jpg: not a readable image .its content is none of PNG, JPEG,"), opened(path):
+        pass
 
 
 def test_textures_of_scenes_have_a_limit(tmp_path, monkeypatch):

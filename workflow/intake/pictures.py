@@ -13,9 +13,9 @@ from iif_core.errors import InputError
 from workflow.intake import limits
 from workflow.intake.documents import check_file, reading
 
-FORMATS = ("PNG", "JPEG", "MPO")
-"""Formats of Pillow that photographs may have, whatever their name: other readers, such as that of PostScript, stay shut. MPO is
-what telephones write as .jpg."""
+FORMATS = ("PNG", "JPEG")
+"""Formats of Pillow that photographs may have, whatever their name: other readers, such as that of PostScript, stay shut. MPO,
+which telephones write as .jpg, is opened as JPEG."""
 TEXTURES = (*FORMATS, "BMP", "TGA", "PPM")
 """The same for textures of Mitsuba scenes and of meshes."""
 PNG_MAGIC = b"\x89PNG"
@@ -54,7 +54,7 @@ def check_chunks(path: Path) -> None:
 @contextmanager
 def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
     """Open a picture by Pillow, with its size checked; raises InputError for a size that is not allowed."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
     check_file(path, _LARGEST_FILE, "a picture")
     check_chunks(path)
@@ -64,6 +64,10 @@ def opened(path: Path, formats: tuple[str, ...] = FORMATS) -> Iterator[Any]:
             image = Image.open(path, formats=formats)
         except Image.DecompressionBombError as error:
             raise InputError(f"{path}: too many pixels ({error}); allowed are {limits.PICTURE_PIXELS}") from None
+        except UnidentifiedImageError:
+            kinds = ", ".join(formats)
+            why = f"its content is none of {kinds}, whatever its name"
+            raise InputError(f"{path}: not a readable image ({why}); save it as one of them") from None
         with image:
             check_pixels(path, *image.size)
             yield image

@@ -197,7 +197,7 @@ def _pixels(path: Path, picture: Any) -> Array | None:
     if picture is None:
         return None
     check_pixels(path, *picture.size)
-    if picture.format not in (None, "WEBP", *TEXTURES):  # of a file that is opened and not decoded yet
+    if picture.format not in (None, "WEBP", "MPO", *TEXTURES):  # of a file that is opened and not decoded yet
         raise InputError(f"{path}: a texture of the format {picture.format}; allowed are {', '.join(TEXTURES)} and WEBP")
     picture = picture.convert("RGB")
     picture.thumbnail((LARGEST_TEXTURE, LARGEST_TEXTURE))
