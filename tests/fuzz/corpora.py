@@ -292,8 +292,8 @@ def artefacts(home: Path) -> None:
 
 
 def read_artefacts() -> None:
-    """Also with manifests that somebody sealed again, as a stranger's results may be. What was changed must be named, so that a case
-    is accepted only where the change left every byte as it was."""
+    """Also with manifests that somebody sealed again, as a stranger's results may be. What was changed must be named: a case is
+    accepted only where the change left every byte as it was, or sealed another manifest."""
     from workflow.artifacts import manifest as manifests
     from workflow.artifacts.files import sha256_of
     from workflow.artifacts.sound import stage_faults
