@@ -134,7 +134,7 @@ def tables() -> dict[str, str]:
     body = [[kind, row["cases"], row["verify"], row["plan"]] for kind, row in harm.items()]
     out["damage"] = table(["what is done to a file", "cases", "named by verify", "named when a run is planned"], body)
     body = []
-    for kind, words in (("power_cuts", "power cut"), ("faults", "error or kill")):
+    for kind, words in (("power_cuts", "power cut"), ("faults", "error of the disk")):
         for case, row in crash.get(kind, {}).items():
             body.append([f"{words}, {case}", row["points"], row["kept"] + row.get("unharmed", 0), row["lost"], row["wrong"]])
     for case, row in crash.get("stages", {}).items():
