@@ -137,8 +137,9 @@ class Disk:
         (one, name), (two, new) = os.path.split(source), os.path.split(target)
         number = self._now[source]
         self._changes.append(("move", self._now[one], name, self._now[two], new, number))
-        inside = [path for path in self._now if path == source or path.startswith(f"{source}/")]
-        for path in [path for path in self._now if path == target or path.startswith(f"{target}/")]:
+        # Another thread of a stage, which notes its memory, may write at the same time.
+        inside = [path for path in list(self._now) if path == source or path.startswith(f"{source}/")]
+        for path in [path for path in list(self._now) if path == target or path.startswith(f"{target}/")]:
             del self._now[path]
         for path in inside:
             self._now[target + path[len(source) :]] = self._now.pop(path)
