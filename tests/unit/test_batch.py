@@ -116,6 +116,18 @@ def test_all_mistakes_of_a_table_come_at_once(project):
 # ------------------------------------------------------------------------------------------------------------ overrides
 
 
+def test_a_job_needs_its_own_line_alone(project):
+    """A table is saved unfinished while jobs run: those of other scenes go on, and the plan of the batch still refuses it."""
+    project("a\t\t\ttpl\tseed=9\nmy room\t\t\ttpl\nb\t\t\ttpl\nb\t\t\ttpl\tseed=8\n")
+    assert settings.load("a").seed == 9
+    assert settings.loading.scene_origin("a") == "config/batch.tsv, line 2"
+    with pytest.raises(InputError, match="line 5, column name: 'b' stands in line 4 already"):
+        settings.load("b")
+    for ask in (batch_table.read_table, lambda: settings.load("c")):
+        with pytest.raises(InputError, match="line 3, column name: found 'my room'"):
+            ask()
+
+
 def test_overrides_are_yaml_values_under_dotted_keys():
     got = batch_table.parse_overrides("capture.views=24; prior.samples = 8;base.flag=true;a.b.c=[1, 2];seed=0;x.path=data/a=b;")
     assert got == {

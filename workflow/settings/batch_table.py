@@ -61,9 +61,31 @@ def read_table(root: Path = Path(".")) -> tuple[Line, ...]:
     Raises:
         InputError: names every mistake about which scenes there are, with line and column.
     """
+    table = _of(root)
+    if table is None:
+        return tuple(Line(0, name) for name in scene_names(root))
+    problems = [said for _, said in table.problems]
+    if not problems and not table.lines:
+        problems = [f"{TABLE}: no scene in it; write the header line {' <tab> '.join(COLUMNS)} and below it a line a scene"]
+    if problems:
+        more = f"\n... and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
+        raise InputError("\n".join(problems[:_SHOWN]) + more)
+    return tuple(table.lines.values())
+
+
+@dataclass(frozen=True)
+class _Table:
+    """Lines without mistakes, by name, and of the others (name, what is wrong), in the order of the file."""
+
+    lines: dict[str, Line]
+    problems: tuple[tuple[str, str], ...]
+
+
+def _of(root: Path) -> _Table | None:
+    """Return what the table holds, right and wrong; None without a table."""
     path = _table(root)
     if not path.is_file():
-        return tuple(Line(0, name) for name in scene_names(root))
+        return None
     status = path.stat()
     return _read_table(path, (status.st_size, status.st_mtime_ns))
 
@@ -74,8 +96,8 @@ def _table(root: Path) -> Path:
 
 
 @lru_cache(8)
-def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
-    problems: list[str] = []
+def _read_table(path: Path, _stamp: tuple[int, int]) -> _Table:
+    problems: list[tuple[str, str]] = []
     header: list[str] = []
     lines: dict[str, Line] = {}
     for number, text in enumerate(_text_of(path).split("\n"), 1):
@@ -90,15 +112,10 @@ def _read_table(path: Path, _stamp: tuple[int, int]) -> tuple[Line, ...]:
         line = Line(number, **dict(zip(header, cells, strict=False)))
         problem = problem or _problem_of_name(line, lines) or _problem_of_file(line, path.parent / "scenes")
         if problem:
-            problems.append(f"{TABLE}, line {number}{problem}")
+            problems.append((line.name, f"{TABLE}, line {number}{problem}"))
         else:
             lines[line.name] = line
-    if not problems and not lines:
-        problems = [f"{TABLE}: no scene in it; write the header line {' <tab> '.join(COLUMNS)} and below it a line a scene"]
-    if problems:
-        more = f"\n... and {len(problems) - _SHOWN} more" if len(problems) > _SHOWN else ""
-        raise InputError("\n".join(problems[:_SHOWN]) + more)
-    return tuple(lines.values())
+    return _Table(lines, tuple(problems))
 
 
 def _text_of(path: Path) -> str:
@@ -167,10 +184,20 @@ def _problem_of_file(line: Line, folder: Path) -> str:
 
 
 def find(name: str, root: Path = Path(".")) -> Line | None:
-    """Return the line that describes a scene; None for a scene with a file of its own, of a study, or not in the table."""
-    if "--" in name or scene_path(name, root).is_file() or not _table(root).is_file():
+    """Return the line that describes a scene; None for a scene with a file of its own, of a study, or not in the table.
+
+    Mistakes in other lines do not count, so that the jobs of a run go on while somebody writes the table.
+
+    Raises:
+        InputError: a mistake in the lines of this scene, or the whole table cannot be read.
+    """
+    table = None if "--" in name or scene_path(name, root).is_file() else _of(root)
+    if table is None:
         return None
-    return next((line for line in read_table(root) if line.name == name and not line.is_plain), None)
+    if own := [said for of, said in table.problems if of == name]:
+        raise InputError("\n".join(own))
+    line = table.lines.get(name)
+    return line if line and not line.is_plain else None
 
 
 def layers(line: Line, root: Path = Path(".")) -> list[tuple[str, dict[str, Any]]]:
