@@ -864,6 +864,20 @@ def _(root):
     return planned(root, source=source)
 
 
+@case("ScanNet++: anonymisation mask empty")
+def _(root):
+    home, source = scannetpp(root)
+    (home / "dslr/resized_anon_masks/DSC00001.png").write_bytes(b"")
+    return planned(root, source=source)
+
+
+@case("ScanNet++: mesh is an error page")
+def _(root):
+    home, source = scannetpp(root)
+    (home / "scans/mesh_aligned_0.05.ply").write_text("<!DOCTYPE html><title>404</title>")
+    return planned(root, source=source)
+
+
 @case("ScanNet++: photograph listed for train and test")
 def _(root):
     home, source = scannetpp(root)

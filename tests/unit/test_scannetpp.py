@@ -199,6 +199,23 @@ def test_missing_files_are_named(copy, gone, words):
     assert words in message and str(copy) in message
 
 
+@pytest.mark.parametrize(
+    ("damaged", "keep", "words"),
+    [
+        ("scans/mesh_aligned_0.05.ply", b"<!DOCTYPE html>", "not a PLY file (it begins with b'<!DOCTYPE html>'"),
+        ("scans/mesh_aligned_0.05.ply", 0, "empty (0 bytes)"),
+        ("scans/mesh_aligned_0.05.ply", 0.1, "cut short (its header announces"),
+        ("dslr/resized_anon_masks/DSC00001.png", 0, "not a readable image"),
+        ("dslr/resized_anon_masks/DSC00001.png", 0.5, "cut short"),
+    ],
+)
+def test_damaged_downloads_are_refused_while_planning(copy, damaged, keep, words):
+    data = (copy / damaged).read_bytes()
+    (copy / damaged).write_bytes(keep if isinstance(keep, bytes) else data[: int(len(data) * keep)])
+    message = refused(copy)
+    assert message.startswith(f"{copy / damaged}: {words}")
+
+
 def test_other_refusals(copy, tmp_path):
     (tmp_path / "data").mkdir()
     shutil.copytree(copy / "dslr", tmp_path / "data/scene/dslr")

@@ -71,6 +71,7 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     mesh_path = scans / "mesh_aligned_0.05.ply"
     if not mesh_path.is_file():
         raise InputError(f"{mesh_path}: not found; download the scene's `scans` too")
+    mesh.find(scans, mesh_path.name)  # refuses what its header tells to be no mesh, or cut short
     of_vertices, annotation = _annotation(scans)
     if of_vertices is None:
         notes.append("no segments.json and segments_anno.json: the scene comes without object ids")

@@ -224,6 +224,9 @@ def frames_of(
             f"{path}: {len(absent)} mask(s) not found: {_some(absent)}; without them what they hide would count as surface."
             " Add them, or leave these photographs out"
         )
+    for frame in frames:
+        if frame.mask is not None:
+            images.header(frame.mask)  # refuses what is no picture, or cut short
     if world is not None:
         frames = [replace(f, matrix=_in_world(world, f.matrix)) for f in frames]
     return Transforms(path, tuple(frames), _depth_unit(path, document), source.get("axes", "opengl"))
