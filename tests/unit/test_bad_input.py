@@ -878,6 +878,13 @@ def _(root):
     return planned(root, source=source)
 
 
+@case("ScanNet++: no annotation")
+def _(root):
+    home, source = scannetpp(root)
+    (home / "scans/segments_anno.json").unlink()
+    return planned(root, source=source, segmentation={"kind": "given"})
+
+
 @case("ScanNet++: photograph listed for train and test")
 def _(root):
     home, source = scannetpp(root)

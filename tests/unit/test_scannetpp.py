@@ -188,7 +188,8 @@ def test_wrong_world_is_named_by_colmap(copy):
     [
         ("dslr/nerfstudio/transforms.json", "it is part of the release"),
         ("scans/mesh_aligned_0.05.ply", "download the scene's `scans` too"),
-        ("scans/segments.json", "segments.json: not found, but segments_anno.json is"),
+        ("scans/segments.json", "segments.json: not found; `segmentation: {kind: given}`, the default, takes"),
+        ("scans/segments_anno.json", "segments_anno.json: not found; `segmentation: {kind: given}`, the default, takes"),
         ("dslr/resized_images/DSC00001.JPG", "1 image(s) not found"),
         ("dslr/resized_anon_masks/DSC00001.png", "1 mask(s) not found"),
     ],
@@ -214,6 +215,20 @@ def test_damaged_downloads_are_refused_while_planning(copy, damaged, keep, words
     (copy / damaged).write_bytes(keep if isinstance(keep, bytes) else data[: int(len(data) * keep)])
     message = refused(copy)
     assert message.startswith(f"{copy / damaged}: {words}")
+
+
+@pytest.mark.parametrize("gone", [("segments.json",), ("segments_anno.json",), ("segments.json", "segments_anno.json")])
+def test_a_scene_without_annotation_needs_another_segmentation(copy, gone):
+    for name in gone:
+        (copy / "scans" / name).unlink()
+    assert "set `segmentation: {kind: geometry}`" in refused(copy)
+    source = {"kind": "scannetpp", "path": str(copy)}
+    tree = {"source": source, "prior": {"kind": "retinex"}, "segmentation": {"kind": "geometry"}}
+    document = settings.dump(settings.SceneSettings.model_validate(tree))
+    assert not any("segments" in path.name for path in scannetpp.raw_inputs(document))
+    found = scannetpp.find_inputs(document["source"], document["capture"])
+    assert found.of_vertices is None
+    assert f"no {' and '.join(gone)}: the scene comes without object ids" in found.transforms.notes
 
 
 def test_other_refusals(copy, tmp_path):

@@ -35,7 +35,14 @@ MAX_DISTANCE, MAX_ANGLE = 0.01, 0.01  # metres and radians by which two pose fil
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
     """List the files that the capture reads, after the checks that need no pixels; raises InputError."""
-    return find_inputs(document["source"], document["capture"]).files()
+    found = find_inputs(document["source"], document["capture"])
+    if found.of_vertices is None and document["segmentation"]["kind"] == "given":
+        missing = next(path for path in _annotation_files(found.mesh.parent) if not path.is_file())
+        raise InputError(
+            f"{missing}: not found; `segmentation: {{kind: given}}`, the default, takes the objects from it. Download it, or set"
+            " `segmentation: {kind: geometry}` (or `masks`, docs/guide/segmentation.md), which needs no annotation"
+        )
+    return found.files()
 
 
 def capture(job: Job) -> None:
@@ -72,10 +79,12 @@ def find_inputs(source: dict[str, Any], settings: dict[str, Any], points: bool =
     if not mesh_path.is_file():
         raise InputError(f"{mesh_path}: not found; download the scene's `scans` too")
     mesh.find(scans, mesh_path.name)  # refuses what its header tells to be no mesh, or cut short
-    of_vertices, annotation = _annotation(scans)
-    if of_vertices is None:
-        notes.append("no segments.json and segments_anno.json: the scene comes without object ids")
-    listed = replace(listed, known=True, notes=tuple(notes), also=(*lists, *also, *annotation))
+    annotation = _annotation_files(scans)
+    missing = [path.name for path in annotation if not path.is_file()]
+    if missing:
+        notes.append(f"no {' and '.join(missing)}: the scene comes without object ids")
+    of_vertices = None if missing else partial(vertex_ids, *annotation)
+    listed = replace(listed, known=True, notes=tuple(notes), also=(*lists, *also, *(() if missing else annotation)))
     return Inputs(listed, mesh_path, of_vertices=of_vertices)
 
 
@@ -177,15 +186,9 @@ def _difference(opengl: list[np.ndarray], opencv: list[np.ndarray]) -> tuple[flo
     return float(np.median(distance)), float(np.median(2 * np.arcsin(np.clip(chord, 0, 1))))
 
 
-def _annotation(scans: Path) -> tuple[Any, list[Path]]:
-    """Return a function that reads the object ids of the vertices (None for a scene without annotation), and its files."""
-    files = [scans / "segments.json", scans / "segments_anno.json"]
-    there = [path.is_file() for path in files]
-    if not any(there):
-        return None, []
-    if not all(there):
-        raise InputError(f"{files[there.index(False)]}: not found, but {files[there.index(True)].name} is; both are needed")
-    return partial(vertex_ids, *files), files
+def _annotation_files(scans: Path) -> tuple[Path, Path]:
+    """Return the two files of object ids, which a scene may lack."""
+    return scans / "segments.json", scans / "segments_anno.json"
 
 
 def vertex_ids(segments: Path, annotation: Path) -> mesh.VertexIds:
