@@ -272,6 +272,24 @@ def test_the_forecast_names_every_stage_and_the_whole(repository, monkeypatch):
     assert os.getcwd() == str(repository)
 
 
+def test_many_cores_are_no_faster_than_the_longest_chain_of_a_scene(monkeypatch):
+    """What waits for one another takes the sum, however many cores there are, also across a stage that is finished."""
+    seconds = {"capture": 10.0, "prior": 20.0, "segmentation": 5.0, "base": 40.0}
+    costs = {stage: model.Cost(None, model.Range(wall, wall, wall), None, None) for stage, wall in seconds.items()}
+    monkeypatch.setattr(forecast, "job_cost", lambda stage, *_: costs[stage])
+
+    def told(scenes, stages, cores):
+        jobs = [forecast.Planned(stage, scene, 2, "draft") for scene in scenes for stage in stages]
+        return forecast.forecast(jobs, cores)[-1]
+
+    chain = forecast.START + 10 + 20 + 40 + 3 * forecast.START_OF_JOB
+    assert f"expected: {forecast.duration(chain)} of wall time on 10000 cores" == told("ab", seconds, 10_000)
+    without_prior = forecast.START + 10 + 40 + 2 * forecast.START_OF_JOB
+    assert f"expected: {forecast.duration(without_prior)} of" in told("ab", ("capture", "base"), 10_000)
+    work = forecast.START + 2 * (75 + 4 * forecast.START_OF_JOB)
+    assert f"expected: {forecast.duration(work)} of wall time on 2 cores" == told("ab", seconds, 2)
+
+
 def test_jobs_are_added_once_and_the_fit_is_that_of_the_table(tmp_path, monkeypatch):
     table, fits = tmp_path / "costs.csv", tmp_path / "coefficients.json"
     records.write_rows(table, planted(rooms=3))

@@ -146,11 +146,13 @@ class Planned(NamedTuple):
 def forecast(jobs: Iterable[Planned], cores: int) -> list[str]:
     """Return lines for a person: a range of time, memory and disk for each stage, and for all jobs together."""
     of_stage: dict[str, list[Cost]] = {}
+    of_scene: dict[str, dict[str, Range]] = {}
     busy = [0.0, 0.0, 0.0]  # middle, low, high of the seconds, times the share of the cores
     for job in jobs:
         cost = job_cost(job.stage, job.scene, job.quality, job.threads)
         of_stage.setdefault(job.stage, []).append(cost)
         if cost.seconds:
+            of_scene.setdefault(job.scene, {})[job.stage] = cost.seconds
             share = min(job.threads, cores) / max(cores, 1)
             busy = [total + share * (part + START_OF_JOB) for total, part in zip(busy, cost.seconds, strict=True)]
     if not of_stage:
@@ -165,8 +167,19 @@ def forecast(jobs: Iterable[Planned], cores: int) -> list[str]:
     if len(unknown) == len(of_stage):
         return [*lines, f"expected: unknown, because nothing was measured yet of {', '.join(unknown)}"]
     beside = f", without {', '.join(unknown)}, of which nothing was measured yet" if unknown else ""
-    whole = f"expected: {_span(START + busy[1], START + busy[2], duration)} of wall time on {cores} cores{beside}"
+    low, high = (START + max(busy[i], *(_chain(stages, i) for stages in of_scene.values())) for i in (1, 2))
+    whole = f"expected: {_span(low, high, duration)} of wall time on {cores} cores{beside}"
     return [*lines, whole]
+
+
+def _chain(seconds: Mapping[str, Range], bound: int) -> float:
+    """Return how long those stages of one scene take that wait for one another: the longest way through them, however many cores
+    there are. `bound` is the index of a Range."""
+    ends: dict[str, float] = {}
+    for stage in STAGES.values():
+        own = seconds[stage.name][bound] + START_OF_JOB if stage.name in seconds else 0.0
+        ends[stage.name] = own + max((ends[name] for name in stage.upstream), default=0.0)
+    return max(ends.values())
 
 
 def _cells(costs: list[Cost]) -> tuple[str, str, str]:
