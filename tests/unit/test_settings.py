@@ -395,3 +395,15 @@ def test_a_comparison_needs_two_names(repository):
         InputError, match="compare/kitchen: no rule makes this. It needs the names of two results, such as compare/kitchen,"
     ):
         settings.refuse_target("compare/kitchen", [], repository)
+
+
+def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
+    """Snakemake passes over it, and runs with the settings of none."""
+    for given in ("none", "default", "workflow/profiles/slurm-scenes", "workflow/profiles/slurm/config.yaml"):
+        settings.refuse_profile(given, repository, repository)
+    settings.refuse_profile(str(repository / "workflow/profiles/slurm"), tmp_path, repository)
+    with pytest.raises(InputError, match=r"slurm-scene: not found; .* Did you mean workflow/profiles/slurm-scenes\?"):
+        settings.refuse_profile("workflow/profiles/slurm-scene", repository, repository)
+    with pytest.raises(InputError) as caught:
+        settings.refuse_profile("workflow/profiles/slurm", tmp_path, repository)
+    assert f"counts from {tmp_path}" in str(caught.value) and f"{repository}/workflow/profiles/slurm-scenes" in str(caught.value)

@@ -112,6 +112,16 @@ def test_a_target_that_nothing_makes_is_one_error(fresh, arguments, found, meant
     )
 
 
+def test_a_profile_that_is_not_there_is_one_error(fresh, monkeypatch):
+    monkeypatch.setenv("PWD", os.getcwd())
+    result = fresh.run("scenes/tiny", "-n", "--workflow-profile", "workflow/profiles/slurm-scene")
+    assert result.returncode == 1
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith(
+        f"error: --workflow-profile workflow/profiles/slurm-scene: not found; a relative path counts from {os.getcwd()}."
+    )
+
+
 @pytest.mark.parametrize("target", ["scenes/tiny", "relight/tiny"])
 def test_a_file_in_the_place_of_a_scene_is_one_error(fresh, target):
     path = fresh.folder / target

@@ -29,7 +29,7 @@ from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings.names import did_you_mean_path
 from workflow.settings import prior as prior_settings
-from workflow.settings import refuse_target, study_files
+from workflow.settings import refuse_profile, refuse_target, study_files
 from workflow.studies import grid as study_sheet
 from workflow.studies import table as study_table
 from workflow.studies import relit
@@ -116,6 +116,21 @@ def tell_status():
 def targets():
     """Targets of the command line; Snakemake itself knows them only when all rules are read."""
     return list(get_argument_parser().parse_args().targets)
+
+
+def profile_or_stop():
+    """Refuse a workflow profile that is not there. Snakemake read it in the folder where it was called, and with `--directory` it is
+    in another one now, and does not say which that was; the shell does."""
+    given = get_argument_parser().parse_args()
+    start = os.environ.get("PWD", FOLDER) if given.directory else FOLDER
+    or_stop(refuse_profile, given.workflow_profile, Path(start), Path(workflow.basedir))
+
+
+# Only where there is something to check: Snakemake takes half a second to read its arguments.
+if workflow.is_main_process and any(
+    word.startswith("--workflow-p") for word in sys.argv
+):
+    profile_or_stop()
 
 
 if workflow.is_main_process and "status" in sys.argv and targets() == ["status"]:
