@@ -100,6 +100,7 @@ def test_a_target_follows_what_was_measured_in_the_room(table, tmp_path, monkeyp
     ("config", "given", "cores", "words"),
     [
         ({"budjet": 3}, {"budjet"}, 2, "budjet: unknown key. Did you mean budget?"),
+        ({"event": "x"}, {"event"}, 2, "event: unknown key. Did you mean events? Allowed: quality, point, budget, target, ev"),
         ({"budget": 3, "point": "p01"}, {"budget", "point"}, 2, "each of them chooses the quality"),
         ({"budget": "soon"}, {"budget"}, 2, "budget: found 'soon', needed seconds"),
         ({"budget": "nan"}, {"budget"}, 2, "budget: found 'nan'"),

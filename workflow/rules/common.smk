@@ -80,17 +80,10 @@ def inputs_again(asked):
         print(f"{path}: its content changed", file=sys.stderr)
 
 
-OTHERS = (
-    "maps",
-    "colour",
-    "inputs",
-    "events",
-)  # keys of `--config` beside those that choose a quality: of score/<scene>, how inputs are compared, where jobs tell of themselves
-
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
 REQUEST = or_stop(
     choose.read,
-    {key: value for key, value in config.items() if key not in OTHERS},
+    config,
     set(workflow.config_settings.overwrite_config or {}),
     workflow.resource_settings.cores,
 )

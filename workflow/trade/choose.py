@@ -21,6 +21,9 @@ from workflow.trade.points import SCORES, SHIPPED, Point, measured_scores, named
 
 CHOOSES = ("quality", "point", "budget", "target")
 """Keys of `--config`, of which one may be given."""
+OTHERS = ("events", "inputs", "maps", "colour")
+"""The other keys of `--config`, which choose no quality: where jobs tell of themselves, how inputs are compared, and what
+`score/<scene>` reads."""
 
 
 MOST_SCENES = 5
@@ -60,10 +63,11 @@ def read(config: Mapping[str, Any], given: Collection[str], cores: int | None) -
     Raises:
         InputError: unknown keys or values.
     """
-    odd = sorted(set(config) - set(CHOOSES))
+    keys = CHOOSES + OTHERS
+    odd = sorted(set(config) - set(keys))
     if odd:
         raise InputError(
-            f"--config {', '.join(odd)}: unknown key.{did_you_mean(odd[0], CHOOSES)} Allowed: {', '.join(CHOOSES)}."
+            f"--config {', '.join(odd)}: unknown key.{did_you_mean(odd[0], keys)} Allowed: {', '.join(keys)}."
             " Everything else belongs in config/scenes/<scene>.yaml (docs/reference/settings.md)."
         )
     asked = [key for key in CHOOSES if key in config and (key in given or key != "quality")]
