@@ -211,6 +211,12 @@ def test_an_unknown_scene_is_looked_for_in_the_table_too(project):
         settings.load("ofice")
 
 
+def test_a_line_with_a_name_alone_is_not_told_to_be_itself(project):
+    project("tpl2\n")
+    with pytest.raises(InputError, match=r"config/scenes/tpl2.yaml: not found. Did you mean scenes/tpl\? Known scenes: tpl and 1"):
+        settings.load("tpl2")
+
+
 # ----------------------------------------------------------------------------------------------------------- all scenes
 
 

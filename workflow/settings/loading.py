@@ -65,11 +65,12 @@ def scene_file(scene: str, root: Path = Path(".")) -> Path:
     if not path.is_file():
         files = scene_names(root)
         listed = [line.name for line in batch_table.read_table(root) if line.name not in files]
+        others = [name for name in files + listed if name != scene]  # a line of the table may have nothing but this name
         other = path.with_suffix(".yml")
         rename = f" {other.name} is there: rename it to {path.name}." if other.is_file() else ""
         more = f" and {len(listed)} of {batch_table.TABLE}" if listed else ""
         raise InputError(
-            f"config/scenes/{scene}.yaml: not found.{rename or did_you_mean(scene, files + listed, 'scenes/{}')}"
+            f"config/scenes/{scene}.yaml: not found.{rename or did_you_mean(scene, others, 'scenes/{}')}"
             f" Known scenes: {', '.join(files) or 'none'}{more}."
             " Add a file there to add a scene (docs/guide/own-data.md)."
         )
