@@ -86,6 +86,9 @@ def test_without_a_table_every_scene_file_counts(project, tmp_path):
         ("name\tpath\tpath\n", ["line 1", "column path stands twice"]),
         ("path\tbase\n", ["line 1", "no column name"]),
         (HEADER + "a b folder\n", ["line 2, column name", "'a b folder'", "tabs", "spaces"]),
+        (HEADER + "a,folder,data/a\n", ["line 2, column name", "'a,folder,data/a'", "separated by tabs", "commas"]),
+        (HEADER + "a;folder;data/a\n", ["line 2, column name", "'a;folder;data/a'", "separated by tabs", "semicolons"]),
+        ("name,source\na,folder\n", ["line 1", "one column, 'name,source'", "separated by tabs, not by commas"]),
         (HEADER + "a\t\t\t\t\textra\n", ["line 2, column 6", "6 cells", "5 columns", "'extra'"]),
         (HEADER + "\tfolder\n", ["line 2, column name", "empty"]),
         (HEADER + "a/b\tfolder\n", ["line 2, column name", "'a/b'", "letters, digits"]),
@@ -213,7 +216,7 @@ def test_an_unknown_scene_is_looked_for_in_the_table_too(project):
 
 def test_a_line_with_a_name_alone_is_not_told_to_be_itself(project):
     project("tpl2\n")
-    with pytest.raises(InputError, match=r"config/scenes/tpl2.yaml: not found. Did you mean scenes/tpl\? Known scenes: tpl and 1"):
+    with pytest.raises(InputError, match=r"config/scenes/tpl2.yaml: not found. Did you mean scenes/tpl\? Known"):
         settings.load("tpl2")
 
 

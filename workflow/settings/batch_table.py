@@ -133,9 +133,9 @@ def _text_of(path: Path) -> str:
 
 def _check_header(cells: list[str], number: int, text: str) -> None:
     where = f"{TABLE}, line {number}"
-    if len(cells) == 1 and len(text.split()) > 1:
+    if other := _instead_of_tabs(text):
         raise InputError(
-            f"{where}: the header has one column, {shown(text.strip())}; columns are separated by tabs, not by spaces"
+            f"{where}: the header has one column, {shown(text.strip())}; columns are separated by tabs, not by {other}"
         )
     for i, cell in enumerate(cells):
         if cell not in COLUMNS:
@@ -153,9 +153,17 @@ def _problem_of_cells(cells: list[str], header: list[str], text: str) -> str:
             f", column {len(header) + 1}: found {len(cells)} cells, the header has {len(header)} columns"
             f" ({', '.join(header)}); remove {shown(cells[len(header)])} or a tab before it"
         )
-    if "\t" not in text and len(text.split()) > 1:
-        return f", column name: found {shown(text.strip())}; cells are separated by tabs, this line has spaces"
+    if other := _instead_of_tabs(text):
+        return f", column name: found {shown(text.strip())}; cells are separated by tabs, this line has {other}"
     return ""
+
+
+def _instead_of_tabs(text: str) -> str:
+    """Return in words what a line has instead of tabs; empty if it has tabs, or one word alone."""
+    if "\t" in text:
+        return ""
+    found = next((name for sign, name in ((",", "commas"), (";", "semicolons")) if sign in text), "")
+    return found or ("spaces" if len(text.split()) > 1 else "")
 
 
 def _problem_of_name(line: Line, earlier: dict[str, Line]) -> str:
