@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 
@@ -204,6 +205,7 @@ def test_a_path_with_a_similar_name_beside_it_is_suggested(tmp_path):
     (tmp_path / "data/office-3/images").mkdir(parents=True)
     assert did_you_mean_path(tmp_path / "data/ofice-3/images") == f" Did you mean {tmp_path}/data/office-3/images?"
     assert did_you_mean_path(tmp_path / "data/ofice-3/photos") == f" Did you mean {tmp_path}/data/office-3?"
+    assert did_you_mean_path(Path("~/data")) == " `~` is not expanded here; write the whole path."
     assert did_you_mean_path(tmp_path / "dta/office-3") == f" Did you mean {tmp_path}/data/office-3?"
     assert did_you_mean_path(tmp_path / "data/kitchen") == did_you_mean_path(tmp_path / "data/office-3/images/0.png") == ""
 

@@ -14,10 +14,13 @@ from workflow.settings.names import did_you_mean
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
 
-REMOVED = {
+NOT_READ = {
     "affines.ridge": " It was removed, because it had no effect; delete it.",
+    "source.path": (
+        " Kind `builtin` is a room of the project and has no path; for your own data, set `source.kind` (column source)."
+    ),
 }
-"""Keys of earlier versions: what to do about them."""
+"""Keys of earlier versions and of other kinds: what to do about them."""
 SHOWN = 10
 """Problems in one message."""
 NEEDED = {
@@ -108,7 +111,7 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
         if kind == "extra_forbidden":
             section = _section_of(where)
             allowed = sorted(section.model_fields) if section else []
-            hint = REMOVED.get(dotted) or did_you_mean(where[-1], allowed, "`{}`") or TWINS.get(str(where[0]), "")
+            hint = NOT_READ.get(dotted) or did_you_mean(where[-1], allowed, "`{}`") or TWINS.get(str(where[0]), "")
             lines.append(f"{path}: `{dotted}`: unknown key.{hint} Allowed here: {', '.join(allowed)}.")
         elif kind in ("model_type", "model_attributes_type", "dict_type"):
             lines.append(

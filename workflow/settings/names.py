@@ -62,7 +62,10 @@ def did_you_mean(name: object, known: Iterable[str], form: str = "{}") -> str:
 
 
 def did_you_mean_path(path: Path) -> str:
-    """Return ` Did you mean X?` where the first missing part of `path` has a similar name beside it; otherwise empty."""
+    """Return ` Did you mean X?` where the first missing part of `path` has a similar name beside it, or what is said of a `~`;
+    otherwise empty."""
+    if path.parts[:1] and path.parts[0].startswith("~"):
+        return " `~` is not expanded here; write the whole path."
     missing = path
     try:
         while not missing.parent.exists():
