@@ -151,14 +151,16 @@ def _upgrade(scenes: list[str]) -> int:
 
 
 def _verify(scenes: list[str]) -> int:
-    from workflow.artifacts.verify import damaged
+    from workflow.artifacts.verify import damaged, with_artefacts
 
     if _not_here(scenes, "verify"):
         return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
         print(line)
-    print(f"{len(problems)} damaged" if problems else "all artefacts are as they were written")
+    nothing = "nothing to compare: no artefacts below results/ and scenes/"
+    sound = "all artefacts are as they were written" if with_artefacts() else nothing
+    print(f"{len(problems)} damaged" if problems else sound)
     return 1 if problems else 0
 
 

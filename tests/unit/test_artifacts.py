@@ -338,6 +338,15 @@ def test_variants_of_a_study_share_stages(tmp_path):
     assert "results/room--fusion-mean-s0/capture/manifest.json: missing" in line
 
 
+def test_verify_of_nothing_promises_nothing(tmp_path, monkeypatch, capsys):
+    from workflow.__main__ import main
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["workflow", "verify"])
+    assert main() == 0
+    assert capsys.readouterr().out == "nothing to compare: no artefacts below results/ and scenes/\n"
+
+
 def test_verify_of_an_unknown_scene_is_one_error(tmp_path, monkeypatch, capsys):
     from workflow.__main__ import main
 
