@@ -164,6 +164,13 @@ def _verify(scenes: list[str]) -> int:
     return 1 if problems else 0
 
 
+def _unknown_quality(quality: str) -> int:
+    """Refuse it once, before it is refused of every scene of a batch, and a summary of what is wrong takes the place of another."""
+    from workflow.settings.loading import photographs
+
+    return _guarded("quality", lambda: photographs(quality))
+
+
 def _status(scenes: list[str], quality: str, as_json: bool) -> int:
     from workflow.status.standing import quality_of
     from workflow.status.table import tell
@@ -311,6 +318,8 @@ def _planned(scene: str, quality: str) -> None:
 def main() -> int:
     """Run the command; the exit code is 0, or 1 with one message on stderr."""
     arguments = _arguments()
+    if arguments.command in ("batch", "status") and _unknown_quality(arguments.quality):
+        return 1
     if arguments.command == "status":
         return _status(arguments.scenes, arguments.quality, arguments.json)
     if arguments.command == "verify":

@@ -2,6 +2,9 @@
 
 import csv
 import json
+import os
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -502,3 +505,19 @@ def test_a_job_without_memory_says_so(tmp_path, monkeypatch, caplog):
     (reason,) = reasons(0.0)
     assert "base of x: not enough memory; " in reason and reason.endswith("(Unable to allocate 9 TiB)")
     assert "Traceback" not in caplog.text and "bug" not in caplog.text
+
+
+def test_an_unknown_quality_is_refused_and_the_summary_stays(project, repository):
+    kept = project / "results/batch/summary.tsv"
+    kept.parent.mkdir(parents=True)
+    kept.write_text("as it was")
+    for command in ("batch", "status"):
+        said = subprocess.run(
+            [sys.executable, "-m", "workflow", command, "--quality", "standrad"],
+            cwd=project,
+            env={**os.environ, "PYTHONPATH": str(repository)},
+            capture_output=True,
+            text=True,
+        )
+        assert said.returncode == 1 and "unknown quality. Did you mean standard?" in said.stderr and not said.stdout
+    assert kept.read_text() == "as it was" and [path.name for path in kept.parent.iterdir()] == ["summary.tsv"]
