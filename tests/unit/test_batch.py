@@ -508,13 +508,14 @@ def test_a_job_without_memory_says_so(tmp_path, monkeypatch, caplog):
 
 
 def test_an_unknown_quality_is_refused_and_the_summary_stays(project, repository):
-    kept = project / "results/batch/summary.tsv"
+    folder = project("tpl\n")
+    kept = folder / "results/batch/summary.tsv"
     kept.parent.mkdir(parents=True)
     kept.write_text("as it was")
     for command in ("batch", "status"):
         said = subprocess.run(
             [sys.executable, "-m", "workflow", command, "--quality", "standrad"],
-            cwd=project,
+            cwd=folder,
             env={**os.environ, "PYTHONPATH": str(repository)},
             capture_output=True,
             text=True,
