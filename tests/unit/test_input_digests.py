@@ -2,10 +2,15 @@
 
 import json
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from workflow.runtime import input_digests
+
+REPOSITORY = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -160,3 +165,61 @@ def test_all_is_read_again_on_demand(here, monkeypatch):
     forget()
     assert input_digests.digests(paths) == first  # nothing is seen
     assert input_digests.rehash() == [paths[0]] and input_digests.digests(paths) != first
+
+
+ADDS = """
+import sys
+from pathlib import Path
+from workflow.runtime import input_digests
+name = sys.argv[1]
+input_digests.WHOLE, input_digests.SAMPLE = 64, 8
+print("ready", flush=True)
+sys.stdin.readline()
+for number in range(20):
+    path = Path(f"{name}{number}")
+    input_digests.digests([path])
+    input_digests.remember([path])
+"""
+
+
+def test_two_processes_lose_nothing_of_one_another(here):
+    """What one adds is kept while the other reads the file, adds to it and writes it."""
+    folder, _ = here
+    for name in "ab":
+        for number in range(20):
+            write(folder / f"{name}{number}", LARGE)
+    command = [sys.executable, "-c", ADDS]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    both = [
+        subprocess.Popen([*command, name], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True)
+        for name in "ab"
+    ]
+    for one in both:
+        assert one.stdout.readline() == "ready\n"
+    for one in both:
+        one.stdin.write("\n")
+        one.stdin.flush()
+    for one in both:
+        one.communicate()
+        assert one.returncode == 0
+    forget()
+    input_digests._recall()
+    known = input_digests._known
+    assert sorted(known) == sorted(f"{name}{number}" for name in "ab" for number in range(20))
+    assert all(entry.whole for entry in known.values())
+
+
+def test_who_has_read_less_of_a_file_does_not_overwrite_who_has_read_all_of_it(here):
+    folder, _ = here
+    path = write(folder / "large", LARGE)
+    with input_digests.unsaved():
+        first = input_digests.digests([path])  # as a long plan, which saves at its end
+    less = dict(input_digests._new)
+    input_digests.digests([path])
+    input_digests.remember([path])  # a job meanwhile
+    input_digests._new.update(less)
+    input_digests._save()
+    status = path.stat()
+    write(path, EDITED, status.st_mtime_ns)
+    forget()
+    assert input_digests.digests([path]) != first

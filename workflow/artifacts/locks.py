@@ -30,6 +30,20 @@ def place(results: Path, scene: str, stage: str) -> Path:
 
 
 @contextmanager
+def briefly(path: Path) -> Iterator[None]:
+    """Hold the lock of a file, and wait for it, for what takes no time: reading, changing and writing a file that many processes
+    add to. On a disk without locks work goes on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            if error.errno not in _UNSUPPORTED:
+                raise
+        yield
+
+
+@contextmanager
 def alone(results: Path, scene: str, stage: str) -> Iterator[None]:
     """Hold the lock of a stage of a scene. On a disk without locks, as some of the network, a warning is logged and work goes on.
 

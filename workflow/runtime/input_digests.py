@@ -16,11 +16,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from workflow.artifacts import locks
 from workflow.artifacts.files import sha256_of, write_atomically
 
 WHOLE = 1 << 20
 SAMPLE = 1 << 12
 CACHE = Path("results/.input-digests.json")
+LOCK = CACHE.with_suffix(".lock")
 
 
 Stamp = tuple[int, int, int, int]
@@ -173,7 +175,14 @@ def _save() -> None:
     global _read_at
     if _held or not _new:
         return
-    text = json.dumps({**_stored(), **_new}, sort_keys=True, separators=(",", ":"))
-    write_atomically(CACHE, lambda temporary: temporary.write_text(text))
+    with locks.briefly(LOCK):
+        entries = _stored()
+        for path, entry in _new.items():
+            other = entries.get(path)
+            if not (other and other.whole and not entry.whole and other.stamp == entry.stamp):  # it has read more of the file
+                entries[path] = entry
+        text = json.dumps(entries, sort_keys=True, separators=(",", ":"))
+        write_atomically(CACHE, lambda temporary: temporary.write_text(text))
+        _read_at = (CACHE.absolute(), CACHE.stat().st_mtime_ns)
     _new.clear()
-    _read_at = (CACHE.absolute(), CACHE.stat().st_mtime_ns)
+    _known.update(entries)
