@@ -268,15 +268,8 @@ def _run_stage(arguments: argparse.Namespace) -> int:
         run_stage(stage, scene, arguments.quality, arguments.threads, arguments.fingerprint, part)
 
     with ExitStack() as held:
-
-        def claim() -> None:
-            try:
-                held.enter_context(locks.alone(Path("results"), scene, name))
-            except InputError as error:
-                state.failed(str(error))
-                raise
-
-        if _guarded(what, claim):
+        # Without `state`: until the lock is held, that file and the log are those of another process.
+        if _guarded(what, lambda: held.enter_context(locks.alone(Path("results"), scene, name))):
             return 1
         return _guarded(what, lambda: configure_logging(arguments.log)) or _guarded(what, run, state)
 
