@@ -34,7 +34,7 @@ def finish(root, scene, stage, inputs=(), mark=MARK, value=0.01):
     writer.json("facts.json", {"value": value})
     writer.table("cells.parquet", {"edge": np.full(3, value)})
     writer.finish()
-    stamps.stamp_stage(root / "results", scene, stage)
+    stamps.stamp_stage(root / "results", scene, stage, writer.seen)
     return root / "results" / scene / stage
 
 
@@ -170,6 +170,36 @@ def test_what_nobody_touched_is_not_read(room, tmp_path, monkeypatch):
     assert "facts.json" in seen and "cells.parquet" not in seen
     monkeypatch.setattr(io, "sha256_of", read)
     assert faults(tmp_path) == ()
+
+
+@pytest.mark.parametrize("noted", [True, False])
+@pytest.mark.parametrize("name", ["facts.json", MANIFEST])
+def test_what_changes_while_it_is_compared_is_found_by_the_next_plan(room, tmp_path, monkeypatch, name, noted):
+    """Once a file has been read, and before its time stamps are noted, it changes."""
+    os.utime(room / "facts.json")
+    if not noted:
+        stamps.place(tmp_path / "results", "s", "base").unlink()
+    original, before = sound.wrong_files, (room / name).read_bytes()
+
+    def disturbed(*arguments):
+        yield from original(*arguments)
+        flip(room / name)
+
+    with monkeypatch.context() as other:
+        other.setattr(sound, "wrong_files", disturbed)
+        faults(tmp_path)
+    assert (room / name).read_bytes() != before
+    (line,) = faults(tmp_path)
+    assert line.startswith(f"{room / name}: its content changed")
+
+
+def test_what_changes_before_the_end_of_its_job_is_found_by_the_next_plan(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        StageWriter, "finish", lambda writer, end=StageWriter.finish: (flip(writer.directory / "facts.json"), end(writer))
+    )
+    room = finish(tmp_path, "s", "capture")
+    (line,) = faults(tmp_path, stage="capture")
+    assert line == f"{room / 'facts.json'}: its content changed since it was written (sha256 differs)"
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"files": 3}', '{"files": {"a": [1]}}', "null"])

@@ -49,6 +49,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
     if known and different == []:
         yield from _broken_chain(folder, known.inputs) if known.fingerprint == fingerprint else [""]
         return
+    seen = stamps.look(folder, [MANIFEST])
     try:
         document = manifests.read(folder / MANIFEST, schema)
     except manifests.Broken as error:
@@ -62,10 +63,12 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
         put = known and own and known.fingerprint == fingerprint
         yield f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here" if put else ""
         return
-    problems = list(wrong_files(folder, document, None if different is None or MANIFEST in different else different))
+    some = different if known and different and MANIFEST not in different else None
+    seen = {**known.files, **stamps.look(folder, some)} if known and some else seen | stamps.look(folder, document["files"])
+    problems = list(wrong_files(folder, document, some))
     yield from problems
     if not problems:
-        stamps.note(noted, folder, document)
+        stamps.note(noted, folder, document, seen)
         yield from _broken_chain(folder, {k: (v.get("scene", ""), v.get("manifest_sha256", "")) for k, v in _inputs(document)})
 
 
@@ -150,6 +153,7 @@ def deliverable_faults(folder: Path, results: Path, scene: str) -> tuple[str, ..
     known = stamps.load(noted)
     if known and known.scene == scene and not stamps.touched(folder, known):
         return ()
+    seen = stamps.look(folder, [MANIFEST])
     try:
         document = manifests.read(folder / MANIFEST, SCENE_SCHEMA)
     except manifests.Broken as error:
@@ -157,9 +161,10 @@ def deliverable_faults(folder: Path, results: Path, scene: str) -> tuple[str, ..
         return (f"{folder / MANIFEST}: {problem}",)
     if document.get("scene") != scene:
         return (f"{folder / MANIFEST}: it belongs to scene {document.get('scene')}, and was put here",)
+    seen |= stamps.look(folder, document["files"])
     problems = tuple(wrong_files(folder, document))
     if not problems:
-        stamps.note(noted, folder, document)
+        stamps.note(noted, folder, document, seen)
     return problems
 
 
@@ -177,9 +182,10 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
         document = manifests.read(source)
     except manifests.Broken:
         return ()  # told of the stage itself
+    seen = stamps.look(folder, document["files"])
     problems = tuple(wrong_files(folder, document))
     if not problems:
-        stamps.note(noted, folder, document, source)
+        stamps.note(noted, folder, document, seen, source)
     return problems
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from workflow.artifacts.manifest import MANIFEST
 DELIVERABLE = "deliverable"
 
 Stamp = tuple[int, int, int]
+NEVER: Stamp = (0, 0, 0)
+"""What no file has."""
 
 
 def stamp_of(status: os.stat_result) -> Stamp:
@@ -65,17 +67,38 @@ def load(path: Path) -> Stamps | None:
         return None
 
 
-def note(path: Path, folder: Path, document: dict[str, Any], manifest: Path | None = None) -> None:
+def look(folder: Path, names: Iterable[str]) -> dict[str, Stamp]:
+    """Return the stamps of files, `NEVER` of one that is not there.
+
+    Look before the content is read: a file that changes after that has another stamp than is noted, and is read again.
+    """
+    out = {}
+    for name in names:
+        try:
+            out[name] = stamp_of(os.stat(folder / name))
+        except OSError:
+            out[name] = NEVER
+    return out
+
+
+def note(
+    path: Path,
+    folder: Path,
+    document: dict[str, Any],
+    seen: Mapping[str, Stamp] | None = None,
+    manifest: Path | None = None,
+) -> None:
     """Note the sizes and time stamps of a folder whose files are what its manifest says.
 
     Args:
         path: where they are noted.
         folder: with the files.
         document: its manifest.
+        seen: stamps that the files had before they were hashed; None = what they have now.
         manifest: where that is, if the folder is a copy and has none of its own.
     """
     names = [*([] if manifest else [MANIFEST]), *document["files"]]
-    found = {name: os.stat(folder / name) for name in names}
+    seen = look(folder, names) if seen is None else seen
     inputs = document.get("inputs", {})
     io.write_json(
         path,
@@ -85,15 +108,15 @@ def note(path: Path, folder: Path, document: dict[str, Any], manifest: Path | No
             "fingerprint": document.get("fingerprint", ""),
             "manifest": io.sha256_of(manifest or folder / MANIFEST),
             "inputs": {stage: [facts.get("scene", ""), facts.get("manifest_sha256", "")] for stage, facts in inputs.items()},
-            "files": {name: stamp_of(status) for name, status in found.items()},
+            "files": {name: seen.get(name, NEVER) for name in names},
         },
     )
 
 
-def stamp_stage(results: Path, scene: str, stage: str) -> None:
-    """Note the stamps of a stage that has just been written."""
+def stamp_stage(results: Path, scene: str, stage: str, seen: Mapping[str, Stamp] | None = None) -> None:
+    """Note the stamps of a stage that has just been written; `seen` is that of `note`."""
     folder = results / scene / stage
-    note(place(results, scene, stage), folder, manifests.read(folder / MANIFEST))
+    note(place(results, scene, stage), folder, manifests.read(folder / MANIFEST), seen)
 
 
 def touched(folder: Path, stamps: Stamps) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
 from workflow.artifacts import manifest as manifests
+from workflow.artifacts import stamps
 from workflow.artifacts.manifest import MANIFEST, STAGE_SCHEMA
 
 SCHEMA = STAGE_SCHEMA
@@ -46,12 +47,17 @@ class StageWriter:
     The old manifest is removed first and the new one is written last, so a killed job leaves a stage that is visibly not done.
     Every method takes the name of a file relative to the folder of the stage, and raises `InputError` for a name that would
     leave that folder.
+
+    Attributes:
+        files: name -> what the manifest says of the file.
+        seen: name -> stamp that the file had before it was hashed (`workflow.artifacts.stamps`).
     """
 
     def __init__(self, directory: Path, provenance: dict[str, Any]):
         self.directory = directory
         self.provenance = provenance
         self.files: dict[str, dict[str, Any]] = {}
+        self.seen: dict[str, stamps.Stamp] = {}
         self.parts: dict[str, Any] = {}
         with io.named(directory):
             io.make_folder(directory)
@@ -131,13 +137,16 @@ class StageWriter:
             return None
         if done["by"] != (by or self.provenance["fingerprint"]):
             return None
+        seen = {}
         for name, facts in done["files"].items():
             if not io.is_inside(self.directory, name):  # a forged note
                 return None
             path = io.inside(self.directory, name)
+            seen |= stamps.look(self.directory, [name])
             if not path.is_file() or io.sha256_of(path) != facts["sha256"]:
                 return None
         self.files |= done["files"]
+        self.seen |= seen
         if by:
             self.parts[part] = done
         return done["facts"]
@@ -177,6 +186,7 @@ class StageWriter:
 
     def _record(self, name: str, **facts: Any) -> None:
         path = self.directory / name
+        self.seen |= stamps.look(self.directory, [name])
         self.files[name] = {"sha256": io.sha256_of(path), "bytes": path.stat().st_size, **facts}
 
     def finish(self) -> None:
@@ -192,6 +202,7 @@ class StageWriter:
                 path.unlink()
         io.flush_folders(self.directory)
         manifests.write(self.directory / MANIFEST, {"schema": SCHEMA, **self.provenance, "files": self.files})
+        self.seen |= stamps.look(self.directory, [MANIFEST])
 
 
 def _noted_parts(directory: Path) -> dict[str, Any]:

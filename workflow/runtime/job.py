@@ -301,7 +301,7 @@ def run_stage(
     module = importlib.import_module(job.stage.module)
     module.run(job)
     job.writer.finish()
-    stamps.stamp_stage(Path("results"), scene, stage)
+    stamps.stamp_stage(Path("results"), scene, stage, job.writer.seen)
     if job.stage.reads_raw:
         input_digests.remember(fp.raw_inputs(stage, job.document))
     job.write_timings()

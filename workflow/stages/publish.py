@@ -41,7 +41,7 @@ def run(job: Job) -> None:
     bring_back(target)
     shutil.rmtree(temporary, ignore_errors=True)
     try:
-        files = _build(job, readers, temporary)
+        files, seen = _build(job, readers, temporary)
         _replace(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -51,12 +51,14 @@ def run(job: Job) -> None:
     }
     writer.json("published.json", published)
     document = manifests.read(target / MANIFEST, SCENE_SCHEMA)
-    stamps.note(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), target, document)
+    stamps.note(stamps.place(Path("results"), job.scene, stamps.DELIVERABLE), target, document, seen)
     job.log.info("%s: %d files, %.1f MB", target, len(files), sum(f["bytes"] for f in files.values()) / 1e6)
 
 
-def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[str, dict[str, Any]]:
-    """Fill the folder, its manifest last, and flush it to disk; return the files of the manifest."""
+def _build(
+    job: Job, readers: dict[str, StageReader], temporary: Path
+) -> tuple[dict[str, dict[str, Any]], dict[str, stamps.Stamp]]:
+    """Fill the folder, its manifest last, and flush it to disk; return the files of the manifest, and the stamps of all."""
     with named(temporary):
         temporary.mkdir()
     for stage, name in deliverables(readers):
@@ -64,12 +66,12 @@ def _build(job: Job, readers: dict[str, StageReader], temporary: Path) -> dict[s
     timings = read_timings(job.scene)
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
     write_parquet(temporary / "timings.parquet", columns, {"iif.schema": SCENE_SCHEMA}, settled=False)
-    files = {}
-    for path in sorted(p for p in temporary.rglob("*") if p.is_file()):
-        files[path.relative_to(temporary).as_posix()] = {"sha256": sha256_of(path), "bytes": path.stat().st_size}
+    names = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file())
+    seen = stamps.look(temporary, names)
+    files = {name: {"sha256": sha256_of(temporary / name), "bytes": seen[name][0]} for name in names}
     manifests.write(temporary / MANIFEST, _manifest(job, files), settled=False)
     flush_folders(temporary)
-    return files
+    return files, seen | stamps.look(temporary, [MANIFEST])
 
 
 def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
