@@ -251,3 +251,33 @@ def test_an_upgrade_seals_nothing_that_is_damaged_and_goes_on_where_it_was_kille
     shutil.rmtree(tmp_path / "results/s/capture")
     (only,) = upgrade(tmp_path / "results")
     assert not only[0]
+
+
+def test_a_deliverable_of_other_settings_is_published_again(tmp_path):
+    """The earlier one is copied back over one that was published since."""
+    folder = tmp_path / "scenes/s"
+
+    def publish(mark):
+        shutil.rmtree(folder, ignore_errors=True)
+        document = {"schema": manifests.SCENE_SCHEMA, "scene": "s", "fingerprint": mark, "files": {}}
+        manifests.write(folder / MANIFEST, document)
+        stamps.note(stamps.place(tmp_path / "results", "s", stamps.DELIVERABLE), folder, document)
+
+    def found(mark):
+        sound.forget()
+        return sound.deliverable_faults(folder, tmp_path / "results", "s", mark)
+
+    first, second = "1" * 16, "2" * 16
+    assert found(first) == ()
+    publish(first)
+    assert found(first) == () and found(second) == ("",)  # settings changed: there is nothing to tell
+    earlier = tmp_path / "earlier"
+    shutil.copytree(folder, earlier)
+    publish(second)
+    shutil.rmtree(folder)
+    shutil.copytree(earlier, folder)
+    assert found(second) == (f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here",)
+    assert found(first) == ()  # back to the settings of the first, it is what is wanted
+    shutil.rmtree(folder)
+    manifests.write(folder / MANIFEST, {"schema": manifests.SCENE_SCHEMA, "scene": "other", "fingerprint": first, "files": {}})
+    assert found(first) == (f"{folder / MANIFEST}: it belongs to scene other, and was put here",)

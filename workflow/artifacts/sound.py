@@ -57,7 +57,8 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
         return
     found = document.get("scene"), document.get("stage", stage)
     if found != (scene, stage):
-        yield f"{folder / MANIFEST}: it belongs to stage {found[1]} of scene {found[0]}, and was put here"
+        owner = f"stage {found[1]} of scene {found[0]}" if stage else f"scene {found[0]}"
+        yield f"{folder / MANIFEST}: it belongs to {owner}, and was put here"
         return
     if document.get("fingerprint") != fingerprint:
         put = known and own and known.fingerprint == fingerprint
@@ -145,27 +146,20 @@ def _digest_of(results: Path, scene: str, stage: str) -> str | None:
 
 
 @lru_cache(None)
-def deliverable_faults(folder: Path, results: Path, scene: str) -> tuple[str, ...]:
-    """Return what is wrong with `scenes/<scene>`, a line for each file; nothing if there is no such folder."""
+def deliverable_faults(folder: Path, results: Path, scene: str, fingerprint: str) -> tuple[str, ...]:
+    """Return what is wrong with `scenes/<scene>`, a line for each file; nothing if there is no such folder.
+
+    Args:
+        folder: of the deliverable.
+        results: folder of the results.
+        scene: which.
+        fingerprint: of stage `publish` under which it is wanted, as for `stage_faults`.
+    """
     if not folder.is_dir():
         return ()
-    noted = stamps.place(results, scene, stamps.DELIVERABLE)
-    known = stamps.load(noted)
-    if known and known.scene == scene and not stamps.touched(folder, known):
-        return ()
-    seen = stamps.look(folder, [MANIFEST])
-    try:
-        document = manifests.read(folder / MANIFEST, SCENE_SCHEMA)
-    except manifests.Broken as error:
-        problem = str(error) if (folder / MANIFEST).is_file() else "missing"
-        return (f"{folder / MANIFEST}: {problem}",)
-    if document.get("scene") != scene:
-        return (f"{folder / MANIFEST}: it belongs to scene {document.get('scene')}, and was put here",)
-    seen |= stamps.look(folder, document["files"])
-    problems = tuple(wrong_files(folder, document))
-    if not problems:
-        stamps.note(noted, folder, document, seen)
-    return problems
+    if not (folder / MANIFEST).is_file():
+        return (f"{folder / MANIFEST}: missing",)
+    return tuple(_faults(folder, stamps.place(results, scene, stamps.DELIVERABLE), SCENE_SCHEMA, scene, "", fingerprint))
 
 
 @lru_cache(None)

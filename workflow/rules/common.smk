@@ -309,16 +309,24 @@ def no_stage(wildcards):
 
 
 def publish_inputs(*names):
-    """What is published. A deliverable of which a file is gone is published again."""
+    """What is published. A deliverable of which a file is gone, or that is another one than is wanted, is published again."""
     inputs_of = reads("publish", *names)
 
     def inputs(wildcards):
         folder = f"scenes/{wildcards.scene}"
         folder_or_stop(folder)
+        quality = quality_of(wildcards.scene)
+        mark = or_stop(fingerprints.fingerprint, "publish", wildcards.scene, quality)
         again_if_unsound(
             folder,
             f"{folder} is published again",
-            sound.deliverable_faults(Path(folder), Path("results"), wildcards.scene),
+            or_stop(
+                sound.deliverable_faults,
+                Path(folder),
+                Path("results"),
+                wildcards.scene,
+                mark,
+            ),
         )
         return inputs_of(wildcards)
 
