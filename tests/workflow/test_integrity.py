@@ -10,6 +10,7 @@ import time
 from support import manifests, planned
 
 from tests.unit import own_scene as own
+from workflow.artifacts.manifest import write
 from workflow.registry import STAGES
 
 NOTHING = "Nothing to be done"
@@ -102,6 +103,19 @@ def test_published_files_that_are_gone_are_named_and_published_again(workflow):
     assert {path.name: path.read_bytes() for path in deliverable.glob("maps/*")} == before
     assert (deliverable / "plan.yaml").is_file()
     assert NOTHING in workflow.run("scenes/tiny").stderr
+
+
+def test_what_publishing_left_is_made_by_publishing_again(workflow):
+    """The record of stage publish is no output of a rule; and a deliverable can be sound and not the one that is wanted."""
+    record, deliverable = workflow.folder / "results/tiny/publish/published.json", workflow.folder / "scenes/tiny/manifest.json"
+    whole = record.read_bytes()
+    record.write_bytes(whole.replace(b'"files"', b'"filez"'))
+    dry = workflow.run("scenes/tiny", "-n")
+    assert planned(dry) == {"publish"} and "published.json: its content changed since it was written" in dry.stderr
+    record.write_bytes(whole)
+    write(deliverable, json.loads(deliverable.read_text()) | {"fingerprint": "0" * 16})
+    dry = workflow.run("scenes/tiny", "-n")
+    assert planned(dry) == {"publish"} and "scenes/tiny/manifest.json: it is that of other settings" in dry.stderr
 
 
 def test_the_last_line_is_the_reason_of_the_failed_job(workflow):

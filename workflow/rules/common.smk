@@ -193,8 +193,11 @@ def reads(stage, *names):
         quality = quality_of(wildcards.scene)
         mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
         or_stop(check_overrides, stage, wildcards.scene, quality)
+        # Rule publish makes the deliverable, and its stage with it.
+        published = stage == "publish"
+        home = f"results/{wildcards.scene}/{stage}/manifest.json"
         again_if_unsound(
-            f"results/{wildcards.scene}/{stage}/manifest.json",
+            f"scenes/{wildcards.scene}" if published else home,
             f"{wildcards.scene}: stage {stage} is made again",
             or_stop(
                 sound.stage_faults,
@@ -368,7 +371,8 @@ def folder_or_stop(folder):
 def again_if_unsound(target, words, faults):
     """Have the job run that makes `target`, if what is there is not what was written, and say once why."""
     if faults and workflow.is_main_process and target not in workflow.dag.forcefiles:
-        print(sound.told(faults, words), file=sys.stderr)
+        if text := sound.told(faults, words):
+            print(text, file=sys.stderr)
         workflow.dag.forcefiles.add(target)
 
 
