@@ -50,7 +50,7 @@ rule verify:
     message:
         "hashing every artefact again"
     shell:
-        "python3 -m workflow verify 2>&1 | tee {log:q}"
+        "rm -f {log:q}; python3 -m workflow verify 2>&1 | tee {log:q}"
 
 
 # Last, because it stands for whatever no rule above makes.

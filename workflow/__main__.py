@@ -275,8 +275,11 @@ def _run_stage(arguments: argparse.Namespace) -> int:
 
 
 def _batch(arguments: argparse.Namespace) -> int:
+    from workflow.artifacts import links
     from workflow.batch import summary
 
+    if _guarded("batch", lambda: links.refuse(Path("results"), summary.FOLDER.name)):
+        return 1
     if arguments.refused:
         return _guarded("batch", lambda: summary.refuse(arguments.quality))
     return _guarded("batch", lambda: summary.write_summary(arguments.quality, arguments.fingerprint))

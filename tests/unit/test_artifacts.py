@@ -1,7 +1,9 @@
 """Artefacts: what is written is read back; what changed on disk is found and named."""
 
 import json
+import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,12 +13,13 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, scratch
+from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, locks, scratch, sound
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import sha256_of, write_parquet
 from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.artifacts.store import PARTS, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
+from workflow.runtime.job import configure_logging
 
 MARK = "0" * 16
 
@@ -243,11 +246,81 @@ def test_names_that_leave_the_folder_are_refused(tmp_path, name):
     assert sorted(path for path in tmp_path.rglob("*")) == before and not Path("/tmp/evil").exists()
 
 
-def test_a_folder_that_is_itself_a_link_can_be_written(tmp_path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "stage").symlink_to(tmp_path / "disk")
-    StageWriter(tmp_path / "stage", provenance()).json("maps/a.json", {})
-    assert (tmp_path / "disk/maps/a.json").is_file()
+LINKS = (
+    "results/s",
+    *(f"results/s/{name}" for name in ("base", "logs", "locks", "stamps", "benchmarks", "parts")),
+    "results/s/logs/base.log",
+    "results/s/locks/base",
+    "results/s/benchmarks/base.jsonl",
+    "results/s/stamps/base.json",
+    "scenes/s",
+    "scenes/.s.tmp",
+    "scenes/.s.old",
+)
+
+
+@pytest.mark.parametrize("link", LINKS)
+def test_nothing_is_made_where_a_link_leads_out(tmp_path, monkeypatch, link):
+    """Results of a stranger: neither a plan nor a job goes on, and what is behind the link stays as it is."""
+    monkeypatch.chdir(tmp_path)
+    outside = Path("own/notes.txt")
+    outside.parent.mkdir()
+    outside.write_text("mine")
+    Path(link).parent.mkdir(parents=True, exist_ok=True)
+    Path(link).symlink_to((outside if link.count("/") == 3 else outside.parent).absolute())
+    results = Path("results")
+
+    def stage():
+        StageWriter(results / "s/base", provenance())
+
+    def job():
+        with locks.alone(results, "s", "base"):
+            pass
+
+    sound.forget()
+    plans = (
+        lambda: sound.stage_faults(results, "s", "base", "0" * 16),
+        lambda: sound.deliverable_faults(Path("scenes/s"), results, "s", "0" * 16),
+        lambda: sound.copy_faults(Path("relight/s"), results, "s", "relight"),
+    )
+    before = sorted(Path().rglob("*"))
+    for begin in (*plans, job, *([stage] if link == "results/s/base" else [])):
+        with pytest.raises(InputError, match=rf"^{re.escape(link)}: a symbolic link to .*own.* Remove the link"):
+            begin()
+    assert sorted(Path().rglob("*")) == before and outside.read_text() == "mine"
+
+
+def test_results_and_scenes_may_be_on_another_disk(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("results", "scenes"):
+        Path("disk", name).mkdir(parents=True)
+        Path(name).symlink_to(Path("disk", name))
+    with locks.alone(Path("results"), "s", "base"):
+        StageWriter(Path("results/s/base"), provenance()).finish()
+    assert Path("disk/results/s/base/manifest.json").is_file()
+
+
+def test_a_file_is_never_written_through_a_link(tmp_path, monkeypatch):
+    """In the place of a log, a lock, a file of a stage, its temporary file; other links in a stage go with what was left."""
+    outside = tmp_path / "own/notes.txt"
+    outside.parent.mkdir()
+    outside.write_text("mine")
+    folder = tmp_path / "results/s/base"
+    writer = StageWriter(folder, provenance())
+    for name in ("a.json", f".a.{os.getpid()}.tmp.json"):
+        (folder / name).symlink_to(outside)
+    (folder / "left").symlink_to(outside.parent)
+    writer.json("a.json", {})
+    writer.finish()
+    assert sorted(path.name for path in folder.iterdir()) == ["a.json", "manifest.json"] and (folder / "a.json").is_file()
+    log = tmp_path / "base.log"
+    log.symlink_to(outside)
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    for opens in (lambda: configure_logging(log), lambda: locks.briefly(log).__enter__()):
+        with pytest.raises(InputError, match=r"base\.log: a symbolic link to"):
+            opens()
+    assert outside.read_text() == "mine"
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

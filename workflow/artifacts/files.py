@@ -70,6 +70,8 @@ def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = 
     with named(path):
         make_folder(path.parent, settled)
         temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+        if temporary.is_symlink():  # which would be written through
+            temporary.unlink()
         try:
             write(temporary)
             _flush(temporary)

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from iif_core.errors import InputError
+from workflow.artifacts import links
 
 _HELD = (errno.EAGAIN, errno.EACCES)
 _UNSUPPORTED = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
@@ -34,7 +35,7 @@ def briefly(path: Path) -> Iterator[None]:
     """Hold the lock of a file, and wait for it, for what takes no time: reading, changing and writing a file that many processes
     add to. On a disk without locks work goes on."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a") as file:
+    with links.open_there(path, "a") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
         except OSError as error:
@@ -48,11 +49,12 @@ def alone(results: Path, scene: str, stage: str) -> Iterator[None]:
     """Hold the lock of a stage of a scene. On a disk without locks, as some of the network, a warning is logged and work goes on.
 
     Raises:
-        InputError: another process holds it; the message says which, where and since when.
+        InputError: another process holds it; the message says which, where and since when. Or a link is where the job writes.
     """
+    links.refuse(results, scene)
     path = place(results, scene, stage)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("a+") as file:  # what its holder has written is not to be lost by looking
+    with links.open_there(path, "a+") as file:  # what its holder has written is not to be lost by looking
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:

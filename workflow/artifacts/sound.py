@@ -13,8 +13,8 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
+from workflow.artifacts import links, stamps
 from workflow.artifacts import manifest as manifests
-from workflow.artifacts import stamps
 from workflow.artifacts.manifest import EARLIER_SCHEMA, MANIFEST, SCENE_SCHEMA, STAGE_SCHEMA
 from workflow.registry import SHARED
 
@@ -33,8 +33,9 @@ def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tup
             empty: it is to be made again, and there is nothing to tell.
 
     Raises:
-        InputError: it is of an earlier schema and would otherwise be what is wanted.
+        InputError: it is of an earlier schema and would otherwise be what is wanted; or a link is where jobs of the scene write.
     """
+    _without_links(results, scene)
     folder, noted = results / scene / stage, stamps.place(results, scene, stage)
     if not (folder / MANIFEST).is_file():
         finished = noted.is_file()  # a job that starts removes it
@@ -154,7 +155,11 @@ def deliverable_faults(folder: Path, results: Path, scene: str, fingerprint: str
         results: folder of the results.
         scene: which.
         fingerprint: of stage `publish` under which it is wanted, as for `stage_faults`.
+
+    Raises:
+        InputError: a link is where jobs of the scene write.
     """
+    _without_links(results, scene)
     if not folder.is_dir():
         return ()
     if not (folder / MANIFEST).is_file():
@@ -164,7 +169,12 @@ def deliverable_faults(folder: Path, results: Path, scene: str, fingerprint: str
 
 @lru_cache(None)
 def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[str, ...]:
-    """Return what is wrong with a folder that is a copy of a stage, a line for each file; nothing if one of both is not there."""
+    """Return what is wrong with a folder that is a copy of a stage, a line for each file; nothing if one of both is not there.
+
+    Raises:
+        InputError: a link is where jobs of the scene write.
+    """
+    _without_links(results, scene)
     source = results / scene / stage / MANIFEST
     if not folder.is_dir() or not source.is_file():
         return ()
@@ -183,9 +193,15 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     return problems
 
 
+@lru_cache(None)
+def _without_links(results: Path, scene: str) -> None:
+    """Look for links once in a plan, before it notes anything."""
+    links.refuse(results, scene)
+
+
 def forget() -> None:
     """Compare anew what was compared: the results are kept for one plan."""
-    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of):
+    for compared in (stage_faults, deliverable_faults, copy_faults, _digest_of, _without_links):
         compared.cache_clear()
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
+from workflow.artifacts import links, stamps
 from workflow.artifacts import manifest as manifests
-from workflow.artifacts import stamps
 from workflow.artifacts.manifest import MANIFEST, STAGE_SCHEMA
 
 SCHEMA = STAGE_SCHEMA
@@ -46,7 +46,7 @@ class StageWriter:
 
     The old manifest is removed first and the new one is written last, so a killed job leaves a stage that is visibly not done.
     Every method takes the name of a file relative to the folder of the stage, and raises `InputError` for a name that would
-    leave that folder.
+    leave that folder. The folder itself must not be a link, because what is not listed is removed from it.
 
     Attributes:
         files: name -> what the manifest says of the file.
@@ -59,6 +59,8 @@ class StageWriter:
         self.files: dict[str, dict[str, Any]] = {}
         self.seen: dict[str, stamps.Stamp] = {}
         self.parts: dict[str, Any] = {}
+        if directory.is_symlink():
+            raise links.refused(directory)
         with io.named(directory):
             io.make_folder(directory)
             for part, note in _noted_parts(directory).items():
@@ -195,7 +197,7 @@ class StageWriter:
             manifests.write(self.directory / PARTS, {"parts": self.parts}, settled=False)
         kept = set(self.files) | {MANIFEST} | ({PARTS} if self.parts else set())
         for path in sorted(self.directory.rglob("*"), reverse=True):
-            if path.is_dir():
+            if path.is_dir() and not path.is_symlink():
                 if not any(path.iterdir()):
                     path.rmdir()
             elif str(path.relative_to(self.directory)) not in kept:

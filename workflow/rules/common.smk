@@ -357,7 +357,7 @@ def relit_inputs(wildcards):
     again_if_unsound(
         folder,
         f"{folder} is copied again",
-        sound.copy_faults(Path(folder), Path("results"), source, "relight"),
+        or_stop(sound.copy_faults, Path(folder), Path("results"), source, "relight"),
     )
     return {"manifest": f"results/{source}/relight/manifest.json"}
 

@@ -16,11 +16,11 @@ from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
-from workflow.artifacts import StageReader, StageWriter, stamps
+from workflow.artifacts import StageReader, StageWriter, links, stamps
 from workflow.artifacts.files import sha256_of, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, events, forecast, input_digests
@@ -307,11 +307,22 @@ def run_stage(
     job.write_timings()
 
 
+class _LogFile(logging.FileHandler):
+    """A log that is begun anew, and not behind a link that lies in its place."""
+
+    def _open(self) -> IO[str]:
+        return links.open_there(self.baseFilename, self.mode)
+
+
 def configure_logging(path: Path | None) -> None:
-    """Log to stderr and, if `path` is given, to that file, warnings included."""
+    """Log to stderr and, if `path` is given, to that file, warnings included.
+
+    Raises:
+        InputError: the file is a link.
+    """
     handlers: list[logging.Handler] = [logging.StreamHandler(sys.stderr)]
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handlers.append(logging.FileHandler(path, mode="w"))
+        handlers.append(_LogFile(path, mode="w"))
     logging.basicConfig(level=logging.INFO, format="%(name)s: %(message)s", handlers=handlers, force=True)
     logging.captureWarnings(True)
