@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from iif_core.errors import InputError
-from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, locks, scratch, sound
+from workflow.artifacts import DamagedArtefact, StageReader, StageWriter, files, locks, scratch, sound, stamps
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.files import sha256_of, write_parquet
 from workflow.artifacts.manifest import SCENE_SCHEMA
@@ -408,7 +408,108 @@ def test_variants_of_a_study_share_stages(tmp_path):
     assert list(damaged(tmp_path)) == []
     shutil.rmtree(tmp_path / "results/room--s0")
     (line,) = damaged(tmp_path)
-    assert "results/room--fusion-mean-s0/capture/manifest.json: missing" in line
+    assert "results/room--s0/capture/manifest.json: missing, although" in line
+
+
+def replace_by_link(path, target):
+    shutil.copy(path, target)
+    path.unlink()
+    path.symlink_to(target)
+
+
+def test_verify_names_links_and_what_lies_hidden(tmp_path):
+    chain(tmp_path, "capture", "report", "publish")
+    writer = StageWriter(tmp_path / "results/s/base", provenance() | {"scene": "s"})
+    writer.json("a.json", {})
+    writer.finish()
+    folder = deliverable(tmp_path)
+    manifests.write(folder / "manifest.json", json.loads((folder / "manifest.json").read_text()) | {"fingerprints": {}})
+    assert list(damaged(tmp_path)) == []
+    replace_by_link(tmp_path / "results/s/base/a.json", tmp_path / "a.json")
+    (line,) = damaged(tmp_path)
+    assert line.startswith(f"{tmp_path}/results/s/base/a.json: a symbolic link in the place of a file; rebuild with:")
+    (tmp_path / "results/s/base/maps").symlink_to(tmp_path)
+    (tmp_path / "results/s/logs").symlink_to(tmp_path)
+    replace_by_link(folder / "manifest.json", tmp_path / "m.json")
+    for name in (".hidden", ".snakemake_timestamp"):
+        (folder / name).touch()
+    assert [line.split(";")[0].removeprefix(f"{tmp_path}/") for line in damaged(tmp_path)] == [
+        "results/s/base/a.json: a symbolic link in the place of a file",
+        "results/s/base/maps: not written by rule base (not in its manifest)",
+        f"results/s/logs: a symbolic link to {str(tmp_path)!r}, and what is behind it would be overwritten or removed. Remove the"
+        " link, or put what it leads to in its place",
+        f"scenes/s/.hidden: not published (not in {folder}/manifest.json)",
+        "scenes/s/manifest.json: a symbolic link in the place of a file",
+    ]
+
+
+@pytest.mark.parametrize("left", ["files", "stamps"])
+def test_verify_names_a_manifest_that_was_taken_from_its_files(tmp_path, left):
+    """Nothing was made from the stage. One that a job left unfinished is no damage."""
+    writer = StageWriter(tmp_path / "results/s/base", provenance() | {"scene": "s"})
+    writer.json("a.json", {})
+    writer.part_done("a", ["a.json"], {})
+    chain(tmp_path, "capture")
+    assert list(damaged(tmp_path)) == []  # a part of a stage is made
+    writer.finish()
+    if left == "stamps":
+        stamps.stamp_stage(tmp_path / "results", "s", "base")
+        (tmp_path / "results/s/base/a.json").unlink()
+    (tmp_path / "results/s/base/manifest.json").unlink()
+    shutil.rmtree(tmp_path / "results/s/capture")  # it is looked for also where no manifest is left
+    (line,) = damaged(tmp_path)
+    assert line == (
+        f"{tmp_path}/results/s/base/manifest.json: missing, although it was finished; rebuild with:"
+        " snakemake --cores 2 results/s/base/manifest.json"
+    )
+    state = tmp_path / "results/s/logs/base.state.json"
+    state.parent.mkdir()
+    state.touch()
+    assert len(list(damaged(tmp_path))) == (left == "stamps")
+
+
+@pytest.mark.parametrize("harm", ["none", "removed", "changed", "of another stage", "forged"])
+def test_verify_reads_the_notes_of_parts(tmp_path, harm):
+    writer = StageWriter(tmp_path / "results/s/base", provenance() | {"scene": "s"})
+    writer.json("a.json", {})
+    writer.part_done("a", ["a.json"], {}, by="digest")
+    writer.finish()
+    path = tmp_path / "results/s/base" / PARTS
+    document = json.loads(path.read_text())
+    if harm == "removed":  # costs time alone
+        path.unlink()
+    elif harm == "changed":
+        path.write_bytes(path.read_bytes().replace(b"digest", b"dig3st"))
+    elif harm == "of another stage":
+        document["parts"]["a"]["files"]["a.json"]["sha256"] = "0" * 64
+        manifests.write(path, document)
+    elif harm == "forged":
+        manifests.write(path, {"parts": {"a": {"by": 3}}})
+    lines = list(damaged(tmp_path))
+    assert len(lines) == (harm in ("changed", "of another stage", "forged"))
+    assert all(line.startswith(f"{path}: ") and line.endswith("--forcerun base") for line in lines)
+
+
+def test_verify_does_not_take_one_variant_for_another(tmp_path):
+    chain(tmp_path, "capture", "base", scene="room--v2", home="room--v2", base=["capture"])
+    chain(tmp_path, "capture", "base", scene="room--v1", home="room--v1", base=["capture"])
+    folder = deliverable(tmp_path, "room--v1")
+    document = json.loads((folder / "manifest.json").read_text()) | {"fingerprints": {"base": ""}}
+    digest = sha256_of(tmp_path / "results/room--v1/base/manifest.json")
+    manifests.write(folder / "manifest.json", document | {"manifests": {"base": digest}})
+    chain(tmp_path, "publish", scene="room--v1")
+    assert list(damaged(tmp_path)) == []
+    shutil.rmtree(tmp_path / "results/room--v1/capture")
+    (line,) = damaged(tmp_path)
+    assert line.startswith(
+        f"{tmp_path}/results/room--v1/capture/manifest.json: missing, although {tmp_path}/results/room--v1/base"
+    )
+    shutil.rmtree(tmp_path / "results/room--v1/base")
+    (line,) = damaged(tmp_path)
+    assert line.startswith(f"{tmp_path}/results/room--v1/base/manifest.json: missing, although {folder} was made from it")
+    digest = sha256_of(tmp_path / "results/room--v2/base/manifest.json")
+    manifests.write(folder / "manifest.json", document | {"manifests": {"base": digest}})
+    assert list(damaged(tmp_path)) == []  # this one it shares
 
 
 def test_verify_of_nothing_promises_nothing(tmp_path, monkeypatch, capsys):

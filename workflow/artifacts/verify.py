@@ -9,16 +9,21 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import files as io
+from workflow.artifacts import links, stamps
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts.manifest import MANIFEST, SCENE_SCHEMA
 from workflow.artifacts.sound import wrong_files
-from workflow.artifacts.store import PARTS, StageReader, chosen, command
-from workflow.registry import SHARED
+from workflow.artifacts.store import PARTS, UNFINISHED, StageReader, chosen, command
+from workflow.registry import SHARED, STAGES
+
+OF_SNAKEMAKE = ".snakemake_timestamp"
+"""What Snakemake leaves in a folder that is an output."""
 
 
 def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator[str]:
-    """Yield one line for each file that is not what was written, is missing or unlisted, and for each link of the chain that is
-    broken: a folder that is gone although others were made from it, and a stage that is not the one from which they were made.
+    """Yield one line for each file that is not what was written, is missing or unlisted, for each symbolic link in its place, and
+    for each link of the chain that is broken: a folder that is gone although others were made from it, a stage whose manifest is
+    gone, and a stage that is not the one from which others were made.
 
     Every content is hashed, whatever time stamps say.
     """
@@ -33,6 +38,7 @@ def damaged(root: Path = Path("."), scenes: list[str] | None = None) -> Iterator
     for scene in with_artefacts(root):
         if scenes and scene not in scenes:
             continue
+        yield from (str(links.refused(link)) for link in links.found(root / "results", scene))
         for line in _gone(root, scene):
             upstream.add(scene)
             yield line
@@ -54,10 +60,13 @@ def _stage(folder: Path, stage: str, scene: str) -> Iterator[str]:
             reader.path(name)
         except InputError as error:
             yield str(error)
+    yield from _parts(folder, reader, quality)
     listed = set(reader.names()) | {MANIFEST, PARTS}
-    for path in sorted(folder.rglob("*")):
-        if not path.is_dir() and str(path.relative_to(folder)) not in listed:
+    for path, name in _entries(folder):
+        if name not in listed:
             yield f"{path}: not written by rule {stage} (not in its manifest); remove it"
+        elif path.is_symlink():
+            yield f"{path}: a symbolic link in the place of a file; rebuild with: {command(scene, stage, quality)}"
     results = folder.parent.parent
     for name, facts in sorted(reader.manifest.get("inputs", {}).items()):
         up = results / facts["scene"] / name.removeprefix(SHARED) / MANIFEST
@@ -66,38 +75,96 @@ def _stage(folder: Path, stage: str, scene: str) -> Iterator[str]:
             yield f"{folder}: it was made from another {up.parent} than is there now; rebuild with: {again}"
 
 
+def _entries(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Yield path and name of every file and every link below a folder, sorted."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_symlink() or not path.is_dir():
+            yield path, path.relative_to(folder).as_posix()
+
+
+def _parts(folder: Path, reader: StageReader, quality: str | None) -> Iterator[str]:
+    """Yield a line if the notes of parts that later jobs take over are not those of the stage. If they are gone, that costs time
+    alone."""
+    path = folder / PARTS
+    if not path.exists():
+        return
+    try:
+        noted = manifests.sealed(path.read_bytes()).get("parts")
+        notes = [manifests.part(note) for note in noted.values()] if isinstance(noted, dict) else []
+        problem = "" if notes else "it has no notes of parts"
+    except (OSError, manifests.Broken) as error:
+        notes, problem = [], str(error)
+    written = reader.manifest["files"]
+    if any(written.get(name, {}).get("sha256") != facts["sha256"] for note in notes for name, facts in note["files"].items()):
+        problem = "it lists other files than the manifest"
+    if problem:
+        yield f"{path}: {problem}; rebuild with: {command(reader.scene, reader.stage, quality)}"
+
+
 def with_artefacts(root: Path = Path(".")) -> list[str]:
     """Return the scenes of which `results/` or `scenes/` holds something, sorted."""
-    results = {path.parents[1].name for path in root.glob(f"results/*/*/{MANIFEST}")}
+    results = {path.parent.name for path in root.glob("results/*/*") if path.name in STAGES}
     return sorted(results | {path.name for path in root.glob("scenes/*") if "." not in path.name})
 
 
 def _gone(root: Path, scene: str) -> Iterator[str]:
-    """Yield one line for each stage without a manifest from which something that is still there was made."""
-    own = root / "results" / scene
-    needed: dict[str, tuple[Path, str | None]] = {}  # stage -> what was made from it, and at which quality
-    for path in [root / "scenes" / scene / MANIFEST, *sorted(own.glob(f"*/{MANIFEST}"))]:
+    """Yield one line for each stage without a manifest that was finished, or from which something that is there was made."""
+    results, folder = root / "results", root / "scenes" / scene
+    own = results / scene
+    needed: dict[Path, tuple[Path, str | None]] = {}  # folder of a stage -> what was made from it, and at which quality
+    for path in sorted(own.glob(f"*/{MANIFEST}")):
         document = _document(path)
-        made_from = document.get("inputs", document.get("fingerprints"))
-        published = ["publish"] if path.parent.parent.name == "scenes" and document else []
-        for stage in [*(made_from if isinstance(made_from, dict) else ()), *published]:
-            needed.setdefault(stage, (path.parent, _quality(document.get("quality"))))
-    if (root / "relight" / scene).is_dir():
-        needed.setdefault("relight", (root / "relight" / scene, None))
+        inputs = document.get("inputs")
+        for name, facts in (inputs if isinstance(inputs, dict) else {}).items():
+            home = facts.get("scene") if isinstance(facts, dict) else None
+            needed.setdefault(
+                results / (home if isinstance(home, str) else scene) / name.removeprefix(SHARED),
+                (path.parent, _quality(document.get("quality"))),
+            )
+    if document := _document(folder / MANIFEST):
+        made_from = document.get("fingerprints")
+        for stage in [*(made_from if isinstance(made_from, dict) else ()), "publish"]:
+            needed.setdefault(_home(results, scene, stage, document), (folder, _quality(document.get("quality"))))
+    if (root / "relight" / scene).is_dir() and not any(root.glob(f"results/{scene}--relight-*/relight/{MANIFEST}")):
+        needed.setdefault(own / "relight", (root / "relight" / scene, None))
     if needed and not own.is_dir():
         made, quality = next(iter(needed.values()))
         yield f"{own}: missing, although {made} was made from it; rebuild with: {command(scene, 'publish', quality)}"
         return
-    for stage, (made, quality) in sorted(needed.items()):
-        path = own / stage / MANIFEST
-        # Derived scenes of studies share equal results, and pictures of a scene may come from a plan of relightings.
-        base = scene.split("--")[0]
-        shared = [base, f"{base}--*"] if "--" in scene else [f"{scene}--relight-*"] if stage == "relight" else []
-        if path.is_file() or any(any(root.glob(f"results/{name}/{stage}/{MANIFEST}")) for name in shared):
+    for stage in STAGES:
+        if _lost(own, stage):
+            needed.setdefault(own / stage, (own / stage, None))
+    for home, (made, quality) in sorted(needed.items()):
+        if (home / MANIFEST).is_file():
             continue
-        again = f"snakemake --cores 2 results/{scene}/{stage}/{MANIFEST}{chosen(quality)}"
-        again = command(scene, stage, quality) if stage == "publish" else again
-        yield f"{path}: missing, although {made} was made from it; rebuild with: {again}"
+        again = f"snakemake --cores 2 results/{home.parent.name}/{home.name}/{MANIFEST}{chosen(quality)}"
+        again = command(scene, "publish", quality) if home.name == "publish" else again
+        why = "it was finished" if made == home else f"{made} was made from it"
+        yield f"{home / MANIFEST}: missing, although {why}; rebuild with: {again}"
+
+
+def _home(results: Path, scene: str, stage: str, document: dict[str, Any]) -> Path:
+    """Return the folder of the stage that a deliverable was made from. Variants of a study share equal results, so it is that of
+    another one which has the manifest that the deliverable names."""
+    own, listed = results / scene / stage, document.get("manifests")
+    digest = listed.get(stage) if isinstance(listed, dict) else None
+    if "--" in scene and digest and not (own / MANIFEST).is_file():
+        base = scene.split("--")[0]
+        for path in sorted([*results.glob(f"{base}/{stage}/{MANIFEST}"), *results.glob(f"{base}--*/{stage}/{MANIFEST}")]):
+            if io.sha256_of(path) == digest:
+                return path.parent
+    return own
+
+
+def _lost(own: Path, stage: str) -> bool:
+    """Whether a stage without a manifest was finished: its stamps are there, or files that no job left unfinished. A job that did
+    not end well leaves the file of its state, and one that made a part its note."""
+    if (own / stage / MANIFEST).is_file():
+        return False
+    if stamps.place(own.parent, own.name, stage).is_file():
+        return True
+    unfinished = (own / "logs" / f"{stage}.state.json").exists() or (own / stage / UNFINISHED).exists()
+    return not unfinished and any(True for _ in _entries(own / stage))
 
 
 def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
@@ -147,9 +214,10 @@ def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: boo
         return
     for line in wrong_files(folder, document):
         yield f"{line}; {again}"
-    for path in sorted(folder.rglob("*")):
-        name = path.relative_to(folder).as_posix()
-        if not path.is_dir() and name != MANIFEST and name not in document["files"] and not name.startswith("."):
+    for path, name in _entries(folder):
+        if path.is_symlink() and name in (MANIFEST, *document["files"]):
+            yield f"{path}: a symbolic link in the place of a file; {again}"
+        elif name not in (MANIFEST, OF_SNAKEMAKE, *document["files"]):
             yield f"{path}: not published (not in {manifest}); move it away, or it is lost when the scene is published again"
     for stage, digest in sorted(document.get("manifests", {}).items()):
         up = results / stage / MANIFEST
