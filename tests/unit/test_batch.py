@@ -13,11 +13,14 @@ import pytest
 
 from iif_core.errors import InputError
 from workflow import settings
+from workflow.artifacts import StageWriter, sound, stamps
 from workflow.artifacts.files import write_exr, write_json, write_parquet
+from workflow.artifacts.manifest import EARLIER_SCHEMA
 from workflow.batch import causes, summary
 from workflow.batch import plan as batch_plan
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import JobState, reasons
+from workflow.scene.named import check_overrides
 from workflow.settings import batch_table
 
 HEADER = "name\tsource\tpath\tbase\toverrides\n"
@@ -30,7 +33,7 @@ def project(tmp_path, monkeypatch):
     (tmp_path / "config/scenes").mkdir(parents=True)
     (tmp_path / "config/scenes/tpl.yaml").write_text(BASE)
     monkeypatch.chdir(tmp_path)
-    caches = (fp.resolved, fp.fingerprint, batch_plan.plan)
+    caches = (fp.resolved, fp.fingerprint, batch_plan.plan, check_overrides)
     for cache in caches:
         cache.cache_clear()
 
@@ -244,6 +247,51 @@ def test_every_scene_is_refused_by_itself(project, monkeypatch):
     assert "line 5: config/scenes/gone.yaml: not found" in plan.refused["gone"]
     assert "line 6: ZeroDivisionError" in plan.refused["disk"] and "a bug" in plan.refused["disk"]
     assert plan.ready["good"] == fp.fingerprint("publish", "good", "draft")
+
+
+SMALL = "builtin\t\t\tsource.scene=tiny;prior.kind=simulated"
+WRONG_NAME = SMALL + ";overrides={nosuchthing: {metallic: 0}}"
+
+
+def segmented(scene):
+    """A finished segmentation with one object, `floor`, and its table."""
+    facts = {"scene": scene, "stage": "segmentation", "quality": "draft", "inputs": {}}
+    facts["fingerprint"] = fp.fingerprint("segmentation", scene, "draft")
+    writer = StageWriter(Path("results") / scene / "segmentation", facts)
+    writer.table("objects.parquet", {"object_id": np.arange(1), "name": ["floor"]})
+    writer.finish()
+    stamps.stamp_stage(Path("results"), scene, "segmentation")
+    sound.forget()
+    return Path("results") / scene / "segmentation"
+
+
+def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
+    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "earlier")) + f"name\t{WRONG_NAME}\n")
+    for path in ("scenes/file", "results/stage/render"):
+        Path(path).parent.mkdir(parents=True)
+        Path(path).touch()
+    segmented("name")
+    manifest = segmented("earlier") / "manifest.json"
+    document = json.loads(manifest.read_text())
+    write_json(manifest, document | {"schema": EARLIER_SCHEMA})
+    plan = batch_plan.plan("draft")
+    assert list(plan.ready) == ["good"]
+    for name, words in {
+        "file": "scenes/file: a file, where the workflow makes a folder",
+        "stage": "results/stage/render: a file, where",
+        "earlier": "python -m workflow upgrade earlier",
+        "name": "`overrides`: there is no object 'nosuchthing'",
+    }.items():
+        assert words in plan.refused[name]
+
+
+def test_a_damaged_segmentation_is_made_again_whatever_overrides_name(project):
+    project(f"a\t{WRONG_NAME}\n")
+    path = segmented("a") / "objects.parquet"
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    assert list(batch_plan.plan("draft").ready) == ["a"]
+    (fault,) = batch_plan.check_stage("segmentation", "a", "draft")
+    assert "objects.parquet: its content changed" in fault
 
 
 def test_the_summary_is_made_again_when_a_scene_or_a_reason_changes(project):

@@ -15,7 +15,8 @@ SMALL = "prior.kind=retinex;segmentation.kind=geometry;capture.width=64;capture.
 
 @pytest.fixture(scope="module")
 def ended(finished, tmp_path_factory):
-    """A batch of a scene that lacks its last two jobs, one with a misspelt key, one without data, one whose first job fails."""
+    """A batch of a scene that lacks its last two jobs, one with a misspelt key, one without data, one whose first job fails, and
+    one with a file in the place of its folder."""
     workflow = finished.copy(tmp_path_factory.mktemp("batch") / "run")
     for path in ("results/tiny/report/manifest.json", "scenes/tiny/manifest.json"):
         (workflow.folder / path).unlink()
@@ -24,6 +25,8 @@ def ended(finished, tmp_path_factory):
     own.save_mesh(workflow.folder / "data/mm/mesh.ply", 1000 * vertices, faces)
     workflow.table = workflow.folder / "config/batch.tsv"
     lines = ["tiny", "key\t\t\ttiny\tcapture.veiws=3", f"data\tfolder\tno/where\t\t{SMALL}", f"mm\tfolder\tdata/mm\t\t{SMALL}"]
+    lines.append("way\t\t\ttiny\tseed=7")
+    (workflow.folder / "scenes/way").touch()
     workflow.table.write_text(HEADER + "".join(f"{line}\n" for line in lines))
     first = "results/mm/capture/manifest.json"
     workflow.said = workflow.run("scenes", "--prioritize", first, "--forcerun", "report")  # so that the failure comes first
@@ -43,14 +46,16 @@ def test_the_good_scene_is_done_and_the_bad_ones_are_named(ended):
         "key": "refused",
         "data": "refused",
         "mm": "failed",
+        "way": "refused",
     }
     assert float(rows["tiny"]["rgb_psnr"]) > 10 and float(rows["tiny"]["max_rss_mb"]) > 50
     assert "line 3, column overrides: `capture.veiws`: unknown key. Did you mean `views`?" in rows["key"]["reason"]
     assert "line 4: no/where: not found" in rows["data"]["reason"]
+    assert rows["way"]["reason"].endswith("scenes/way: a file, where the workflow makes a folder. Move it away.")
     assert rows["mm"]["stage"] == "capture" and "is 5590 m across" in rows["mm"]["reason"]
     said = ended.said.stderr
     assert said.index("is 5590 m across") < said.index("publishing scenes/tiny"), "the failure was to come first"
-    assert "1 of 4 scenes done" in said and "Traceback" not in said
+    assert "1 of 5 scenes done" in said and "Traceback" not in said
     page = (ended.folder / "results/batch/report.html").read_text()
     assert page.count('src="pictures/tiny.') == 1 and '"../../scenes/tiny/report.html"' in page
 

@@ -8,7 +8,7 @@ from iif_core.evaluation.catalogue import METRICS
 
 STATUSES = {
     "done": "published, as the settings, inputs and code of now would make it",
-    "refused": "its settings or data cannot be used; no job was started",
+    "refused": "its settings or data cannot be used; no job is started",
     "failed": "a job ended with an error",
     "killed": "a job was started, did not end, and its process is gone (memory, time limit, node)",
     "running": "a job of it runs",

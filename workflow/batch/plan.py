@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 from iif_core.errors import InputError
+from workflow.artifacts import DamagedArtefact, sound
 from workflow.artifacts.files import sha256_of
 from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import input_digests
+from workflow.scene.named import check_overrides
 from workflow.settings.batch_table import Line, read_table
 
 
@@ -28,7 +33,8 @@ class Plan:
 
 @lru_cache(None)
 def plan(quality: str) -> Plan:
-    """Check every scene of the table on its own: its settings, and everything about its source except pixels.
+    """Check every scene of the table on its own: its settings, everything about its source except pixels, and whatever else of it
+    would stop a plan (`check`).
 
     Raises:
         InputError: the table itself cannot be read (`read_table`).
@@ -42,12 +48,49 @@ def plan(quality: str) -> Plan:
                 said = time.monotonic()
                 print(f"batch: {done} of {len(lines)} scenes checked", file=sys.stderr)
             try:
-                ready[line.name] = fp.fingerprint("publish", line.name, quality)
+                mark = fp.fingerprint("publish", line.name, quality)
+                check(line.name, quality)
+                ready[line.name] = mark
             except InputError as error:
                 refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
             except Exception as error:  # whatever is wrong with one scene must not stop hundreds of others
                 refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
     return Plan(lines, ready, refused)
+
+
+def check(scene: str, quality: str) -> None:
+    """Check what Snakemake's plan of a scene looks at beside its settings and its source.
+
+    Raises:
+        InputError: the folder of what is published is a file; or as `check_stage`.
+    """
+    check_folder(f"scenes/{scene}")
+    for stage in fp.NEEDED:
+        check_stage(stage, scene, quality)
+
+
+def check_stage(stage: str, scene: str, quality: str) -> tuple[str, ...]:
+    """Check what of a stage lies in results/, and return what is wrong with it that making it again mends (`stage_faults`).
+
+    Raises:
+        InputError: a file is in the way, the stage is of an earlier version, or `overrides` names what is not there.
+    """
+    mark = fp.fingerprint(stage, scene, quality)
+    for folder in (f"results/{scene}", f"results/{scene}/{stage}"):
+        check_folder(folder)
+    with suppress(DamagedArtefact):  # of a segmentation that will be made again; then its objects are known
+        check_overrides(stage, scene, quality)
+    return sound.stage_faults(Path("results"), scene, stage, mark)
+
+
+def check_folder(folder: str) -> None:
+    """Refuse a file in the place of a folder, which Snakemake would take for the finished folder.
+
+    Raises:
+        InputError: there is one.
+    """
+    if os.path.lexists(folder) and not os.path.isdir(folder):
+        raise InputError(f"{folder}: a file, where the workflow makes a folder. Move it away.")
 
 
 def fingerprint(quality: str) -> str:

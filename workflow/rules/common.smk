@@ -23,7 +23,6 @@ from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import events, forecast, input_digests, native, slurm
 from workflow.runtime.job_state import reasons, retold
-from workflow.scene.named import check_overrides
 from workflow.status import table as status
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
@@ -191,21 +190,13 @@ def reads(stage, *names):
 
     def inputs(wildcards):
         quality = quality_of(wildcards.scene)
-        mark = or_stop(fingerprints.fingerprint, stage, wildcards.scene, quality)
-        or_stop(check_overrides, stage, wildcards.scene, quality)
         # Rule publish makes the deliverable, and its stage with it.
         published = stage == "publish"
         home = f"results/{wildcards.scene}/{stage}/manifest.json"
         again_if_unsound(
             f"scenes/{wildcards.scene}" if published else home,
             f"{wildcards.scene}: stage {stage} is made again",
-            or_stop(
-                sound.stage_faults,
-                Path("results"),
-                wildcards.scene,
-                stage,
-                mark,
-            ),
+            or_stop(batch_table.check_stage, stage, wildcards.scene, quality),
         )
         common = study_files.shared_scene(wildcards.scene)
         found = {name: manifest(name, wildcards.scene) for name in own}
@@ -364,8 +355,7 @@ def relit_inputs(wildcards):
 
 def folder_or_stop(folder):
     """Refuse a file in the place of a folder, which Snakemake would take for the finished folder."""
-    if os.path.lexists(folder) and not os.path.isdir(folder):
-        stop(f"{folder}: a file, where the workflow makes a folder. Move it away.")
+    or_stop(batch_table.check_folder, folder)
 
 
 def again_if_unsound(target, words, faults):
