@@ -239,7 +239,25 @@ def test_what_snakemake_is_told(cluster, state, answer):
     assert slurm.answer_to_snakemake("3") == answer
 
 
-def test_a_controller_that_is_down_ends_no_job(cluster):
+@pytest.mark.parametrize(
+    "error",
+    [
+        "slurm_load_jobs error: Unable to contact slurm controller (connect failure)",
+        "slurm_load_jobs error: Socket timed out on send/recv operation",
+        "slurm_load_jobs error: Zero Bytes were transmitted or received",
+        "",
+    ],
+)
+def test_a_controller_that_does_not_answer_ends_no_job(cluster, error):
+    """Not even where it answers to `scontrol ping`, which is cheap, or where accounting knows an earlier end of the job."""
+    cluster(4, "NODE_FAIL", program="sacct")
+    ping = "Slurmctld(primary) at vm is UP"
+    (cluster.programs / "scontrol").write_text(f"#!/bin/sh\n[ $1 = ping ] && echo '{ping}' && exit\necho '{error}' >&2\nexit 1\n")
     assert slurm.answer_to_snakemake("4") == "running"
-    (cluster.programs / "scontrol.ping").write_text("Slurmctld(primary) at vm is UP\n")
-    assert slurm.answer_to_snakemake("4") == "success"  # forgotten: Snakemake looks for its files
+
+
+def test_a_job_that_the_controller_has_forgotten_is_asked_of_accounting(cluster):
+    (cluster.programs / "scontrol").write_text("#!/bin/sh\necho 'slurm_load_jobs error: Invalid job id specified' >&2\nexit 1\n")
+    assert slurm.answer_to_snakemake("4") == "success"  # Snakemake looks for its files
+    cluster(4, "TIMEOUT", program="sacct")
+    assert slurm.answer_to_snakemake("4") == "failed"

@@ -30,18 +30,22 @@ ENDED = (*KILLED, "COMPLETED", "FAILED", "REVOKED")
 """States that a job does not leave by itself; in any other, such as STAGE_OUT or RESV_DEL_HOLD, it is still Slurm's."""
 
 
-def _answer(*command: str) -> str:
-    """Return what a command prints; empty if there is no answer."""
+def _answer(*command: str) -> tuple[str, str]:
+    """Return what a command prints, and what a command that failed prints to stderr; both are empty if there is no answer."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=False)
     except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
-        return ""
-    return done.stdout if done.returncode == 0 else ""
+        return "", ""
+    return (done.stdout, "") if done.returncode == 0 else ("", done.stderr)
 
 
-def _shown(job: str) -> dict[str, str]:
-    """Return the fields of `scontrol show job`, which knows a finished job for MinJobAge (300 s by default)."""
-    return dict(re.findall(r"(?:^|\s)([A-Za-z:/_]+)=(\S*)", _answer("scontrol", "-o", "show", "job", job)))
+def _shown(job: str) -> tuple[dict[str, str], bool]:
+    """Return the fields of `scontrol show job`, and whether the controller says that it has no such job: it forgets a finished
+    one after MinJobAge (300 s by default). Any other failure, as of a controller that is busy, says nothing of the job.
+    """
+    text, error = _answer("scontrol", "-o", "show", "job", job)
+    fields = re.findall(r"(?:^|\s)([A-Za-z:/_]+)=(\S*)", text)
+    return dict(fields), "Invalid job id specified" in error
 
 
 class Own(NamedTuple):
@@ -68,7 +72,7 @@ def own(environment: Mapping[str, str] = os.environ) -> Own | None:
     job = environment.get("SLURM_JOB_ID", "")
     if not job:
         return None
-    shown = _shown(job)
+    shown, _ = _shown(job)
     node = environment.get("SLURMD_NODENAME") or shown.get("BatchHost") or environment.get("SLURM_JOB_NODELIST", "")
     restarts = shown.get("Restarts", environment.get("SLURM_RESTART_COUNT", "0"))
     count = int(restarts) if restarts.isdigit() else 0
@@ -110,10 +114,12 @@ def _minutes(text: str) -> int | None:
 
 def state_of(job: str) -> str:
     """Return the state of a job in Slurm's word (`TIMEOUT`, `RUNNING`, ...); empty if it is not known any more."""
-    shown = _shown(job).get("JobState", "")
-    if shown:
-        return shown
-    lines = _answer("sacct", "-n", "-X", "-P", "-D", "-o", "State", "-j", job).split("\n")
+    return _shown(job)[0].get("JobState", "") or _accounted(job)
+
+
+def _accounted(job: str) -> str:
+    """Return the state of a job in the records of accounting; empty where there are none."""
+    lines = _answer("sacct", "-n", "-X", "-P", "-D", "-o", "State", "-j", job)[0].split("\n")
     words = [line.split()[0] for line in lines if line.strip()]
     return words[-1].rstrip("+") if words else ""
 
@@ -156,7 +162,7 @@ class Node(NamedTuple):
 
 def nodes() -> list[Node]:
     """Return the kinds of nodes of each partition; empty if `sinfo` does not answer."""
-    return read_nodes(_answer("sinfo", "-h", "-e", "-o", "%c %m %P"))
+    return read_nodes(_answer("sinfo", "-h", "-e", "-o", "%c %m %P")[0])
 
 
 def read_nodes(text: str) -> list[Node]:
@@ -238,12 +244,11 @@ def _too_large(job: Asked, among: list[Node]) -> str:
 def answer_to_snakemake(job: str) -> str:
     """Return `running`, `success` or `failed`, as the executor cluster-generic asks for.
 
-    A job that Slurm does not know any more counts as finished: Snakemake looks for its files and tries again if they lack. While
-    the controller does not answer, jobs count as running.
+    Of a job that the controller has forgotten, accounting is asked. Without it the job counts as finished: Snakemake looks for its
+    files and tries again if they lack. While the controller does not answer, jobs count as running.
     """
-    state = state_of(job)
-    if not state:
-        return "success" if _answer("scontrol", "ping").count(" UP") else "running"
+    shown, forgotten = _shown(job)
+    state = shown.get("JobState") or (_accounted(job) or "COMPLETED" if forgotten else "")
     if state == "COMPLETED":
         return "success"
     return "failed" if state in ENDED else "running"
