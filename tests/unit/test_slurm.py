@@ -58,6 +58,8 @@ def test_the_job_of_a_process(cluster):
     cluster(7, "RUNNING", restarts=2, log="/x/7.log")
     assert slurm.own({}) is None
     assert slurm.own({"SLURM_JOB_ID": "7"}) == slurm.Own("7", "n7", 2000, 90, 2, "/x/7.log")
+    cluster(9, "RUNNING", log="/data/my rooms/.snakemake/slurm_logs/9.log")
+    assert slurm.own({"SLURM_JOB_ID": "9"}) == slurm.Own("9", "n9", 2000, 90, 0, "/data/my rooms/.snakemake/slurm_logs/9.log")
     assert slurm.own({"SLURM_JOB_ID": "8", "SLURMD_NODENAME": "x", "SLURM_RESTART_COUNT": "1"}) == slurm.Own(
         "8", "x", None, None, 1, ""
     )

@@ -42,9 +42,11 @@ def _answer(*command: str) -> tuple[str, str]:
 def _shown(job: str) -> tuple[dict[str, str], bool]:
     """Return the fields of `scontrol show job`, and whether the controller says that it has no such job: it forgets a finished
     one after MinJobAge (300 s by default). Any other failure, as of a controller that is busy, says nothing of the job.
+
+    Fields are not quoted: a value, such as the path of a log, may hold spaces and ends before the next key.
     """
     text, error = _answer("scontrol", "-o", "show", "job", job)
-    fields = re.findall(r"(?:^|\s)([A-Za-z:/_]+)=(\S*)", text)
+    fields = re.findall(r"(?:^|\s)([A-Za-z:/_]+)=(.*?)(?=\s+[A-Za-z:/_]+=|\s*$)", text, re.M)
     return dict(fields), "Invalid job id specified" in error
 
 
@@ -244,8 +246,8 @@ def _too_large(job: Asked, among: list[Node]) -> str:
 def answer_to_snakemake(job: str) -> str:
     """Return `running`, `success` or `failed`, as the executor cluster-generic asks for.
 
-    Of a job that the controller has forgotten, accounting is asked. Without it the job counts as finished: Snakemake looks for its
-    files and tries again if they lack. While the controller does not answer, jobs count as running.
+    Of a job that the controller has forgotten, accounting is asked. Without it the job counts as finished: Snakemake looks for
+    its files and tries again if they lack. While the controller does not answer, jobs count as running.
     """
     shown, forgotten = _shown(job)
     state = shown.get("JobState") or (_accounted(job) or "COMPLETED" if forgotten else "")
