@@ -416,6 +416,16 @@ def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):
     assert "`snakemake verify` tells which are damaged" in Path("results/batch/summary.tsv").read_text()
 
 
+@pytest.mark.parametrize(
+    "content", ["[1]", '{"s": "1e999", "cpu_time": [], "job": 3}', '{"s": 1, "job": {"cpu_seconds": "x"}}', "[" * 9999]
+)
+def test_records_of_jobs_may_hold_anything(five, content):
+    for name in ("base.jsonl", "base.parts.json", "base.threads"):
+        (Path("results/done/benchmarks") / name).write_text(content)
+    summary.write_summary("draft")
+    assert "\tdone\tdone\t" in Path("results/batch/summary.tsv").read_text()
+
+
 @pytest.mark.parametrize(("dynamic_range", "photograph", "rendered"), [("ldr", 102, 51), ("hdr", 188, 124)])
 def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph, rendered):
     """sRGB code of 0.4 and 0.2 as they are (LDR), of linear 0.4 x exposure 1.25 = 0.5 and linear 0.2 (HDR); albedo linear 0.5."""

@@ -10,13 +10,16 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from iif_core.errors import InputError
 from workflow.artifacts import stamps
 from workflow.artifacts.files import write_json
-from workflow.runtime import alive, events, job_state
+from workflow.batch import summary
+from workflow.runtime import alive, attempts, events, job_state, slurm
 from workflow.runtime import fingerprint as fp
-from workflow.runtime.job_state import JobState, noted, reasons, state_file
+from workflow.runtime.job_state import JobState, noted, reasons, retold, state_file
 from workflow.status import standing, table
 
 TINY = "source: {kind: builtin, scene: tiny}\nprior: {kind: simulated}\n"
@@ -281,6 +284,64 @@ def test_files_that_hold_anything_do_not_raise(project, content):
     document = json.loads(table.json_line(found, time.time()))
     assert document["state"] == found.state
     assert len(table.text([found], time.time(), 80, False)) == 3
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.integers(-(2**70), 2**70) | st.floats() | st.text(st.characters()),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=5,
+)
+KEYS = {
+    "state": st.sampled_from(["started", "failed"]),
+    "reason": st.just("no light"),
+    "fingerprint": st.just("mark"),
+    "since": st.sampled_from(["0001-01-01T00:00:00+14:00", "9999-12-31T23:59:59-14:00", "2026-01-01T00:00:00+00:00"]),
+    "host": st.just("vm"),
+    "pid": st.sampled_from([2**40, 2**31, -1, 0, 2**22]),
+    "kernel": st.builds(alive.kernel),
+    "start": st.sampled_from([1, 2**61, -1]),
+    "attempt": st.sampled_from([1, -5, 10**30]),
+    "peak_mb": st.sampled_from([900, -1, 10**30]),
+    "earlier": st.just(["attempt 1 failed: no light"]),
+    "slurm": st.fixed_dictionaries(
+        {key: st.sampled_from(["7", "--all", "\0"]) | JSON for key in ("job", "node", "log")},
+        optional={key: st.just(5) | JSON for key in ("memory_mb", "minutes", "restarts")},
+    ),
+    "told": st.just("attempt 2"),
+}
+
+
+@settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(document=st.fixed_dictionaries({}, optional={key: JSON | usual for key, usual in KEYS.items()}))
+@example(document={"state": "started", "fingerprint": "mark", "pid": 2**40, "start": 1, "kernel": alive.kernel()})
+@example(document={"state": "failed", "since": "0001-01-01T00:00:00+14:00"})
+def test_a_state_that_holds_anything_stops_nobody(project, document):
+    path = state_file("a", "base")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(document))
+    path.with_name("base.attempts.json").write_text(json.dumps(document))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(slurm, "_answer", lambda *command: ("", ""))  # a controller that does not know the job
+        patch.setattr(fp, "fingerprint", lambda stage, scene, quality: "mark")
+        before = job_state._read(path)
+        said = [*reasons(0.0), *retold(0.0), attempts.killed(before), attempts.told(attempts.facts_of(before, "mark"))]
+        assert all(line.replace("\n", "").isprintable() for line in said)
+        found = stand()
+        assert found.state != "unknown", found.reason
+        table.json_line(found, time.time())
+        summary._why_not("a", "draft")
+
+
+def test_a_state_that_is_a_pipe_is_not_waited_for(project):
+    path = state_file("a", "base")
+    path.parent.mkdir(parents=True)
+    os.mkfifo(path)
+    assert noted(path, time.time()) is None and reasons(0.0) == []
+
+
+def test_time_stamps_of_any_year_can_be_told():
+    for then in (-1e12, 0.5, 1e15):
+        assert json.loads(table.json_line(standing.Standing("a", "stale", since=then), 1e9))["since"]
 
 
 def test_a_bug_of_one_scene_does_not_hide_the_others(project, monkeypatch):

@@ -92,14 +92,14 @@ def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
     if scene in plan.refused:
         return row | {"status": "refused", "reason": plan.refused[scene], "source": line.source or None}
     row["source"] = json.loads(fp.resolved(scene, quality))["source"]["kind"]
-    row |= _costs(scene)
-    if _is_published(scene, plan.ready[scene]):
-        try:
-            return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene)}
-        except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
-            reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
-            return row | {"status": "failed", "stage": "publish", "reason": reason}
-    return row | _why_not(scene, quality)
+    try:
+        row |= _costs(scene)
+        if not _is_published(scene, plan.ready[scene]):
+            return row | _why_not(scene, quality)
+        return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene)}
+    except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
+        reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
+        return row | {"status": "failed", "stage": "publish", "reason": reason}
 
 
 def _is_published(scene: str, fingerprint: str) -> bool:
@@ -109,7 +109,7 @@ def _is_published(scene: str, fingerprint: str) -> bool:
 def _fingerprint_in(manifest: Path) -> str:
     try:
         return str(json.loads(manifest.read_text()).get("fingerprint", ""))
-    except (OSError, ValueError, AttributeError):
+    except (OSError, ValueError, AttributeError, RecursionError):
         return ""
 
 

@@ -5,12 +5,17 @@ A job that is killed says nothing itself, so Slurm is asked, or what was seen of
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from datetime import datetime
 from typing import Any
 
+from iif_core.errors import InputError
 from workflow.runtime import alive, slurm
 
 REMEMBERED = 3
 """Earlier attempts that are told of."""
+TIMES = (0.0, 1e11)
+"""Seconds since 1970 that can be a time of a job; the last is in the year 5138."""
 GUESS = "out of memory, or over its time limit?"
 
 
@@ -43,15 +48,61 @@ def told(facts: dict[str, Any]) -> str:
 
 
 def sound(document: dict[str, Any]) -> dict[str, Any]:
-    """Return a state without the facts of attempts that are not of the form that jobs write."""
-    own, earlier = document.get("slurm"), document.get("earlier")
-    bad = {
-        "slurm": not (isinstance(own, dict) and own.keys() >= set(slurm.Own._fields)),
-        "earlier": not (isinstance(earlier, list) and all(isinstance(line, str) for line in earlier)),
-        "attempt": not isinstance(document.get("attempt"), int),
-        "peak_mb": not isinstance(document.get("peak_mb"), int),
-    }
-    return {key: value for key, value in document.items() if not bad.get(key)}
+    """Return what of a file of attempts or of a state is of the form that jobs write; whatever else it holds is left out.
+
+    Readers rely on it: on types, on ranges, and on texts that hold nothing which could steer a terminal.
+    """
+    kept = {key: _FORMS[key](value) for key, value in document.items() if key in _FORMS}
+    return {key: value for key, value in kept.items() if value is not None}
+
+
+def moment(text: Any) -> float | None:
+    """Return a time as a state has it, in seconds as `time.time`; None if it is none, or not within `TIMES`."""
+    try:
+        found = datetime.fromisoformat(text).timestamp()
+    except (TypeError, ValueError, OverflowError, OSError):
+        return None
+    return found if TIMES[0] <= found <= TIMES[1] else None
+
+
+def _text(value: Any) -> str | None:
+    return str(InputError(value)) if isinstance(value, str) else None
+
+
+def _texts(value: Any) -> list[str] | None:
+    fits = isinstance(value, list) and all(isinstance(line, str) for line in value)
+    return [str(InputError(line)) for line in value] if fits else None
+
+
+def _number(low: int, high: int) -> Callable[[Any], int | None]:
+    return lambda value: value if isinstance(value, int) and not isinstance(value, bool) and low <= value <= high else None
+
+
+def _own(value: Any) -> dict[str, Any] | None:
+    if not isinstance(value, dict):
+        return None
+    asked = {key: value[key] for key in ("memory_mb", "minutes") if value.get(key) is not None}
+    texts = [value.get(key) for key in ("job", "node", "log")]
+    if not all(isinstance(text, str) for text in texts) or not texts[0].isdecimal():
+        return None
+    if any(_size(number) is None for number in (value.get("restarts"), *asked.values())):
+        return None
+    restarts, memory, minutes = value["restarts"], asked.get("memory_mb"), asked.get("minutes")
+    return slurm.Own(texts[0], str(InputError(texts[1])), memory, minutes, restarts, texts[2])._asdict()
+
+
+_size = _number(0, 10**9)
+_FORMS: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys(("state", "reason", "fingerprint", "host", "kernel", "told"), _text),
+    "since": lambda value: value if moment(value) is not None else None,
+    "pid": _number(1, 2**31 - 1),
+    "start": _number(0, 2**62),
+    "attempt": _number(1, 10**6),
+    "peak_mb": _size,
+    "earlier": _texts,
+    "slurm": _own,
+}
+"""Key of a state -> the value, or None if a job would not write it."""
 
 
 def ending(document: dict[str, Any], now: slurm.Own | None = None) -> str:

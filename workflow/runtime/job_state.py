@@ -148,14 +148,8 @@ def noted(path: Path, now: float) -> Noted | None:
         return None
     if state == "started":
         state = "running" if alive.runs(document, touched, now) else "killed"
-    return Noted(state, _moment(document.get("since"), touched), document)
-
-
-def _moment(text: Any, otherwise: float) -> float:
-    try:
-        return datetime.fromisoformat(text).timestamp()
-    except (TypeError, ValueError, OverflowError, OSError):
-        return otherwise
+    since = attempts.moment(document.get("since"))
+    return Noted(state, touched if since is None else since, document)
 
 
 def reasons(since: float, root: Path = Path(".")) -> list[str]:
@@ -169,7 +163,7 @@ def reasons(since: float, root: Path = Path(".")) -> list[str]:
         if document.get("state") == "started":
             if alive.lives(document):
                 continue  # of another run
-            changed = _moment(document.get("since"), changed)  # it was touched since
+            changed = attempts.moment(document.get("since")) or changed  # it was touched since
         if changed < int(since):
             continue
         owner, name = path.parents[1].name, path.name.removesuffix(".state.json")
@@ -201,7 +195,7 @@ def _read_new(path: Path) -> tuple[float, dict[str, Any]] | None:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text())
+        document = json.loads(path.read_text()) if path.is_file() else {}  # a pipe would be waited for
     except (OSError, ValueError, RecursionError):
         return {}
     return attempts.sound(document) if isinstance(document, dict) else {}

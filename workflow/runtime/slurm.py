@@ -143,6 +143,8 @@ def said_in(log: str, job: str) -> str:
 
     This is the only witness of memory where Slurm measures it itself and not the kernel: the state is FAILED then.
     """
+    if not os.path.isfile(log):
+        return ""
     try:
         with open(log, "rb") as file:
             file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL))

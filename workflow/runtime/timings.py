@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,15 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
         path = root / "results" / scene / "benchmarks" / f"{stage}.jsonl"
         try:
             lines = [line for line in path.read_text().splitlines() if line.strip()]
-            facts = json.loads(lines[-1])
+            facts = dict(json.loads(lines[-1]))
             seconds = float(facts["s"])
-        except (OSError, ValueError, KeyError, IndexError):
+        except (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError):
             continue
         rows.append(
             {
                 "rule": stage,
                 "wildcards": f"scene={scene}",
-                "seconds": seconds,
+                "seconds": _number(seconds),
                 "cpu_seconds": _number(facts.get("cpu_time")),
                 "max_rss_mb": _number(facts.get("max_rss")),
                 "threads": int(_number(facts.get("threads", _threads(path)))),
@@ -45,26 +46,33 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
 def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]:
     """Return what a job recorded itself (`Job.timed`): part -> seconds, cpu_seconds; `job`: the whole, with max_rss_mb, threads.
 
-    Empty if there is no readable file. Snakemake samples too rarely to measure the CPU time of a short job.
+    Only numbers are kept; empty if there is no readable file. Snakemake samples too rarely to measure the CPU time of a short
+    job.
     """
     try:
         document = json.loads((root / "results" / scene / "benchmarks" / f"{stage}.parts.json").read_text())
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
-    return document if isinstance(document, dict) else {}
+    parts = document.items() if isinstance(document, dict) else ()
+    return {part: _numbers(facts) for part, facts in parts if isinstance(facts, dict)}
+
+
+def _numbers(facts: dict[str, Any]) -> dict[str, float]:
+    """Return the entries that are finite numbers."""
+    return {key: value for key, value in facts.items() if isinstance(value, int | float) and _number(value) == value}
 
 
 def _threads(benchmark: Path) -> str:
     """Return what `python -m workflow` wrote beside the benchmark, because Snakemake's short format has no threads."""
     try:
         return benchmark.with_suffix(".threads").read_text()
-    except OSError:
+    except (OSError, ValueError):
         return ""
 
 
 def _number(value: Any) -> float:
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return 0.0
-    return number if number == number else 0.0
+    return number if math.isfinite(number) else 0.0

@@ -14,6 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from iif_core.errors import InputError
+from workflow.runtime.attempts import TIMES
 from workflow.runtime.forecast import duration, size
 from workflow.settings import batch_table
 from workflow.settings.names import RESERVED, scene_names
@@ -72,7 +73,8 @@ def json_line(one: Standing, now: float) -> str:
     """Return a scene as one line of JSON. `since` is a time in UTC, `seconds` the time since then."""
     document = asdict(one)
     if one.since is not None:
-        document["since"] = datetime.fromtimestamp(one.since, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+        then = min(max(one.since, TIMES[0]), TIMES[1])  # a time stamp of a file can be any
+        document["since"] = datetime.fromtimestamp(then, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
     document["seconds"] = None if one.since is None else round(max(0.0, now - one.since), 1)
     for key in ("expected_seconds", "cpu_seconds", "max_rss_mb", "remaining_cpu_seconds"):
         document[key] = None if document[key] is None else round(document[key], 1)
