@@ -227,6 +227,16 @@ def test_states_under_other_settings_do_not_count(project):
     assert stand().state == "waiting"
 
 
+def test_a_job_that_was_run_by_hand_counts(project):
+    state = JobState("a", "capture")  # nobody planned it
+    state.started()
+    write_json(state.path, json.loads(state.path.read_text()) | {"start": 1})
+    assert (stand().state, summary._why_not("a", "draft")["status"]) == ("killed", "killed")
+    state.failed("no light")
+    assert (stand().state, stand().reason) == ("failed", "no light")
+    assert summary._why_not("a", "draft")["reason"] == "no light"
+
+
 def test_a_stage_that_several_jobs_make_runs_as_long_as_one_does(project):
     made("capture")
     for part in ("1-of-3", "2-of-3", "3-of-3"):

@@ -119,7 +119,7 @@ def _why_not(scene: str, quality: str) -> Row:
     others: dict[str, Row] = {}
     for stage in missing:
         job = noted(state_file(scene, stage), time.time())
-        if not job or job.document.get("fingerprint") != fp.fingerprint(stage, scene, quality):
+        if not job or not job.is_of(fp.fingerprint(stage, scene, quality)):
             continue
         state = "killed" if job.state == "running" and attempts.ended_for_slurm(job.document) else job.state
         found = {"status": state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}

@@ -135,6 +135,10 @@ class Noted(NamedTuple):
     since: float
     document: dict[str, Any]
 
+    def is_of(self, fingerprint: str) -> bool:
+        """Return whether the job was planned as `fingerprint`, or run by hand: then its last run counts, whatever it was."""
+        return self.document.get("fingerprint") in ("", fingerprint)
+
 
 def noted(path: Path, now: float) -> Noted | None:
     """Return what a state file says; None if there is none, or nothing that can be read. Never raises, whatever it holds."""

@@ -144,9 +144,7 @@ def _unfinished(base: Standing, jobs: dict[str, Noted], published: dict[str, Any
     """A scene that is not done and of which nothing runs."""
     scene, missing = base.scene, fp.missing_stages(base.scene, quality)
     ended = [
-        (stage, jobs[stage])
-        for stage in missing
-        if stage in jobs and jobs[stage].document.get("fingerprint") == fp.fingerprint(stage, scene, quality)
+        (stage, jobs[stage]) for stage in missing if stage in jobs and jobs[stage].is_of(fp.fingerprint(stage, scene, quality))
     ]
     for state in ("failed", "killed"):
         for stage, job in ended:
