@@ -152,12 +152,13 @@ def _upgrade(scenes: list[str]) -> int:
 
 def _verify(scenes: list[str]) -> int:
     from workflow.artifacts.verify import damaged, with_artefacts
+    from workflow.runtime.attempts import written_out
 
     if _not_here(scenes, "verify"):
         return 1
     problems = list(damaged(Path("."), scenes or None))
     for line in problems:
-        print(line)
+        print(written_out(line))
     nothing = "nothing to compare: no artefacts below results/ and scenes/"
     sound = "all artefacts are as they were written" if with_artefacts() else nothing
     print(f"{len(problems)} damaged" if problems else sound)
@@ -201,13 +202,12 @@ CAUSES = {
 
 def _of_the_machine(error: OSError) -> str:
     """Return a sentence on an error of the operating system: the file, what is wrong, and what to do."""
+    from workflow.runtime.attempts import written_out
+
     place = f"{error.filename}: " if error.filename else ""
-    words = CAUSES.get(error.errno or 0)
-    return (
-        f"{place}{words}"
-        if words
-        else f"{place}{error.strerror or error} (if the file should be there, please report it with the log)"
-    )
+    known = CAUSES.get(error.errno or 0)
+    words = known or f"{error.strerror or error} (if the file should be there, please report it with the log)"
+    return written_out(f"{place}{words}")
 
 
 def _guarded(what: str, run: Callable[[], object], state: JobState | None = None) -> int:

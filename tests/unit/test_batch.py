@@ -534,6 +534,21 @@ def test_few_failures_have_a_line_each_and_many_a_line_a_cause():
     assert causes.refusals({"a": "line 2: bad"}) == ["line 2: bad"]
 
 
+def test_messages_do_not_steer_a_terminal(project, monkeypatch, capsys):
+    """Whatever a state file, a name of a file or an error brings: control characters are written out (SECURITY.md)."""
+    from workflow import __main__ as commands
+    from workflow.artifacts import verify
+
+    steering, shown = "\x1b]0;x\x07\u202e\x9b2J", r"\x1b]0;x\x07\u202e\x9b2J"
+    assert commands._of_the_machine(OSError(28, "No space left on device", steering)).startswith(f"{shown}: the disk is full")
+    JobState("a", "base").failed(f"{steering}\nsecond line")
+    (line,) = reasons(0.0)
+    assert line.endswith(f": {shown}\nsecond line")
+    assert summary.closing(_failures({"a": steering})).endswith(f"a: failed in capture: {shown}")
+    monkeypatch.setattr(verify, "damaged", lambda root, scenes: [f"{steering}: missing"])
+    assert commands._verify([]) == 1 and capsys.readouterr().out.splitlines()[0] == f"{shown}: missing"
+
+
 def test_the_shipped_table_can_be_read(repository):
     lines = batch_table.read_table(repository)
     assert [line.name for line in lines if line.is_plain] and all(

@@ -18,6 +18,7 @@ from workflow.artifacts.files import sha256_of
 from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import input_digests
+from workflow.runtime.attempts import written_out
 from workflow.scene.named import check_overrides
 from workflow.settings.batch_table import Line, read_table
 
@@ -54,7 +55,8 @@ def plan(quality: str) -> Plan:
             except InputError as error:
                 refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
             except Exception as error:  # whatever is wrong with one scene must not stop hundreds of others
-                refused[line.name] = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
+                reason = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
+                refused[line.name] = written_out(reason)
     return Plan(lines, ready, refused)
 
 

@@ -78,7 +78,7 @@ def closing(rows: Sequence[Row]) -> str:
     """Return the last message of a run: how many scenes are done, and what the others lack."""
     done = sum(row["status"] == "done" for row in rows)
     lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
-    return "\n".join([*lines, *causes.lines(rows)])
+    return attempts.written_out("\n".join([*lines, *causes.lines(rows)]))
 
 
 # ------------------------------------------------------------------------------------------------------------ one scene

@@ -22,6 +22,7 @@ from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import events, forecast, input_digests, native, slurm
+from workflow.runtime.attempts import written_out
 from workflow.runtime.job_state import reasons, retold
 from workflow.status import table as status
 from workflow.relighting.check import check_relightings
@@ -76,7 +77,7 @@ def inputs_again(asked):
             f"--config inputs={asked}: the only value is rehash, which reads every known input file again"
         )
     for path in input_digests.rehash():
-        print(f"{path}: its content changed", file=sys.stderr)
+        print(written_out(f"{path}: its content changed"), file=sys.stderr)
 
 
 # `--config`: a quality by name, or for each scene the one that a number of seconds or a score asks for.
@@ -362,7 +363,7 @@ def again_if_unsound(target, words, faults):
     """Have the job run that makes `target`, if what is there is not what was written, and say once why."""
     if faults and workflow.is_main_process and target not in workflow.dag.forcefiles:
         if text := sound.told(faults, words):
-            print(text, file=sys.stderr)
+            print(written_out(text), file=sys.stderr)
         workflow.dag.forcefiles.add(target)
 
 

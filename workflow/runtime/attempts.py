@@ -56,6 +56,11 @@ def sound(document: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in kept.items() if value is not None}
 
 
+def written_out(text: str) -> str:
+    """Return a text as messages have it: characters that could steer a terminal are written out, as `InputError` does."""
+    return str(InputError(text))
+
+
 def moment(text: Any) -> float | None:
     """Return a time as a state has it, in seconds as `time.time`; None if it is none, or not within `TIMES`."""
     try:
@@ -66,12 +71,12 @@ def moment(text: Any) -> float | None:
 
 
 def _text(value: Any) -> str | None:
-    return str(InputError(value)) if isinstance(value, str) else None
+    return written_out(value) if isinstance(value, str) else None
 
 
 def _texts(value: Any) -> list[str] | None:
     fits = isinstance(value, list) and all(isinstance(line, str) for line in value)
-    return [str(InputError(line)) for line in value] if fits else None
+    return [written_out(line) for line in value] if fits else None
 
 
 def _number(low: int, high: int) -> Callable[[Any], int | None]:
@@ -88,7 +93,7 @@ def _own(value: Any) -> dict[str, Any] | None:
     if any(_size(number) is None for number in (value.get("restarts"), *asked.values())):
         return None
     restarts, memory, minutes = value["restarts"], asked.get("memory_mb"), asked.get("minutes")
-    return slurm.Own(texts[0], str(InputError(texts[1])), memory, minutes, restarts, texts[2])._asdict()
+    return slurm.Own(texts[0], written_out(texts[1]), memory, minutes, restarts, texts[2])._asdict()
 
 
 _size = _number(0, 10**9)

@@ -174,7 +174,7 @@ def reasons(since: float, root: Path = Path(".")) -> list[str]:
         log = path.with_name(f"{name}.log")
         reason = document.get("reason") or attempts.killed(document)
         found.append((changed, f"error: {owner}: {name} failed ({log}): {reason}"))
-    return [message for _, message in sorted(found)]
+    return [attempts.written_out(message) for _, message in sorted(found)]
 
 
 def retold(since: float, root: Path = Path(".")) -> list[str]:
@@ -184,7 +184,7 @@ def retold(since: float, root: Path = Path(".")) -> list[str]:
         new = _read_new(path)
         if new and new[0] >= since and new[1].get("told"):
             found.append((new[0], f"{path.parents[1].name}: {path.name.removesuffix('.attempts.json')}: {new[1]['told']}"))
-    return [line for _, line in sorted(found)]
+    return [attempts.written_out(line) for _, line in sorted(found)]
 
 
 def _read_new(path: Path) -> tuple[float, dict[str, Any]] | None:
