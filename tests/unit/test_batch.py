@@ -375,6 +375,14 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
     assert table["rgb_psnr"].to_pylist() == [30.0, None, None, None, None]
 
 
+@pytest.mark.parametrize("between", ["\n", "\r", "\r\n", "\x0b", "\x85", "\u2028"])
+def test_a_reason_is_one_cell_of_the_table(five, monkeypatch, between):
+    monkeypatch.setitem(five.refused, "refused", f"one\t\x1btwo{between}three")
+    summary.write_summary("draft")
+    text = Path("results/batch/summary.tsv").read_bytes().decode()
+    assert "\tone \\x1btwo | three\t" in text and len(text.splitlines()) == 6
+
+
 def test_a_job_that_runs_is_told_from_a_killed_one(five):
     JobState("idle", "prior", "prior of idle").started()  # by this process
     summary.write_summary("draft")
@@ -489,12 +497,19 @@ def _failures(reasons_by_scene, status="failed", stage="capture"):
         ),
         ("config/batch.tsv, line 3: no mesh in scene NAME", "config/batch.tsv, line 12: no mesh in scene NAME"),
         ("no faces\nsecond line 1", "no faces\nanother line"),
+        (
+            "results/NAME/locks/base: stage base of NAME is being made by process 12 on vm since 2026-01-01 00:00:00. Wait",
+            "results/NAME/locks/base: stage base of NAME is being made by process 345 on vm since 2026-02-03 04:05:06. Wait",
+        ),
+        ("it was killed (out of memory? It had 1,200 MB when last seen)", "it was killed (out of memory?)"),
+        ("was killed for its memory: this process had 90 MB when last seen", "was killed for its memory"),
     ],
 )
-def test_one_cause_has_one_group(one, other):
-    rows = _failures({"a-1": one.replace("NAME", "a-1"), "office": other.replace("NAME", "office")})
+@pytest.mark.parametrize("names", [("a-1", "office"), ("kitchen", "bedroom")])
+def test_one_cause_has_one_group(one, other, names):
+    rows = _failures({name: text.replace("NAME", name) for name, text in zip(names, (one, other), strict=True)})
     (group,) = causes.groups(rows)
-    assert [row["scene"] for row in group.rows] == ["a-1", "office"] and group.heading == "2 scenes failed in capture"
+    assert [row["scene"] for row in group.rows] == list(names) and group.heading == "2 scenes failed in capture"
 
 
 @pytest.mark.parametrize(
@@ -503,6 +518,8 @@ def test_one_cause_has_one_group(one, other):
         ("`capture.veiws`: unknown key", "`capture.widht`: unknown key"),
         ("no mesh", "no photographs"),
         ("mesh: no faces", "mesh: no vertices"),
+        ("CUDA error 2: out of memory", "CUDA error 700: illegal address"),
+        ("the device fails with CUDA error 2", "the device fails with CUDA error 700"),
     ],
 )
 def test_different_causes_stay_apart(one, other):

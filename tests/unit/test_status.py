@@ -477,6 +477,32 @@ def test_lines_of_two_processes_do_not_mix(tmp_path, repository):
         assert [one[1:] for one in found if one[0] == name] == [(i, i % 900) for i in range(2000)]
 
 
+def test_a_line_that_did_not_fit_on_the_disk_spoils_no_other(tmp_path, monkeypatch, caplog):
+    path, write = tmp_path / "e.jsonl", os.write
+    monkeypatch.setenv(events.VARIABLE, str(path))
+    events.tell("started", "a", "base", "mark")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda handle, data: write(handle, data[:20]))
+        events.tell("progress", "a", "base", "mark")
+    assert "No space left on device" in caplog.text
+    events.tell("finished", "a", "base", "mark")
+    assert [one["event"] for one in read(path)] == ["started", "finished"]
+
+
+def test_every_key_of_an_event_is_on_its_page(repository, project, monkeypatch):
+    monkeypatch.setenv(events.VARIABLE, str(project / "e.jsonl"))
+    for end in (JobState.done, lambda state: state.failed("no light")):
+        state = JobState("a", "base", "mark")
+        state.started()
+        end(state)
+    page = (repository / "docs/reference/events.md").read_text()
+    table = [line.split("|")[1:3] for line in page.splitlines() if line.startswith("| `")]
+    known = {key: of for keys, of in table for key in keys.replace("`", "").replace(" ", "").split(",")}
+    for one in read(project / "e.jsonl"):
+        for key in one:
+            assert key in known and ("all" in known[key] or f"`{one['event']}`" in known[key]), (key, one["event"])
+
+
 def test_where_events_go(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert events.checked("results/e.jsonl") == f"{tmp_path}/results/e.jsonl"

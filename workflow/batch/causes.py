@@ -12,7 +12,8 @@ FEW = 10
 ELLIPSIS = "…"
 _PATH = re.compile(r"[^\s'\"`(),;:=]*/[^\s'\"`(),;:]*")
 _FILE = re.compile(r"(?<![\w`.])[\w-]+(?:\.[\w-]+)*\.(?:exr|png|jpe?g|json|parquet|ply|obj|glb|yaml|tsv|npz|txt|xml|bin)\b", re.I)
-_COORDINATE = re.compile(r"[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.I)
+_NUMBER = re.compile(r"(\b(?:error|errno|code|signal) )?[-+]?\d+(?:[.,]\d+)*(?:e[-+]?\d+)?", re.I)
+_SEEN = re.compile(r"[;:]? (?:it|this process) had [\d,]+ MB when last seen", re.I)  # `attempts.py`
 _WITH_DIGITS = re.compile(rf"[\w-]*{ELLIPSIS}[\w-]*(?:{ELLIPSIS}[\w-]*)*")
 _SEVERAL = re.compile(rf"{ELLIPSIS}(?:(?:, and |, | and | x | to | ){ELLIPSIS})+")
 
@@ -48,18 +49,20 @@ class Group:
 def cause_of(reason: str, scene: str) -> str:
     """Return the reason without paths, names of files, views and scenes, and numbers: an ellipsis stands for each.
 
-    Keys of settings and other words stay. Of a reason of several lines the first counts.
+    Keys of settings and other words stay, and so do numbers of errors, such as `CUDA error 700`. Of a reason of several lines the
+    first counts.
 
     >>> cause_of("data/a-1/mesh.ply is 5590 m across; allowed: 1 to 300", "a-1")
     '… is … m across; allowed: …'
     """
     text = reason.strip().partition("\n")[0]
-    text = _PATH.sub(ELLIPSIS, text)
+    text = _PATH.sub(ELLIPSIS, _SEEN.sub("", text))
     text = _FILE.sub(ELLIPSIS, text)
     text = re.sub(rf"(?<=scene )['\"]?{re.escape(scene)}\b['\"]?|(?<=['\"]){re.escape(scene)}(?=['\"])", ELLIPSIS, text)
+    text = re.sub(rf"(\bstage [\w-]+ of ){re.escape(scene)}(?![\w-])", rf"\1{ELLIPSIS}", text)
     if not scene.isalpha():  # a scene called `mesh` must not hide the word
         text = re.sub(rf"(?<![\w-]){re.escape(scene)}(?![\w-])", ELLIPSIS, text)
-    text = _COORDINATE.sub(ELLIPSIS, text)
+    text = _NUMBER.sub(lambda found: found[0] if found[1] else ELLIPSIS, text)
     text = _WITH_DIGITS.sub(ELLIPSIS, text)
     return _SEVERAL.sub(ELLIPSIS, text)
 

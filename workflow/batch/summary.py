@@ -185,4 +185,4 @@ def _tsv(rows: Sequence[Row]) -> str:
 def _cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
-    return " | ".join(str(value).split("\n")).replace("\t", " ")
+    return " | ".join(attempts.written_out(line.replace("\t", " ")) for line in str(value).splitlines())

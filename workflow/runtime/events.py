@@ -7,6 +7,7 @@ to one file of a network disk can overwrite each other.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -102,10 +103,20 @@ def taken() -> dict[str, float]:
 
 
 def _append(path: Path, line: bytes) -> None:
+    """Append a line; of one that does not fit on the disk nothing stays, so that the next is not glued to its half.
+
+    Raises:
+        OSError: the line could not be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        os.write(handle, line)  # one call, so that lines of several processes do not mix
+        written = os.write(handle, line)  # one call, so that lines of several processes do not mix
+        if written < len(line):
+            end = os.lseek(handle, 0, os.SEEK_CUR)
+            if os.fstat(handle).st_size == end:  # nobody has written since
+                os.ftruncate(handle, end - written)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     finally:
         os.close(handle)
 
