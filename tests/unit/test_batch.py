@@ -467,6 +467,29 @@ def test_pictures_show_what_the_report_shows(project, dynamic_range, photograph,
     assert write_pictures(["a"], folder) == {} and not list((folder / "pictures").iterdir())
 
 
+def test_a_published_scene_whose_last_job_failed_says_so(five):
+    """As where a damaged stage was to be made again; the deliverable is there, so the scene is done."""
+    JobState("done", "render", "render of done").failed("results/done/render/maps: a file is in the place of a folder")
+    JobState("done", "room", "room of other settings").failed("long ago")
+    summary.write_summary("draft")
+    with open("results/batch/summary.tsv", newline="") as file:
+        row = next(row for row in csv.DictReader(file, delimiter="\t") if row["scene"] == "done")
+    reason = "it is published, but its last job of render failed: results/done/render/maps: a file is in the place of a folder"
+    assert (row["status"], row["reason"], row["log"]) == ("done", reason, "results/done/logs/render.log")
+    plan = five
+    closing = summary.closing([summary.row_of(line, plan, "draft") for line in plan.lines]).splitlines()
+    assert closing[0].startswith("1 of 5 scenes done") and f"done: done: {reason}" in closing
+    page = Path("results/batch/report.html").read_text()
+    assert "1 scene done</b>, done: it is published" in page and '"../../results/done/logs/render.log"' in page
+
+
+def test_a_part_of_the_prior_that_failed_is_the_reason(five):
+    JobState("idle", "prior.3-of-8", "prior of idle").failed("no weights")
+    found = summary._why_not("idle", "draft")
+    assert (found["status"], found["stage"], found["reason"]) == ("failed", "prior", "no weights")
+    assert found["log"] == "results/idle/logs/prior.3-of-8.log"
+
+
 def test_only_a_finished_plan_counts_as_complete(five):
     summary.write_summary("draft", "mark")
     assert Path("results/batch/complete").read_text() == "mark\n"
@@ -539,7 +562,7 @@ def test_few_failures_have_a_line_each_and_many_a_line_a_cause():
     few = _failures({f"s{i}": f"data/s{i}: no mesh" for i in range(causes.FEW)})
     assert summary.closing(few).splitlines()[1:] == [f"s{i}: failed in capture: data/s{i}: no mesh" for i in range(causes.FEW)]
     many = [*few, *_failures({f"t{i}": f"line {i}: bad key" for i in range(19)}, "refused", None), *_failures({"u": "alone"})]
-    assert summary.closing([*many, {"scene": "v", "status": "done"}]).splitlines()[1:] == [
+    assert summary.closing([*many, {"scene": "v", "status": "done", "reason": None}]).splitlines()[1:] == [
         "19 scenes refused, such as t0: line 0: bad key",
         "10 scenes failed in capture, such as s0: data/s0: no mesh",
         "u: failed in capture: alone",

@@ -176,6 +176,22 @@ def test_a_scene_goes_from_waiting_to_done(project):
     assert (found.state, found.stage, found.remaining_cpu_seconds) == ("done", "", None) and time.time() - found.since < 60
 
 
+def test_a_published_scene_whose_last_job_failed_says_so(project):
+    for stage in fp.NEEDED:
+        made(stage)
+    published()
+    state = JobState("a", "render", fp.fingerprint("render", "a", "draft"))
+    state.failed("no room")
+    found = stand()
+    assert (found.state, found.stage, found.reason) == ("done", "", "it is published, but its last job of render failed: no room")
+    state.started()
+    write_json(state.path, json.loads(state.path.read_text()) | {"start": 1})
+    assert stand().reason == "it is published, but its last job of render was killed"
+    state.done()
+    JobState("a", "render", "of other settings").failed("long ago")
+    assert (stand().state, stand().reason) == ("done", "")
+
+
 @pytest.mark.parametrize(
     ("changed", "words"),
     [

@@ -22,7 +22,7 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes that are not done for one cause.
+    """Scenes that are not done for one cause, or of which a job failed for one cause although they are published.
 
     Attributes:
         status, stage: of all of them; the stage is empty for scenes that were refused.
@@ -68,22 +68,21 @@ def cause_of(reason: str, scene: str) -> str:
 
 
 def groups(rows: Iterable[Row]) -> list[Group]:
-    """Return the scenes that are not done by cause, the largest group first; equal ones in the order of the table.
+    """Return the scenes that have a reason by cause, the largest group first; equal ones in the order of the table.
 
     Args:
         rows: of the summary, also of scenes that are done.
     """
     found: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        if row["status"] != "done":
-            key = row["status"], row["stage"] or "", cause_of(row["reason"] or "", row["scene"])
-            found.setdefault(key, []).append(row)
+    for row in filter(_is_told, rows):
+        key = row["status"], row["stage"] or "", cause_of(row["reason"] or "", row["scene"])
+        found.setdefault(key, []).append(row)
     return [Group(*key, tuple(of)) for key, of in sorted(found.items(), key=lambda item: -len(item[1]))]
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each scene that is not done; where there are more than `FEW`, one for each cause, with an example."""
-    others = [row for row in rows if row["status"] != "done"]
+    """Return a line for each scene that has a reason; where there are more than `FEW`, one for each cause, with an example."""
+    others = list(filter(_is_told, rows))
     if len(others) <= FEW:
         return [_line(row) for row in others]
     found = groups(others)
@@ -102,6 +101,10 @@ def refusals(refused: Mapping[str, str]) -> list[str]:
     if len(refused) <= FEW:
         return list(refused.values())
     return lines([{"scene": scene, "status": "refused", "stage": "", "reason": reason} for scene, reason in refused.items()])
+
+
+def _is_told(row: Row) -> bool:
+    return row["status"] != "done" or bool(row["reason"])
 
 
 def _line(row: Row) -> str:

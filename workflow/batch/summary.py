@@ -75,7 +75,7 @@ def refuse(quality: str) -> None:
 
 
 def closing(rows: Sequence[Row]) -> str:
-    """Return the last message of a run: how many scenes are done, and what the others lack."""
+    """Return the last message of a run: how many scenes are done, what the others lack, and which jobs failed beside."""
     done = sum(row["status"] == "done" for row in rows)
     lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
     return attempts.written_out("\n".join([*lines, *causes.lines(rows)]))
@@ -96,7 +96,7 @@ def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
         row |= _costs(scene)
         if not _is_published(scene, plan.ready[scene]):
             return row | _why_not(scene, quality)
-        return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene)}
+        return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene), **_since(scene, quality)}
     except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
         reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
         return row | {"status": "failed", "stage": "publish", "reason": reason}
@@ -116,19 +116,38 @@ def _fingerprint_in(manifest: Path) -> str:
 def _why_not(scene: str, quality: str) -> Row:
     """Return status, stage, reason and log of the first job that did not end well, or of the first missing one if none ran."""
     missing = fp.missing_stages(scene, quality)
-    others: dict[str, Row] = {}
-    for stage in missing:
-        job = noted(state_file(scene, stage), time.time())
+    jobs = _jobs(scene, missing, quality)
+    stage = missing[0] if missing else "publish"
+    idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
+    return jobs.get("failed") or jobs.get("running") or jobs.get("killed") or idle
+
+
+def _since(scene: str, quality: str) -> Row:
+    """Return reason and log of a job of a published scene that did not end well, as where damage was to be mended; empty if all
+    did."""
+    jobs = _jobs(scene, fp.NEEDED, quality)
+    job = jobs.get("failed") or jobs.get("killed")
+    if not job:
+        return {}
+    ended = "failed" if job["status"] == "failed" else "was killed"
+    return {"reason": f"it is published, but its last job of {job['stage']} {ended}: {job['reason']}", "log": job["log"]}
+
+
+def _jobs(scene: str, stages: Sequence[str], quality: str) -> dict[str, Row]:
+    """Return status, stage, reason and log of the first job in each of the states `failed`, `running` and `killed`."""
+    found: dict[str, Row] = {}
+    names = sorted(path.name for path in Path(f"results/{scene}/logs").glob("*.state.json"))
+    for stage, name in [(stage, name) for stage in stages for name in names if name.partition(".")[0] == stage]:
+        job = noted(state_file(scene, name.removesuffix(".state.json")), time.time())
         if not job or not job.is_of(fp.fingerprint(stage, scene, quality)):
             continue
         state = "killed" if job.state == "running" and attempts.ended_for_slurm(job.document) else job.state
-        found = {"status": state, "stage": stage, "log": f"results/{scene}/logs/{stage}.log"}
+        reason = "it runs" if state == "running" else attempts.killed(job.document)
         if state == "failed":
-            return found | {"reason": "; ".join([str(job.document.get("reason", "")), *job.document.get("earlier", [])])}
-        others.setdefault(state, found | {"reason": "it runs" if state == "running" else attempts.killed(job.document)})
-    stage = missing[0] if missing else "publish"
-    idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
-    return others.get("running") or others.get("killed") or idle
+            reason = "; ".join([job.document.get("reason", ""), *job.document.get("earlier", [])])
+        log = f"results/{scene}/logs/{name.removesuffix('.state.json')}.log"
+        found.setdefault(state, {"status": state, "stage": stage, "reason": reason, "log": log})
+    return found
 
 
 def _costs(scene: str) -> Row:

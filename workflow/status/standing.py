@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -52,8 +52,8 @@ class Standing:
         expected_seconds: wall time that the job of `stage` is expected to take, if it runs and such jobs were measured.
         cpu_seconds, max_rss_mb: that its jobs took: the last run of each, and of running ones so far.
         remaining_cpu_seconds: that are expected to make the scene complete; None where that was not looked at.
-        reason: why it is not done, where there is one.
-        log, line: of the job of `stage`: its path, and the last line that is not empty.
+        reason: why it is not done, where there is one; or how a job ended since, if it is done.
+        log, line: of the job of `stage`, or of that job: its path, and the last line that is not empty.
     """
 
     scene: str
@@ -115,7 +115,7 @@ def _standing(scene: str, quality_of: Callable[[str], str], now: float, look: bo
             return _of_running(base, jobs, quality)
         found, touched = _published(scene)
         if found and _is_current(found, touched, scene, quality):
-            return replace(base, state="done", since=touched, **_logged(scene, "publish"))
+            return _done(replace(base, since=touched), jobs, quality)
         if look or _begun(scene):
             return _unfinished(base, jobs, found, touched, quality)
         _source_is_there(scene, quality)
@@ -140,17 +140,32 @@ def _of_running(base: Standing, jobs: dict[str, Noted], quality: str | None) -> 
     )
 
 
+def _done(base: Standing, jobs: dict[str, Noted], quality: str) -> Standing:
+    """A scene that is published as it is wanted; a job that did not end well, as where damage was to be mended, is no secret."""
+    ended = _ended(jobs, fp.NEEDED, base.scene, quality)
+    if not ended:
+        return replace(base, state="done", **_logged(base.scene, "publish"))
+    stage, job = ended
+    how = f"failed: {job.document.get('reason', '')}" if job.state == "failed" else "was killed"
+    reason = f"it is published, but its last job of {stage} {how}"
+    return replace(base, state="done", reason=reason, **_logged(base.scene, stage))
+
+
+def _ended(jobs: dict[str, Noted], stages: Sequence[str], scene: str, quality: str) -> tuple[str, Noted] | None:
+    """Return the first of some stages whose last job failed, or else was killed."""
+    ended = [
+        (stage, jobs[stage]) for stage in stages if stage in jobs and jobs[stage].is_of(fp.fingerprint(stage, scene, quality))
+    ]
+    return next((one for state in ("failed", "killed") for one in ended if one[1].state == state), None)
+
+
 def _unfinished(base: Standing, jobs: dict[str, Noted], published: dict[str, Any], touched: float, quality: str) -> Standing:
     """A scene that is not done and of which nothing runs."""
     scene, missing = base.scene, fp.missing_stages(base.scene, quality)
-    ended = [
-        (stage, jobs[stage]) for stage in missing if stage in jobs and jobs[stage].is_of(fp.fingerprint(stage, scene, quality))
-    ]
-    for state in ("failed", "killed"):
-        for stage, job in ended:
-            if job.state == state:
-                reason = str(job.document.get("reason") or "")
-                return replace(base, state=state, stage=stage, since=job.since, reason=reason, **_logged(scene, stage))
+    if ended := _ended(jobs, missing, scene, quality):
+        stage, job = ended
+        reason = job.document.get("reason", "")
+        return replace(base, state=job.state, stage=stage, since=job.since, reason=reason, **_logged(scene, stage))
     stage = missing[0] if missing else "publish"
     if published:
         made = published.get("quality")
