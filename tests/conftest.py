@@ -37,8 +37,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """End whatever a test waits for in vain; tests marked `long` may take their time."""
-    if item.get_closest_marker("long"):
+    """End whatever a test waits for in vain; those marked `long`, and those of a cluster, may take their time."""
+    if item.get_closest_marker("long") or REPOSITORY / "tests/slurm" in item.path.parents:
         return (yield)
 
     def end() -> None:

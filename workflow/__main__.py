@@ -166,7 +166,7 @@ def _verify(scenes: list[str]) -> int:
 
 
 def _unknown_quality(quality: str) -> int:
-    """Refuse it once, before it is refused of every scene of a batch, and a summary of what is wrong takes the place of another."""
+    """Refuse it once, before it is refused of every scene of a batch and a summary of that takes the place of a good one."""
     from workflow.settings.loading import photographs
 
     return _guarded("quality", lambda: photographs(quality))

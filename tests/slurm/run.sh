@@ -132,4 +132,4 @@ slurmd
 for _ in $(seq 40); do sinfo -h -o %t 2>/dev/null | grep -qE 'idle|mix' && break; sleep 0.5; done
 sinfo || { tail -n 20 "$state"/log/*.log >&2; exit 1; }
 export IIF_SLURM_STATE=$state
-.venv/bin/python -m pytest -p no:cacheprovider -q tests/slurm "$@"
+.venv/bin/python -m pytest -p no:cacheprovider -o faulthandler_timeout=0 -q tests/slurm "$@"

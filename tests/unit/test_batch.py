@@ -266,10 +266,11 @@ def segmented(scene):
 
 
 def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
-    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "earlier")) + f"name\t{WRONG_NAME}\n")
+    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "earlier", "link")) + f"name\t{WRONG_NAME}\n")
     for path in ("scenes/file", "results/stage/render"):
         Path(path).parent.mkdir(parents=True)
         Path(path).touch()
+    Path("scenes/link").symlink_to("../config")
     segmented("name")
     manifest = segmented("earlier") / "manifest.json"
     document = json.loads(manifest.read_text())
@@ -281,6 +282,7 @@ def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
         "stage": "results/stage/render: a file, where",
         "earlier": "python -m workflow upgrade earlier",
         "name": "`overrides`: there is no object 'nosuchthing'",
+        "link": "scenes/link: a symbolic link",
     }.items():
         assert words in plan.refused[name]
 

@@ -64,9 +64,10 @@ def check(scene: str, quality: str) -> None:
     """Check what Snakemake's plan of a scene looks at beside its settings and its source.
 
     Raises:
-        InputError: the folder of what is published is a file; or as `check_stage`.
+        InputError: the folder of what is published is a file, or a link is where jobs write; or as `check_stage`.
     """
     check_folder(f"scenes/{scene}")
+    sound.deliverable_faults(Path(f"scenes/{scene}"), Path("results"), scene, fp.fingerprint("publish", scene, quality))
     for stage in fp.NEEDED:
         check_stage(stage, scene, quality)
 
