@@ -425,7 +425,7 @@ def _(root):
     vertices, faces, _ = own.room_mesh()
     trimesh.Trimesh(vertices, faces, process=False).export(path)
     path.write_bytes(path.read_bytes()[:-30])
-    return captured(root)
+    return planned(root)
 
 
 def moved(root, which, by):

@@ -51,7 +51,9 @@ def _check_ply(path: Path, size: int) -> None:
             words_needed = 5 if words[1:2] == ["list"] else 3
             if not elements or len(words) != words_needed or set(kinds) - set(_SIZES):
                 raise InputError(f"{where}: expected a property of an element, of a type of PLY; {AGAIN}")
-            elements[-1][2].append(_SIZES[kinds[0]])  # of a list, its count is there at least
+            of_face = elements[-1][0] == "face" and words[-1] in ("vertex_indices", "vertex_index")
+            corners = [_SIZES[kinds[-1]]] * 3 if of_face and words[1] == "list" else []
+            elements[-1][2].extend([_SIZES[kinds[0]], *corners])  # a list has its count at least, and a face three corners
     least = 0
     for name, count, sizes in elements:
         if count > limits.MESH_ELEMENTS:
