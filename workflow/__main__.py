@@ -176,8 +176,7 @@ def _status(scenes: list[str], quality: str, as_json: bool) -> int:
     from workflow.status.standing import quality_of
     from workflow.status.table import tell
 
-    tell(scenes, partial(quality_of, quality=quality), as_json)
-    return 0
+    return tell(scenes, partial(quality_of, quality=quality), as_json)
 
 
 CAUSES = {

@@ -381,7 +381,7 @@ def test_nothing_is_written(project):
     before = sorted(Path(".").rglob("*"))
     for name in ("a", "b"):
         stand(name)
-    table.tell([], lambda _: "draft")
+    assert table.tell([], lambda _: "draft") == 0
     assert sorted(Path(".").rglob("*")) == before
 
 
@@ -401,7 +401,7 @@ def test_which_scenes_are_shown(project):
 
 def test_a_table_that_cannot_be_read_hides_no_scene(project, capsys):
     Path("config/batch.tsv").write_text("name\tbase\nx y\ta\n")
-    table.tell([], lambda _: "draft")
+    assert table.tell([], lambda _: "draft") == 1
     said = capsys.readouterr()
     assert "config/batch.tsv, line 2" in said.err and "a      waiting" in said.out
 
@@ -416,7 +416,7 @@ def test_lines_fit_the_terminal_and_hold_nothing_that_steers_it():
     assert first.split() == ["scene", "state", "stage", "for", "CPU", "memory"]
     assert running.split("  ") == ["kitchen", "running", "base +1", "42 s of about 1 min", "1 min 40 s", "1.2 GB"]
     assert len(failed) == 100 and failed.endswith("x...") and "3 days" in failed and "\x1b" not in failed and "no light" in failed
-    assert last == "2 scenes: 1 running, 1 failed; 1 min 40 s of CPU time so far, about 1 min 40 s to go"
+    assert last == "2 scenes: 1 running, 1 failed; 1 min 40 s of CPU time so far, about 1 min 40 s to go; at quality draft"
     assert max(map(len, table.text(rows, now, 76, coloured=False)[:3])) <= 76
     coloured = table.text(rows, now, 100, coloured=True)
     assert "\x1b[31mfailed " in coloured[2] and len(coloured[2]) == 100 + len("\x1b[31m\x1b[0m")

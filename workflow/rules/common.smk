@@ -102,8 +102,7 @@ def tell_status():
                 workflow.logger_manager.logger.removeHandler(handler)
                 handler.close()
                 os.unlink(path)
-    status.tell([], lambda scene: choose.choice(REQUEST, scene).quality)
-    sys.exit(0)
+    sys.exit(status.tell([], lambda scene: choose.choice(REQUEST, scene).quality))
 
 
 def targets():

@@ -46,19 +46,20 @@ def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
     return list(dict.fromkeys([*(line.name for line in lines), *others]))
 
 
-def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool = False) -> None:
-    """Print where scenes stand.
+def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool = False) -> int:
+    """Print where scenes stand; return the exit code, which is 1 if the batch table cannot be read.
 
     Args:
         named: scenes that are asked for; all without any.
         quality_of: returns the quality of a scene, or raises `InputError`.
         as_json: one JSON object on each line instead of a table.
     """
-    now = time.time()
+    now, code = time.time(), 0
     try:
         scenes = scenes_to_show(named)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
+        code = 1  # what follows may be other scenes than those of the table
         scenes = sorted({*scene_names(), *standing.with_running_jobs()})
     found = list(standing.survey(scenes, quality_of, now))
     lines = [json_line(one, now) for one in found] if as_json else text(found, now, _width(), _coloured())
@@ -67,6 +68,7 @@ def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool =
     except BrokenPipeError:  # `| head` has seen enough
         with suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return code
 
 
 def json_line(one: Standing, now: float) -> str:
@@ -130,7 +132,8 @@ def _words(one: Standing) -> str:
 
 
 def total(found: Sequence[Standing]) -> str:
-    """Return the last line: how many scenes there are in each state, CPU time so far, and what is expected to be left."""
+    """Return the last line: how many scenes there are in each state, CPU time so far, what is expected to be left, and the quality
+    under which they were looked at."""
     counts = {state: sum(one.state == state for one in found) for state in STATES}
     parts = [f"{count} {state}" for state, count in counts.items() if count]
     spent = sum(one.cpu_seconds for one in found)
@@ -139,7 +142,9 @@ def total(found: Sequence[Standing]) -> str:
     so_far = f"{duration(spent)} of CPU time so far" if spent else "nothing done so far"
     left = f", about {duration(sum(known) / len(known) * len(unfinished))} to go" if known else ""
     name = "scene" if len(found) == 1 else "scenes"
-    return f"{len(found)} {name}: {', '.join(parts)}; {so_far}{left}"
+    qualities = list(dict.fromkeys(one.quality for one in found if one.quality))
+    looked_at = f"; at quality {', '.join(qualities)}" if qualities else ""
+    return f"{len(found)} {name}: {', '.join(parts)}; {so_far}{left}{looked_at}"
 
 
 def _width() -> int:
