@@ -132,8 +132,8 @@ def _words(one: Standing) -> str:
 
 
 def total(found: Sequence[Standing]) -> str:
-    """Return the last line: how many scenes there are in each state, CPU time so far, what is expected to be left, and the quality
-    under which they were looked at."""
+    """Return the last line: how many scenes there are in each state, CPU time so far, what is expected to be left, and the
+    quality under which they were looked at."""
     counts = {state: sum(one.state == state for one in found) for state in STATES}
     parts = [f"{count} {state}" for state, count in counts.items() if count]
     spent = sum(one.cpu_seconds for one in found)
