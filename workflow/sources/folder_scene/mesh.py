@@ -119,7 +119,7 @@ def _refuse_cut(path: Path) -> None:
     promised = sum(int(count) for _, count in counts)
     body = data[data.find(b"\n", len(head)) + 1 :].rstrip()
     found = body.count(b"\n") + 1 if body else 0
-    if found == promised and re.search(rb"element\s+face\s+[1-9]\d*\s+property\s+list[^\n]*\s*$", head):
+    if found == promised and re.search(rb"element\s+face\s+[1-9]\d*\s+property\s+list[^\n]*\Z", head.rstrip()):
         corners, *last = body[body.rfind(b"\n") + 1 :].split()  # of a header that ends with faces, and these with their vertices
         found -= not corners.isdigit() or len(last) < int(corners)
     if found < promised:
