@@ -369,7 +369,7 @@ class TestMake:
         assert lines[-1] == '.venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"'
         assert (
             self.commands(repository, clean_environment, "test-all")[-1]
-            == ".venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder"
+            == ".venv/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -o faulthandler_timeout=0"
         )
         assert {"make lint", "make test"} <= set((repository / ".ci" / "run").read_text().splitlines())
 

@@ -220,7 +220,7 @@ class Disk:
         self._step("open", place)
         opener = keywords.pop("opener", None)
         raw = _Raw(self, place, mode.replace("t", "").replace("b", ""), opener)
-        if opener:  # a file without a name, of which nothing is left
+        if opener and os.path.isdir(file):  # a file without a name, of which nothing is left
             return raw if buffering == 0 else io.BufferedRandom(raw)
         if place not in self._now:
             self._new(place, folder=False)
