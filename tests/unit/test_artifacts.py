@@ -285,7 +285,7 @@ def test_nothing_is_made_where_a_link_leads_out(tmp_path, monkeypatch, link):
     )
     before = sorted(Path().rglob("*"))
     for begin in (*plans, job, *([stage] if link == "results/s/base" else [])):
-        with pytest.raises(InputError, match=rf"^{re.escape(link)}: a symbolic link to .*own.* Remove the link"):
+        with pytest.raises(InputError, match=rf"^{re.escape(link)}: a symbolic link to .* Remove the link"):
             begin()
     assert sorted(Path().rglob("*")) == before and outside.read_text() == "mine"
 
