@@ -19,6 +19,7 @@ from workflow.artifacts.files import sha256_of, write_parquet
 from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.artifacts.store import PARTS, ids_from_disk, ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
+from workflow.intake.names import shown
 from workflow.runtime.job import configure_logging
 
 MARK = "0" * 16
@@ -436,7 +437,7 @@ def test_verify_names_links_and_what_lies_hidden(tmp_path):
     assert [line.split(";")[0].removeprefix(f"{tmp_path}/") for line in damaged(tmp_path)] == [
         "results/s/base/a.json: a symbolic link in the place of a file",
         "results/s/base/maps: not written by rule base (not in its manifest)",
-        f"results/s/logs: a symbolic link to {str(tmp_path)!r}, and what is behind it would be overwritten or removed. Remove the"
+        f"results/s/logs: a symbolic link to {shown(str(tmp_path))}, and what is behind it would be overwritten or removed. Remove the"
         " link, or put what it leads to in its place",
         f"scenes/s/.hidden: not published (not in {folder}/manifest.json)",
         "scenes/s/manifest.json: a symbolic link in the place of a file",
