@@ -437,7 +437,8 @@ def test_verify_names_links_and_what_lies_hidden(tmp_path):
     assert [line.split(";")[0].removeprefix(f"{tmp_path}/") for line in damaged(tmp_path)] == [
         "results/s/base/a.json: a symbolic link in the place of a file",
         "results/s/base/maps: not written by rule base (not in its manifest)",
-        f"results/s/logs: a symbolic link to {shown(str(tmp_path))}, and what is behind it would be overwritten or removed. Remove the"
+        f"results/s/logs: a symbolic link to {shown(str(tmp_path))}, and what is behind it would be overwritten or removed."
+        " Remove the"
         " link, or put what it leads to in its place",
         f"scenes/s/.hidden: not published (not in {folder}/manifest.json)",
         "scenes/s/manifest.json: a symbolic link in the place of a file",
