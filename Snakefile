@@ -70,5 +70,5 @@ onsuccess:
 
 
 onerror:
-    tell_reasons()
+    tell_reasons(log)
     tell_attempts()

@@ -248,6 +248,18 @@ def test_one_job_for_each_stage(batch, local):
         assert any(float(row["CPU Efficiency (%)"]) > 0 and float(row["Memory Usage (%)"]) > 0 for row in rows), rows
 
 
+@pytest.mark.parametrize("profile", ["slurm-scenes", "slurm"])
+def test_why_slurm_refuses_a_job_is_the_last_line(batch, profile):
+    """It never begins, so it leaves no state and no log."""
+    folder = batch(f"refused-{profile}")
+    small = ["--set-threads", "capture=2", "emission=2", "shading=2", "render=2"] if profile == "slurm" else []
+    whole = command(folder, "--workflow-profile", PROFILES / profile, "--retries", "0", *small, "--", "scenes/a")
+    asked = {**environment(), "SBATCH_PARTITION": "nowhere", "SBATCH_QOS": "nothing"}
+    done = subprocess.run(whole, env=asked, capture_output=True, text=True)
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1 and last.startswith("error: Slurm refused a job: sbatch: error: "), done.stderr[-3000:]
+
+
 def test_a_job_that_no_node_can_run_is_refused_before_any_is_submitted(batch):
     folder = batch("too large")
     cases = (

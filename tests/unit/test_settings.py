@@ -409,3 +409,9 @@ def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
     with pytest.raises(InputError) as caught:
         settings.refuse_profile("workflow/profiles/slurm", tmp_path, repository)
     assert f"counts from {tmp_path}" in str(caught.value) and f"{repository}/workflow/profiles/slurm-scenes" in str(caught.value)
+
+
+def test_a_name_that_nothing_is_scattered_by_is_refused():
+    settings.refuse_scatter({"prior": 8}, ("prior",))
+    with pytest.raises(InputError, match="--set-scatter piror: nothing is scattered by this name. Did you mean prior"):
+        settings.refuse_scatter({"piror": 8}, ("prior",))

@@ -150,6 +150,14 @@ def test_the_reason_is_that_of_the_run_and_of_the_batch(cluster):
     assert killed(document | {"peak_mb": 700}).startswith(told)
 
 
+def test_attempts_of_an_earlier_run_do_not_count(cluster, monkeypatch):
+    """A command that is given again has told before why its jobs failed; a run that is not known counts as one."""
+    for run, number in (("1", 1), ("1", 2), ("2", 1), ("2", 2), ("", 1)):
+        monkeypatch.setenv(attempts.RUN, run)
+        document = attempt()
+        assert document["attempt"] == number and ("earlier" in document) == (number == 2), run
+
+
 def test_without_slurm_attempts_are_counted_until_one_ends_well(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("SLURM_JOB_ID", raising=False)
@@ -263,3 +271,19 @@ def test_a_job_that_the_controller_has_forgotten_is_asked_of_accounting(cluster)
     assert slurm.answer_to_snakemake("4") == "success"  # Snakemake looks for its files
     cluster(4, "TIMEOUT", program="sacct")
     assert slurm.answer_to_snakemake("4") == "failed"
+
+
+def test_why_jobs_were_refused(cluster, capfd):
+    """`sbatch` for the executor cluster-generic, which does not tell what it said of a group of jobs; and the log of slurm."""
+    program = cluster.programs / "sbatch"
+    refuses = "echo 'sbatch: error: no such QOS' >&2; exit 1"
+    program.write_text(f"#!/bin/sh\nif test $1 = good; then echo 17; echo note >&2; else {refuses}; fi\n")
+    program.chmod(0o755)
+    assert slurm.submit("sbatch", "good") == 0 and capfd.readouterr() == ("17\n", "note\n")
+    assert slurm.refusals("") == []
+    assert [slurm.submit("sbatch", "bad"), slurm.submit("sbatch", "bad")] == [1, 1]
+    assert capfd.readouterr() == ("", "sbatch: error: no such QOS\n" * 2)
+    assert slurm.submit("no-sbatch-here") == 127
+    log = "    SLURM sbatch failed. The error message was 'sbatch: error: too\nlong'.\n    sbatch call:\n        sbatch -x\n"
+    kept = ["sbatch: error: no such QOS", "no-sbatch-here: No such file or directory"]
+    assert slurm.refusals(log) == [*kept, "sbatch: error: too long"]

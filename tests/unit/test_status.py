@@ -395,7 +395,11 @@ def test_which_scenes_are_shown(project):
     Path("config/batch.tsv").write_text("name\tbase\nx\ta\ny\ta\n")
     assert table.scenes_to_show() == ["x", "y"]
     JobState("b", "base", "mark").started()  # asked for by name, beside the batch
-    assert table.scenes_to_show() == ["x", "y", "b"]
+    JobState("a--fast", "base", "mark").failed("no light")
+    JobState("gone", "base", "mark").failed("no light")  # it was taken out of the table, and its file with it
+    assert table.scenes_to_show() == ["x", "y", "a--fast", "b"]
+    JobState("gone", "base", "mark").started()
+    assert table.scenes_to_show() == ["x", "y", "a--fast", "b", "gone"]
     assert table.scenes_to_show(["b", "a", "b"]) == ["b", "a"]
 
 
@@ -525,7 +529,7 @@ def test_where_events_go(tmp_path, monkeypatch):
     assert events.place(events.checked("results/events")) == tmp_path / f"results/events/{events.platform.node()}.jsonl"
     Path("file").write_text("")
     Path("folder.jsonl").mkdir()
-    for named in ("file", "folder.jsonl", "file/e.jsonl"):
+    for named in ("file", "folder.jsonl", "file/e.jsonl", "/proc/events", "/proc/version.jsonl/x"):
         with pytest.raises(InputError, match=f"--config events={named}: "):
             events.checked(named)
 

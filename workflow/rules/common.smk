@@ -22,14 +22,14 @@ from workflow.comparison import named as comparison
 from workflow.registry import SHARED
 from workflow.runtime import fingerprint as fingerprints
 from workflow.runtime import events, forecast, input_digests, native, slurm
-from workflow.runtime.attempts import written_out
+from workflow.runtime.attempts import RUN, written_out
 from workflow.runtime.job_state import reasons, retold
 from workflow.status import table as status
 from workflow.relighting.check import check_relightings
 from workflow.settings import SCENE_NAME, scene_file
 from workflow.settings.names import did_you_mean_path
 from workflow.settings import prior as prior_settings
-from workflow.settings import refuse_profile, refuse_target, study_files
+from workflow.settings import refuse_profile, refuse_scatter, refuse_target, study_files
 from workflow.studies import grid as study_sheet
 from workflow.studies import table as study_table
 from workflow.studies import relit
@@ -37,6 +37,7 @@ from workflow.trade import bench, choose
 
 STARTED = time.time()
 FOLDER = os.getcwd()
+SCATTERED = ("prior",)  # rules of `scattergather` in stages.smk
 KERNEL_BENCHMARKS = "hashgrid|base_cost"
 STABILITY_PARTS = (
     "kernels",
@@ -52,6 +53,9 @@ STABILITY_PARTS = (
 )
 
 native.process_environment()
+if workflow.is_main_process:
+    # Jobs inherit it, also those on other machines, so that they know attempts of this run from those of earlier ones.
+    os.environ[RUN] = f"{STARTED:.3f}-{os.getpid()}"
 
 
 def stop(message):
@@ -116,6 +120,9 @@ def profile_or_stop():
     given = get_argument_parser().parse_args()
     start = os.environ.get("PWD", FOLDER) if given.directory else FOLDER
     or_stop(refuse_profile, given.workflow_profile, Path(start), Path(workflow.basedir))
+
+
+or_stop(refuse_scatter, workflow.resource_settings.overwrite_scatter, SCATTERED)
 
 
 # Only where there is something to check: Snakemake takes half a second to read its arguments.
@@ -646,6 +653,7 @@ def refuse_too_large():
     """Stop before anything is submitted if a job asks for more than any node has: Slurm would let it wait for ever."""
     if submission() is None:
         return
+    Path(slurm.REFUSALS).unlink(missing_ok=True)  # of an earlier run
     jobs = workflow.dag.needrun_jobs(exclude_finished=False)
     asked = [asked_of_a_node(job) for job in jobs if not job.is_local]
     if asked and (found := slurm.too_large(asked, slurm.nodes())):
@@ -673,16 +681,32 @@ if "--unlock" not in sys.argv:
     atexit.register(tell_lock)
 
 
-def tell_reasons():
+def tell_reasons(logs):
     """Say why jobs failed, after the last line of Snakemake: the last line that a user reads is the reason."""
     if not workflow.is_main_process:
         return  # a job on a node of a cluster
+    refused = refused_by_slurm(logs)
+    if refused:  # what is told last is registered first
+        atexit.register(print, "\n" + "\n".join(refused), file=sys.stderr)
     if batch_asked:
         # Jobs failed, so the summary was not made: it tells of what there is. It is not `complete`, so the next run makes it.
         command = [sys.executable, "-m", "workflow", "batch", "--quality", QUALITY]
         atexit.register(subprocess.run, command, cwd=os.getcwd(), check=False)
-    elif found := reasons(STARTED) or damages():
+    elif found := reasons(STARTED) or ([] if refused else damages()):
         atexit.register(print, "\n" + "\n".join(found), file=sys.stderr)
+
+
+def refused_by_slurm(logs):
+    """One message for every reason for which Slurm refused jobs in this run: they never began, so nothing else tells of them."""
+    if submission() is None:
+        return []
+    text = "\n".join(
+        Path(path).read_text(errors="replace") for path in logs if os.path.isfile(path)
+    )
+    return [
+        written_out(f"error: Slurm refused a job: {reason}")
+        for reason in slurm.refusals(text)
+    ]
 
 
 def tell_attempts():

@@ -12,6 +12,8 @@ from typing import Any
 from iif_core.errors import InputError
 from workflow.runtime import alive, slurm
 
+RUN = "IIF_RUN"
+"""Variable that names the run of Snakemake that a job belongs to; jobs on other machines inherit it."""
 REMEMBERED = 3
 """Earlier attempts that are told of."""
 TIMES = (0.0, 1e11)
@@ -19,18 +21,22 @@ TIMES = (0.0, 1e11)
 GUESS = "out of memory, or over its time limit?"
 
 
-def facts_of(before: dict[str, Any], fingerprint: str) -> dict[str, Any]:
-    """Return what is noted of an attempt: its number (`attempt`), its Slurm job (`slurm`), how those before it ended (`earlier`).
+def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[str, Any]:
+    """Return what is noted of an attempt: its number (`attempt`), its run (`run`), its Slurm job (`slurm`), how those before it
+    ended (`earlier`).
 
     Args:
         before: state that the attempt before has left; empty if that ended well.
         fingerprint: of this attempt; attempts at something else do not count.
+        run: of Snakemake; attempts of an earlier run do not count, which has told of them. Empty where none is known.
     """
     own = slurm.own()
     facts: dict[str, Any] = {"attempt": 1}
+    if run:
+        facts["run"] = run
     if own:
         facts["slurm"] = own._asdict()
-    if before.get("fingerprint") == fingerprint:
+    if before.get("fingerprint") == fingerprint and before.get("run", "") == run:
         number = before.get("attempt", 1)
         facts["attempt"] = number + 1
         ended = f"attempt {number}{_place(before)} {ending(before, own)}"
@@ -98,7 +104,7 @@ def _own(value: Any) -> dict[str, Any] | None:
 
 _size = _number(0, 10**9)
 _FORMS: dict[str, Callable[[Any], Any]] = {
-    **dict.fromkeys(("state", "reason", "fingerprint", "host", "kernel", "told"), _text),
+    **dict.fromkeys(("state", "reason", "fingerprint", "run", "host", "kernel", "told"), _text),
     "since": lambda value: value if moment(value) is not None else None,
     "pid": _number(1, 2**31 - 1),
     "start": _number(0, 2**62),

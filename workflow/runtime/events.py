@@ -13,6 +13,7 @@ import logging
 import os
 import platform
 import resource
+import tempfile
 import time
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -48,9 +49,23 @@ def checked(named: str) -> str:
     nearest = Path(path)
     while not os.path.lexists(nearest):
         nearest = nearest.parent
-    if not os.access(nearest, os.W_OK) or (nearest != Path(path) and not nearest.is_dir()):
+    if not _can_write(nearest, nearest == Path(path) and not nearest.is_dir()):
         raise InputError(f"--config events={named}: {nearest} is no folder that you may write to; name another place")
     return path
+
+
+def _can_write(path: Path, is_file: bool) -> bool:
+    """Return whether something can be written to a file, or made in a folder. It is tried, because a file system such as /proc
+    refuses also whoever may write everywhere."""
+    try:
+        if is_file:
+            os.close(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC))
+        else:
+            with tempfile.TemporaryFile(dir=path):
+                pass
+    except OSError:
+        return False
+    return True
 
 
 def tell(event: str, scene: str, stage: str, fingerprint: str, **facts: Any) -> None:

@@ -45,6 +45,7 @@ class Job:
     """What the `run(job)` of a stage receives.
 
     Attributes:
+        name: of the job: that of its stage, or `prior.3-of-8` if it makes a part alone.
         settings: the parts of the settings tree that the registry lists for this stage, by attribute (`job.settings.base.ridge`);
             any other raises AttributeError.
         seed: seed of the scene, if the registry lists it.
@@ -53,7 +54,8 @@ class Job:
         log: logger of the job; `progress(done, total, what)` writes at most one line every five seconds.
     """
 
-    def __init__(self, stage: str, scene: str, quality: str, threads: int):
+    def __init__(self, stage: str, scene: str, quality: str, threads: int, part: Part | None = None):
+        self.name = f"{stage}.{part}" if part else stage
         self.stage, self.scene, self.quality, self.threads = STAGES[stage], scene, quality, threads
         self.log = logging.getLogger(f"{stage}")
         self.document = json.loads(fp.resolved(scene, quality))
@@ -233,7 +235,7 @@ class Job:
         self.log.info("%s: %d of %d (%.0f s%s)", what, done, total, spent, left)
         if events.due():
             facts = {"what": what, "done": done, "total": total, "seconds": round(spent, 3)}
-            events.tell("progress", self.scene, self.stage.name, self.fingerprint, **facts)
+            events.tell("progress", self.scene, self.name, self.fingerprint, **facts)
 
 
 def library_versions() -> dict[str, str]:
@@ -286,7 +288,7 @@ def run_stage(
     Raises:
         InputError: the input cannot be used, or settings, code or input files changed since the job was planned.
     """
-    job = Job(stage, scene, quality, threads)
+    job = Job(stage, scene, quality, threads, part)
     if expected and expected != job.fingerprint:
         raise InputError(
             f"scene {scene}, stage {stage}: settings, code or input files changed while the workflow was running"
@@ -296,7 +298,7 @@ def run_stage(
         job.log.info("rays are traced on %s", job.device)
     if part:
         importlib.import_module(f"{job.stage.module}_part").run(job, *part)
-        job.write_timings(f"{stage}.{part}")
+        job.write_timings(job.name)
         return
     module = importlib.import_module(job.stage.module)
     module.run(job)

@@ -50,7 +50,7 @@ class JobState:
         """Note that the job runs. If an earlier attempt did not end well, log how that ended, and what this one asks for."""
         self._begun = time.monotonic()
         if self.fingerprint:
-            self._facts = attempts.facts_of(_read(self.path), self.fingerprint)
+            self._facts = attempts.facts_of(_read(self.path), self.fingerprint, os.environ.get(attempts.RUN, ""))
             self._tell()
         self._write("started", "")
         threading.Thread(target=self._watch, name="watch", daemon=True).start()

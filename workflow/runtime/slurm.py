@@ -28,6 +28,12 @@ KILLED = {
 """How Slurm ends jobs that say nothing themselves."""
 ENDED = (*KILLED, "COMPLETED", "FAILED", "REVOKED")
 """States that a job does not leave by itself; in any other, such as STAGE_OUT or RESV_DEL_HOLD, it is still Slurm's."""
+LOGS = ".snakemake/slurm_logs"
+"""Where Slurm writes what jobs say."""
+REFUSALS = f"{LOGS}/refused.log"
+"""What `sbatch` says when it refuses a job of the executor cluster-generic, which does not tell that of a group of jobs."""
+REFUSED = re.compile(r"sbatch failed\. The error message was '(.*?)'\.\n\s+sbatch call:", re.S)
+"""What the executor slurm logs when Slurm refuses a job."""
 
 
 def _answer(*command: str) -> tuple[str, str]:
@@ -258,5 +264,41 @@ def answer_to_snakemake(job: str) -> str:
     return "failed" if state in ENDED else "running"
 
 
-if __name__ == "__main__":  # `cluster-generic-status-cmd` of workflow/profiles/slurm-scenes
+def submit(*command: str) -> int:
+    """Run `sbatch` for the executor cluster-generic: print the number of the job, and keep why it was refused in `REFUSALS`.
+
+    Returns:
+        The exit code.
+    """
+    os.makedirs(LOGS, exist_ok=True)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
+        code, out, error = done.returncode, done.stdout, done.stderr
+    except OSError as failure:
+        code, out, error = 127, "", f"{command[0]}: {failure.strerror}\n"
+    sys.stderr.write(error)
+    sys.stdout.write(out)
+    if code:
+        with open(REFUSALS, "a", encoding="utf-8") as file:
+            file.write((error.strip() or f"{command[0]} ended with exit code {code}") + "\n")
+    return code
+
+
+def refusals(log: str) -> list[str]:
+    """Return why Slurm refused jobs of this run, each reason once.
+
+    Args:
+        log: text of Snakemake's own log of the run.
+    """
+    try:
+        with open(REFUSALS, encoding="utf-8", errors="replace") as file:
+            kept = file.read().splitlines()
+    except OSError:
+        kept = []
+    return list(dict.fromkeys(" ".join(text.split()) for text in [*kept, *REFUSED.findall(log)] if text.strip()))
+
+
+if __name__ == "__main__":  # commands of workflow/profiles/slurm-scenes
+    if sys.argv[1] == "submit":
+        sys.exit(submit(*sys.argv[2:]))
     print(answer_to_snakemake(sys.argv[1]))

@@ -1,9 +1,9 @@
-"""What a target that no rule makes, or a profile that is not there, was probably meant to be."""
+"""What an unknown target, profile or name of `--set-scatter` was probably meant to be."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from iif_core.errors import InputError
@@ -59,6 +59,18 @@ def refuse_profile(given: str, start: Path, checkout: Path) -> None:
         f"--workflow-profile {given}: not found; a relative path counts from {start}.{hint} Those of the workflow are"
         f" {', '.join(named)}."
     )
+
+
+def refuse_scatter(given: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse a name of `--set-scatter` that nothing is scattered by, which Snakemake passes over without a word.
+
+    Raises:
+        InputError: there is one.
+    """
+    for name in given:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise InputError(f"--set-scatter {name}: nothing is scattered by this name.{hint} Known: {', '.join(known)}.")
 
 
 def _meant(target: str, scenes: list[str], rules: list[str], root: Path) -> str:

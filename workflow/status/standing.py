@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -93,10 +93,21 @@ def survey(scenes: list[str], quality_of: Callable[[str], str], now: float) -> I
             yield found
 
 
-def with_running_jobs(root: Path = Path("results")) -> list[str]:
-    """Return the folders of results/ in which a job of a stage has a state, sorted: it runs or did not end well."""
-    found = {path.parents[1].name for path in root.glob("*/logs/*.state.json") if path.name.partition(".")[0] in STAGES}
-    return sorted(found)
+def with_running_jobs(now: float, known: Collection[str]) -> list[str]:
+    """Return the folders of results/ in which a job of a stage runs, sorted; and those in which one did not end well, of a scene
+    that still has settings.
+
+    Args:
+        now: the present time, as `time.time`.
+        known: names of scenes that have settings; what a study derives from them has, too.
+    """
+    found: dict[str, bool] = {}
+    for path in sorted(Path("results").glob("*/logs/*.state.json")):
+        scene = path.parents[1].name
+        if path.name.partition(".")[0] in STAGES and not found.get(scene):
+            job = noted(path, now)
+            found[scene] = job is not None and (job.state == "running" or scene in known or scene.partition("--")[0] in known)
+    return [scene for scene, shown in found.items() if shown]
 
 
 def _begun(scene: str) -> bool:

@@ -30,8 +30,8 @@ GAP = "  "
 
 
 def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
-    """Return which scenes are shown: those that are named; or those of the batch table, and others of which jobs run or did not
-    end well; or, without a table, everything that has a file or a folder in results/.
+    """Return which scenes are shown: those that are named; or those of the batch table, and others of which jobs run, or
+    did not end well while they still have settings; or, without a table, everything that has a file or a folder in results/.
 
     Raises:
         InputError: the table cannot be read.
@@ -40,7 +40,8 @@ def scenes_to_show(named: Sequence[str] = ()) -> list[str]:
         return list(dict.fromkeys(named))
     lines = batch_table.read_table()
     if any(line.number for line in lines):
-        return list(dict.fromkeys([*(line.name for line in lines), *standing.with_running_jobs()]))
+        of_table = [line.name for line in lines]
+        return list(dict.fromkeys([*of_table, *standing.with_running_jobs(time.time(), {*of_table, *scene_names()})]))
     folders = sorted(path.parent.name for path in Path("results").glob("*/logs") if path.is_dir())
     others = [name for name in folders if name not in RESERVED]
     return list(dict.fromkeys([*(line.name for line in lines), *others]))
@@ -60,7 +61,7 @@ def tell(named: Sequence[str], quality_of: Callable[[str], str], as_json: bool =
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         code = 1  # what follows may be other scenes than those of the table
-        scenes = sorted({*scene_names(), *standing.with_running_jobs()})
+        scenes = sorted({*scene_names(), *standing.with_running_jobs(now, scene_names())})
     found = list(standing.survey(scenes, quality_of, now))
     lines = [json_line(one, now) for one in found] if as_json else text(found, now, _width(), _coloured())
     try:
