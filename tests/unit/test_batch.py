@@ -325,6 +325,9 @@ def five(project, monkeypatch):
     monkeypatch.setattr(batch_plan, "plan", lambda quality: plan)
 
     write_json(Path("scenes/done/manifest.json"), {"fingerprint": "publish of done"})
+    write_json(
+        Path("scenes/done/verdict.json"), {"verdict": "doubtful", "sentence": "Usable with care: 0 lamps\tfound.", "lights": {}}
+    )
     view = ["000", "001", "000", "000"]
     columns = {"view": view, "quantity": ["rgb", "rgb_held_out", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
     columns |= {"protocol": ["raw"] * 4, "value": np.array([30.0, 20.0, 25.0, 9.0])}
@@ -366,6 +369,8 @@ def test_every_scene_has_a_row_that_says_how_it_ended(five):
     done = rows["done"]
     assert (done["rgb_psnr"], done["rgb_psnr_held_out"], done["albedo_psnr"], done["roughness_l2"]) == ("30", "20", "25", "")
     assert (done["seconds"], done["cpu_seconds"], done["max_rss_mb"], done["slowest"]) == ("8", "11", "120", "base 5 s")
+    assert (done["verdict"], done["doubt"]) == ("doubtful", "Usable with care: 0 lamps found.")
+    assert {rows[name]["verdict"] for name in ("refused", "failed", "killed", "idle")} == {""}
     assert rows["refused"]["reason"].endswith("<script>bad data</script> | second line")
     assert (rows["failed"]["stage"], rows["failed"]["reason"]) == ("segmentation", "mesh: no faces")
     assert rows["failed"]["log"] == "results/failed/logs/segmentation.log"
@@ -410,6 +415,7 @@ def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
     assert "<script>bad" not in text and "&lt;script&gt;bad" in text
     assert set(page.found) == {
         "#scenes",
+        "#verdict=doubtful",
         *(f"#status={status}" for status in ("done", "refused", "failed", "killed", "not%20run")),
         "../../scenes/done/report.html",
         "../../results/failed/logs/segmentation.log",
@@ -564,7 +570,8 @@ def test_few_failures_have_a_line_each_and_many_a_line_a_cause():
     few = _failures({f"s{i}": f"data/s{i}: no mesh" for i in range(causes.FEW)})
     assert summary.closing(few).splitlines()[1:] == [f"s{i}: failed in capture: data/s{i}: no mesh" for i in range(causes.FEW)]
     many = [*few, *_failures({f"t{i}": f"line {i}: bad key" for i in range(19)}, "refused", None), *_failures({"u": "alone"})]
-    assert summary.closing([*many, {"scene": "v", "status": "done", "reason": None}]).splitlines()[1:] == [
+    assert summary.closing([*many, {"scene": "v", "status": "done", "reason": None, "verdict": "poor"}]).splitlines() == [
+        "1 of 31 scenes done (1 poor, by their reports); results/batch/report.html, results/batch/summary.tsv",
         "19 scenes refused, such as t0: line 0: bad key",
         "10 scenes failed in capture, such as s0: data/s0: no mesh",
         "u: failed in capture: alone",

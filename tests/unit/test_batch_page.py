@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from tests.browser import DESKTOP, PHONE, axe
-from workflow.batch.columns import SCORES, STATUSES
+from workflow.batch.columns import SCORES, STATUSES, VERDICTS
 from workflow.batch.page import render
 from workflow.batch.summary import COLUMNS
 
@@ -33,6 +33,7 @@ def rows(count=12):
                 "views": 100 - i,
                 "rgb_psnr": 9.5 + (7 * i) % 12,
             }
+            row |= {"verdict": ("good", "poor", "doubtful")[i % 4 % 3], "doubt": "0 lamps found" if i % 4 % 3 else None}
             row |= {"seconds": 10.0 * i + 5, "cpu_seconds": 3.0 + i, "max_rss_mb": 400.0}
         out.append(row)
     return out
@@ -45,7 +46,7 @@ def write(folder, table):
     for i, name in enumerate(pictures.values()):
         Image.new("RGB", (402, 100), (i % 256, 128, 90)).save(folder / name)
     path = folder / "report.html"
-    path.write_text(render(table, "draft", SCORES, STATUSES, pictures))
+    path.write_text(render(table, "draft", SCORES, STATUSES, VERDICTS, pictures))
     return path
 
 
@@ -105,6 +106,13 @@ def test_rows_are_found_and_the_address_shows_the_same_again(batch, opened, page
     page.locator("a.state", has_text="refused").click()
     told(page, "2 of 12 scenes")
     assert names(page) == ["01", "07"]
+    page.locator("a.state", has_text="poor").click()
+    told(page, "2 of 12 scenes")
+    assert names(page) == ["05", "09"]
+    page.evaluate("location.hash = '#sort=verdict'")
+    told(page, "12 scenes")
+    ranked = page.locator("tbody.scenes td.verdict").all_inner_texts()
+    assert ranked == ["good"] * 4 + ["doubtful"] * 2 + ["poor"] * 2 + ["–"] * 4
     page.evaluate("location.hash = '#stage=capture&name=0010&sort=nonsense&status=none'")
     told(page, "1 of 12 scenes")
     assert names(page) == ["10"]

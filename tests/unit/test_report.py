@@ -407,6 +407,7 @@ def test_deliverable_is_complete_and_verifies(toy):
     expected |= {
         "camera_response.parquet",
         "plan.yaml",
+        "verdict.json",
         "metrics.parquet",
         "timings.parquet",
         "report.html",

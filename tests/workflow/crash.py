@@ -145,7 +145,7 @@ class FakeJob:
         chosen = {
             "export": ["scene.glb", "export.json", "textures/base_color.png"],
             "render": ["maps/000.exr"],
-            "report": ["report.html", "plan.yaml"],
+            "report": ["report.html", "verdict.json", "plan.yaml"],
             "room": ["room.html", "scene_unlit.glb"],
             "metrics": ["metrics.parquet"],
             "affines": ["objects.parquet"],

@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml metrics.parquet
-timings.parquet report.html room.html scene_unlit.glb scene.usdc manifest.json""".split()
+FILES = """scene.glb mitsuba/scene.xml mitsuba/render.py objects.parquet objects.csv emitters.parquet plan.yaml verdict.json
+metrics.parquet timings.parquet report.html room.html scene_unlit.glb scene.usdc manifest.json""".split()
 
 
 @pytest.fixture(scope="module")

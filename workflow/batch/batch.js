@@ -4,7 +4,7 @@
   const table = document.getElementById("table"), body = table.querySelector("tbody.scenes");
   const form = document.querySelector(".filters"), found = form.querySelector("output");
   const rows = [...body.rows], heads = [...table.querySelectorAll("thead th")];
-  const fields = ["name", "status", "stage", "source"];
+  const fields = ["name", "status", "verdict", "stage", "source"];
   let sorted = "";  // column, with a minus before it where the largest comes first; empty: the order of the batch table
 
   // What is shown stands in the address, so that a view can be sent to somebody: #status=failed&sort=-rgb_psnr

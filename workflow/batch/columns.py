@@ -16,6 +16,13 @@ STATUSES = {
 }
 
 
+VERDICTS = {
+    "good": "no check of its report found a fault",
+    "doubtful": "usable with care: a check of its report is in doubt",
+    "poor": "not to be relied on for what its report names",
+}
+
+
 class Score(NamedTuple):
     """One column of scores: mean over the views of a row of metrics.parquet. `split`: of these photographs alone."""
 

@@ -32,7 +32,12 @@ QUALITY = 85
 
 
 def render(
-    rows: Sequence[dict[str, Any]], quality: str, columns: Sequence[Score], statuses: dict[str, str], pictures: dict[str, str]
+    rows: Sequence[dict[str, Any]],
+    quality: str,
+    columns: Sequence[Score],
+    statuses: dict[str, str],
+    verdicts: dict[str, str],
+    pictures: dict[str, str],
 ) -> str:
     """Return the page as HTML text, with every text escaped.
 
@@ -41,12 +46,14 @@ def render(
         quality: preset of the batch.
         columns: scores to show, where some scene has them.
         statuses: status -> its meaning.
+        verdicts: verdict on a finished scene -> its meaning, the best first.
         pictures: scene -> file of its pictures, from the folder of the page.
     """
     done = [row for row in rows if row["status"] == "done"]
     scores = [score for score in columns if any(row[score.column] is not None for row in done)]
     style, script = STYLE.read_text() + OWN_STYLE.read_text(), TABLES.read_text() + SCRIPT.read_text()
     counts = {status: sum(row["status"] == status for row in rows) for status in statuses}
+    judged = {word: sum(row["verdict"] == word for row in done) for word in verdicts}
     return template(TEMPLATE).render(
         rows=rows,
         done=done,
@@ -54,10 +61,13 @@ def render(
         counts=counts,
         choices={
             "status": [status for status, count in counts.items() if count],
+            "verdict": [word for word, count in judged.items() if count],
             "stage": sorted({row["stage"] for row in rows if row["stage"]}),
             "source": sorted({row["source"] for row in rows if row["source"]}),
         },
-        meanings=statuses,
+        judged=judged,
+        ranks={word: rank for rank, word in enumerate(verdicts)},
+        meanings=statuses | verdicts,
         scores=scores,
         medians={score.column: _median([row[score.column] for row in done]) for score in scores},
         total_cpu=sum(row["cpu_seconds"] or 0.0 for row in rows),

@@ -19,7 +19,7 @@ from iif_core.errors import InputError
 from workflow.artifacts.files import read_parquet, remove, write_atomically
 from workflow.batch import causes
 from workflow.batch import plan as batch_plan
-from workflow.batch.columns import SCORES, STATUSES
+from workflow.batch.columns import SCORES, STATUSES, VERDICTS
 from workflow.batch.page import render, write_pictures
 from workflow.runtime import attempts
 from workflow.runtime import fingerprint as fp
@@ -28,14 +28,14 @@ from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
 FOLDER = Path("results/batch")
-_TEXT = ("scene", "status", "stage", "reason", "source", "base", "quality", "log", "report", "slowest")
+_TEXT = ("scene", "status", "stage", "reason", "source", "base", "quality", "verdict", "doubt", "log", "report", "slowest")
 COLUMNS = {
     "line": "int64",
-    **dict.fromkeys(_TEXT[:7], "string"),
+    **dict.fromkeys(_TEXT[:9], "string"),
     "views": "int64",
     **dict.fromkeys((score.column for score in SCORES), "float64"),
     **dict.fromkeys(("seconds", "cpu_seconds", "max_rss_mb"), "float64"),
-    **dict.fromkeys(_TEXT[7:], "string"),
+    **dict.fromkeys(_TEXT[9:], "string"),
 }
 
 Row = dict[str, Any]
@@ -55,7 +55,7 @@ def write_summary(quality: str, complete: str | None = None) -> None:
     write_atomically(FOLDER / "summary.parquet", partial(_write_parquet, rows))
     write_atomically(FOLDER / "summary.tsv", lambda path: path.write_text(_tsv(rows), encoding="utf-8"))
     pictures = write_pictures([row["scene"] for row in rows if row["status"] == "done"], FOLDER)
-    page = render(rows, quality, SCORES, STATUSES, pictures)
+    page = render(rows, quality, SCORES, STATUSES, VERDICTS, pictures)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
     if complete:
         write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
@@ -76,8 +76,11 @@ def refuse(quality: str) -> None:
 
 def closing(rows: Sequence[Row]) -> str:
     """Return the last message of a run: how many scenes are done, what the others lack, and which jobs failed beside."""
-    done = sum(row["status"] == "done" for row in rows)
-    lines = [f"{done} of {len(rows)} scenes done; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
+    done = [row for row in rows if row["status"] == "done"]
+    judged = {word: sum(row["verdict"] == word for row in done) for word in VERDICTS}
+    words = ", ".join(f"{count} {word}" for word, count in judged.items() if count)
+    verdicts = f" ({words}, by their reports)" if words else ""
+    lines = [f"{len(done)} of {len(rows)} scenes done{verdicts}; {FOLDER / 'report.html'}, {FOLDER / 'summary.tsv'}"]
     return attempts.written_out("\n".join([*lines, *causes.lines(rows)]))
 
 
@@ -96,7 +99,13 @@ def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
         row |= _costs(scene)
         if not _is_published(scene, plan.ready[scene]):
             return row | _why_not(scene, quality)
-        return row | {"status": "done", "report": f"scenes/{scene}/report.html", **_scores(scene), **_since(scene, quality)}
+        return row | {
+            "status": "done",
+            "report": f"scenes/{scene}/report.html",
+            **_verdict(scene),
+            **_scores(scene),
+            **_since(scene, quality),
+        }
     except Exception as error:  # damaged files are for `snakemake verify` to name; the other rows are still wanted
         reason = f"its files cannot be read ({type(error).__name__}: {error}); `snakemake verify` tells which are damaged"
         return row | {"status": "failed", "stage": "publish", "reason": reason}
@@ -165,6 +174,17 @@ def _costs(scene: str) -> Row:
         "max_rss_mb": memory,
         "slowest": f"{slowest['rule']} {slowest['seconds']:.0f} s",
     }
+
+
+def _verdict(scene: str) -> Row:
+    """Return what the report of a scene says of it: a key of `VERDICTS`, and the sentence unless no fault was found.
+
+    Raises:
+        Exception: of any kind, if the file is missing or damaged.
+    """
+    found = json.loads((Path("scenes") / scene / "verdict.json").read_text())
+    word = next(word for word in VERDICTS if word == found["verdict"])
+    return {"verdict": word, "doubt": None if word == "good" else str(found["sentence"])}
 
 
 def _scores(scene: str) -> Row:

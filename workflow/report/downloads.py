@@ -37,6 +37,7 @@ KINDS = (
     Kind("camera_response.cube", "response curve of the camera as a 1D lookup table", "OCIO, Nuke, Resolve"),
     Kind("environment.exr", "light from outside, a latitude-longitude map", "any renderer"),
     Kind("cameras.json", "cameras of the photographs (nerfstudio's transforms.json)", "nerfstudio, blender_import.py"),
+    Kind("verdict.json", "the verdict of this page, with all findings", "a text editor, jq"),
     Kind("plan.yaml", "what was modelled, what was left out, and why", "a text editor"),
     Kind("metrics.parquet", "scores of every view", "pandas, DuckDB"),
     Kind("timings.parquet", "time and memory of every job", "pandas, DuckDB"),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -175,6 +175,20 @@ class Verdict:
     sentence: str
     level: str
     lights: Sequence[Light]
+
+    @property
+    def word(self) -> str:
+        return WORDS[self.level]
+
+    def document(self) -> dict[str, Any]:
+        """Return the verdict as `verdict.json` has it: in words, with all findings."""
+        lights = {
+            light.name: {"verdict": light.word, "findings": [
+                {"verdict": WORDS[one.level], "text": one.text, "remedy": one.remedy} for one in light.findings
+            ]}
+            for light in self.lights
+        }  # fmt: skip
+        return {"verdict": self.word, "sentence": self.sentence, "lights": lights}
 
 
 def judge(e: Evidence) -> Verdict:

@@ -83,6 +83,7 @@ def deliverables(readers: dict[str, StageReader]) -> list[tuple[str, str]]:
         ("report", "report.html"),
         ("room", "room.html"),
         ("room", "scene_unlit.glb"),
+        ("report", "verdict.json"),
         ("report", "plan.yaml"),
         ("metrics", "metrics.parquet"),
     ]

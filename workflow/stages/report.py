@@ -70,7 +70,7 @@ NUMERICS = ("base", "emission", "shading", "affines")
 
 
 def run(job: Job) -> None:
-    """Write report.html and plan.yaml."""
+    """Write report.html, verdict.json and plan.yaml."""
     capture = CaptureReader(job.read("capture"))
     recovered = read_recovered(job)
     summary = job.read("metrics").json("summary.json")
@@ -85,10 +85,12 @@ def run(job: Job) -> None:
     ranked = _ranked(capture, scores)
     names = publish.published_names({stage: job.read(stage) for stage in job.stage.upstream})
     overrides = [(item["component"], item["override"]) for item in plan if item.get("override")]
+    verdict = judge(_evidence(job, capture, recovered, summary))
+    job.writer.json("verdict.json", verdict.document())
     page = Page(
         scene=job.scene,
         credit=job.settings.report.credit or str(capture.facts.get("credit", "")),
-        verdict=judge(_evidence(job, capture, recovered, summary)),
+        verdict=verdict,
         hero=_pair(job, capture, ranked[len(ranked) // 2], scores, HERO_WIDTH),
         hero_note=_hero_note(ranked[len(ranked) // 2], scores),
         headline=_headline(summary, capture, recovered),
