@@ -270,6 +270,17 @@ def test_a_scene_that_cannot_be_used_is_refused(project):
     assert {stand(name).state for name in "bcd"} == {"refused"} and "not found" in stand("d").reason
 
 
+def test_what_lies_in_the_place_of_its_folders_refuses_a_scene(project):
+    Path("results/a").mkdir(parents=True)
+    for path in ("scenes/a", "results/a/render"):
+        Path(path).parent.mkdir(exist_ok=True)
+        Path(path).touch()
+        assert stand().state == "refused" and stand().reason.startswith(f"{path}: a file, where the workflow makes a folder")
+        Path(path).unlink()
+    Path("scenes/a").symlink_to("../config")
+    assert stand().state == "refused" and stand().reason.startswith("scenes/a: a symbolic link to ")
+
+
 def test_beyond_those_looked_into_missing_data_are_seen(project, monkeypatch):
     monkeypatch.setattr(standing, "LOOKED_INTO", 1)
     Path("data/x").mkdir(parents=True)

@@ -122,6 +122,24 @@ def test_a_profile_that_is_not_there_is_one_error(fresh, monkeypatch):
     )
 
 
+def test_an_unknown_name_of_scattered_jobs_is_one_error(fresh):
+    result = fresh.run("scenes/tiny", "-n", "--set-scatter", "piror=3")
+    assert result.returncode == 1
+    assert result.stderr.strip().splitlines()[-1].startswith("error: --set-scatter piror: nothing is scattered by this name.")
+
+
+@pytest.mark.parametrize("target", ["plan/tiny", "relight/tiny"])
+def test_a_link_in_the_place_of_a_folder_is_one_error(fresh, target):
+    path = fresh.folder / target
+    path.parent.mkdir()
+    path.symlink_to(fresh.folder / "config")
+    result = fresh.run(target, "-n")
+    path.unlink()
+    path.parent.rmdir()
+    assert result.returncode == 1
+    assert result.stderr.strip().splitlines()[-1].startswith(f"error: {target}: a symbolic link to ")
+
+
 @pytest.mark.parametrize("target", ["scenes/tiny", "relight/tiny"])
 def test_a_file_in_the_place_of_a_scene_is_one_error(fresh, target):
     path = fresh.folder / target

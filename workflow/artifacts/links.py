@@ -44,6 +44,19 @@ def refuse(results: Path, scene: str) -> None:
         raise refused(link)
 
 
+def check_folder(folder: str) -> None:
+    """Refuse a file in the place of a folder, which Snakemake would take for the finished folder, and a link, behind which it
+    would remove and write.
+
+    Raises:
+        InputError: there is one.
+    """
+    if os.path.islink(folder):
+        raise refused(Path(folder))
+    if os.path.lexists(folder) and not os.path.isdir(folder):
+        raise InputError(f"{folder}: a file, where the workflow makes a folder. Move it away.")
+
+
 def refused(link: Path) -> InputError:
     """Return the error that names a link, and what to do."""
     try:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import sys
 import time
 from contextlib import suppress
@@ -13,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from iif_core.errors import InputError
-from workflow.artifacts import DamagedArtefact, sound
+from workflow.artifacts import DamagedArtefact, links, sound
 from workflow.artifacts.files import sha256_of
 from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
@@ -66,7 +65,7 @@ def check(scene: str, quality: str) -> None:
     Raises:
         InputError: the folder of what is published is a file, or a link is where jobs write; or as `check_stage`.
     """
-    check_folder(f"scenes/{scene}")
+    links.check_folder(f"scenes/{scene}")
     sound.deliverable_faults(Path(f"scenes/{scene}"), Path("results"), scene, fp.fingerprint("publish", scene, quality))
     for stage in fp.NEEDED:
         check_stage(stage, scene, quality)
@@ -80,20 +79,10 @@ def check_stage(stage: str, scene: str, quality: str) -> tuple[str, ...]:
     """
     mark = fp.fingerprint(stage, scene, quality)
     for folder in (f"results/{scene}", f"results/{scene}/{stage}"):
-        check_folder(folder)
+        links.check_folder(folder)
     with suppress(DamagedArtefact):  # of a segmentation that will be made again; then its objects are known
         check_overrides(stage, scene, quality)
     return sound.stage_faults(Path("results"), scene, stage, mark)
-
-
-def check_folder(folder: str) -> None:
-    """Refuse a file in the place of a folder, which Snakemake would take for the finished folder.
-
-    Raises:
-        InputError: there is one.
-    """
-    if os.path.lexists(folder) and not os.path.isdir(folder):
-        raise InputError(f"{folder}: a file, where the workflow makes a folder. Move it away.")
 
 
 def fingerprint(quality: str) -> str:

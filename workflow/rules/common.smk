@@ -15,7 +15,7 @@ from snakemake.cli import get_argument_parser
 sys.path.insert(0, workflow.basedir)
 
 from iif_core.errors import InputError
-from workflow.artifacts import sound
+from workflow.artifacts import links, sound
 from workflow.batch import causes
 from workflow.batch import plan as batch_table
 from workflow.comparison import named as comparison
@@ -362,7 +362,7 @@ def relit_inputs(wildcards):
 
 def folder_or_stop(folder):
     """Refuse a file in the place of a folder, which Snakemake would take for the finished folder."""
-    or_stop(batch_table.check_folder, folder)
+    or_stop(links.check_folder, folder)
 
 
 def again_if_unsound(target, words, faults):

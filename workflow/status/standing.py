@@ -5,18 +5,20 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
-from workflow.artifacts import stamps
+from workflow.artifacts import DamagedArtefact, links, stamps
 from workflow.artifacts.manifest import MANIFEST
 from workflow.registry import STAGES
 from workflow.runtime import alive, forecast
 from workflow.runtime import fingerprint as fp
 from workflow.runtime.job_state import Noted, noted
+from workflow.scene.named import check_overrides
 from workflow.settings import study_files
 
 STATES = {
@@ -124,6 +126,7 @@ def _standing(scene: str, quality_of: Callable[[str], str], now: float, look: bo
         base = replace(base, quality=quality)
         if running:
             return _of_running(base, jobs, quality)
+        _check_places(scene)
         found, touched = _published(scene)
         if found and _is_current(found, touched, scene, quality):
             return _done(replace(base, since=touched), jobs, quality)
@@ -135,6 +138,17 @@ def _standing(scene: str, quality_of: Callable[[str], str], now: float, look: bo
         if running:
             return _of_running(base, jobs, None)
         return replace(base, state="refused", reason=str(error))
+
+
+def _check_places(scene: str) -> None:
+    """Look at the folders of a scene as a plan does.
+
+    Raises:
+        InputError: a file or a link is where the workflow makes one of them, or where jobs write.
+    """
+    links.refuse(Path("results"), scene)
+    for folder in (f"scenes/{scene}", f"results/{scene}", *(f"results/{scene}/{stage}" for stage in fp.NEEDED)):
+        links.check_folder(folder)
 
 
 def _of_running(base: Standing, jobs: dict[str, Noted], quality: str | None) -> Standing:
@@ -173,6 +187,8 @@ def _ended(jobs: dict[str, Noted], stages: Sequence[str], scene: str, quality: s
 def _unfinished(base: Standing, jobs: dict[str, Noted], published: dict[str, Any], touched: float, quality: str) -> Standing:
     """A scene that is not done and of which nothing runs."""
     scene, missing = base.scene, fp.missing_stages(base.scene, quality)
+    with suppress(DamagedArtefact):  # of a segmentation that will be made again; then its objects are known
+        check_overrides("affines", scene, quality)
     if ended := _ended(jobs, missing, scene, quality):
         stage, job = ended
         reason = job.document.get("reason", "")

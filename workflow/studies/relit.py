@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from iif_core.errors import InputError
-from workflow.artifacts import StageReader
-from workflow.artifacts.files import copy, flush_folders, make_folder
+from workflow.artifacts import StageReader, links
+from workflow.artifacts.files import copy, flush_folders, inside, make_folder
 from workflow.runtime import fingerprint as fp
 from workflow.settings import active_plan, plan_names
 from workflow.settings.study_files import RELIGHT, scene_of
@@ -52,8 +52,11 @@ def deliver(scene: str, plan: str, quality: str) -> None:
 
 
 def _copy(scene: str, target: Path) -> None:
+    for folder in (target.parent, target):  # of the scene and, for a plan, its own
+        if folder != TARGET and folder.is_symlink():
+            raise links.refused(folder)
     reader = StageReader(Path("results") / scene / "relight", "relight", scene)
     make_folder(target)
     for name in reader.manifest["files"]:
-        copy(reader.path(name), target / name)
+        copy(reader.path(name), inside(target, name))
     flush_folders(target)
