@@ -14,7 +14,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -149,12 +149,16 @@ class Stage:
                 lay_out(folder, content)
 
 
-def warm() -> list[str]:
-    """Import what stages import; return the names of those that a scene needs, in their order."""
+def warm(more: Iterable[str] = ()) -> list[str]:
+    """Import what stages import; return the names of those that a scene needs, in their order.
+
+    Args:
+        more: stages that are made on demand and are tried as well.
+    """
     native.prepare()
     native.limit_threads(1)
     names = [stage.name for stage in STAGES.values() if not stage.on_demand]
-    for name in names:
+    for name in [*names, *more]:
         importlib.import_module(STAGES[name].module)
     return names
 
@@ -200,8 +204,8 @@ def main() -> int:
     parser.add_argument("stages", nargs="+", help="name=number of trials, or name for all")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    warm()
     chosen = {name: int(most or 0) for name, _, most in (text.partition("=") for text in arguments.stages)}
+    warm(chosen)
     wrong = 0
     for row in try_stages(arguments.folder, arguments.scene, chosen, arguments.seed):
         wrong += row["wrong"]
