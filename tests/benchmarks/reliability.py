@@ -66,56 +66,71 @@ KINDS: dict[str, Callable[[Path], None]] = {
 }
 
 
+class Folder:
+    """A finished stage, or what is published of a scene, in a copy of results/ and scenes/.
+
+    Attributes:
+        path: of the folder; name: of the stage, empty for what is published.
+        mark: fingerprint under which it is wanted.
+    """
+
+    def __init__(self, root: Path, path: Path):
+        published = path.parent == root / "scenes"
+        self.root, self.path, self.name = root, path, "" if published else path.name
+        self.scene = path.name if published else path.parent.name
+        self.mark = json.loads((path / MANIFEST).read_text())["fingerprint"]
+        self.noted = stamps.place(root / "results", self.scene, self.name or stamps.DELIVERABLE)
+
+    def faults(self) -> tuple[str, ...]:
+        """Return what is found when a run is planned."""
+        sound.forget()
+        results = self.root / "results"
+        if self.name:
+            return sound.stage_faults(results, self.scene, self.name, self.mark)
+        return sound.deliverable_faults(self.path, results, self.scene, self.mark)
+
+    def count(self, row: dict[str, int], path: Path) -> None:
+        """Count whether a damaged file or folder is named."""
+        row["cases"] += 1
+        row["plan"] += any(str(path) in line for line in self.faults())
+        row["verify"] += any(str(path) in line for line in damaged(self.root, [self.scene]))
+
+
 def damage(source: Path) -> dict[str, Any]:
-    """Damage each file of each finished stage under `source`/results in each way, and count what is found."""
-    out: dict[str, Any] = {
-        kind: {"cases": 0, "verify": 0, "plan": 0} for kind in (*KINDS, "stage of another scene", "stage removed")
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
+    """Damage each file of each finished stage and of each published scene in `source` in each way, and count what is found."""
+    more = ("put in the place of another scene's", "stage removed")
+    out: dict[str, Any] = {kind: {"cases": 0, "verify": 0, "plan": 0} for kind in (*KINDS, *more)}
+    with tempfile.TemporaryDirectory() as place:
+        root = Path(place)
         for part in ("results", "scenes"):
             shutil.copytree(source / part, root / part, symlinks=True)
-        stages = sorted(path.parent for path in (root / "results").glob(f"*/*/{MANIFEST}"))
+        found = sorted(path.parent for pattern in ("results/*/*/", "scenes/*/") for path in root.glob(pattern + MANIFEST))
         assert not list(damaged(root)), "what is there must be sound to begin with"
-        marks = {stage: json.loads((stage / MANIFEST).read_text())["fingerprint"] for stage in stages}
-        for stage in stages:
-            assert not _found(stage, marks[stage]), stage  # notes the stamps of the copy
-        for stage in stages:
-            for path in sorted(path for path in stage.rglob("*") if path.is_file() and path.stat().st_size):
+        folders = [Folder(root, path) for path in found]
+        for folder in folders:
+            assert not folder.faults(), folder.path  # notes the stamps of the copy
+        for folder in folders:
+            for path in sorted(path for path in folder.path.rglob("*") if path.is_file() and path.stat().st_size):
                 for kind, harm in KINDS.items():
-                    kept, noted = path.read_bytes(), _noted(stage).read_bytes()
+                    kept, noted = path.read_bytes(), folder.noted.read_bytes()
                     harm(path)
-                    _count(out[kind], root, stage, marks[stage], path)
+                    folder.count(out[kind], path)
                     path.write_bytes(kept)
-                    _noted(stage).write_bytes(noted)
-                    assert not _found(stage, marks[stage])  # sound again; the new stamp is noted
-            aside = stage.with_name("aside")
-            stage.rename(aside)
-            _count(out["stage removed"], root, stage, marks[stage], stage)
-            shutil.copytree(aside, stage)
-            other = stage / MANIFEST
-            text = other.read_text().replace(f'"scene": "{stage.parent.name}"', '"scene": "elsewhere"')
+                    folder.noted.write_bytes(noted)
+                    assert not folder.faults()  # sound again; the new stamp is noted
+            aside = root / "aside"
+            folder.path.rename(aside)
+            if folder.name:  # Snakemake itself knows that a published scene is not there
+                folder.count(out[more[1]], folder.path)
+            shutil.copytree(aside, folder.path)
+            other = folder.path / MANIFEST
+            text = other.read_text().replace(f'"scene": "{folder.scene}"', '"scene": "elsewhere"')
             manifests.write(other, json.loads(text))  # sound in itself
-            _count(out["stage of another scene"], root, stage, marks[stage], stage)
-            shutil.rmtree(stage)
-            aside.rename(stage)
-            assert not _found(stage, marks[stage])
+            folder.count(out[more[0]], folder.path)
+            shutil.rmtree(folder.path)
+            aside.rename(folder.path)
+            assert not folder.faults()
     return out
-
-
-def _noted(stage: Path) -> Path:
-    return stamps.place(stage.parent.parent, stage.parent.name, stage.name)
-
-
-def _found(stage: Path, mark: str) -> tuple[str, ...]:
-    sound.forget()
-    return sound.stage_faults(stage.parent.parent, stage.parent.name, stage.name, mark)
-
-
-def _count(row: dict[str, int], root: Path, stage: Path, mark: str, path: Path) -> None:
-    row["cases"] += 1
-    row["plan"] += any(str(path) in line for line in _found(stage, mark))
-    row["verify"] += any(str(path) in line for line in damaged(root, [stage.parent.name]))
 
 
 # ---------------------------------------------------------------------------------------------------------------- tables
