@@ -98,7 +98,7 @@ class Folder:
 
 def damage(source: Path) -> dict[str, Any]:
     """Damage each file of each finished stage and of each published scene in `source` in each way, and count what is found."""
-    more = ("put in the place of another scene's", "stage removed")
+    more = ("that of another scene put in its place", "stage removed")
     out: dict[str, Any] = {kind: {"cases": 0, "verify": 0, "plan": 0} for kind in (*KINDS, *more)}
     with tempfile.TemporaryDirectory() as place:
         root = Path(place)
