@@ -172,6 +172,29 @@ def test_what_nobody_touched_is_not_read(room, tmp_path, monkeypatch):
     assert faults(tmp_path) == ()
 
 
+def test_a_manifest_that_was_touched_has_no_content_read_but_its_own(room, tmp_path, monkeypatch):
+    """Snakemake touches it when a job has ended. A file that was touched as well is read, and a harm of it is found."""
+    compared = []
+    original = sound.wrong_files
+    monkeypatch.setattr(sound, "wrong_files", lambda *given: compared.append(given[2]) or original(*given))
+    os.utime(room / MANIFEST)
+    assert faults(tmp_path) == () and compared == [[]]
+    assert faults(tmp_path) == () and compared == [[]]  # the stamp is noted
+    os.utime(room / MANIFEST)
+    in_secret(flip)(room / "facts.json")
+    (line,) = faults(tmp_path)
+    assert line.startswith(f"{room / 'facts.json'}: its content changed") and compared == [[], ["facts.json"]]
+
+
+def test_another_manifest_has_all_contents_compared(room, tmp_path):
+    """One that is sealed, lists the same files, and came into the place of the one that is noted."""
+    document = manifests.read(room / MANIFEST)
+    document["files"]["facts.json"]["sha256"] = "0" * 64
+    manifests.write(room / MANIFEST, document)
+    (line,) = faults(tmp_path)
+    assert line.startswith(f"{room / 'facts.json'}: its content changed")
+
+
 @pytest.mark.parametrize("noted", [True, False])
 @pytest.mark.parametrize("name", ["facts.json", MANIFEST])
 def test_what_changes_while_it_is_compared_is_found_by_the_next_plan(room, tmp_path, monkeypatch, name, noted):

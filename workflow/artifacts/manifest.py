@@ -154,8 +154,17 @@ def read(path: Path, schema: str = STAGE_SCHEMA) -> dict[str, Any]:
     Raises:
         Broken: as `parse`, or it cannot be read.
     """
+    return load(path, schema)[0]
+
+
+def load(path: Path, schema: str = STAGE_SCHEMA) -> tuple[dict[str, Any], str]:
+    """Return the content of a manifest, and the SHA-256 of its file in hexadecimal, of one reading.
+
+    Raises:
+        Broken: as `parse`, or it cannot be read.
+    """
     try:
         data = path.read_bytes()
     except OSError as error:
         raise Broken(f"not readable ({error.strerror})") from None
-    return parse(data, schema)
+    return parse(data, schema), hashlib.sha256(data).hexdigest()

@@ -52,7 +52,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
         return
     seen = stamps.look(folder, [MANIFEST])
     try:
-        document = manifests.read(folder / MANIFEST, schema)
+        document, digest = manifests.load(folder / MANIFEST, schema)
     except manifests.Broken as error:
         yield "" if _is_earlier(folder, fingerprint) else f"{folder / MANIFEST}: {error}"
         return
@@ -65,12 +65,16 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
         put = known and own and known.fingerprint == fingerprint
         yield f"{folder / MANIFEST}: it is that of other settings, inputs or code, and was put here" if put else ""
         return
-    some = different if known and different and MANIFEST not in different else None
-    seen = {**known.files, **stamps.look(folder, some)} if known and some else seen | stamps.look(folder, document["files"])
+    some = None  # whose contents are compared: all
+    if known and different and (MANIFEST not in different or digest == known.manifest):
+        some = [name for name in different if name != MANIFEST]  # Snakemake touches a manifest when its job has ended
+        seen = {**known.files, **seen, **stamps.look(folder, some)}
+    else:
+        seen |= stamps.look(folder, document["files"])
     problems = list(wrong_files(folder, document, some))
     yield from problems
     if not problems:
-        stamps.note(noted, folder, document, seen)
+        stamps.note(noted, folder, document, seen, digest)
         yield from _broken_chain(folder, {k: (v.get("scene", ""), v.get("manifest_sha256", "")) for k, v in _inputs(document)})
 
 
@@ -183,13 +187,13 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     if known and known.manifest == _digest_of(results, scene, stage) and not stamps.touched(folder, known):
         return ()
     try:
-        document = manifests.read(source)
+        document, digest = manifests.load(source)
     except manifests.Broken:
         return ()  # told of the stage itself
     seen = stamps.look(folder, document["files"])
     problems = tuple(wrong_files(folder, document))
     if not problems:
-        stamps.note(noted, folder, document, seen, source)
+        stamps.note(noted, folder, document, seen, digest, copy=True)
     return problems
 
 

@@ -86,7 +86,8 @@ def note(
     folder: Path,
     document: dict[str, Any],
     seen: Mapping[str, Stamp] | None = None,
-    manifest: Path | None = None,
+    manifest: str = "",
+    copy: bool = False,
 ) -> None:
     """Note the sizes and time stamps of a folder whose files are what its manifest says.
 
@@ -95,9 +96,10 @@ def note(
         folder: with the files.
         document: its manifest.
         seen: stamps that the files had before they were hashed; None = what they have now.
-        manifest: where that is, if the folder is a copy and has none of its own.
+        manifest: SHA-256 of its manifest when `document` was read; empty = of what is there now.
+        copy: whether the folder is a copy, which has no manifest of its own.
     """
-    names = [*([] if manifest else [MANIFEST]), *document["files"]]
+    names = [*([] if copy else [MANIFEST]), *document["files"]]
     seen = look(folder, names) if seen is None else seen
     inputs = document.get("inputs", {})
     io.write_json(
@@ -106,7 +108,7 @@ def note(
             "scene": document.get("scene", ""),
             "stage": document.get("stage", ""),
             "fingerprint": document.get("fingerprint", ""),
-            "manifest": io.sha256_of(manifest or folder / MANIFEST),
+            "manifest": manifest or io.sha256_of(folder / MANIFEST),
             "inputs": {stage: [facts.get("scene", ""), facts.get("manifest_sha256", "")] for stage, facts in inputs.items()},
             "files": {name: seen.get(name, NEVER) for name in names},
         },
