@@ -298,16 +298,30 @@ def _design(name: str, seed: int) -> None:
 
 def _planned(scene: str, quality: str) -> None:
     """Write plan/<scene>/plan.yaml: the decisions of stage `plan`, and what is expected of them."""
-    from workflow.artifacts import StageReader
+    from workflow.artifacts import StageReader, links
     from workflow.artifacts.files import write_atomically
     from workflow.decisions.expected import whole, with_expectation
     from workflow.decisions.record import plan_text
 
+    links.check_folder(f"plan/{scene}")
     plan = StageReader(Path("results") / scene / "plan", "plan", scene).json("plan.json")["plan"]
     cost = whole(scene, quality)
     text = plan_text(scene, quality, [with_expectation(item, cost) for item in plan])
     write_atomically(Path("plan") / scene / "plan.yaml", lambda path: path.write_text(text))
     print(text)
+
+
+def _into(arguments: argparse.Namespace, place: Path, work: Callable[[], None]) -> Callable[[], None]:
+    """Return the work, before which a place that nobody named is looked at: results of a stranger may have a link there."""
+
+    def checked() -> None:
+        from workflow.artifacts import links
+
+        if not arguments.output:
+            links.check_folder(str(place))
+        work()
+
+    return checked
 
 
 def main() -> int:
@@ -368,13 +382,14 @@ def main() -> int:
 
         pair = (arguments.a, arguments.b)
         place = arguments.output or Path("compare") / ",".join(pair)
-        return _guarded("compare", partial(write_comparison, *pair, arguments.quality, place), JobState("studies", "compare"))
+        work = partial(write_comparison, *pair, arguments.quality, place)
+        return _guarded("compare", _into(arguments, place, work), JobState("studies", "compare"))
     if arguments.command == "score":
         from workflow.comparison.maps import write_scores
 
         place = arguments.output or Path("score") / arguments.scene
         work = partial(write_scores, arguments.scene, arguments.maps, arguments.quality, arguments.colour, place)
-        return _guarded(f"score {arguments.scene}", work, JobState("studies", "score"))
+        return _guarded(f"score {arguments.scene}", _into(arguments, place, work), JobState("studies", "score"))
     if arguments.command == "grid":
         from workflow.studies.grid import write_grid
 

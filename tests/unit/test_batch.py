@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -266,8 +267,10 @@ def segmented(scene):
 
 
 def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
-    project("".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "earlier", "link")) + f"name\t{WRONG_NAME}\n")
-    for path in ("scenes/file", "results/stage/render"):
+    project(
+        "".join(f"{name}\t{SMALL}\n" for name in ("good", "file", "stage", "logs", "earlier", "link")) + f"name\t{WRONG_NAME}\n"
+    )
+    for path in ("scenes/file", "results/stage/render", "results/logs/logs"):
         Path(path).parent.mkdir(parents=True)
         Path(path).touch()
     Path("scenes/link").symlink_to("../config")
@@ -280,6 +283,7 @@ def test_what_lies_in_the_folders_of_a_scene_refuses_that_scene_alone(project):
     for name, words in {
         "file": "scenes/file: a file, where the workflow makes a folder",
         "stage": "results/stage/render: a file, where",
+        "logs": "results/logs/logs: a file, where",
         "earlier": "python -m workflow upgrade earlier",
         "name": "`overrides`: there is no object 'nosuchthing'",
         "link": "scenes/link: a symbolic link",
@@ -424,6 +428,17 @@ def test_the_page_links_to_what_is_here_and_escapes_what_it_is_told(five):
     for words in ("<b>1</b>", "mesh: no faces", "held-out PSNR"):
         assert words in text
     assert "roughness L2" not in text  # no scene has it
+
+
+def test_a_deliverable_that_was_changed_is_not_done(five, monkeypatch):
+    """Scores and verdict are read from its files, so none of them is told."""
+    lines = ("scenes/done/verdict.json: its content changed", "scenes/done/scene.glb: missing")
+    monkeypatch.setattr(batch_plan, "plan", lambda quality: replace(five, damaged={"done": lines}))
+    summary.write_summary("draft")
+    with open("results/batch/summary.tsv", newline="") as file:
+        row = next(row for row in csv.DictReader(file, delimiter="\t") if row["scene"] == "done")
+    assert (row["status"], row["verdict"], row["rgb_psnr"]) == ("damaged", "", "")
+    assert row["reason"] == f"{lines[0]}, and 1 more"
 
 
 def test_a_damaged_deliverable_is_a_row_and_not_the_end(five):

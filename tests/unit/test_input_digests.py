@@ -150,6 +150,18 @@ def test_a_time_stamp_that_is_set_back_hides_nothing(here):
     assert input_digests.digests([path]) not in (first, []) and read[-1] == "f"
 
 
+def test_a_file_that_is_replaced_while_it_is_read_is_another_file(here, monkeypatch):
+    folder, _ = here
+    path = write(folder / "f", LARGE)
+    first = input_digests.digests([path])
+    whole = input_digests.sha256_of
+    with monkeypatch.context() as network:
+        network.setattr(input_digests, "sha256_of", lambda path: whole(write(path, EDITED + b"more")))
+        input_digests.remember([path])
+    forget()
+    assert input_digests.digests([path]) != first
+
+
 def test_all_is_read_again_on_demand(here, monkeypatch):
     """Also where `stat` says nothing, as on a disk that has lost a bit."""
     folder, read = here

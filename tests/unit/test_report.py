@@ -18,7 +18,9 @@ from iif_core.camera.pinhole import direction_derivatives, look_at, pixel_direct
 from iif_core.errors import InputError
 from iif_core.surface.cells import grid_origin, voxel_indices
 from workflow.artifacts import StageReader, StageWriter
-from workflow.artifacts.files import read_exr, read_parquet
+from workflow.artifacts import manifest as manifests
+from workflow.artifacts.files import read_exr, read_parquet, sha256_of
+from workflow.artifacts.manifest import SCENE_SCHEMA
 from workflow.artifacts.store import ids_to_disk, rgb, split_rgb
 from workflow.artifacts.verify import damaged
 from workflow.decisions.record import PROVISIONAL, SETTLED, not_probed
@@ -455,6 +457,32 @@ def test_failed_publication_leaves_the_old_one(toy, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         publish.run(FakeJob("publish", toy))
     assert (toy / "scenes/toy/manifest.json").is_file() and not list((toy / "scenes").glob(".*"))
+
+
+def test_a_copy_that_differs_from_what_a_stage_wrote_is_not_published(toy, tmp_path, monkeypatch):
+    import shutil
+
+    place = tmp_path / "toy"
+    shutil.copytree(toy, place)
+    monkeypatch.chdir(place)
+    before, original = (place / "scenes/toy/manifest.json").read_bytes(), publish.copy
+
+    def harmful(source, target):
+        original(source, target)
+        if target.name == "objects.parquet":
+            target.write_bytes(target.read_bytes()[:-1] + b"x")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(publish, "copy", harmful)
+        with pytest.raises(InputError, match=r"objects.parquet: the copy differs from what rule affines wrote"):
+            publish.run(FakeJob("publish", place))
+        assert (place / "scenes/toy/manifest.json").read_bytes() == before
+    path = place / "scenes/toy/objects.parquet"  # as if it had been published nevertheless
+    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    document = manifests.read(path.with_name("manifest.json"), SCENE_SCHEMA)
+    document["files"]["objects.parquet"]["sha256"] = sha256_of(path)
+    manifests.write(path.with_name("manifest.json"), document)
+    assert [line for line in damaged(place) if line.startswith(f"{path}: it is not what rule ")]
 
 
 def test_editing_the_deliverable_does_not_reach_the_results(toy, tmp_path):

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -154,8 +156,17 @@ def test_attempts_of_an_earlier_run_do_not_count(cluster, monkeypatch):
     """A command that is given again has told before why its jobs failed; a run that is not known counts as one."""
     for run, number in (("1", 1), ("1", 2), ("2", 1), ("2", 2), ("", 1)):
         monkeypatch.setenv(attempts.RUN, run)
-        document = attempt()
+        state = JobState("a", "base", "mark")
+        state.started()
+        state.failed("no light")
+        document = json.loads(state.path.read_text())
         assert document["attempt"] == number and ("earlier" in document) == (number == 2), run
+    attempt()  # one that was killed, and its run perhaps with it
+    monkeypatch.setenv(attempts.RUN, "3")
+    document = attempt()
+    assert document["attempt"] == 1 and document["earlier"][0].startswith(
+        "in an earlier run, attempt 2 was killed without a word"
+    )
 
 
 def test_without_slurm_attempts_are_counted_until_one_ends_well(tmp_path, monkeypatch):
@@ -281,9 +292,41 @@ def test_why_jobs_were_refused(cluster, capfd):
     program.chmod(0o755)
     assert slurm.submit("sbatch", "good") == 0 and capfd.readouterr() == ("17\n", "note\n")
     assert slurm.refusals("") == []
-    assert [slurm.submit("sbatch", "bad"), slurm.submit("sbatch", "bad")] == [1, 1]
+    assert [slurm.submit("sbatch", "bad", f"--comment={scene}") for scene in "ab"] == [1, 1]
     assert capfd.readouterr() == ("", "sbatch: error: no such QOS\n" * 2)
     assert slurm.submit("no-sbatch-here") == 127
     log = "    SLURM sbatch failed. The error message was 'sbatch: error: too\nlong'.\n    sbatch call:\n        sbatch -x\n"
     kept = ["sbatch: error: no such QOS", "no-sbatch-here: No such file or directory"]
     assert slurm.refusals(log) == [*kept, "sbatch: error: too long"]
+    assert slurm.submit("sbatch", "good", "--comment=a") == 0  # the next attempt was taken; that of b was not
+    assert slurm.refusals("") == kept
+    assert slurm.submit("sbatch", "good", "--comment=b") == 0
+    assert slurm.refusals("") == kept[1:]
+    bare = "import sys, workflow.runtime.slurm; sys.exit('numpy' in sys.modules)"  # it is asked about each job every few seconds
+    assert subprocess.run([sys.executable, "-c", bare], cwd=Path(__file__).parents[2]).returncode == 0
+
+
+def test_jobs_of_other_clusters_and_answers_without_a_number_are_refused(cluster, capfd):
+    """In a federation `sbatch --parsable` prints the cluster, too; Slurm is asked about jobs of this one alone."""
+    for name, text in (("sbatch", 'echo "$1"'), ("scancel", f'echo "$@" >> {cluster.programs}/cancelled')):
+        (cluster.programs / name).write_text(f"#!/bin/sh\n{text}\n")
+        (cluster.programs / name).chmod(0o755)
+    (cluster.programs / "scontrol.config").write_text("Configuration data\nClusterName             = west\n")
+    assert slurm.submit("sbatch", "17;west") == 0 and capfd.readouterr().out == "17\n"
+    assert slurm.submit("sbatch", "18;east") == 1 and capfd.readouterr().out == ""
+    assert (cluster.programs / "cancelled").read_text() == "-M east 18\n"
+    (told,) = slurm.refusals("")
+    assert told.startswith("job 18 went to cluster east and was cancelled")
+    assert slurm.submit("sbatch", "") == 1 and "printed no number of a job" in slurm.refusals("")[0]
+
+
+def test_a_job_that_would_never_start_has_failed(cluster):
+    (cluster.programs / "scancel").write_text(f'#!/bin/sh\necho "$@" >> {cluster.programs}/cancelled\n')
+    (cluster.programs / "scancel").chmod(0o755)
+    for number, reason, answer in ((1, "Resources", "running"), (2, "JobHeldUser", "running"), (3, slurm.STUCK[0], "failed")):
+        cluster(number, "PENDING")
+        shown = cluster.programs / f"scontrol.{number}"
+        shown.write_text(shown.read_text().replace("Reason=None", f"Reason={reason}"))
+        assert slurm.answer_to_snakemake(str(number)) == answer
+    assert (cluster.programs / "cancelled").read_text() == "3\n"
+    assert slurm.refusals("") == ["job 3 would never have started (Slurm says launch_failed_requeued_held) and was cancelled"]

@@ -270,6 +270,35 @@ def test_a_scene_that_cannot_be_used_is_refused(project):
     assert {stand(name).state for name in "bcd"} == {"refused"} and "not found" in stand("d").reason
 
 
+def test_a_file_of_a_deliverable_that_was_changed_is_told(project):
+    path = Path("scenes/a/verdict.json")
+    path.parent.mkdir(parents=True)
+    path.write_text("{}")
+    published(files={"verdict.json": {}})
+    assert stand().state == "done"
+    path.write_text("[]")
+    assert (stand().state, stand().reason) == ("stale", "scenes/a/verdict.json: changed or gone since it was published")
+    path.unlink()
+    assert stand().state == "stale"
+
+
+@pytest.mark.parametrize(
+    "name", ["scenes/a/manifest.json", "results/a/stamps/deliverable.json", "results/a/benchmarks/base.parts.json"]
+)
+def test_a_pipe_or_a_giant_in_the_place_of_a_record_is_not_waited_for(project, name):
+    published()
+    made("base")
+    path = Path(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    stand()
+    path.unlink()
+    with open(path, "wb") as file:
+        file.truncate(300 << 30)
+    stand()
+
+
 def test_what_lies_in_the_place_of_its_folders_refuses_a_scene(project):
     Path("results/a").mkdir(parents=True)
     for path in ("scenes/a", "results/a/render"):
@@ -540,7 +569,9 @@ def test_where_events_go(tmp_path, monkeypatch):
     assert events.place(events.checked("results/events")) == tmp_path / f"results/events/{events.platform.node()}.jsonl"
     Path("file").write_text("")
     Path("folder.jsonl").mkdir()
-    for named in ("file", "folder.jsonl", "file/e.jsonl", "/proc/events", "/proc/version.jsonl/x"):
+    os.mkfifo("pipe.jsonl")
+    assert events.checked("/proc/events", tried=False) == "/proc/events"  # on a node, where a job goes on without
+    for named in ("file", "folder.jsonl", "file/e.jsonl", "/proc/events", "/proc/version.jsonl/x", "pipe.jsonl"):
         with pytest.raises(InputError, match=f"--config events={named}: "):
             events.checked(named)
 

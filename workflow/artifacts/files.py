@@ -8,6 +8,7 @@ import io
 import json
 import os
 import shutil
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,6 +28,26 @@ def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
+
+
+LARGEST_RECORD = 1 << 28
+"""Bytes of a file of facts, such as a manifest or the stamps of a stage: far more than any that the workflow writes."""
+
+
+def read_record(path: Path | str) -> bytes:
+    """Return the content of a file of facts, which may have come with the results of somebody else.
+
+    Raises:
+        OSError: it cannot be read, is no regular file (a pipe would be waited for), or is larger than `LARGEST_RECORD`.
+    """
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(handle, "rb") as file:
+        status = os.fstat(handle)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        if status.st_size > LARGEST_RECORD:
+            raise OSError(errno.EFBIG, "too large for a file of facts", str(path))
+        return file.read(LARGEST_RECORD + 1)
 
 
 def inside(folder: Path, name: str) -> Path:

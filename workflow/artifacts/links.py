@@ -13,6 +13,8 @@ from typing import IO, Any
 from iif_core.errors import InputError
 from workflow.intake.names import shown
 
+KEPT = ("results", "scenes", "plan", "bench", "relight", "compare", "score")
+"""Folders of the working folder that may be links themselves."""
 RECORDS = ("benchmarks", "locks", "logs", "parts", "stamps")
 """Folders of a scene whose files are written in place by jobs, by Snakemake or by the shell. Stages put whole files in the place
 of links (`write_atomically`), and `inside` refuses a folder of theirs that leads out."""
@@ -44,6 +46,17 @@ def refuse(results: Path, scene: str) -> None:
         raise refused(link)
 
 
+def check_folders(results: Path, scene: str, *stages: str) -> None:
+    """Look at the folder of a scene, of its deliverable, of its records and of some stages, as `check_folder`.
+
+    Raises:
+        InputError: as `check_folder`.
+    """
+    home = results / scene
+    for folder in (results.parent / "scenes" / scene, home, *(home / name for name in (*RECORDS, *stages))):
+        check_folder(str(folder))
+
+
 def check_folder(folder: str) -> None:
     """Refuse a file in the place of a folder, which Snakemake would take for the finished folder, and a link, behind which it
     would remove and write.
@@ -63,9 +76,10 @@ def refused(link: Path) -> InputError:
         target = f" to {shown(os.readlink(link))}"
     except OSError:  # it has just been removed
         target = ""
+    top = next((part for part in link.parts if part in KEPT), "results")
     return InputError(
         f"{link}: a symbolic link{target}, and what is behind it would be overwritten or removed. Remove the link, or put what it"
-        " leads to in its place; to keep results on another disk, make `results` or `scenes` itself a link"
+        f" leads to in its place; to keep it on another disk, make `{top}` itself a link"
     )
 
 

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from workflow.artifacts.files import write_atomically
+from workflow.artifacts.files import read_record, write_atomically
 
 MANIFEST = "manifest.json"
 STAGE_SCHEMA = "iif.stage/2"
@@ -164,7 +164,7 @@ def load(path: Path, schema: str = STAGE_SCHEMA) -> tuple[dict[str, Any], str]:
         Broken: as `parse`, or it cannot be read.
     """
     try:
-        data = path.read_bytes()
+        data = read_record(path)
     except OSError as error:
         raise Broken(f"not readable ({error.strerror})") from None
     return parse(data, schema), hashlib.sha256(data).hexdigest()

@@ -81,7 +81,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
 def _is_earlier(folder: Path, fingerprint: str) -> bool:
     """Whether the manifest is of the earlier schema and of other settings than are wanted; one of the same is refused."""
     try:
-        document = json.loads((folder / MANIFEST).read_bytes())
+        document = json.loads(io.read_record(folder / MANIFEST))
         if document["schema"] != EARLIER_SCHEMA:
             return False
         same = document["fingerprint"] == fingerprint
@@ -117,12 +117,15 @@ def wrong_files(folder: Path, document: dict[str, Any], names: list[str] | None 
         except InputError as error:
             yield str(error)
             continue
-        if not path.is_file():
+        try:
+            if not path.is_file():
+                yield f"{path}: missing"
+            elif (size := path.stat().st_size) != facts["bytes"]:
+                yield f"{path}: {size} bytes on disk, {facts['bytes']} were written"
+            elif io.sha256_of(path) != facts["sha256"]:
+                yield f"{path}: its content changed since it was written (sha256 differs)"
+        except FileNotFoundError:  # a job that makes it again has removed it meanwhile
             yield f"{path}: missing"
-        elif path.stat().st_size != facts["bytes"]:
-            yield f"{path}: {path.stat().st_size} bytes on disk, {facts['bytes']} were written"
-        elif io.sha256_of(path) != facts["sha256"]:
-            yield f"{path}: its content changed since it was written (sha256 differs)"
 
 
 def _broken_chain(folder: Path, inputs: Any) -> Iterator[str]:

@@ -58,12 +58,12 @@ def place(results: Path, scene: str, of: str) -> Path:
 def load(path: Path) -> Stamps | None:
     """Return what is noted; None if nothing is, or nothing that can be read: the contents are compared then."""
     try:
-        document = json.loads(path.read_bytes())
+        document = json.loads(io.read_record(path))
         inputs = {str(stage): (str(scene), str(digest)) for stage, (scene, digest) in document["inputs"].items()}
         files = {str(name): (int(size), int(mtime), int(ctime)) for name, (size, mtime, ctime) in document["files"].items()}
         words = (str(document[key]) for key in ("scene", "stage", "fingerprint", "manifest"))
         return Stamps(*words, inputs, files)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return None
 
 

@@ -211,7 +211,7 @@ def _noted_parts(directory: Path) -> dict[str, Any]:
     """Return the notes that a finished job left of parts of its stage; none if there are none, or they cannot be read. They are
     not in the manifest, which Snakemake removes before it starts a job."""
     try:
-        noted = manifests.sealed((directory / PARTS).read_bytes()).get("parts")
+        noted = manifests.sealed(io.read_record(directory / PARTS)).get("parts")
         parts = {name: manifests.part(note) for name, note in noted.items()} if isinstance(noted, dict) else {}
         return parts if all(io.is_inside(directory, name) for name in parts) else {}
     except (OSError, manifests.Broken):

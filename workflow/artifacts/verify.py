@@ -89,7 +89,7 @@ def _parts(folder: Path, reader: StageReader, quality: str | None) -> Iterator[s
     if not path.exists():
         return
     try:
-        noted = manifests.sealed(path.read_bytes()).get("parts")
+        noted = manifests.sealed(io.read_record(path)).get("parts")
         notes = [manifests.part(note) for note in noted.values()] if isinstance(noted, dict) else []
         problem = "" if notes else "it has no notes of parts"
     except (OSError, manifests.Broken) as error:
@@ -190,7 +190,7 @@ def _published(root: Path, scene: str, damaged_results: bool) -> Iterator[str]:
 
 def _document(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text()) if path.is_file() else {}
+        document = json.loads(io.read_record(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}
@@ -224,9 +224,25 @@ def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: boo
         if up.is_file() and io.sha256_of(up) != digest:
             yield f"{folder}: it was made from another {up.parent} than is there now; {again}"
             return
+    for name, stage in _copied(results, document):
+        yield f"{folder / name}: it is not what rule {stage} wrote, {results / stage / name}; {again}"
     own = _document(results / "publish/published.json").get("manifest_sha256")
     if own is not None and own != io.sha256_of(manifest):
         yield f"{manifest}: it is not the one that {results / 'publish'} wrote; {again}"
+
+
+def _copied(results: Path, document: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield name and stage of each listed file of a deliverable of which every stage that has a file of this name lists another
+    content."""
+    listed: dict[str, dict[str, str]] = {}
+    for stage in document.get("manifests", {}):
+        made = _document(results / stage / MANIFEST).get("files")
+        for name, facts in (made if isinstance(made, dict) else {}).items():
+            if name in document["files"] and isinstance(facts, dict):
+                listed.setdefault(name, {})[stage] = str(facts.get("sha256"))
+    for name, digests in sorted(listed.items()):
+        if document["files"][name]["sha256"] not in digests.values():
+            yield name, next(iter(digests))
 
 
 def _quality(found: Any) -> str | None:

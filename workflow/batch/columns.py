@@ -8,6 +8,7 @@ from iif_core.evaluation.catalogue import METRICS
 
 STATUSES = {
     "done": "published, as the settings, inputs and code of now would make it",
+    "damaged": "published, and not what was written any more; the next run publishes it again",
     "refused": "its settings or data cannot be used; no job is started",
     "failed": "a job ended with an error",
     "killed": "a job was started, did not end, and its process is gone (memory, time limit, node)",

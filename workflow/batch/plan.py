@@ -7,7 +7,7 @@ import json
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,11 +24,13 @@ from workflow.settings.batch_table import Line, read_table
 
 @dataclass(frozen=True)
 class Plan:
-    """The lines of the table; scene -> fingerprint of its deliverable; scene that cannot be run -> reason."""
+    """The lines of the table; scene -> fingerprint of its deliverable; scene that cannot be run -> reason; scene of which what is
+    published was damaged -> what is wrong, a line for each file."""
 
     lines: tuple[Line, ...]
     ready: dict[str, str]
     refused: dict[str, str]
+    damaged: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @lru_cache(None)
@@ -40,7 +42,7 @@ def plan(quality: str) -> Plan:
         InputError: the table itself cannot be read (`read_table`).
     """
     lines = read_table()
-    ready, refused = {}, {}
+    ready, refused, damaged = {}, {}, {}
     said = time.monotonic()
     with input_digests.saved_once():
         for done, line in enumerate(lines):
@@ -49,26 +51,30 @@ def plan(quality: str) -> Plan:
                 print(f"batch: {done} of {len(lines)} scenes checked", file=sys.stderr)
             try:
                 mark = fp.fingerprint("publish", line.name, quality)
-                check(line.name, quality)
+                faults = check(line.name, quality)
                 ready[line.name] = mark
+                if told := tuple(filter(None, faults)):
+                    damaged[line.name] = told
             except InputError as error:
                 refused[line.name] = str(error) if line.at() in str(error) or not line.number else f"{line.at()}: {error}"
             except Exception as error:  # whatever is wrong with one scene must not stop hundreds of others
-                reason = f"{line.at()}: {type(error).__name__}: {error} (a bug: please report it)"
+                reason = f"{line.at() + ': ' if line.number else ''}{type(error).__name__}: {error} (a bug: please report it)"
                 refused[line.name] = written_out(reason)
-    return Plan(lines, ready, refused)
+    return Plan(lines, ready, refused, damaged)
 
 
-def check(scene: str, quality: str) -> None:
-    """Check what Snakemake's plan of a scene looks at beside its settings and its source.
+def check(scene: str, quality: str) -> tuple[str, ...]:
+    """Check what Snakemake's plan of a scene looks at beside its settings and its source, and return what is wrong with what is
+    published, which publishing it again mends.
 
     Raises:
         InputError: the folder of what is published is a file, or a link is where jobs write; or as `check_stage`.
     """
-    links.check_folder(f"scenes/{scene}")
-    sound.deliverable_faults(Path(f"scenes/{scene}"), Path("results"), scene, fp.fingerprint("publish", scene, quality))
+    links.check_folders(Path("results"), scene)
     for stage in fp.NEEDED:
         check_stage(stage, scene, quality)
+    mark = fp.fingerprint("publish", scene, quality)
+    return sound.deliverable_faults(Path(f"scenes/{scene}"), Path("results"), scene, mark)
 
 
 def check_stage(stage: str, scene: str, quality: str) -> tuple[str, ...]:
@@ -78,8 +84,7 @@ def check_stage(stage: str, scene: str, quality: str) -> tuple[str, ...]:
         InputError: a file is in the way, the stage is of an earlier version, or `overrides` names what is not there.
     """
     mark = fp.fingerprint(stage, scene, quality)
-    for folder in (f"results/{scene}", f"results/{scene}/{stage}"):
-        links.check_folder(folder)
+    links.check_folders(Path("results"), scene, stage)
     with suppress(DamagedArtefact):  # of a segmentation that will be made again; then its objects are known
         check_overrides(stage, scene, quality)
     return sound.stage_faults(Path("results"), scene, stage, mark)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import read_parquet, remove, write_atomically
+from workflow.artifacts.files import read_parquet, read_record, remove, write_atomically
 from workflow.batch import causes
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES, VERDICTS
@@ -99,6 +99,9 @@ def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
         row |= _costs(scene)
         if not _is_published(scene, plan.ready[scene]):
             return row | _why_not(scene, quality)
+        if faults := plan.damaged.get(scene):
+            more = f", and {len(faults) - 1} more" if len(faults) > 1 else ""
+            return row | {"status": "damaged", "stage": "publish", "reason": faults[0] + more}
         return row | {
             "status": "done",
             "report": f"scenes/{scene}/report.html",
@@ -117,7 +120,7 @@ def _is_published(scene: str, fingerprint: str) -> bool:
 
 def _fingerprint_in(manifest: Path) -> str:
     try:
-        return str(json.loads(manifest.read_text()).get("fingerprint", ""))
+        return str(json.loads(read_record(manifest)).get("fingerprint", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
         return ""
 
@@ -182,7 +185,7 @@ def _verdict(scene: str) -> Row:
     Raises:
         Exception: of any kind, if the file is missing or damaged.
     """
-    found = json.loads((Path("scenes") / scene / "verdict.json").read_text())
+    found = json.loads(read_record(Path("scenes") / scene / "verdict.json"))
     word = next(word for word in VERDICTS if word == found["verdict"])
     return {"verdict": word, "doubt": None if word == "good" else str(found["sentence"])}
 

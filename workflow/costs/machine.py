@@ -9,6 +9,8 @@ import os
 from functools import lru_cache
 from pathlib import Path
 
+from workflow.artifacts.files import read_record
+
 LATEST = 120
 """Jobs that are looked at, the latest first."""
 SHORTEST = 2.0
@@ -28,7 +30,7 @@ def machine_factor(root: Path = Path("results")) -> float:
     total, count = 0.0, 0
     for path in files[:LATEST]:
         try:
-            document = json.loads(Path(path).read_text())
+            document = json.loads(read_record(path))
             taken, expected = float(document["job"]["cpu_seconds"]), float(document["expected"]["cpu_seconds"])
         except (OSError, ValueError, KeyError, TypeError):
             continue

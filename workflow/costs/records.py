@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from workflow.artifacts.files import write_atomically
+from workflow.artifacts.files import read_record, write_atomically
 from workflow.costs.size import size_of_capture
 from workflow.costs.work import work_of
 from workflow.registry import SHARED, STAGES
@@ -31,7 +31,7 @@ def gather(roots: Iterable[Path]) -> list[dict[str, Any]]:
     """
     rows: dict[tuple[Any, ...], dict[str, Any]] = {}
     for root in roots:
-        manifests = {path: json.loads(path.read_text()) for path in sorted(root.glob("*/*/manifest.json"))}
+        manifests = {path: json.loads(read_record(path)) for path in sorted(root.glob("*/*/manifest.json"))}
         known = {(one["stage"], one["fingerprint"]): one for one in manifests.values()}
         for path, manifest in manifests.items():
             row = _row(path, manifest, known)

@@ -147,7 +147,9 @@ for place in (".", "results", "scenes", ".snakemake"):
 or_stop(inputs_again, config.get("inputs"))
 if config.get("events"):
     # Jobs inherit it, also those that Snakemake starts on other machines, because it hands `--config` on to them.
-    os.environ[events.VARIABLE] = or_stop(events.checked, str(config["events"]))
+    os.environ[events.VARIABLE] = or_stop(
+        events.checked, str(config["events"]), workflow.is_main_process
+    )
 
 
 def quality_of(scene):

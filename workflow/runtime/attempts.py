@@ -28,7 +28,8 @@ def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[st
     Args:
         before: state that the attempt before has left; empty if that ended well.
         fingerprint: of this attempt; attempts at something else do not count.
-        run: of Snakemake; attempts of an earlier run do not count, which has told of them. Empty where none is known.
+        run: of Snakemake; attempts of an earlier run do not count. That one has told of those that failed; one that was killed
+            is told of, because its run may have been killed with it. Empty where none is known.
     """
     own = slurm.own()
     facts: dict[str, Any] = {"attempt": 1}
@@ -36,7 +37,10 @@ def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[st
         facts["run"] = run
     if own:
         facts["slurm"] = own._asdict()
-    if before.get("fingerprint") == fingerprint and before.get("run", "") == run:
+    if before.get("fingerprint") == fingerprint and before.get("run", "") != run:
+        if before.get("state") == "started":
+            facts["earlier"] = [f"in an earlier run, attempt {before.get('attempt', 1)}{_place(before)} {ending(before, own)}"]
+    elif before.get("fingerprint") == fingerprint:
         number = before.get("attempt", 1)
         facts["attempt"] = number + 1
         ended = f"attempt {number}{_place(before)} {ending(before, own)}"

@@ -13,6 +13,7 @@ import logging
 import os
 import platform
 import resource
+import stat
 import tempfile
 import time
 from datetime import UTC, datetime
@@ -36,13 +37,19 @@ def place(named: str) -> Path:
     return Path(named) if named.endswith(".jsonl") else Path(named) / f"{platform.node() or 'unknown'}.jsonl"
 
 
-def checked(named: str) -> str:
+def checked(named: str, tried: bool = True) -> str:
     """Return a place for events as an absolute path, so that jobs find it from any folder.
+
+    Args:
+        named: as it was given.
+        tried: whether it is seen if something can be written there. A job on a node goes on without events where it cannot.
 
     Raises:
         InputError: nothing can be written there.
     """
     path = os.path.abspath(named) + (os.sep if named.endswith(os.sep) else "")
+    if not tried:
+        return path
     kind = "a file" if named.endswith(".jsonl") else "a folder"
     if os.path.isdir(path) if kind == "a file" else os.path.isfile(path):
         raise InputError(f"--config events={named}: needed {kind}; a name that ends in .jsonl is a file, any other a folder")
@@ -59,13 +66,25 @@ def _can_write(path: Path, is_file: bool) -> bool:
     refuses also whoever may write everywhere."""
     try:
         if is_file:
-            os.close(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC))
+            _close_if_regular(os.open(path, os.O_WRONLY | os.O_APPEND | os.O_NONBLOCK | os.O_CLOEXEC))
         else:
             with tempfile.TemporaryFile(dir=path):
                 pass
     except OSError:
         return False
     return True
+
+
+def _close_if_regular(handle: int) -> None:
+    """Close a file.
+
+    Raises:
+        OSError: it is none, but a pipe, whose reader may be gone when a job writes.
+    """
+    regular = stat.S_ISREG(os.fstat(handle).st_mode)
+    os.close(handle)
+    if not regular:
+        raise OSError(errno.EINVAL, "not a regular file")
 
 
 def tell(event: str, scene: str, stage: str, fingerprint: str, **facts: Any) -> None:
@@ -124,7 +143,7 @@ def _append(path: Path, line: bytes) -> None:
         OSError: the line could not be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     try:
         written = os.write(handle, line)  # one call, so that lines of several processes do not mix
         if written < len(line):

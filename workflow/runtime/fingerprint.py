@@ -22,7 +22,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow import settings as settings_module
-from workflow.artifacts.files import sha256_of, write_json
+from workflow.artifacts.files import read_record, sha256_of, write_json
 from workflow.intake.names import shown
 from workflow.registry import STAGES
 from workflow.runtime import input_digests
@@ -87,11 +87,16 @@ _lock = threading.Lock()  # stages read their upstream from several threads
 def _recall() -> None:
     """Read what an earlier process found with the same version of Python and of this module."""
     try:
-        document = json.loads(_CODE.read_text())
-        if document["by"] == _reader_of_code():
+        document = json.loads(read_record(_CODE))
+        if document["by"] == _reader_of_code() and document["seal"] == _seal(document["modules"]):
             _remembered.update(document["modules"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         pass
+
+
+def _seal(modules: dict[str, list[Any]]) -> str:
+    """Return a digest of what is kept of the code: a flipped bit would have every scene made again, and nobody would know why."""
+    return hashlib.sha256(json.dumps(modules, sort_keys=True).encode()).hexdigest()
 
 
 def _reader_of_code() -> str:
@@ -102,7 +107,7 @@ def _save() -> None:
     global _unsaved
     with _lock:
         if _unsaved and not _held:
-            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered})
+            write_json(_CODE, {"by": _reader_of_code(), "modules": _remembered, "seal": _seal(_remembered)})
             _unsaved = False
 
 
@@ -317,7 +322,7 @@ def missing_stages(scene: str, quality: str) -> list[str]:
 def _made(stage: str, scene: str, quality: str) -> str:
     """Return the fingerprint under which a stage was made; empty if it was not, or its manifest cannot be read."""
     try:
-        document = json.loads(Path(f"results/{home(stage, scene, quality)}/{stage}/manifest.json").read_bytes())
+        document = json.loads(read_record(f"results/{home(stage, scene, quality)}/{stage}/manifest.json"))
         return str(document.get("fingerprint", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
         return ""

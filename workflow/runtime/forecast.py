@@ -6,10 +6,10 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from iif_core.errors import InputError
+from workflow.artifacts.files import read_record
 from workflow.costs.machine import machine_factor
 from workflow.costs.model import Cost, Range, predict
 from workflow.costs.size import estimate, size_of_capture
@@ -41,7 +41,7 @@ def scene_size(scene: str, quality: str) -> SceneSize:
     """
     home = fingerprints.home("capture", scene, quality)
     try:
-        manifest = json.loads(Path(f"results/{home}/capture/manifest.json").read_text())
+        manifest = json.loads(read_record(f"results/{home}/capture/manifest.json"))
         if manifest["fingerprint"] == fingerprints.fingerprint("capture", scene, quality):
             return size_of_capture(manifest)
     except (OSError, ValueError, KeyError, TypeError, IndexError):

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from workflow.artifacts import locks
-from workflow.artifacts.files import sha256_of, write_atomically
+from workflow.artifacts.files import read_record, sha256_of, write_atomically
 
 WHOLE = 1 << 20
 SAMPLE = 1 << 12
@@ -68,7 +68,9 @@ def remember(paths: Iterable[Path]) -> None:
     for path in paths:
         entry = _known.get(str(path))
         if entry and not entry.whole and entry.stamp == _stamp(path):
-            _note(path, entry._replace(whole=sha256_of(path)))
+            whole = sha256_of(path)
+            if entry.stamp == _stamp(path):  # otherwise it was replaced while it was read
+                _note(path, entry._replace(whole=whole))
     _save()
 
 
@@ -162,11 +164,11 @@ def _recall() -> None:
 
 def _stored() -> dict[str, Known]:
     try:
-        document = json.loads(CACHE.read_text())
+        document = json.loads(read_record(CACHE))
         # Earlier versions kept (size, time stamp, digest, whole): without the rest of the stamp, the content is compared once.
         entries = {path: [*entry[:2], 0, 0, *entry[2:]] if len(entry) == 4 else entry for path, entry in document.items()}
         return {path: Known(*entry) for path, entry in entries.items() if len(entry) == len(Known._fields)}
-    except (OSError, ValueError, AttributeError, TypeError):
+    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
         return {}
 
 

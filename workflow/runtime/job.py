@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple
 from iif_core.errors import InputError
 from workflow import settings as settings_module
 from workflow.artifacts import StageReader, StageWriter, links, stamps
-from workflow.artifacts.files import sha256_of, write_json
+from workflow.artifacts.files import read_record, sha256_of, write_json
 from workflow.registry import SHARED, STAGES
 from workflow.runtime import device, events, forecast, input_digests
 from workflow.runtime import fingerprint as fp
@@ -209,7 +209,7 @@ class Job:
         memories = []
         for path in (Path("results") / self.scene / "benchmarks").glob(f"{self.stage.name}.*-of-*.parts.json"):
             try:
-                document = json.loads(path.read_text())
+                document = json.loads(read_record(path))
                 spent = {key: float(document["job"][key]) for key in (*self._earlier, "max_rss_mb")}
                 mine = document["fingerprint"] == self.fingerprint
             except (OSError, ValueError, KeyError, TypeError):

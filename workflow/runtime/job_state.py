@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from workflow.artifacts.files import write_json
+from workflow.artifacts.files import read_record, write_json
 from workflow.runtime import alive, attempts, events
 
 LOOK = 5.0
@@ -199,7 +199,7 @@ def _read_new(path: Path) -> tuple[float, dict[str, Any]] | None:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        document = json.loads(path.read_text()) if path.is_file() else {}  # a pipe would be waited for
+        document = json.loads(read_record(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return attempts.sound(document) if isinstance(document, dict) else {}

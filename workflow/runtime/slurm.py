@@ -6,12 +6,14 @@ counts as no answer, because no run may depend on it.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 PATIENCE = 10.0
@@ -28,6 +30,8 @@ KILLED = {
 """How Slurm ends jobs that say nothing themselves."""
 ENDED = (*KILLED, "COMPLETED", "FAILED", "REVOKED")
 """States that a job does not leave by itself; in any other, such as STAGE_OUT or RESV_DEL_HOLD, it is still Slurm's."""
+STUCK = ("launch_failed_requeued_held", "BadConstraints")
+"""Reasons of a job that waits for which Slurm will never start it by itself. One that a person holds goes on waiting."""
 LOGS = ".snakemake/slurm_logs"
 """Where Slurm writes what jobs say."""
 REFUSALS = f"{LOGS}/refused.log"
@@ -255,50 +259,90 @@ def answer_to_snakemake(job: str) -> str:
     """Return `running`, `success` or `failed`, as the executor cluster-generic asks for.
 
     Of a job that the controller has forgotten, accounting is asked. Without it the job counts as finished: Snakemake looks for
-    its files and tries again if they lack. While the controller does not answer, jobs count as running.
+    its files and tries again if they lack. While the controller does not answer, jobs count as running. One that Slurm will never
+    start by itself is cancelled, and has failed.
     """
     shown, forgotten = _shown(job)
     state = shown.get("JobState") or (_accounted(job) or "COMPLETED" if forgotten else "")
     if state == "COMPLETED":
         return "success"
+    if state == "PENDING" and (reason := shown.get("Reason", "")) in STUCK:
+        _answer("scancel", job)
+        _keep(job, f"job {job} would never have started (Slurm says {reason}) and was cancelled")
+        return "failed"
     return "failed" if state in ENDED else "running"
 
 
 def submit(*command: str) -> int:
     """Run `sbatch` for the executor cluster-generic: print the number of the job, and keep why it was refused in `REFUSALS`.
 
+    A job that went to another cluster is cancelled and counts as refused: nothing that is asked about it would be answered.
+
     Returns:
         The exit code.
     """
-    os.makedirs(LOGS, exist_ok=True)
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
         code, out, error = done.returncode, done.stdout, done.stderr
     except OSError as failure:
         code, out, error = 127, "", f"{command[0]}: {failure.strerror}\n"
     sys.stderr.write(error)
-    sys.stdout.write(out)
+    of = " ".join(option for option in command if option.startswith("--comment="))
     if code:
-        with open(REFUSALS, "a", encoding="utf-8") as file:
-            file.write((error.strip() or f"{command[0]} ended with exit code {code}") + "\n")
-    return code
+        _keep(of, error.strip() or f"{command[0]} ended with exit code {code}")
+        return code
+    found = next(filter(None, (re.fullmatch(r"(\d+)(?:;(\S+))?", line.strip()) for line in out.splitlines())), None)
+    problem = ""
+    if found is None:
+        problem = f"{command[0]} printed no number of a job: {out.strip()[:200]!r}"
+    elif found[2] and found[2] != _cluster():
+        _answer("scancel", "-M", found[2], found[1])
+        problem = (
+            f"job {found[1]} went to cluster {found[2]} and was cancelled: jobs must go to the cluster of this machine."
+            " Unset SLURM_CLUSTERS and SBATCH_CLUSTERS, and leave out --clusters"
+        )
+    if problem:
+        sys.stderr.write(problem + "\n")
+        _keep(of, problem)
+        return 1
+    _keep(of, "")
+    sys.stdout.write(f"{found[1]}\n")
+    return 0
+
+
+def _cluster() -> str:
+    """Return the name of the cluster of this machine; empty if Slurm does not say."""
+    found = re.search(r"^ClusterName\s*=\s*(\S+)", _answer("scontrol", "show", "config")[0], re.M)
+    return found[1] if found else ""
+
+
+def _keep(job: str, reason: str) -> None:
+    """Keep why Slurm refused a job, or an empty reason when it took it after all."""
+    os.makedirs(LOGS, exist_ok=True)
+    with open(REFUSALS, "a", encoding="utf-8") as file:
+        file.write(json.dumps([job, reason]) + "\n")
 
 
 def refusals(log: str) -> list[str]:
-    """Return why Slurm refused jobs of this run, each reason once.
+    """Return why Slurm refused jobs of this run that it did not take later, each reason once.
 
     Args:
         log: text of Snakemake's own log of the run.
     """
-    try:
-        with open(REFUSALS, encoding="utf-8", errors="replace") as file:
-            kept = file.read().splitlines()
-    except OSError:
-        kept = []
-    return list(dict.fromkeys(" ".join(text.split()) for text in [*kept, *REFUSED.findall(log)] if text.strip()))
+    from workflow.artifacts.files import read_record  # not for every question about a job, of which there are many
+
+    kept: dict[str, str] = {}
+    with suppress(OSError, ValueError):
+        for line in read_record(REFUSALS).decode().splitlines():
+            job, reason = json.loads(line)
+            kept.pop(str(job), None)
+            kept[str(job)] = str(reason)
+    return list(dict.fromkeys(" ".join(text.split()) for text in [*kept.values(), *REFUSED.findall(log)] if text.strip()))
 
 
 if __name__ == "__main__":  # commands of workflow/profiles/slurm-scenes
-    if sys.argv[1] == "submit":
+    if sys.argv[1:2] == ["submit"] and len(sys.argv) > 2:
         sys.exit(submit(*sys.argv[2:]))
+    if len(sys.argv) != 2:
+        sys.exit("usage: python -m workflow.runtime.slurm submit sbatch ... | <number of a job>")
     print(answer_to_snakemake(sys.argv[1]))

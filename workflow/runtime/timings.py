@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from workflow.artifacts.files import read_record
 from workflow.registry import STAGES
 
 
@@ -24,7 +25,7 @@ def read_timings(scene: str, root: Path = Path(".")) -> list[dict[str, Any]]:
     for stage in STAGES:
         path = root / "results" / scene / "benchmarks" / f"{stage}.jsonl"
         try:
-            lines = [line for line in path.read_text().splitlines() if line.strip()]
+            lines = [line for line in read_record(path).decode().splitlines() if line.strip()]
             facts = dict(json.loads(lines[-1]))
             seconds = float(facts["s"])
         except (OSError, ValueError, KeyError, IndexError, TypeError, OverflowError, RecursionError):
@@ -50,7 +51,7 @@ def read_parts(scene: str, stage: str, root: Path = Path(".")) -> dict[str, Any]
     job.
     """
     try:
-        document = json.loads((root / "results" / scene / "benchmarks" / f"{stage}.parts.json").read_text())
+        document = json.loads(read_record(root / "results" / scene / "benchmarks" / f"{stage}.parts.json"))
     except (OSError, ValueError, RecursionError):
         return {}
     parts = document.items() if isinstance(document, dict) else ()
@@ -65,7 +66,7 @@ def _numbers(facts: dict[str, Any]) -> dict[str, float]:
 def _threads(benchmark: Path) -> str:
     """Return what `python -m workflow` wrote beside the benchmark, because Snakemake's short format has no threads."""
     try:
-        return benchmark.with_suffix(".threads").read_text()
+        return read_record(benchmark.with_suffix(".threads")).decode()
     except (OSError, ValueError):
         return ""
 

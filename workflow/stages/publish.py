@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from iif_core.errors import InputError
 from workflow.artifacts import manifest as manifests
 from workflow.artifacts import stamps
 from workflow.artifacts.files import copy, flush_folder, flush_folders, inside, make_folder, named, sha256_of, write_parquet
@@ -61,7 +62,9 @@ def _build(
     """Fill the folder, its manifest last, and flush it to disk; return the files of the manifest, and the stamps of all."""
     with named(temporary):
         temporary.mkdir()
+    made: dict[str, tuple[StageReader, str]] = {}
     for stage, name in deliverables(readers):
+        made[name] = readers[stage], readers[stage].manifest["files"][name]["sha256"]
         copy(readers[stage].path(name), inside(temporary, name))  # so that editing the deliverable does not change results/
     timings = read_timings(job.scene)
     columns = {name: np.array([row[name] for row in timings], dtype) for name, dtype in TIMING_COLUMNS.items()}
@@ -69,6 +72,12 @@ def _build(
     names = sorted(path.relative_to(temporary).as_posix() for path in temporary.rglob("*") if path.is_file())
     seen = stamps.look(temporary, names)
     files = {name: {"sha256": sha256_of(temporary / name), "bytes": seen[name][0]} for name in names}
+    for name, (reader, digest) in made.items():  # what is sealed here is what the stages have sealed, and not what became of it
+        if files[name]["sha256"] != digest:
+            raise InputError(
+                f"{temporary / name}: the copy differs from what rule {reader.stage} wrote, {reader.directory / name}; it changed"
+                " meanwhile, or the disk lost a part. Run the same command again; if it happens again, check the disk"
+            )
     manifests.write(temporary / MANIFEST, _manifest(job, files), settled=False)
     flush_folders(temporary)
     return files, seen | stamps.look(temporary, [MANIFEST])

@@ -13,6 +13,7 @@ from typing import Any
 
 from iif_core.errors import InputError
 from workflow.artifacts import DamagedArtefact, links, stamps
+from workflow.artifacts.files import read_record
 from workflow.artifacts.manifest import MANIFEST
 from workflow.registry import STAGES
 from workflow.runtime import alive, forecast
@@ -129,6 +130,9 @@ def _standing(scene: str, quality_of: Callable[[str], str], now: float, look: bo
         _check_places(scene)
         found, touched = _published(scene)
         if found and _is_current(found, touched, scene, quality):
+            if changed := _changed(scene):
+                reason = f"scenes/{scene}/{changed}: changed or gone since it was published"
+                return replace(base, state="stale", stage="publish", since=touched, reason=reason)
             return _done(replace(base, since=touched), jobs, quality)
         if look or _begun(scene):
             return _unfinished(base, jobs, found, touched, quality)
@@ -147,8 +151,7 @@ def _check_places(scene: str) -> None:
         InputError: a file or a link is where the workflow makes one of them, or where jobs write.
     """
     links.refuse(Path("results"), scene)
-    for folder in (f"scenes/{scene}", f"results/{scene}", *(f"results/{scene}/{stage}" for stage in fp.NEEDED)):
-        links.check_folder(folder)
+    links.check_folders(Path("results"), scene, *fp.NEEDED)
 
 
 def _of_running(base: Standing, jobs: dict[str, Noted], quality: str | None) -> Standing:
@@ -241,6 +244,15 @@ def _is_current(document: dict[str, Any], touched: float, scene: str, quality: s
     if same and "fingerprint" in document and touched > _code_changed() and _is_original(scene):
         return True
     return bool(document.get("fingerprint") == fp.fingerprint("publish", scene, quality))
+
+
+def _changed(scene: str) -> str:
+    """Return the name of a file of a deliverable that is gone or has another size or time stamp than when it was published; empty
+    if there is none, or if the deliverable is a copy, whose time stamps say nothing."""
+    noted_of = stamps.load(stamps.place(Path("results"), scene, stamps.DELIVERABLE))
+    if noted_of is None or not _is_original(scene):
+        return ""
+    return next(iter(stamps.touched(Path("scenes") / scene, noted_of)), "")
 
 
 def _is_original(scene: str) -> bool:
@@ -357,8 +369,7 @@ def printable(text: str) -> str:
 
 def _document(path: str) -> dict[str, Any]:
     try:
-        with open(path, "rb") as file:
-            document = json.loads(file.read())
+        document = json.loads(read_record(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return document if isinstance(document, dict) else {}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
+from workflow.artifacts import links
 from workflow.artifacts.files import write_atomically, write_json
 from workflow.costs.machine import machine_factor
 from workflow.registry import STAGES
@@ -54,6 +55,7 @@ def measured(scene: str, score: str) -> dict[str, float] | None:
 def write_bench(scene: str, cores: int = 2) -> None:
     """Write bench.json, which `--config target=...` reads, and bench.md, which a person reads."""
     folder, points, rows, now = FOLDER / scene, {}, [], marks(scene)
+    links.check_folder(str(folder))
     folder.mkdir(parents=True, exist_ok=True)
     for point, derived in scenes(scene).items():
         scores = measured_scores(json.loads(Path(f"results/{derived}/metrics/summary.json").read_text()))
