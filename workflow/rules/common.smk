@@ -280,6 +280,12 @@ def job(stage):
     return arguments
 
 
+def on_nodes():
+    """Whether jobs are submitted to a cluster; each has a Snakemake of its own there."""
+    plugin = workflow.executor_plugin
+    return plugin is not None and plugin.common_settings.non_local_exec
+
+
 def needs(stage):
     """Memory, time and disk that a job of a stage asks for, by the cost model; memory and time grow with every retry."""
 
@@ -292,7 +298,7 @@ def needs(stage):
         return resource
 
     return {
-        "mem_mb": value(forecast.memory_mb, True),
+        "mem_mb": value(lambda cost: forecast.memory_mb(cost, on_nodes()), True),
         "runtime": value(forecast.minutes, True),
         "disk_mb": value(forecast.disk_mb, False),
     }

@@ -18,6 +18,8 @@ from workflow.registry import STAGES
 from workflow.runtime import fingerprint as fingerprints
 
 MEMORY_MARGIN = 1.1
+BESIDE_MB = 150
+"""Of the Snakemake that runs beside a job on a node: it has 104 MB for a job of one stage."""
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
@@ -65,9 +67,16 @@ def job_cost(stage: str, scene: str, quality: str, threads: int = 2, machine: fl
     return predict(stage, job_work(stage, scene, quality), threads, factor)
 
 
-def memory_mb(cost: Cost) -> int:
-    """Return the memory to ask for: a tenth above what nine of ten such jobs took. The next attempt asks for twice that."""
-    return _rounded(cost.memory_mb.high * MEMORY_MARGIN) if cost.memory_mb else UNKNOWN_MEMORY
+def memory_mb(cost: Cost, on_node: bool = False) -> int:
+    """Return the memory to ask for: a tenth above what nine of ten such jobs took. The next attempt asks for twice that.
+
+    Args:
+        cost: of the job.
+        on_node: whether it is submitted to a cluster, which counts the memory of the Snakemake that starts it there as well.
+    """
+    if not cost.memory_mb:
+        return UNKNOWN_MEMORY
+    return _rounded(cost.memory_mb.high * MEMORY_MARGIN + (BESIDE_MB if on_node else 0))
 
 
 def minutes(cost: Cost) -> int:
