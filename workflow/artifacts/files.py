@@ -75,7 +75,7 @@ def is_inside(folder: Path, name: str) -> bool:
     return True
 
 
-def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True) -> None:
+def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = True, flushed: bool = True) -> None:
     """Call `write(temporary)` beside `path`, flush that file to disk and rename it to `path`: no reader sees half a file, and
     after a power cut `path` has its old content or the new one.
 
@@ -84,6 +84,7 @@ def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = 
         write: writes the content to the path that it is given.
         settled: flush the folder as well, so that the new content is there after a power cut. A caller that writes many files
             flushes each folder once instead (`flush_folders`).
+        flushed: flush the content. Without it the file may be empty or torn after a power cut, so its readers must do without it.
 
     Raises:
         OSError: with the name of the file, whatever part of the work failed.
@@ -95,7 +96,8 @@ def write_atomically(path: Path, write: Callable[[Path], None], settled: bool = 
             temporary.unlink()
         try:
             write(temporary)
-            _flush(temporary)
+            if flushed:
+                _flush(temporary)
             os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -315,7 +317,7 @@ def _values(column: Any) -> np.ndarray:
     return np.frombuffer(data, kind, end)[column.offset :]
 
 
-def write_json(path: Path, document: Any, settled: bool = True) -> None:
-    """Write JSON with sorted keys. `settled` is that of `write_atomically`."""
+def write_json(path: Path, document: Any, settled: bool = True, flushed: bool = True) -> None:
+    """Write JSON with sorted keys. `settled` and `flushed` are those of `write_atomically`."""
     text = json.dumps(document, indent=1, sort_keys=True, allow_nan=False) + "\n"
-    write_atomically(path, lambda temporary: temporary.write_text(text), settled)
+    write_atomically(path, lambda temporary: temporary.write_text(text), settled, flushed)

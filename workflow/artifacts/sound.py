@@ -74,7 +74,7 @@ def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fing
     problems = list(wrong_files(folder, document, some))
     yield from problems
     if not problems:
-        stamps.note(noted, folder, document, seen, digest)
+        stamps.note(noted, folder, document, seen, digest, flushed=False)
         yield from _broken_chain(folder, {k: (v.get("scene", ""), v.get("manifest_sha256", "")) for k, v in _inputs(document)})
 
 
@@ -196,7 +196,7 @@ def copy_faults(folder: Path, results: Path, scene: str, stage: str) -> tuple[st
     seen = stamps.look(folder, document["files"])
     problems = tuple(wrong_files(folder, document))
     if not problems:
-        stamps.note(noted, folder, document, seen, digest, copy=True)
+        stamps.note(noted, folder, document, seen, digest, copy=True, flushed=False)
     return problems
 
 

@@ -88,6 +88,7 @@ def note(
     seen: Mapping[str, Stamp] | None = None,
     manifest: str = "",
     copy: bool = False,
+    flushed: bool = True,
 ) -> None:
     """Note the sizes and time stamps of a folder whose files are what its manifest says.
 
@@ -98,6 +99,8 @@ def note(
         seen: stamps that the files had before they were hashed; None = what they have now.
         manifest: SHA-256 of its manifest when `document` was read; empty = of what is there now.
         copy: whether the folder is a copy, which has no manifest of its own.
+        flushed: as in `write_atomically`. A plan notes thousands of folders, and the next one compares the contents of those
+            whose notes a power cut has taken.
     """
     names = [*([] if copy else [MANIFEST]), *document["files"]]
     seen = look(folder, names) if seen is None else seen
@@ -112,6 +115,8 @@ def note(
             "inputs": {stage: [facts.get("scene", ""), facts.get("manifest_sha256", "")] for stage, facts in inputs.items()},
             "files": {name: seen.get(name, NEVER) for name in names},
         },
+        settled=flushed,
+        flushed=flushed,
     )
 
 
