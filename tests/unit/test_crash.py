@@ -48,7 +48,7 @@ MUTANTS = {
     "a file is written in place": (
         io,
         "write_atomically",
-        lambda path, write, settled=True: (path.parent.mkdir(parents=True, exist_ok=True), write(path)),
+        lambda path, write, *_: (path.parent.mkdir(parents=True, exist_ok=True), write(path)),
         "file over an earlier one",
         "neither the earlier one nor the new one",
     ),
