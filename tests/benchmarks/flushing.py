@@ -35,7 +35,7 @@ def main() -> None:
     folder = Path(sys.argv[1]) / "flushing"
     flush, fsync, write = io.flush_folder, os.fsync, io.write_atomically
 
-    def each(path, content, settled=True):
+    def each(path, content, *_):
         write(path, content, True)
 
     ways = {
