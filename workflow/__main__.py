@@ -203,7 +203,8 @@ def _of_the_machine(error: OSError) -> str:
     """Return a sentence on an error of the operating system: the file, what is wrong, and what to do."""
     from workflow.runtime.attempts import written_out
 
-    place = f"{error.filename}: " if error.filename else ""
+    name = error.filename2 or error.filename  # of a renaming, what was to be replaced: the other is a name of ours
+    place = f"{name}: " if name else ""
     known = CAUSES.get(error.errno or 0)
     words = known or f"{error.strerror or error} (if the file should be there, please report it with the log)"
     return written_out(f"{place}{words}")

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -336,10 +337,12 @@ def five(project, monkeypatch):
     columns = {"view": view, "quantity": ["rgb", "rgb_held_out", "albedo", "rgb"], "metric": ["psnr", "psnr", "psnr", "l2"]}
     columns |= {"protocol": ["raw"] * 4, "value": np.array([30.0, 20.0, 25.0, 9.0])}
     write_parquet(Path("scenes/done/metrics.parquet"), columns, {})
-    cameras = {"name": ["000", "001"], "split": ["train", "test"]}
-    write_parquet(Path("results/done/capture/cameras.parquet"), cameras, {})
+    for name in ("000", "001"):
+        path = Path(f"scenes/done/maps/{name}.exr")
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
     benchmarks = Path("results/done/benchmarks")
-    benchmarks.mkdir()
+    benchmarks.mkdir(parents=True)
     (benchmarks / "capture.jsonl").write_text('{"s": 3.0, "cpu_time": 4.0, "max_rss": 100.0}\n')
     (benchmarks / "base.jsonl").write_text('{"s": 5.0, "cpu_time": 6.0, "max_rss": 80.0}\n')
     write_json(benchmarks / "base.parts.json", {"job": {"cpu_seconds": 7.0, "max_rss_mb": 120.0}})
@@ -513,11 +516,29 @@ def test_a_part_of_the_prior_that_failed_is_the_reason(five):
     assert found["log"] == "results/idle/logs/prior.3-of-8.log"
 
 
-def test_only_a_finished_plan_counts_as_complete(five):
+def test_only_a_finished_plan_counts_as_complete(five, monkeypatch):
+    with pytest.raises(InputError, match="failed and 2 more: not done, although all jobs ended well"):
+        summary.write_summary("draft", "mark")
+    assert not Path("results/batch/complete").exists() and Path("results/batch/report.html").is_file()
+    lines = tuple(line for line in five.lines if line.name in ("done", "refused"))
+    monkeypatch.setattr(batch_plan, "plan", lambda quality: replace(five, lines=lines))
     summary.write_summary("draft", "mark")
-    assert Path("results/batch/complete").read_text() == "mark\n"
+    assert Path("results/batch/complete").read_text().splitlines()[0] == "mark"
+    assert batch_plan.faults_of_the_summary() == ()
+    page, table = Path("results/batch/report.html"), Path("results/batch/summary.tsv")
+    page.write_text("")
+    table.unlink()
+    assert batch_plan.faults_of_the_summary() == (f"{table}: missing", f"{page}: its content changed since it was written")
     summary.write_summary("draft")
-    assert not Path("results/batch/complete").exists()
+    assert not Path("results/batch/complete").exists() and batch_plan.faults_of_the_summary() == ()
+
+
+def test_a_scene_whose_results_were_removed_is_done(five):
+    """What is published has everything that the table tells."""
+    shutil.rmtree("results/done")
+    plan = batch_plan.plan("draft")
+    row = summary.row_of(plan.lines[0], plan, "draft")
+    assert (row["status"], row["views"], row["rgb_psnr"], row["verdict"]) == ("done", 2, 30.0, "doubtful")
 
 
 def test_refusing_names_every_scene(five):

@@ -413,5 +413,7 @@ def test_a_workflow_profile_that_is_not_there_is_refused(repository, tmp_path):
 
 def test_a_name_that_nothing_is_scattered_by_is_refused():
     settings.refuse_scatter({"prior": 8}, ("prior",))
+    with pytest.raises(InputError, match="--set-scatter prior=0: needs a number of parts"):
+        settings.refuse_scatter({"prior": 0}, ("prior",))
     with pytest.raises(InputError, match="--set-scatter piror: nothing is scattered by this name. Did you mean prior"):
         settings.refuse_scatter({"piror": 8}, ("prior",))

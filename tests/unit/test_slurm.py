@@ -165,7 +165,7 @@ def test_attempts_of_an_earlier_run_do_not_count(cluster, monkeypatch):
     monkeypatch.setenv(attempts.RUN, "3")
     document = attempt()
     assert document["attempt"] == 1 and document["earlier"][0].startswith(
-        "in an earlier run, attempt 2 was killed without a word"
+        "the last one of an earlier run was killed without a word"
     )
 
 

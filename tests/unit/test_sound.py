@@ -172,6 +172,29 @@ def test_what_nobody_touched_is_not_read(room, tmp_path, monkeypatch):
     assert faults(tmp_path) == ()
 
 
+@pytest.mark.parametrize("state", ["failed", "started"])
+def test_a_stage_whose_last_job_ended_badly_is_made_again(room, tmp_path, state):
+    """As one that was to mend damage: it has removed manifest and stamps, and what was made from the stage is there."""
+    shutil.rmtree(room)
+    stamps.place(tmp_path / "results", "s", "base").unlink()
+    assert faults(tmp_path) == ()
+    path = tmp_path / "results/s/logs/base.state.json"
+    for mark, found in ((MARK, ("",)), ("", ("",)), ("2" * 16, ())):
+        io.write_json(path, {"state": state, "fingerprint": mark})
+        assert faults(tmp_path) == found
+    path.write_text("[")
+    assert faults(tmp_path) == ()
+
+
+def test_a_folder_in_the_place_of_a_manifest_is_told(room, tmp_path):
+    (room / MANIFEST).unlink()
+    (room / MANIFEST).mkdir()
+    finish(tmp_path, "s", "render")
+    (line,) = faults(tmp_path)
+    assert line == f"{room / MANIFEST}: missing, although it was finished"
+    assert sound._digest_of(tmp_path / "results", "s", "base") is None
+
+
 def test_a_manifest_that_was_touched_has_no_content_read_but_its_own(room, tmp_path, monkeypatch):
     """Snakemake touches it when a job has ended. A file that was touched as well is read, and a harm of it is found."""
     compared = []

@@ -299,6 +299,16 @@ def test_a_pipe_or_a_giant_in_the_place_of_a_record_is_not_waited_for(project, n
     stand()
 
 
+def test_a_deliverable_that_is_gone_is_told_as_such(project):
+    for stage in standing.fp.NEEDED:
+        made(stage)
+    assert (stand().state, stand().reason) == ("stale", "scenes/a is not there; the next run publishes it")
+    Path("scenes/a").mkdir(parents=True)
+    assert stand().reason == "scenes/a/manifest.json is not there; the next run publishes it"
+    Path("scenes/a/manifest.json").write_text("rubbish")
+    assert stand().reason == "scenes/a/manifest.json is not what was published; the next run publishes it"
+
+
 def test_what_lies_in_the_place_of_its_folders_refuses_a_scene(project):
     Path("results/a").mkdir(parents=True)
     for path in ("scenes/a", "results/a/render"):
@@ -570,6 +580,9 @@ def test_where_events_go(tmp_path, monkeypatch):
     Path("file").write_text("")
     Path("folder.jsonl").mkdir()
     os.mkfifo("pipe.jsonl")
+    for named in ("", " ", "scenes/a", "scenes/e.jsonl", "results/a/events.jsonl"):
+        with pytest.raises(InputError, match="name a file such as results/events.jsonl"):
+            events.checked(named)
     assert events.checked("/proc/events", tried=False) == "/proc/events"  # on a node, where a job goes on without
     for named in ("file", "folder.jsonl", "file/e.jsonl", "/proc/events", "/proc/version.jsonl/x", "pipe.jsonl"):
         with pytest.raises(InputError, match=f"--config events={named}: "):

@@ -38,9 +38,20 @@ def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tup
     _without_links(results, scene)
     folder, noted = results / scene / stage, stamps.place(results, scene, stage)
     if not (folder / MANIFEST).is_file():
-        finished = noted.is_file()  # a job that starts removes it
-        return (f"{folder if not folder.is_dir() else folder / MANIFEST}: missing, although it was finished",) if finished else ()
+        if noted.is_file():  # a job that starts removes it
+            return (f"{folder if not folder.is_dir() else folder / MANIFEST}: missing, although it was finished",)
+        # What its last job left unfinished is tried again, also where what was made from an earlier one is still there.
+        return ("",) if _ended_badly(results / scene / "logs" / f"{stage}.state.json", fingerprint) else ()
     return tuple(_faults(folder, noted, STAGE_SCHEMA, scene, stage, fingerprint))
+
+
+def _ended_badly(state: Path, fingerprint: str) -> bool:
+    """Whether a job left a state (`workflow/runtime/job_state.py`), and would make what is wanted or was run by hand."""
+    try:
+        document = json.loads(io.read_record(state))
+        return document["state"] in ("started", "failed") and document["fingerprint"] in ("", fingerprint)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return False
 
 
 def _faults(folder: Path, noted: Path, schema: str, scene: str, stage: str, fingerprint: str) -> Iterator[str]:
@@ -146,6 +157,8 @@ def _digest_of(results: Path, scene: str, stage: str) -> str | None:
     try:
         status = path.stat()
     except OSError:
+        return None
+    if not path.is_file():
         return None
     known = stamps.load(stamps.place(results, scene, stage))
     if known and known.files.get(MANIFEST) == stamps.stamp_of(status):

@@ -70,9 +70,18 @@ def _stage(folder: Path, stage: str, scene: str) -> Iterator[str]:
     results = folder.parent.parent
     for name, facts in sorted(reader.manifest.get("inputs", {}).items()):
         up = results / facts["scene"] / name.removeprefix(SHARED) / MANIFEST
-        if up.is_file() and io.sha256_of(up) != facts["manifest_sha256"]:
+        if up.is_file() and io.sha256_of(up) != facts["manifest_sha256"] and not _is_broken(up):
             again = command(scene, stage, quality)
             yield f"{folder}: it was made from another {up.parent} than is there now; rebuild with: {again}"
+
+
+def _is_broken(manifest: Path) -> bool:
+    """Whether a manifest was changed: that is told of its own stage, and not of each that was made from it."""
+    try:
+        manifests.read(manifest)
+    except manifests.Broken:
+        return True
+    return False
 
 
 def _entries(folder: Path) -> Iterator[tuple[Path, str]]:
@@ -221,7 +230,7 @@ def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: boo
             yield f"{path}: not published (not in {manifest}); move it away, or it is lost when the scene is published again"
     for stage, digest in sorted(document.get("manifests", {}).items()):
         up = results / stage / MANIFEST
-        if up.is_file() and io.sha256_of(up) != digest:
+        if up.is_file() and io.sha256_of(up) != digest and not _is_broken(up):
             yield f"{folder}: it was made from another {up.parent} than is there now; {again}"
             return
     for name, stage in _copied(results, document):

@@ -58,6 +58,7 @@ def render(
         rows=rows,
         done=done,
         causes=groups(rows),
+        explained=any(row["reason"] or row["verdict"] == "poor" for row in rows),
         counts=counts,
         choices={
             "status": [status for status, count in counts.items() if count],

@@ -13,13 +13,16 @@ from pathlib import Path
 
 from iif_core.errors import InputError
 from workflow.artifacts import DamagedArtefact, links, sound
-from workflow.artifacts.files import sha256_of
+from workflow.artifacts.files import is_inside, read_record, sha256_of
 from workflow.batch.page import FILES
 from workflow.runtime import fingerprint as fp
 from workflow.runtime import input_digests
 from workflow.runtime.attempts import written_out
 from workflow.scene.named import check_overrides
 from workflow.settings.batch_table import Line, read_table
+
+FOLDER = Path("results/batch")
+WRITTEN = ("summary.parquet", "summary.tsv", "report.html")
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,22 @@ def plan(quality: str) -> Plan:
                 reason = f"{line.at() + ': ' if line.number else ''}{type(error).__name__}: {error} (a bug: please report it)"
                 refused[line.name] = written_out(reason)
     return Plan(lines, ready, refused, damaged)
+
+
+def faults_of_the_summary() -> tuple[str, ...]:
+    """Return what is wrong with the table and the page of a batch that was complete, a line for each file."""
+    try:
+        lines = read_record(FOLDER / "complete").decode().splitlines()[1:]
+    except (OSError, ValueError):
+        return ()
+    out = []
+    for digest, _, name in (line.partition("  ") for line in lines):
+        path = FOLDER / name
+        if not is_inside(FOLDER, name) or not path.is_file():
+            out.append(f"{path}: missing")
+        elif sha256_of(path) != digest:
+            out.append(f"{path}: its content changed since it was written")
+    return tuple(out)
 
 
 def check(scene: str, quality: str) -> tuple[str, ...]:

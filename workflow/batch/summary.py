@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from iif_core.errors import InputError
-from workflow.artifacts.files import read_parquet, read_record, remove, write_atomically
+from workflow.artifacts.files import read_parquet, read_record, remove, sha256_of, write_atomically
 from workflow.batch import causes
 from workflow.batch import plan as batch_plan
 from workflow.batch.columns import SCORES, STATUSES, VERDICTS
@@ -27,7 +27,7 @@ from workflow.runtime.job_state import noted, state_file
 from workflow.runtime.timings import read_parts, read_timings
 from workflow.settings.batch_table import Line
 
-FOLDER = Path("results/batch")
+FOLDER = batch_plan.FOLDER
 _TEXT = ("scene", "status", "stage", "reason", "source", "base", "quality", "verdict", "doubt", "log", "report", "slowest")
 COLUMNS = {
     "line": "int64",
@@ -46,8 +46,12 @@ def write_summary(quality: str, complete: str | None = None) -> None:
 
     Args:
         quality: preset of the batch.
-        complete: fingerprint of the plan, when all its jobs are done. Without it, `results/batch/complete` is removed, so that
-            Snakemake does not take what a failed run left for the summary of a finished one.
+        complete: fingerprint of the plan, when all its jobs are done; it is kept with the digests of all files. Without it,
+            `results/batch/complete` is removed, so that Snakemake does not take what a failed run left for the summary of a
+            finished one.
+
+    Raises:
+        InputError: `complete` is given, and a scene is not done nevertheless.
     """
     remove(FOLDER / "complete")
     plan = batch_plan.plan(quality)
@@ -57,9 +61,16 @@ def write_summary(quality: str, complete: str | None = None) -> None:
     pictures = write_pictures([row["scene"] for row in rows if row["status"] == "done"], FOLDER)
     page = render(rows, quality, SCORES, STATUSES, VERDICTS, pictures)
     write_atomically(FOLDER / "report.html", lambda path: path.write_text(page, encoding="utf-8"))
-    if complete:
-        write_atomically(FOLDER / "complete", lambda path: path.write_text(f"{complete}\n"))
     logging.getLogger("batch").info("%s", closing(rows))
+    if not complete:
+        return
+    left = [row["scene"] for row in rows if row["scene"] in plan.ready and row["status"] != "done"]
+    if left:
+        others = f" and {len(left) - 1} more" if len(left) > 1 else ""
+        raise InputError(f"{left[0]}{others}: not done, although all jobs ended well; the table and the page say why")
+    files = [FOLDER / name for name in (*batch_plan.WRITTEN, *pictures.values())]
+    lines = [complete, *(f"{sha256_of(path)}  {path.relative_to(FOLDER).as_posix()}" for path in files)]
+    write_atomically(FOLDER / "complete", lambda path: path.write_text("\n".join(lines) + "\n"))
 
 
 def refuse(quality: str) -> None:
@@ -97,11 +108,11 @@ def row_of(line: Line, plan: batch_plan.Plan, quality: str) -> Row:
     row["source"] = json.loads(fp.resolved(scene, quality))["source"]["kind"]
     try:
         row |= _costs(scene)
-        if not _is_published(scene, plan.ready[scene]):
-            return row | _why_not(scene, quality)
         if faults := plan.damaged.get(scene):
             more = f", and {len(faults) - 1} more" if len(faults) > 1 else ""
             return row | {"status": "damaged", "stage": "publish", "reason": faults[0] + more}
+        if not _is_published(scene, plan.ready[scene]):
+            return row | _why_not(scene, quality)
         return row | {
             "status": "done",
             "report": f"scenes/{scene}/report.html",
@@ -130,7 +141,10 @@ def _why_not(scene: str, quality: str) -> Row:
     missing = fp.missing_stages(scene, quality)
     jobs = _jobs(scene, missing, quality)
     stage = missing[0] if missing else "publish"
-    idle = {"status": "not run", "stage": stage, "reason": f"stage {stage} has not run"}
+    reason = f"stage {stage} has not run"
+    if not missing:
+        reason = f"all stages are finished, and scenes/{scene} is not there, or not what they made; the next run publishes it"
+    idle = {"status": "not run", "stage": stage, "reason": reason}
     return jobs.get("failed") or jobs.get("running") or jobs.get("killed") or idle
 
 
@@ -192,10 +206,10 @@ def _verdict(scene: str) -> Row:
 
 def _scores(scene: str) -> Row:
     table = read_parquet(Path("scenes") / scene / "metrics.parquet")
-    cameras = read_parquet(Path("results") / scene / "capture/cameras.parquet")
-    split = dict(zip(cameras["name"].tolist(), cameras["split"].tolist(), strict=True))
+    rows = list(zip(*(table[name].tolist() for name in ("view", "quantity", "metric", "protocol", "value")), strict=True))
+    held_out = {view for view, quantity, *_ in rows if quantity == "rgb_held_out"}
+    split = {path.stem: "test" if path.stem in held_out else "train" for path in (Path("scenes") / scene / "maps").glob("*.exr")}
     out: Row = {"views": len(split)}
-    rows = zip(*(table[name].tolist() for name in ("view", "quantity", "metric", "protocol", "value")), strict=True)
     values: dict[str, list[float]] = {score.column: [] for score in SCORES}
     for view, *key, value in rows:
         for score in SCORES:

@@ -145,7 +145,7 @@ for place in (".", "results", "scenes", ".snakemake"):
 
 
 or_stop(inputs_again, config.get("inputs"))
-if config.get("events"):
+if config.get("events") is not None:
     # Jobs inherit it, also those that Snakemake starts on other machines, because it hands `--config` on to them.
     os.environ[events.VARIABLE] = or_stop(
         events.checked, str(config["events"]), workflow.is_main_process
@@ -579,6 +579,11 @@ def batch_targets(wildcards):
         [] if workflow.dag_settings.batch else [f"scenes/{name}" for name in plan.ready]
     )
     refused = ["results/batch/refused"] if plan.refused else []
+    again_if_unsound(
+        "results/batch/complete",
+        "the table and the page of the batch are made again",
+        or_stop(batch_table.faults_of_the_summary),
+    )
     return [*scenes, "results/batch/complete", *refused]
 
 

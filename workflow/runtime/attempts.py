@@ -39,7 +39,7 @@ def facts_of(before: dict[str, Any], fingerprint: str, run: str = "") -> dict[st
         facts["slurm"] = own._asdict()
     if before.get("fingerprint") == fingerprint and before.get("run", "") != run:
         if before.get("state") == "started":
-            facts["earlier"] = [f"in an earlier run, attempt {before.get('attempt', 1)}{_place(before)} {ending(before, own)}"]
+            facts["earlier"] = [f"the last one of an earlier run{_place(before)} {ending(before, own)}"]
     elif before.get("fingerprint") == fingerprint:
         number = before.get("attempt", 1)
         facts["attempt"] = number + 1
@@ -54,7 +54,8 @@ def told(facts: dict[str, Any]) -> str:
     if not earlier:
         return ""
     asks = _asks(facts.get("slurm", {}))
-    return f"attempt {facts['attempt']}{f', which asks for {asks}' if asks else ''}: {'; '.join(earlier)}"
+    number = f"{facts['attempt']}{' of this run' if facts['attempt'] == 1 else ''}"
+    return f"attempt {number}{f', which asks for {asks}' if asks else ''}: {'; '.join(earlier)}"
 
 
 def sound(document: dict[str, Any]) -> dict[str, Any]:

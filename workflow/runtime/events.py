@@ -50,6 +50,12 @@ def checked(named: str, tried: bool = True) -> str:
     path = os.path.abspath(named) + (os.sep if named.endswith(os.sep) else "")
     if not tried:
         return path
+    inner = os.path.relpath(path).split(os.sep)
+    if not named.strip() or (inner[0] in ("results", "scenes") and len(inner) > 2 - (inner[0] == "scenes")):
+        raise InputError(
+            f"--config events={named}: name a file such as results/events.jsonl, or a folder; none in results/<scene> or scenes/,"
+            " where everything that is not of the scene is removed"
+        )
     kind = "a file" if named.endswith(".jsonl") else "a folder"
     if os.path.isdir(path) if kind == "a file" else os.path.isfile(path):
         raise InputError(f"--config events={named}: needed {kind}; a name that ends in .jsonl is a file, any other a folder")

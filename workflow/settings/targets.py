@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from iif_core.errors import InputError
@@ -61,13 +61,15 @@ def refuse_profile(given: str, start: Path, checkout: Path) -> None:
     )
 
 
-def refuse_scatter(given: Iterable[str], known: Sequence[str]) -> None:
-    """Refuse a name of `--set-scatter` that nothing is scattered by, which Snakemake passes over without a word.
+def refuse_scatter(given: Mapping[str, int], known: Sequence[str]) -> None:
+    """Refuse a name of `--set-scatter` that nothing is scattered by, which Snakemake passes over without a word, and no parts.
 
     Raises:
         InputError: there is one.
     """
-    for name in given:
+    for name, parts in given.items():
+        if parts < 1:
+            raise InputError(f"--set-scatter {name}={parts}: needs a number of parts, at least 1.")
         if name not in known:
             hint = did_you_mean(name, known)
             raise InputError(f"--set-scatter {name}: nothing is scattered by this name.{hint} Known: {', '.join(known)}.")

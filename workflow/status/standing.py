@@ -197,6 +197,10 @@ def _unfinished(base: Standing, jobs: dict[str, Noted], published: dict[str, Any
         reason = job.document.get("reason", "")
         return replace(base, state=job.state, stage=stage, since=job.since, reason=reason, **_logged(scene, stage))
     stage = missing[0] if missing else "publish"
+    if not missing and published.get("fingerprint") != fp.fingerprint("publish", scene, quality):
+        what = f"scenes/{scene}/{MANIFEST} is" if os.path.isdir(f"scenes/{scene}") else f"scenes/{scene} is"
+        how = "not what was published" if os.path.exists(f"scenes/{scene}/{MANIFEST}") else "not there"
+        return replace(base, state="stale", stage=stage, since=touched or None, reason=f"{what} {how}; the next run publishes it")
     if published:
         made = published.get("quality")
         reason = f"made at quality {made}" if made != quality else "settings, inputs or code changed since"
