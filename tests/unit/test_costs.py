@@ -249,7 +249,7 @@ def test_rows_of_finished_jobs(tmp_path, document):
 def test_what_snakemake_is_told():
     fits = {("render", "all", name): model.Fit({"job": 100.0}, 0.5, 2.0, 9, 3) for name in model.MEASURES}
     cost = model.predict("render", Work("all", {"job": 1.0}), 2, 1.0, fits)
-    assert forecast.memory_mb(cost) == 300 and forecast.disk_mb(cost) == 200
+    assert forecast.memory_mb(cost) == 250 and forecast.disk_mb(cost) == 200
     assert forecast.memory_mb(cost, on_node=True) == 400  # with the Snakemake beside it
     assert forecast.minutes(cost) == forecast.TIME_LEAST + 14
     nothing = model.Cost(None, None, None, None)

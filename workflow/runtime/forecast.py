@@ -90,7 +90,7 @@ def disk_mb(cost: Cost) -> int:
 
 
 def _rounded(mb: float) -> int:
-    return math.ceil(mb / 100) * 100
+    return math.ceil(mb / 50) * 50
 
 
 class Wall(NamedTuple):
