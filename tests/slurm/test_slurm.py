@@ -153,7 +153,7 @@ def test_a_batch_survives_a_cancelled_job_and_a_killed_controller(batch, local):
     cancelled = time.time()
     wait_for(lambda: [number for number in running() if number != first])
     state = Path(os.environ["IIF_SLURM_STATE"])
-    # A controller that is killed before it has saved this would think that the job runs until the node registers again: half an hour.
+    # A controller that was killed before it saved this believes for half an hour, until the node registers again, that the job ru
     wait_for(lambda: (state / "state/job_state").stat().st_mtime > cancelled + 1)
     os.kill(int((state / "slurmctld.pid").read_text()), signal.SIGKILL)
     time.sleep(5)
