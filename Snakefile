@@ -15,6 +15,7 @@ report: "workflow/report/captions/workflow.rst"
 
 
 include: "workflow/rules/common.smk"
+include: "workflow/rules/hooks.smk"
 
 
 # Read with `--sdm apptainer` alone: the image of envs/Dockerfile, converted by

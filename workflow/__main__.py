@@ -313,7 +313,7 @@ def _planned(scene: str, quality: str) -> None:
 
 
 def _into(arguments: argparse.Namespace, place: Path, work: Callable[[], None]) -> Callable[[], None]:
-    """Return the work, before which a place that nobody named is looked at: results of a stranger may have a link there."""
+    """Return `work` with a check before it: where the user names no place, a stranger's results may have put a link there."""
 
     def checked() -> None:
         from workflow.artifacts import links

@@ -1,6 +1,6 @@
 """Symbolic links where the workflow writes: what is behind one would be overwritten or removed with what is made there.
 
-`results` and `scenes` themselves may be links to another disk; nothing below them that jobs write to may be one.
+`results`, `scenes` and the like (`KEPT`) may be links to another disk; nothing below them that jobs write to may be one.
 """
 
 from __future__ import annotations

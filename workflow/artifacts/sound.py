@@ -46,7 +46,12 @@ def stage_faults(results: Path, scene: str, stage: str, fingerprint: str) -> tup
 
 
 def _ended_badly(state: Path, fingerprint: str) -> bool:
-    """Whether a job left a state (`workflow/runtime/job_state.py`), and would make what is wanted or was run by hand."""
+    """Whether the last job of a stage did not end well, and was planned as what is wanted or run by hand.
+
+    Args:
+        state: what the job left (`workflow/runtime/job_state.py`); it is gone when a job ends well.
+        fingerprint: under which the stage is wanted.
+    """
     try:
         document = json.loads(io.read_record(state))
         return document["state"] in ("started", "failed") and document["fingerprint"] in ("", fingerprint)

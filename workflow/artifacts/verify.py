@@ -241,8 +241,7 @@ def _deliverable(manifest: Path, scene: str, results: Path, damaged_results: boo
 
 
 def _copied(results: Path, document: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and stage of each listed file of a deliverable of which every stage that has a file of this name lists another
-    content."""
+    """Yield (name, stage) for each file of a deliverable whose content is not that of any stage with a file of this name."""
     listed: dict[str, dict[str, str]] = {}
     for stage in document.get("manifests", {}):
         made = _document(results / stage / MANIFEST).get("files")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from iif_core.evaluation.catalogue import METRICS
+from workflow.report.verdict import AMBER, GREEN, RED, WORDS
 
 STATUSES = {
     "done": "published, as the settings, inputs and code of now would make it",
@@ -18,9 +19,9 @@ STATUSES = {
 
 
 VERDICTS = {
-    "good": "no check of its report found a fault",
-    "doubtful": "usable with care: a check of its report is in doubt",
-    "poor": "not to be relied on for what its report names",
+    WORDS[GREEN]: "no check of its report found a fault",
+    WORDS[AMBER]: "usable with care: a check of its report is in doubt",
+    WORDS[RED]: "not to be relied on for what its report names",
 }
 
 

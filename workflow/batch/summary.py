@@ -201,7 +201,7 @@ def _verdict(scene: str) -> Row:
     """
     found = json.loads(read_record(Path("scenes") / scene / "verdict.json"))
     word = next(word for word in VERDICTS if word == found["verdict"])
-    return {"verdict": word, "doubt": None if word == "good" else str(found["sentence"])}
+    return {"verdict": word, "doubt": None if word == next(iter(VERDICTS)) else str(found["sentence"])}
 
 
 def _scores(scene: str) -> Row:

@@ -19,7 +19,7 @@ from workflow.runtime import fingerprint as fingerprints
 
 MEMORY_MARGIN = 1.1
 BESIDE_MB = 150
-"""Of the Snakemake that runs beside a job on a node: it has 104 MB for a job of one stage."""
+"""MB that are added on a cluster, where each job has a Snakemake process beside it (docs/development/costs.md)."""
 TIME_MARGIN, TIME_LEAST = 4.0, 10
 """A scheduler ends a job that takes longer than it said, so this is generous, and minutes."""
 UNKNOWN_MEMORY, UNKNOWN_MINUTES, UNKNOWN_DISK = 12_000, 720, 20_000
