@@ -31,7 +31,8 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     out = argparse.ArgumentParser(prog="python -m lab.prior", description=__doc__)
     commands = out.add_subparsers(dest="command", required=True)
-    _add_rooms(commands)
+    for add in (_add_rooms, _add_train, _add_evaluate, _add_export, _add_pack):
+        add(commands)
     return out
 
 
@@ -78,6 +79,158 @@ def _rooms(options: argparse.Namespace) -> None:
     (first, last), (i, n) = options.seeds, options.part
     made = maker.make_all(range(first + i, last, n), stop)
     print(f"{made} rooms made in {folder.path}")
+
+
+def _add_train(commands: argparse._SubParsersAction) -> None:
+    p = commands.add_parser("train", help="train the network on crops", description=_train.__doc__)
+    p.add_argument("folder", type=Path, help="a folder that `rooms` fills, or has filled")
+    p.add_argument("out", type=Path, help="where weights, recipe, curve and state go; a run continues from the state there")
+    p.add_argument("--steps", type=int, default=0, help="steps in all; default: by --seconds")
+    p.add_argument("--seconds", type=float, default=float("inf"), help="seconds in all, waiting for rooms included")
+    p.add_argument("--start", type=float, default=0, help="make rooms for so many seconds before the first step")
+    p.add_argument("--workers", type=int, default=0, help="processes that make rooms meanwhile; default none")
+    p.add_argument("--generate", type=float, default=float("inf"), help="seconds after which the workers start no more rooms")
+    p.add_argument("--seeds", default="30000:1000000000", metavar="FIRST:STOP", type=_range, help="of the workers' rooms")
+    p.add_argument("--assets", type=Path, help="of the workers' rooms")
+    p.add_argument("--samples", type=int, default=40, help="paths per pixel of the workers' rooms")
+    p.add_argument("--consume", action="store_true", help="keep no captures, and delete crops once they are in memory")
+    p.add_argument("--capacity", type=int, default=2000, help="crops in memory, 1.5 MB each; default 2000")
+    p.add_argument("--batch", type=int, default=48, help="crops of a step, default 48")
+    p.add_argument("--rate", type=float, default=1.2e-3, help="largest step size, default 0.0012")
+    p.add_argument("--widths", type=_widths, default=(40, 80, 128, 192, 224), help="features by level, default 40,80,128,192,224")
+    p.add_argument("--heads", type=int, default=8, help="hypotheses, default 8")
+    p.add_argument("--no-weights", action="store_true", help="without a mixture weight for each hypothesis")
+    p.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
+    p.add_argument("--state", type=Path, help="where the state goes that a run continues from; default: OUT/state.pt")
+    p.add_argument("--edge", type=int, default=128, help="pixels along a crop, as the folder has them; default 128")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--compile", action="store_true", help="torch.compile")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    p.add_argument("--threads", type=int, default=2, help="of the trainer on a CPU, default 2")
+    p.set_defaults(run=_train)
+
+
+def _train(options: argparse.Namespace) -> None:
+    """Train on the crops of a folder, by steps or by the clock, perhaps while workers fill it. It may be killed at any time; the
+    same command continues from the last saved state."""
+    import torch
+
+    from lab.prior import training
+
+    torch.set_num_threads(options.threads)
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = torch.backends.cudnn.benchmark = True
+    names = ("out", "steps", "seconds", "start", "batch", "capacity", "rate", "widths", "heads", "init", "state", "seed")
+    names += ("consume", "compile", "device", "edge")
+    own = {name: getattr(options, name) for name in names}
+    plan = training.Plan(options.folder, **own, weighted=not options.no_weights)
+    workers = [_worker(options, i) for i in range(options.workers)]
+    try:
+        done = training.Trainer(plan).train(workers)
+    finally:
+        for worker in workers:
+            if worker.poll() is None:
+                worker.terminate()
+    print(f"{done.steps} steps on {done.rooms} rooms, {done.crops} crops, in {done.seconds:.0f} s: {options.out}")
+
+
+def _worker(options: argparse.Namespace, number: int) -> subprocess.Popen:
+    """Start a process that makes every `options.workers`-th room."""
+    command = [sys.executable, "-m", "lab.prior", "rooms", str(options.folder), "--seeds", "{}:{}".format(*options.seeds)]
+    command += ["--part", f"{number}/{options.workers}", "--device", options.device, "--samples", str(options.samples)]
+    command += ["--seconds", str(options.generate)] + (["--crops-only"] if options.consume else [])
+    command += ["--assets", str(options.assets)] if options.assets else []
+    options.out.mkdir(parents=True, exist_ok=True)
+    with open(options.out / "workers.log", "a") as log:
+        return subprocess.Popen(command, env=os.environ | dict.fromkeys(_ONE_THREAD, "1"), stdout=log, stderr=log)
+
+
+def _add_evaluate(commands: argparse._SubParsersAction) -> None:
+    p = commands.add_parser("evaluate", help="measure errors and calibration of weights", description=_evaluate.__doc__)
+    p.add_argument("weights", type=Path, help="folder with weights.safetensors and recipe.json")
+    p.add_argument("--rooms", type=Path, help="folder that `rooms` filled: the rooms that are kept back from training")
+    p.add_argument(
+        "--captures", type=Path, nargs="*", default=[], help="folders of stage capture, results/<scene>/capture, with truth"
+    )
+    p.add_argument("--objects", choices=("given", "mesh"), default="mesh", help="of --captures; default mesh")
+    p.add_argument("--limit", type=int, default=0, help="rooms at most; default all")
+    p.add_argument("--views", type=int, default=0, help="views of each capture at most; default all")
+    p.add_argument("--retinex", action="store_true", help="score prior retinex as well")
+    p.add_argument("--raw-scales", action="store_true", help="without the recipe's scale_calibration, as `export` wants it")
+    p.add_argument("--report", type=Path, help="JSON file for all numbers")
+    p.add_argument("--pictures", type=Path, help="PNG file: the first view of twelve captures")
+    p.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    p.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    """Measure weights on generated rooms that were kept back, or on captures of the product with truth: scores of predictions,
+    share of the errors inside of the stated 68 % intervals, metal found, and use of the heads."""
+    import json
+
+    from lab.prior import evaluation, machine, shards
+
+    machine.prepare(options.device, 2)
+    weights = evaluation.Weights.load(options.weights, options.device)
+    if options.captures:
+        sources = evaluation.product_captures(options.captures, options.objects == "given", options.views, options.retinex)
+    elif options.rooms:
+        files = sorted((options.rooms / "rooms").glob("[0-9]*.npz"), key=lambda path: int(path.stem))
+        kept = [path for path in files if shards.is_held_out(int(path.stem))]
+        if not kept:
+            raise InputError(
+                f"{options.rooms}: none of its {len(files)} rooms is one that is kept back (one in {shards.HELD_OUT[0]})"
+            )
+        sources = evaluation.held_out_rooms(kept[: options.limit or None], options.views, options.retinex)
+    else:
+        raise InputError("neither --rooms nor --captures is given; name what to measure on")
+    report = evaluation.evaluate(weights, sources, options.pictures, not options.raw_scales)
+    print(evaluation.table(report))
+    if options.report:
+        options.report.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def _add_export(commands: argparse._SubParsersAction) -> None:
+    p = commands.add_parser("export", help="write weights as the product reads them", description=_export.__doc__)
+    p.add_argument("trained", type=Path, help="folder that `train` wrote")
+    p.add_argument("target", type=Path, help="folder that is written: weights.safetensors, recipe.json")
+    p.add_argument("--report", type=Path, required=True, help="what `evaluate --raw-scales --report` wrote")
+    p.set_defaults(run=_export)
+
+
+def _export(options: argparse.Namespace) -> None:
+    """Write weights in half precision with their recipe: inputs, sizes, outputs, data, seconds, held-out scores, calibration of
+    the scales, hash."""
+    import json
+
+    from lab.prior.export import export
+
+    recipe = export(options.trained, options.target, json.loads(options.report.read_text()))
+    print(f"{options.target}: {recipe['parameters']} parameters, sha256 {recipe['sha256'][:16]}...")
+
+
+def _add_pack(commands: argparse._SubParsersAction) -> None:
+    p = commands.add_parser("pack", help="pack everything for a GPU machine without a network", description=_pack.__doc__)
+    p.add_argument("target", type=Path, help="folder that is written")
+    p.add_argument("--wheels", type=Path, required=True, help="folder of wheels of mitsuba and drjit for that machine's Python")
+    p.add_argument("--assets", type=Path, help="folder or file of textures and skies")
+    p.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
+    p.set_defaults(run=_pack)
+
+
+def _pack(options: argparse.Namespace) -> None:
+    """Pack code, renderer, denoiser, assets and first weights into a folder of less than 64 MiB. There, `bash run.sh OUT` unpacks
+    it and trains with workers on a CUDA device. The machine needs Python with torch, numpy, scipy, numba, Pillow, safetensors."""
+    from lab.prior.pack import pack
+
+    size = pack(options.target, options.wheels, options.assets, options.init)
+    print(f"{options.target}: {size / 2**20:.1f} MiB")
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    parts = text.split(",")
+    if not all(part.isdigit() and int(part) % 8 == 0 and int(part) > 0 for part in parts):
+        raise argparse.ArgumentTypeError(f"{text!r}; write multiples of 8 with commas, for example 40,80,128")
+    return tuple(int(part) for part in parts)
 
 
 def _range(text: str) -> tuple[int, int]:

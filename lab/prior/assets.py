@@ -9,6 +9,7 @@ nothing of them is in this repository.
 from __future__ import annotations
 
 import csv
+import io
 import re
 from dataclasses import dataclass
 from functools import lru_cache
@@ -50,7 +51,7 @@ class Assets:
 
     def save(self, path: Path) -> None:
         """Write one file that `load` reads."""
-        arrays = {f"texture_{name}": texture for name, texture in zip(self.names, self.textures, strict=True)}
+        arrays = {f"texture_{name}": _encoded(texture) for name, texture in zip(self.names, self.textures, strict=True)}
         arrays |= {f"sky_{i:03d}": np.minimum(sky, 6e4).astype(np.float16) for i, sky in enumerate(self.skies)}
         np.savez_compressed(path, **arrays)
 
@@ -79,7 +80,7 @@ def load(path: Path | None) -> Assets:
         skies = sorted(key for key in file.files if key.startswith("sky_"))
         return Assets(
             tuple(name.removeprefix("texture_") for name in names),
-            tuple(file[name] for name in names),
+            tuple(_decoded(file[name]) for name in names),
             tuple(file[key].astype(np.float32) for key in skies),
         )
 
@@ -107,6 +108,27 @@ def _from_folder(folder: Path) -> Assets:
     if not names and not skies:
         raise FileNotFoundError(f"{folder}: neither textures/*.jpg nor hdri/*.exr; name a folder that has them, or none")
     return Assets(tuple(names), tuple(textures), skies)
+
+
+def _encoded(texture: np.ndarray) -> np.ndarray:
+    """A texture as bytes: the length of the first of two JPEG pictures in four bytes, then colour and roughness."""
+    from PIL import Image
+
+    parts = []
+    for image in (texture[..., :3], texture[..., 3]):
+        buffer = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(image)).save(buffer, "JPEG", quality=92)
+        parts.append(buffer.getvalue())
+    return np.frombuffer(len(parts[0]).to_bytes(4, "little") + parts[0] + parts[1], np.uint8)
+
+
+def _decoded(stored: np.ndarray) -> np.ndarray:
+    from PIL import Image
+
+    data = stored.tobytes()
+    end = 4 + int.from_bytes(data[:4], "little")
+    colour, rough = (np.asarray(Image.open(io.BytesIO(part))) for part in (data[4:end], data[end:]))
+    return np.dstack([colour, rough])
 
 
 def _sky(path: Path) -> np.ndarray:
