@@ -172,7 +172,9 @@ def _evaluate(options: argparse.Namespace) -> None:
     machine.prepare(options.device, 2)
     weights = evaluation.Weights.load(options.weights, options.device)
     if options.captures:
-        sources = evaluation.product_captures(options.captures, options.objects == "given", options.views, options.retinex)
+        sources = evaluation.product_captures(
+            options.captures, weights, options.objects == "given", options.views, options.retinex
+        )
     elif options.rooms:
         files = sorted((options.rooms / "rooms").glob("[0-9]*.npz"), key=lambda path: int(path.stem))
         kept = [path for path in files if shards.is_held_out(int(path.stem))]
@@ -180,7 +182,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             raise InputError(
                 f"{options.rooms}: none of its {len(files)} rooms is one that is kept back (one in {shards.HELD_OUT[0]})"
             )
-        sources = evaluation.held_out_rooms(kept[: options.limit or None], options.views, options.retinex)
+        sources = evaluation.held_out_rooms(kept[: options.limit or None], weights, options.views, options.retinex)
     else:
         raise InputError("neither --rooms nor --captures is given; name what to measure on")
     report = evaluation.evaluate(weights, sources, options.pictures, not options.raw_scales)

@@ -17,17 +17,19 @@ import numpy as np
 import torch
 
 from iif_core.evaluation.metrics import Target, material_masks
-from iif_core.priors.features import CHANNELS, features, gather
+from iif_core.priors.features import CHANNELS, Gathering, features
 from iif_core.priors.hypotheses import Hypotheses, combined
 from iif_core.reflectance.material import PROPERTIES
 from lab.prior import captures, network
 from lab.prior.captures import Capture
-from workflow.priors.views import CaptureViews
+from lab.prior.inputs import Views
 from workflow.scene.normal_form import CaptureReader, View
 
 COVERED = 0.68
 WIDTH = float(-np.log(1 - COVERED))
 """Half width of the 68 % interval of a Laplace distribution in scales."""
+FIRST_EVERY = 3
+"""The first prediction, of which only the mean albedo of objects is used, is made for every view of so many."""
 METAL = 0.5  # metallic from which a pixel counts as metal
 SHOWN = {
     "albedo up to scale, dB": "albedo/psnr/scaled",
@@ -94,26 +96,33 @@ class Case:
     retinex: np.ndarray | None = None
 
 
-def cases(capture: Capture | CaptureReader, given: bool, most: int = 0, retinex: bool = False, seed: int = 0) -> Iterator[Case]:
+def cases(
+    capture: Capture | CaptureReader, weights: Weights | None, given: bool, most: int = 0, retinex: bool = False, seed: int = 0
+) -> Iterator[Case]:
     """Go through the views of a capture with truth.
 
     Args:
         capture: generated, or of the product.
+        weights: of the first prediction, with which the light is gathered again as the product does; None = gather once.
         given: whether the objects of the capture may be read; otherwise pieces of the mesh take their place.
         most: views at most, spread evenly; 0 = all. The light is gathered from all views in any case.
         retinex: whether to make the predictions of prior `retinex` as well.
         seed: of the rays.
     """
-    views = CaptureViews(capture, given)  # type: ignore[arg-type]  # Capture offers what CaptureReader does
-    gathered = gather(views, views.tracer(), seed=seed)
+    views = Views(capture, given)
+
+    def first(gathering: Gathering, i: int) -> np.ndarray:
+        return combined(weights.heads(features(gathering, views, i))[..., :8], 1).maps[0, ..., :3]
+
+    gathering = views.gather(first if weights else None, FIRST_EVERY, seed)
     baseline = _retinex(capture, given, seed) if retinex else None
     chosen = np.unique(np.linspace(0, len(views) - 1, most or len(views)).round().astype(int))
     for number in chosen:
-        view = views.views[number]
+        view = views.cameras[number]
         truth, masks = _truth(capture, view)
         if masks["albedo"].any():
             photo = capture.photo(view)[0]
-            inputs, group = features(gathered, views, int(number)), views[int(number)].group
+            inputs, group = features(gathering, views, int(number)), views[number].group
             yield Case(
                 view.name, inputs, _shown(photo, capture.is_hdr), truth, masks, group, baseline(view) if baseline else None
             )
@@ -260,20 +269,20 @@ def evaluate(
     return scores.report()
 
 
-def held_out_rooms(files: list[Path], views: int, retinex: bool) -> Iterator[Iterator[Case]]:
+def held_out_rooms(files: list[Path], weights: Weights, views: int, retinex: bool) -> Iterator[Iterator[Case]]:
     """Go through captures of generated rooms, with objects as each of them was drawn."""
     for path in files:
         capture = captures.load(path)
-        yield cases(capture, capture.given, views, retinex)
+        yield cases(capture, weights, capture.given, views, retinex)
 
 
-def product_captures(folders: list[Path], given: bool, views: int, retinex: bool) -> Iterator[Iterator[Case]]:
+def product_captures(folders: list[Path], weights: Weights, given: bool, views: int, retinex: bool) -> Iterator[Iterator[Case]]:
     """Go through folders of the product's stage `capture` (results/<scene>/capture)."""
     from workflow.artifacts.store import StageReader
 
     for folder in folders:
         reader = StageReader(folder, "capture", folder.resolve().parent.name)
-        yield cases(CaptureReader(reader), given, views, retinex)
+        yield cases(CaptureReader(reader), weights, given, views, retinex)
 
 
 def table(report: dict[str, Any]) -> str:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from iif_core.priors.features import CHANNELS, ViewArrays, features, gather
+from iif_core.priors.features import CHANNELS, Gathering, ViewArrays, features, gather_again, gather_views
 from lab.prior.captures import Capture
 from workflow.priors.views import CaptureViews
+from workflow.scene.normal_form import CaptureReader
 
 EDGE = 128
 """Pixels along a crop."""
 _SEEN, _CLIPPED = 0.2, 0.7
-_STREAM = 0x63726F70
+TWICE = 0.7
+"""Share of the captures whose light is gathered twice, as the product does for its second prediction."""
+KNOWN_ERROR = (0.1, 0.2, 0.05)
+"""Standard deviations of log albedo in a first prediction: of a capture, of an object, of a channel of an object."""
+AlbedoOf = Callable[[Gathering, int], np.ndarray]
+_STREAM, _LIGHT_STREAM = 0x63726F70, 0x6C69
 
 
 @dataclass(frozen=True)
@@ -38,17 +45,68 @@ class Crops:
         return len(self.inputs)
 
 
-def views_of(capture: Capture) -> list[ViewArrays]:
-    """Return what the product reads of a capture, with given objects or pieces of the mesh; all views stay in memory."""
-    views = CaptureViews(capture, capture.given)  # type: ignore[arg-type]  # Capture offers what CaptureReader does
-    return [views[i] for i in range(len(views))]
+class Views(list[ViewArrays]):
+    """All views of a capture in memory, with the response that the product estimates.
+
+    Args:
+        capture: generated, or of the product.
+        given: whether the objects of the capture may be read; otherwise pieces of the mesh take their place.
+    """
+
+    def __init__(self, capture: Capture | CaptureReader, given: bool):
+        own = CaptureViews(capture, given)  # type: ignore[arg-type]  # Capture offers what CaptureReader does
+        self.response = own.calibrate()
+        super().__init__(own[i] for i in range(len(own)))
+        self.cameras, self.trace = own.views, own.tracer()
+
+    def gather(self, albedo_of: AlbedoOf | None, every: int = 1, seed: int = 0) -> Gathering:
+        """Gather the light; with `albedo_of` twice, the second time with the mean albedo of each object.
+
+        Args:
+            albedo_of: gives the albedo (H, W, 3) of a view by its number, once the light has been gathered; NaN = not known.
+            every: it is asked for every view of so many.
+            seed: of the rays.
+        """
+        first = gather_views(self, self.trace, seed=seed)
+        if albedo_of is None:
+            return first
+        total, count = np.zeros((len(first.group), 3)), np.zeros(len(first.group))
+        for i in range(0, len(self), every):
+            albedo = albedo_of(first, i)
+            use = self[i].used & ~self[i].saturated & np.isfinite(albedo).all(-1)
+            row = np.searchsorted(first.group, self[i].group[use])
+            count += np.bincount(row, minlength=len(count))
+            total += np.stack([np.bincount(row, np.log(np.maximum(a, 0.01)), len(count)) for a in albedo[use].T], 1)
+        with np.errstate(invalid="ignore"):
+            return gather_again(first, self, total / count[:, None])
+
+
+def _known_albedo(capture: Capture, rng: np.random.Generator) -> AlbedoOf:
+    """Albedo as a first prediction would have it: the truth, with wrong levels of capture, objects and their channels."""
+    level = rng.normal(0, KNOWN_ERROR[0])
+    size = max(int(capture.instance.max()), 0) + 1
+    own = np.exp(level + rng.normal(0, KNOWN_ERROR[1], (size, 1)) + rng.normal(0, KNOWN_ERROR[2], (size, 3)))
+
+    def albedo(gathering: Gathering, i: int) -> np.ndarray:
+        face = capture.gbuffer(capture.used[i])[1]
+        counts = capture.truth.valid[i] & (face >= 0)
+        factor = own[np.maximum(capture.instance[np.maximum(face, 0)], 0)]
+        return np.where(counts[..., None], capture.truth.albedo[i] * factor, np.nan)
+
+    return albedo
+
+
+def gathered(capture: Capture, seed: int) -> tuple[Views, Gathering]:
+    """Read the views of a generated capture and gather their light, once or twice as the seed has it."""
+    rng = np.random.default_rng([seed, _LIGHT_STREAM])
+    views = Views(capture, capture.given)
+    return views, views.gather(_known_albedo(capture, rng) if rng.random() < TWICE else None, seed=seed)
 
 
 def all_inputs(capture: Capture, seed: int = 0) -> np.ndarray:
-    """Compute the inputs (V, C, H, W) float32 of all views."""
-    views = views_of(capture)
-    gathered = gather(views, capture.tracer, seed=seed)
-    return np.stack([features(gathered, views, i) for i in range(len(views))])
+    """Compute the inputs (V, C, H, W) float32 of all views, as `crops` does."""
+    views, gathering = gathered(capture, seed)
+    return np.stack([features(gathering, views, i) for i in range(len(views))])
 
 
 def crops(capture: Capture, seed: int, edge: int = EDGE) -> Crops:
@@ -63,11 +121,10 @@ def crops(capture: Capture, seed: int, edge: int = EDGE) -> Crops:
         Crops that show enough surface and are not mostly saturated; there may be none.
     """
     rng = np.random.default_rng([seed, _STREAM])
-    views = views_of(capture)
-    gathered = gather(views, capture.tracer, seed=seed)
+    views, gathering = gathered(capture, seed)
     out: list[tuple] = []
     for number, view in enumerate(views):
-        inputs, truth = features(gathered, views, number), capture.truth.stacked(number)
+        inputs, truth = features(gathering, views, number), capture.truth.stacked(number)
         counts = capture.truth.valid[number] & (view.depth > 0)
         size = view.depth.shape[0]
         for _ in range(2 if size >= 1.5 * edge else 1):

@@ -133,8 +133,8 @@ def test_mixture_weights_are_the_chances_of_the_heads(batch):
     flat = losses.Batch(torch.zeros(1), torch.zeros(1), torch.ones(2, 1, 2, 2), group, torch.zeros(1), 8)
     error = torch.where(torch.arange(8)[:, None] % 4 < 3, torch.tensor([0.0, 5.0]), torch.tensor([5.0, 0.0]))
     logit = torch.zeros(2, requires_grad=True)
-    optimiser = torch.optim.Adam([logit], 0.05)
-    for _ in range(400):
+    optimiser = torch.optim.Adam([logit], 0.1)
+    for _ in range(150):
         optimiser.zero_grad()
         losses.mixture_likelihood(logit[None, :, None, None].expand(2, 2, 2, 2), error, torch.ones(8), flat).backward()
         optimiser.step()

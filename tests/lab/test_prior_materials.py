@@ -113,9 +113,9 @@ def test_assets_survive_the_file_and_a_folder_without_any_is_refused(tmp_path, c
     sky = np.random.default_rng(0).uniform(0, 5, (64, 128, 3)).astype(np.float32)
     Assets(coloured.names, coloured.textures, (sky,)).save(tmp_path / "assets.npz")
     again = load(tmp_path / "assets.npz")
-    assert again.names == coloured.names and all(
-        np.array_equal(a, b) for a, b in zip(again.textures, coloured.textures, strict=True)
-    )
+    assert again.names == coloured.names
+    for a, b in zip(again.textures, coloured.textures, strict=True):
+        assert a.shape == b.shape and np.abs(a.astype(int) - b).mean() < 4, "JPEG keeps them roughly"
     assert np.allclose(again.skies[0], sky, rtol=1e-3)
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="neither textures"):

@@ -91,3 +91,22 @@ def test_a_wrong_range_is_refused(capsys):
     with pytest.raises(SystemExit):
         command.main(["rooms", "x", "--seeds", "9:3"])
     assert "FIRST:STOP" in capsys.readouterr().err
+
+
+def test_light_is_gathered_again_with_roughly_known_albedo(capture):
+    known = inputs._known_albedo(capture, np.random.default_rng(0))
+    views = inputs.Views(capture, True)
+    once = views.gather(None)
+    asked = []
+
+    def albedo_of(gathering, i):
+        asked.append(i)
+        assert gathering.group.shape == once.group.shape
+        return known(gathering, i)
+
+    twice = views.gather(albedo_of, every=2)
+    assert asked == [0, 2] and np.array_equal(once.group, twice.group)
+    assert not np.allclose(once.light.log_light, twice.light.log_light)
+    counts = capture.truth.valid[0] & (capture.gbuffer(capture.used[0])[1] >= 0)
+    ratio = np.log(known(once, 0)[counts] / np.maximum(capture.truth.albedo[0][counts], 1e-3))
+    assert 0.02 < ratio.std() < 0.5 and np.isnan(known(once, 0)[~counts]).all()

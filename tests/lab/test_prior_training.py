@@ -117,7 +117,7 @@ def test_augmentation_mirrors_and_permutes_inputs_with_the_truth(monkeypatch):
 
 
 def test_evaluation_counts_what_it_says(capture):
-    case = next(evaluation.cases(capture, True, most=1))
+    case = next(evaluation.cases(capture, None, True, most=1))
     truth = case.truth
     heads = np.zeros((2, *truth["roughness"].shape, 9), np.float32)
     heads[..., :3] = np.log(np.maximum(truth["albedo"], 0.01))
