@@ -26,6 +26,7 @@ class Block:
         segments: (s,) int32 ids, ascending; start: (s + 1,) int64, the pixels of segments[j] are start[j] ... start[j + 1] - 1.
         usable: (K,) bool.
         inside: (K, n) bool, no albedo channel is exactly 0 or 1; (0, 0) if that holds for all.
+        scale: (3, n) float32 Laplace scales that the prior states for albedo, roughness and metallic; (3, 0) if it states none.
     """
 
     values: NDArray
@@ -35,10 +36,11 @@ class Block:
     start: NDArray
     usable: NDArray
     inside: NDArray
+    scale: NDArray
 
     @property
     def nbytes(self) -> int:
-        return sum(getattr(self, name).nbytes for name in ("values", "cell", "weight", "segments", "start", "inside"))
+        return sum(getattr(self, name).nbytes for name in ("values", "cell", "weight", "segments", "start", "inside", "scale"))
 
 
 def covisibility_weight(viewpoints: NDArray, floor: float) -> NDArray:
@@ -69,6 +71,7 @@ def make_block(problem: FusionProblem, view: int) -> tuple[Block, list[Dropped]]
         np.append(start, len(found.pixel)).astype(np.int64),
         found.usable,
         np.zeros((0, 0), bool) if inside.all() else inside,
+        problem.stated_scale(view, found.pixel),
     )
     return block, found.dropped
 

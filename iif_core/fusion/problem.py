@@ -35,6 +35,8 @@ class FusionProblem:
         point: view -> (N, 3) float32 surface points of the pixels in world coordinates, m, with any value where there is
             no surface; read by textures that are functions of space.
         tangent: view -> (N, 2, 3) float32 displacement of the surface point over one pixel to the right and down, m.
+        scale: view -> (N, 3) or (H, W, 3) Laplace scales > 0 that the prior states for its albedo, roughness and metallic at each
+            pixel (Eq. F.50); None = it states none.
         neighbours: (m, 2) int32 pairs of neighbouring cells of one object, for closing seams between its parts.
     """
 
@@ -48,6 +50,7 @@ class FusionProblem:
     point: Sequence[NDArray] | Callable[[int], NDArray] | None = None
     tangent: Sequence[NDArray] | Callable[[int], NDArray] | None = None
     neighbours: NDArray | None = None
+    scale: Callable[[int], NDArray | None] | None = None
 
     @property
     def n_segments(self) -> int:
@@ -66,6 +69,19 @@ class FusionProblem:
                 f"predictions of view {view} have {maps.shape[1]} pixels, its cell map has {np.size(self.cell_of_pixel[view])}"
             )
         return maps
+
+    def stated_scale(self, view: int, pixel: NDArray) -> NDArray:
+        """Return the scales (3, n) float32 that the prior states for the pixels (n,) of a view, (3, 0) where it states none.
+
+        Raises:
+            InputError: another shape.
+        """
+        scale = None if self.scale is None else self.scale(view)
+        if scale is None:
+            return np.zeros((3, 0), np.float32)
+        if scale.shape[-1] != 3 or scale.size != 3 * np.size(self.cell_of_pixel[view]):
+            raise InputError(f"scales of view {view} have shape {scale.shape}; (H, W, 3) of its cell map is needed")
+        return np.ascontiguousarray(scale.reshape(-1, 3)[pixel].T, np.float32)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,8 @@ def cell_scales(run: FusionPass, texture: NDArray) -> tuple[NDArray, NDArray]:
         block = run.blocks(view)
         target = kernels.texture_at(texture, block.cell)
         mixed, b_ref, votes_of = reference_distribution(run, block, target)
+        if block.scale.size:  # predictions that agree may be wrong together
+            b_ref = np.fmax(b_ref, block.scale[[0, 0, 0, 1, 2]])
         return block, laplace.scale_contribution(mixed - target, b_ref, floor), votes_of
 
     cells = CellSums(run.problem.n_cells)

@@ -181,7 +181,7 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
         way = radius * (np.cos(angle) * tangents[0] + np.sin(angle) * tangents[1]) + np.sqrt(1 - u[:, :1]) * cells.normals
         face, t = trace(start, way)
         hit = np.flatnonzero(face >= 0)
-        row = _find(cells, start[hit] + np.asarray(t, np.float64)[hit, None] * way[hit])
+        row = find_voxel(cells, start[hit] + np.asarray(t, np.float64)[hit, None] * way[hit])
         seen = row >= 0
         plain = seen & ~shines[row]  # lamps have rays of their own
         known[hit[plain]] += cells.voxel_radiance[row[plain]]
@@ -244,20 +244,28 @@ def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trac
     return np.minimum(total / SHADOW_RAYS * len(lamp) * cells.edge**2 / np.pi, 1.0)
 
 
-def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tuple[NDArray, NDArray]:
+def fit_light(
+    cells: SurfaceCells, gathered: Gathered, albedo: float | NDArray, spread: float = SPREAD["albedo"]
+) -> tuple[NDArray, NDArray]:
     """Fit log light on every cell and log albedo of its group, (n, 3) each; diffuse radiance is e^(their sum), up to texture
     (Eq. L.57).
 
-    A group of m cells has the weight of sqrt(m). The albedo has a weak prior at `mean_albedo`, which fixes the scale where no
-    photographed surface lights anything.
+    A group of m cells has the weight of sqrt(m).
+
+    Args:
+        cells: n cells; gathered: what they see.
+        albedo: prior mean of the albedos of groups, one for all or (groups, 3) in the order of their ids; fixes the scale where
+            no photographed surface lights anything.
+        spread: standard deviation of that prior, in log albedo.
     """
     _, group = np.unique(cells.group, return_inverse=True)
     group = group.ravel()
     groups = int(group.max(initial=-1)) + 1
     use = cells.pixels >= 2
     weight0 = use / np.sqrt(np.maximum(np.bincount(group[use], minlength=groups)[group], 1))
-    prior_weight = WIDTH**2 / SPREAD["albedo"] ** 2  # precision of the albedo's prior, in units of a cell's
-    light, albedo = np.zeros((len(cells), 3)), np.zeros((len(cells), 3))
+    prior_weight = WIDTH**2 / spread**2  # precision of the albedo's prior, in units of a cell's
+    log_prior = np.log(np.broadcast_to(albedo, (groups, 3)))
+    light, log_albedo = np.zeros((len(cells), 3)), np.zeros((len(cells), 3))
     floor = 1e-3 * float(np.exp(gathered.start).mean()) if gathered.start.size else 1e-6
     active = gathered.share.max(0, initial=0) > 2e-3
     share = gathered.share[:, active]
@@ -270,7 +278,7 @@ def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tu
             mean = gathered.known[:, c] + share @ source + floor
             difference = cells.log_radiance[:, c] - np.log(mean)
             total = np.bincount(group, weight, groups) + prior_weight
-            level = (np.bincount(group, weight * difference, groups) + prior_weight * np.log(mean_albedo)) / total
+            level = (np.bincount(group, weight * difference, groups) + prior_weight * log_prior[:, c]) / total
             residual = difference - level[group]
             weight = weight0 / (1 + (residual / WIDTH) ** 2)
             slope = share * source / mean[:, None]
@@ -282,8 +290,8 @@ def fit_light(cells: SurfaceCells, gathered: Gathered, mean_albedo: float) -> tu
             right = np.einsum("ni,n->i", centred, weight * residual) - precision * (theta - first)
             theta = theta + np.clip(np.linalg.solve(matrix, right), -1, 1) if len(theta) else theta
         light[:, c] = np.log(gathered.known[:, c] + share @ np.exp(theta) + floor)
-        albedo[:, c] = level[group]
-    return light, albedo
+        log_albedo[:, c] = level[group]
+    return light, log_albedo
 
 
 def residual_light(cells: SurfaceCells, residual: NDArray, reach: float) -> NDArray:
@@ -348,7 +356,7 @@ def sphere_points(count: int) -> NDArray:
     return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], 1)
 
 
-def _find(cells: SurfaceCells, points: NDArray) -> NDArray:
+def find_voxel(cells: SurfaceCells, points: NDArray) -> NDArray:
     """Row of the voxel around each point, -1 where no photograph shows it."""
     if not len(points) or not len(cells.voxel_key):
         return np.full(len(points), -1)
@@ -374,22 +382,24 @@ def _sums(row: NDArray, count: int, values: NDArray) -> NDArray:
 
 
 def estimate_log_light(
-    cells: SurfaceCells, trace: Trace, mean_albedo: float, reaches: tuple[float, ...], seed: int = 0
+    cells: SurfaceCells,
+    gathered: Gathered,
+    albedo: float | NDArray,
+    reaches: tuple[float, ...],
+    spread: float = SPREAD["albedo"],
 ) -> NDArray:
-    """Estimate the light on the cells: gathered, fitted, and completed by the residual light.
+    """Estimate the light on the cells: what `gather` found, fitted, and completed by the residual light.
 
     Args:
-        cells: n cells.
-        trace: intersects rays with the mesh.
-        mean_albedo: prior mean of the albedos of groups.
+        cells: n cells; gathered: what they see.
+        albedo, spread: prior of the albedos of groups, as in `fit_light`.
         reaches: scales of the residual light, in edges of a cell.
-        seed: of the random numbers.
 
     Returns:
         (len(reaches), n, 3) log light, one version for each reach.
     """
     if not len(cells):
         return np.zeros((len(reaches), 0, 3))
-    light, albedo = fit_light(cells, gather(cells, trace, seed), mean_albedo)
-    residual = np.where((cells.pixels >= 2)[:, None], cells.log_radiance - light - albedo, 0.0)
+    light, log_albedo = fit_light(cells, gathered, albedo, spread)
+    residual = np.where((cells.pixels >= 2)[:, None], cells.log_radiance - light - log_albedo, 0.0)
     return np.stack([light + residual_light(cells, residual, reach * cells.edge) for reach in reaches])

@@ -1,12 +1,55 @@
 """Sources of the K material predictions of a view: one plug-in module per kind, chosen by `prior: {kind: ...}`.
 
-A plug-in is a module `workflow/priors/<kind>.py` with the function
+A plug-in is a module `workflow/priors/<kind>.py`. Where each view is predicted by itself, it has the function
 
     predict(view, settings, capture, seed) -> (K, H, W, 5) float32
 
-It returns linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are the
-sections that stage prior reads (`prior` and `source`), and `capture` is the normal form. Two functions are optional:
+and where views share work, the class
+
+    Predictor(settings, capture, seed, keep), called with a view -> Predicted
+
+which may have `concurrent = True` where several threads may call it at once with equal results.
+
+Predictions are linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are
+the sections that stage prior reads (`prior`, `source` and `segmentation.kind`), `capture` is the normal form, and `keep` returns
+an array that holds the same values on disk. Two functions are optional:
 
     raw_inputs(document) -> list[Path]   files from outside that it reads; called while Snakemake plans, refuses missing files
     describe(settings) -> dict           facts about a learned model, written to model.json
 """
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from workflow.scene.normal_form import CaptureReader, View
+
+Keep = Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Predictions of one view.
+
+    Attributes:
+        maps: (K, H, W, 5) float32 linear albedo R G B, perceptual roughness and metallic in [0, 1]; NaN where there is no value.
+        scale: (H, W, 3) float32 Laplace scales of the error of albedo, roughness and metallic; None = the prior states none.
+    """
+
+    maps: np.ndarray
+    scale: np.ndarray | None = None
+
+
+def predictor(settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep) -> Callable[[View], Predicted]:
+    """Return what predicts a view by the prior that the settings name."""
+    module = importlib.import_module(f"workflow.priors.{settings.prior.kind}")
+    if hasattr(module, "Predictor"):
+        return module.Predictor(settings, capture, seed, keep)
+    return lambda view: Predicted(module.predict(view, settings, capture, seed))

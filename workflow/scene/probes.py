@@ -147,7 +147,7 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation:
         )
     edge = float(np.median(depth)) / VOXELS_IN_DEPTH
     table = _table(photos, edge, rng)
-    points = _draw(photos, geometry, capture.faces()["instance_id"], table, rng)
+    points = _draw(photos, geometry, _given_objects(job, capture), table, rng)
     light, secondary, photographed = _light_rows(points, geometry, table, rng)
     missed = np.array([np.count_nonzero(p.usable & (p.face < 0)) for p in photos])
     counted = sum(np.count_nonzero(p.usable) for p in photos)
@@ -155,6 +155,13 @@ def probe_rows(job: Job, capture: CaptureReader, geometry: Geometry, saturation:
     gloss = _gloss_rows(points, photos, geometry, table, sky, rng)
     outside = sky / max(inside, 1e-12) if missed.any() else None
     return ProbeRows(light, gloss, float(missed.sum() / max(counted, 1)), secondary, photographed, outside)
+
+
+def _given_objects(job: Job, capture: CaptureReader) -> np.ndarray:
+    """(m,) object of each face where the scene says that objects are given, else -1."""
+    if job.settings.segmentation.kind == "given":
+        return capture.faces()["instance_id"]
+    return np.full(len(capture.faces()["face_id"]), -1, np.int32)
 
 
 def _mean_radiance(photos: list[ViewRadiance], hit: bool) -> float:

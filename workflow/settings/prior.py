@@ -52,6 +52,18 @@ class RetinexPrior(PriorBase):
     """Mean albedo to which each prediction is scaled."""
 
 
+class LearnedPrior(PriorBase):
+    """A small network that corrects photographs divided by the light gathered from all of them; its weights are part of the
+    repository (docs/method/priors.md#learned)."""
+
+    BY_VIEW: ClassVar[bool] = False
+    kind: Literal["learned"] = "learned"
+    samples: int = Field(8, ge=1, le=16)
+    """Predictions per photograph, K: the 8 hypotheses of the network, and 8 more from the mirrored photograph."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """`auto`: the GPU if torch finds one."""
+
+
 class DiffusionPrior(PriorBase):
     accept_license: bool = False
     """Set to `true` if you have read the licence of the weights and may use them for this."""
@@ -95,7 +107,9 @@ class MarigoldPrior(DiffusionPrior):
     """Longest side in pixels to which photographs are scaled for the model; by default as the checkpoint recommends (768)."""
 
 
-Prior = Annotated[SimulatedPrior | FilesPrior | RetinexPrior | RgbxPrior | MarigoldPrior, Field(discriminator="kind")]
+Prior = Annotated[
+    LearnedPrior | RetinexPrior | FilesPrior | RgbxPrior | MarigoldPrior | SimulatedPrior, Field(discriminator="kind")
+]
 
 
 def by_view(kind: str) -> bool:

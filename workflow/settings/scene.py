@@ -12,10 +12,10 @@ from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISH
 from workflow.settings.limits import Limits
 from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
 from workflow.settings.override import ByObject, Override
-from workflow.settings.prior import Prior
+from workflow.settings.prior import LearnedPrior, Prior
 from workflow.settings.relight import Relightings, lamp_bases, recombines
 from workflow.settings.section import Section
-from workflow.settings.segmentation import GivenSegmentation, Segmentation
+from workflow.settings.segmentation import GeometrySegmentation, Segmentation
 from workflow.settings.source import Capture, Source
 
 
@@ -30,9 +30,9 @@ class SceneSettings(Section):
     capture: Capture = Capture()
     limits: Limits = Limits()
     """What a quality may ask for at most."""
-    prior: Prior
+    prior: Prior = LearnedPrior()
     """Where the K material predictions come from."""
-    segmentation: Segmentation = GivenSegmentation()
+    segmentation: Segmentation = GeometrySegmentation()
     """Which surface belongs to which object."""
     base: Base = Base()
     emission: Emission = Emission()
@@ -61,10 +61,15 @@ class SceneSettings(Section):
     is none. Recorded in the manifests, and no reason to run a job again: numbers differ by rounding and noise alone. What a GPU
     brings is in docs/results/performance.md#a-gpu."""
 
+    @field_validator("prior", mode="before")
+    @classmethod
+    def _learned_unless_named(cls, value: Any) -> Any:
+        return {"kind": "learned", **value} if isinstance(value, dict) else value
+
     @field_validator("segmentation", mode="before")
     @classmethod
-    def _given_unless_named(cls, value: Any) -> Any:
-        return {"kind": "given", **value} if isinstance(value, dict) else value
+    def _geometry_unless_named(cls, value: Any) -> Any:
+        return {"kind": "geometry", **value} if isinstance(value, dict) else value
 
     @model_validator(mode="after")
     def _known_predictions(self) -> SceneSettings:

@@ -16,9 +16,9 @@ class SegmentationBase(Section):
 
 
 class GivenSegmentation(SegmentationBase):
-    """Object ids that came with the source, of the faces of the mesh or of views."""
+    """Object ids that came with the source, of the faces of the mesh or of views. Nothing reads them under another kind."""
 
-    kind: Literal["given"] = "given"
+    kind: Literal["given"]
 
 
 class PiecesOfMesh(SegmentationBase):
@@ -88,7 +88,7 @@ class MaskSegmentation(PiecesOfMesh):
 class GeometrySegmentation(PiecesOfMesh):
     """Graph-based segmentation of the mesh after Felzenszwalb and Huttenlocher; needs neither ids nor masks."""
 
-    kind: Literal["geometry"]
+    kind: Literal["geometry"] = "geometry"
 
 
 Segmentation = Annotated[GivenSegmentation | MaskSegmentation | GeometrySegmentation, Field(discriminator="kind")]

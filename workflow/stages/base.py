@@ -59,6 +59,7 @@ def run(job: Job) -> None:
         point=_points(capture, views),
         tangent=_tangents(capture, views),
         neighbours=neighbour_pairs(grid.keys) if settings.seams else None,
+        scale=lambda position: _read_scale(prior, views[position]),
     )
     if settings.variant == "image_affine":
         problem = one_segment_per_view(problem)
@@ -296,6 +297,13 @@ def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarra
             out[k, ..., :3] = rgb(channels, f"{layer}.albedo")
             out[k, ..., 3], out[k, ..., 4] = channels[f"{layer}.roughness"], channels[f"{layer}.metallic"]
     return np.clip(out, 0, 1, out=out)  # every solver reads the same values; NaN stays
+
+
+def _read_scale(prior: StageReader, view: View) -> np.ndarray | None:
+    """(H, W, 3) Laplace scales that the prior states for a view, or None."""
+    channels = prior.exr(f"maps/{view.name}.exr")
+    names = [f"scale.{name}" for name in PROPERTIES]
+    return np.stack([channels[name] for name in names], -1) if names[0] in channels else None
 
 
 def _raw_maps(prior: StageReader, view: View, samples: int, surface: np.ndarray) -> dict[str, np.ndarray]:

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import importlib
-from types import ModuleType
+from collections.abc import Iterator
 
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.fusion.blocks import map_in_order
 from iif_core.fusion.problem import prediction_faults
 from iif_core.numerics.filters import fill_from_neighbours
+from iif_core.reflectance.material import PROPERTIES
+from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import split_rgb
+from workflow.priors import Predicted, predictor
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -28,23 +32,34 @@ def run(job: Job) -> None:
         InputError: no prediction can be used.
     """
     capture = CaptureReader(job.read("capture"))
-    prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
-    views = capture.used
-    seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
-    rows: list[Row] = []
-    for done, view in enumerate(views):
-        job.progress(done, len(views), "views predicted")
-        kept = job.writer.part_kept(view.name)
-        rows += _predicted(job, prior, capture, view, seed) if kept is None else map(tuple, kept["rows"])
+    rows = predicted(job, capture, capture.used)
     _write_table(job, rows)
+    prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
     if hasattr(prior, "describe"):
         job.writer.json("model.json", prior.describe(job.settings))
+
+
+def predicted(job: Job, capture: CaptureReader, views: list[View]) -> list[Row]:
+    """Write the maps of views that no earlier run has written, and return the rows of predictions.parquet of all of them."""
+    kept = [job.writer.part_kept(view.name) for view in views]
+    rows: list[Row] = []
+    left = [view for view, own in zip(views, kept, strict=True) if own is None]
+    found: Iterator[Predicted] = iter(())
+    if left:
+        seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
+        predict = predictor(job.settings, capture, seed, Scratch(job.writer.directory))
+        threads = job.threads if getattr(predict, "concurrent", False) else 1
+        found = map_in_order(lambda i: predict(left[i]), len(left), threads)
+    for done, (view, own) in enumerate(zip(views, kept, strict=True)):
+        job.progress(done, len(views), "views predicted")
+        rows += _written(job, next(found), view) if own is None else map(tuple, own["rows"])
     job.progress(len(views), len(views), "views predicted")
+    return rows
 
 
-def _predicted(job: Job, prior: ModuleType, capture: CaptureReader, view: View, seed: int) -> list[Row]:
-    maps = prior.predict(view, job.settings, capture, seed)
-    expected = (job.settings.prior.samples, view.height, view.width, 5)
+def _written(job: Job, found: Predicted, view: View) -> list[Row]:
+    """Write the maps of a view, and return its rows of predictions.parquet."""
+    maps, expected = found.maps, (job.settings.prior.samples, view.height, view.width, 5)
     if maps.shape != expected:
         raise InputError(f"view {view.name}: the prior made {maps.shape}, needed {expected}; please report it")
     rows: list[Row] = []
@@ -57,6 +72,8 @@ def _predicted(job: Job, prior: ModuleType, capture: CaptureReader, view: View, 
             note = f"{count} pixels without a finite value, filled from their neighbours" if count else ""
         rows.append((view.view_id, k, not fault, fault or note))
     name = f"maps/{view.name}.exr"
+    if channels and found.scale is not None:
+        channels |= {f"scale.{of}": found.scale[..., i].astype(np.float16) for i, of in enumerate(PROPERTIES)}
     if channels:
         job.writer.exr(name, channels)
     job.writer.part_done(view.name, [name] if channels else [], {"rows": rows})

@@ -6,11 +6,9 @@ module is apart from that of the stage so that fingerprints know nothing of it.
 
 from __future__ import annotations
 
-import importlib
-
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader
-from workflow.stages.prior import _predicted
+from workflow.stages.prior import predicted
 
 
 def run(job: Job, number: int, count: int) -> None:
@@ -22,11 +20,4 @@ def run(job: Job, number: int, count: int) -> None:
         count: of parts. Views are dealt out in turn, so that parts differ by one view at most.
     """
     capture = CaptureReader(job.read("capture"))
-    prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
-    views = capture.used[number - 1 :: count]
-    seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
-    for done, view in enumerate(views):
-        job.progress(done, len(views), "views predicted")
-        if job.writer.part_kept(view.name) is None:
-            _predicted(job, prior, capture, view, seed)
-    job.progress(len(views), len(views), "views predicted")
+    predicted(job, capture, capture.used[number - 1 :: count])

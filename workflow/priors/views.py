@@ -1,0 +1,181 @@
+"""The photographs of a capture with the surface that they show, as priors read them that use all photographs."""
+
+from __future__ import annotations
+
+from functools import cached_property, lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+
+from iif_core.camera.calibration.choice import calibrate_response
+from iif_core.camera.overlap import PatchRows, join_rows, patch_edge, patch_numbers, patch_rows
+from iif_core.camera.response import Response
+from iif_core.light.irradiance import Trace
+from iif_core.priors.features import ViewArrays, borders, surface_points
+from iif_core.surface.cells import grid_origin
+from iif_core.surface.triangles import face_geometry
+from workflow.runtime import device
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.scene.photograph import GAMMA
+from workflow.segmentations.geometry import pieces
+from workflow.segmentations.surface import Surface
+
+SATURATED = 0.99  # sensor value
+FAMILY = "spline"
+"""Curve of the response: the richest, because there is no choice to make yet (stage emission makes it)."""
+VIEW_MEMORY, BYTES = 1 << 29, 40
+"""Bytes of views that are kept in memory, and bytes of a pixel."""
+PATCH_PIXELS = 4_000_000
+"""Photographs are thinned to about this many pixels for the response."""
+PIECES = SimpleNamespace(scale=0.05, min_faces=100, min_area=0.01, colour=0.1)
+"""Pieces of the mesh take the place of objects where no one gives them (the defaults of segmentation `geometry`)."""
+
+
+class CaptureViews:
+    """Every photograph that is not held out, read when it is asked for, `factor` times smaller in both directions.
+
+    Args:
+        capture: the normal form.
+        objects_given: whether the objects of the capture may be read; otherwise pieces of the mesh take their place.
+        factor: a pixel is the mean of factor x factor pixels of the photograph, and has the surface of the middle one.
+    """
+
+    def __init__(self, capture: CaptureReader, objects_given: bool, factor: int = 1):
+        self.capture, self.factor, self.objects_given = capture, factor, objects_given
+        self.views = capture.used
+        self.vertices, self.faces = capture.mesh()
+        self.face_normals, _ = face_geometry(self.vertices, self.faces)
+        given = capture.faces()["instance_id"].astype(np.int64)
+        by_face = objects_given and bool((given >= 0).any())
+        self.face_group = given if by_face else pieces(Surface(capture), PIECES).astype(np.int64)
+        self.number = {view.view_id: i for i, view in enumerate(self.views)}
+        most = max((view.width * view.height for view in self.views), default=1) // factor**2 + 1
+        self._kept = lru_cache(max(VIEW_MEMORY // (BYTES * most), 1))(self._of)
+        self.exposure = np.array([view.exposure if view.exposure > 1e-6 else 1.0 for view in self.views])
+        self.response: Response | None = None
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> ViewArrays:
+        return self.of(self.views[index])
+
+    def of(self, view: View) -> ViewArrays:
+        """Read one photograph; an 8-bit one becomes linear by the response, or by the power 2.2 as long as there is none."""
+        return self._kept(self.number[view.view_id], self.factor)
+
+    def full(self, view: View) -> ViewArrays:
+        """Read one photograph at its own size."""
+        return self._of(self.number[view.view_id], 1)
+
+    def _of(self, number: int, f: int) -> ViewArrays:
+        capture, view = self.capture, self.views[number]
+        photo, valid = capture.photo(view)
+        saturated = np.zeros(photo.shape[:2], bool)
+        exposure = 1.0
+        if not capture.is_hdr:
+            saturated = photo.max(-1) >= SATURATED
+            photo = np.clip(photo, 0, 1)
+            photo = photo**GAMMA if self.response is None else self._linear(photo)
+            exposure = float(self.exposure[number])
+        depth, face = capture.gbuffer(view)
+        directions = view.directions()
+        group = capture.given_instances(view) if self.objects_given else None
+        valid = valid & np.isfinite(photo).all(-1)
+        intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
+        if f > 1:
+            photo, valid, saturated = _means(photo, valid, f), _any(valid, f), _any(saturated, f)
+            depth, face, directions = (_middles(array, f) for array in (depth, face, directions))
+            group = None if group is None else _middles(group, f)
+            # The middle pixel of a block lies at the middle of a smaller pixel.
+            intrinsics = np.r_[intrinsics[:2] / f, (intrinsics[2:] - (f // 2 + 0.5)) / f + 0.5]
+        hit = (face >= 0) & (depth > 0)
+        normals = np.where(hit[..., None], self.face_normals[face], 0)
+        # A face without area has no normal; the unit vector towards the camera takes its place.
+        towards = -directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        normals = np.where(((normals**2).sum(-1, keepdims=True) < 0.5) & hit[..., None], towards, normals)
+        normals = np.where((normals * towards).sum(-1, keepdims=True) < 0, -normals, normals)
+        if group is None:
+            group = np.where(hit, self.face_group[face], -1)
+        depth = np.where(hit, depth, 0).astype(np.float32)
+        surface = depth, normals.astype(np.float32), group.astype(np.int32)
+        return ViewArrays(photo, hit & valid, saturated, *surface, view.world_from_camera, intrinsics, exposure)
+
+    def _linear(self, photo: np.ndarray) -> np.ndarray:
+        """Invert the response, by a table of a sixteenth of the steps of 8-bit values."""
+        nodes = np.linspace(0, 1, 16 * 255 + 1)
+        table = self._table
+        return np.stack([np.interp(photo[..., c], nodes, table[:, c]) for c in range(3)], -1).astype(np.float32)
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        assert self.response is not None
+        return self.response.inverse(np.repeat(np.linspace(0, 1, 16 * 255 + 1)[:, None], 3, 1))
+
+    def calibrate(self) -> str:
+        """Estimate the response, and exposures that are not given, from surface that several photographs show (Eq. C.17 to C.28);
+        returns why this response. Radiance needs none."""
+        if self.capture.is_hdr or not self.views:
+            return "photographs are linear radiance"
+        given = not self.capture.facts.get("exposure_estimated", False)
+        found = calibrate_response(self._shared_surface(), self.exposure, (FAMILY,), SATURATED, given)
+        self.exposure = np.asarray(found.exposure, np.float64)
+        self._kept.cache_clear()
+        if not found.rows:
+            return f"{found.reason.split(':')[0]}: taken as the power {GAMMA}"
+        self.response = found.response
+        return found.reason
+
+    def _shared_surface(self) -> PatchRows:
+        """Patches of surface away from borders, as all views show them."""
+        depths = [(self.capture.gbuffer(view)[0], view.fx) for view in self.views]
+        footprints = [float(np.median(depth[depth > 0])) / fx for depth, fx in depths if (depth > 0).any()]
+        corners = self.vertices[np.unique(self.faces)]
+        extent = float(np.ptp(corners, axis=0).max())
+        edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
+        origin = grid_origin(corners, edge)
+        pixels = sum(depth.size for depth, _ in depths)
+        parts = []
+        for number, view in enumerate(self.views):
+            own = self.of(view)
+            use = own.used & ~borders(own.group)
+            group = own.group[use]
+            patch = patch_numbers(surface_points(own)[use], group, edge, origin)
+            value = self.capture.photo(view)[0][use]
+            share = min(1.0, PATCH_PIXELS / pixels)
+            parts.append(patch_rows(patch, own.normals[use], group, value, number, SATURATED, share=share))
+        return join_rows(parts)
+
+    def tracer(self) -> Trace:
+        """Return a function that intersects rays with the mesh."""
+        device.mitsuba()
+        from iif_core.light.transport.geometry import build_geometry, trace
+
+        geometry = build_geometry(self.vertices, self.faces, np.full(len(self.faces), -1, np.int32))
+        return lambda origins, directions: trace(geometry, origins, directions)
+
+
+def _padded(array: np.ndarray, factor: int) -> np.ndarray:
+    """Repeat the last row and column until the sizes are multiples of the factor."""
+    h, w = array.shape[:2]
+    return np.pad(array, [(0, -h % factor), (0, -w % factor), *[(0, 0)] * (array.ndim - 2)], "edge")
+
+
+def _blocks(array: np.ndarray, factor: int) -> np.ndarray:
+    """(H, W, ...) -> (H / f, f, W / f, f, ...)."""
+    array = _padded(array, factor)
+    return array.reshape(array.shape[0] // factor, factor, array.shape[1] // factor, factor, *array.shape[2:])
+
+
+def _means(photo: np.ndarray, valid: np.ndarray, factor: int) -> np.ndarray:
+    """Mean of the valid pixels of every block; 0 without any."""
+    total = _blocks(np.where(valid[..., None], photo, 0), factor).sum((1, 3))
+    return (total / np.maximum(_blocks(valid, factor).sum((1, 3)), 1)[..., None]).astype(np.float32)
+
+
+def _any(mask: np.ndarray, factor: int) -> np.ndarray:
+    return _blocks(mask, factor).any((1, 3))
+
+
+def _middles(array: np.ndarray, factor: int) -> np.ndarray:
+    return _blocks(array, factor)[:, factor // 2, :, factor // 2]
