@@ -97,6 +97,9 @@ def _add_train(commands: argparse._SubParsersAction) -> None:
     p.add_argument("--capacity", type=int, default=2000, help="crops in memory, 1.5 MB each; default 2000")
     p.add_argument("--batch", type=int, default=48, help="crops of a step, default 48")
     p.add_argument("--rate", type=float, default=1.2e-3, help="largest step size, default 0.0012")
+    p.add_argument(
+        "--heat", type=float, default=1.0, help="temperature at the start, default 1; lower keeps the heads of --init apart"
+    )
     p.add_argument("--widths", type=_widths, default=(40, 80, 128, 192, 224), help="features by level, default 40,80,128,192,224")
     p.add_argument("--heads", type=int, default=8, help="hypotheses, default 8")
     p.add_argument("--no-weights", action="store_true", help="without a mixture weight for each hypothesis")
@@ -119,7 +122,7 @@ def _train(options: argparse.Namespace) -> None:
 
     torch.set_num_threads(options.threads)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = torch.backends.cudnn.benchmark = True
-    names = ("out", "steps", "seconds", "start", "batch", "capacity", "rate", "widths", "heads", "init", "state", "seed")
+    names = ("out", "steps", "seconds", "start", "batch", "capacity", "rate", "heat", "widths", "heads", "init", "state", "seed")
     names += ("consume", "compile", "device", "edge")
     own = {name: getattr(options, name) for name in names}
     plan = training.Plan(options.folder, **own, weighted=not options.no_weights)

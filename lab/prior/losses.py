@@ -52,9 +52,9 @@ class Batch:
     groups: int
 
 
-def temperature(progress: float) -> float:
+def temperature(progress: float, start: float = TEMPERATURE[0]) -> float:
     """Return the temperature of the shares at a progress of training in [0, 1]."""
-    start, end = TEMPERATURE
+    end = TEMPERATURE[1]
     return start * (end / start) ** min(progress / ANNEALED, 1.0)
 
 

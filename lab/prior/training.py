@@ -48,7 +48,8 @@ class Plan:
         steps: number of steps; 0 = by the clock. seconds: of training and waiting, over all runs; inf = by steps.
         start: seconds to wait for rooms before the first step, from the start of the process.
         batch: crops of a step. capacity: crops in memory, at most; later rooms replace earlier ones.
-        rate: highest step size. widths, heads: of the network. weighted: with mixture weights.
+        rate: highest step size. heat: temperature of the shares at the start (`losses.temperature`).
+        widths, heads: of the network. weighted: with mixture weights.
         init: weights to start from, or None. seed: of the network, the batches and the order of the crops.
         state: file that a run continues from; None = state.pt in `out`.
         consume: delete a file of crops once it is read. compile: torch.compile. device: cpu or cuda. edge: pixels along a crop.
@@ -62,6 +63,7 @@ class Plan:
     batch: int = 48
     capacity: int = 2000
     rate: float = 1.2e-3
+    heat: float = losses.TEMPERATURE[0]
     widths: tuple[int, ...] = (40, 80, 128, 192, 224)
     heads: int = 8
     weighted: bool = True
@@ -178,7 +180,18 @@ class Trainer:
         self.state = plan.state or plan.out / "state.pt"
         if self.state.exists():
             self._restore()
-        self.run = torch.compile(self.model) if plan.compile else self.model
+        self.run = self._compiled() if plan.compile else self.model
+
+    def _compiled(self) -> torch.nn.Module:
+        """Compile the network now, while workers make the first rooms; what cannot be compiled runs as it is."""
+        torch._dynamo.config.suppress_errors = True
+        run = torch.compile(self.model)
+        shape = (self.plan.batch, len(CHANNELS), self.plan.edge, self.plan.edge)
+        nothing = Batch(torch.zeros(shape, device=self.plan.device), *[torch.zeros(0)] * 4, 0)
+        self._predict(run, nothing).sum().backward()
+        self.optimiser.zero_grad(set_to_none=True)
+        _LOG.info("compiled after %.0f s", time.time() - self.born)
+        return run
 
     # ------------------------------------------------------------------------------------------------------------- data
 
@@ -217,7 +230,7 @@ class Trainer:
             group["lr"] = rate
         index = torch.randint(len(self.pool), (plan.batch,), generator=self.generator, device=plan.device)
         batch = augmented(self.pool.batch(index), self.generator)
-        loss, numbers = losses.loss_of(self._predict(self.run, batch), batch, losses.temperature(part))
+        loss, numbers = losses.loss_of(self._predict(self.run, batch), batch, losses.temperature(part, plan.heat))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
@@ -238,12 +251,14 @@ class Trainer:
     @torch.no_grad()
     def evaluate(self) -> list[float]:
         """Return the numbers `losses.LOGGED` of the average network on the rooms that are kept back; empty without any."""
+        if not len(self.held_out):
+            return []
         total, count = torch.zeros(len(losses.LOGGED), device=self.plan.device), 0
         for index in torch.arange(len(self.held_out), device=self.plan.device).split(self.plan.batch):
             batch = self.held_out.batch(index)
             total += len(index) * losses.loss_of(self._predict(self.average, batch), batch, losses.TEMPERATURE[1])[1]
             count += len(index)
-        return (total / count).tolist() if count else []
+        return (total / count).tolist()
 
     # ------------------------------------------------------------------------------------------------------------- files
 

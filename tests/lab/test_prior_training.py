@@ -80,6 +80,8 @@ def test_weights_of_an_older_network_start_a_new_one(folder, tmp_path):
     save_file({name: array.half() for name, array in old.state_dict().items()}, tmp_path / "old.safetensors")
     trainer = training.Trainer(training.Plan(folder, tmp_path / "out", steps=1, init=tmp_path / "old.safetensors", **SMALL))
     assert torch.allclose(trainer.model.out.weight, old.out.weight, atol=1e-4)
+    (folder / "crops/3.npz").unlink()
+    assert trainer.train().steps == 1, "without a room that is kept back"
     with pytest.raises(InputError, match="when to end"):
         training.Plan(folder, tmp_path)
     with pytest.raises(InputError, match="no crops"):
