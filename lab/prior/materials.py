@@ -143,7 +143,7 @@ def _blends(xp: Namespace, local: Sequence[Any], column: Column) -> tuple[Any, A
     fu, fv = u / column("size_u"), v / column("size_v")
     i, j = xp.floor(fu), xp.floor(fv)
     du, dv = fu - i, fv - j
-    # Text: cells of random ink in words of four; some lines are headings in the third colour.
+    # Text: cells of random ink, four to a word; some lines are headings in the third colour.
     written = (_hash(xp, i, j, 3 + zero) > 0.3) & (_hash(xp, xp.floor(i * 0.25), j, 5 + zero) > 0.22)
     ink = xp.where(written & (dv < 0.62) & (dv > 0.15) & (du < 0.8), one, zero)
     heading = xp.where(_hash(xp, xp.floor(j * 0.2), 2 + zero, zero) > 0.85, ink, zero)

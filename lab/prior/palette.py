@@ -135,7 +135,7 @@ class Palette:
         return draw(base, place, self._common(face))
 
     def _pick(self, place: str) -> Colour:
-        """A colour that comes again, or a new one; walls, floors and ceilings have colours of their own kind."""
+        """A colour that comes again, or a new one; walls, floors and ceilings always get a new one."""
         again = place not in ("wall", "ceiling", "floor") and self.rng.random() < 0.5
         return self.colours[self.rng.integers(len(self.colours))] if again else self.colour(place)
 

@@ -106,7 +106,7 @@ def test_a_capture_survives_its_file(capture, tmp_path):
     assert np.array_equal(again.truth.albedo, capture.truth.albedo)
     view = again.used[1]
     assert np.array_equal(again.gbuffer(view)[1], capture.gbuffer(view)[1])
-    assert not list(tmp_path.glob(".*")), "the temporary file is gone"
+    assert not list(tmp_path.glob(".*")), "no temporary file stays"
 
 
 def test_truth_is_the_material_of_what_a_pixel_shows(llvm, room):
