@@ -53,7 +53,7 @@ STAGES: dict[str, Stage] = {
             ),
         ),
         Stage("prior", ("capture",), ("prior", "source", "segmentation.kind", "seed"), reads_raw=True),
-        Stage("segmentation", ("capture",), ("segmentation", "source", "capture"), reads_raw=True),
+        Stage("segmentation", ("capture", "prior"), ("segmentation", "source", "capture"), reads_raw=True),
         Stage("base", ("capture", "prior", "segmentation"), ("base", "seed")),
         Stage("base_scores", ("capture", "prior", "segmentation", "base"), (), reads_raw=True, on_demand=True),
         Stage(

@@ -87,7 +87,7 @@ rule prior_part:
 
 use rule stage as segmentation with:
     input:
-        unpack(reads("segmentation", "capture")),
+        unpack(reads("segmentation", "capture", "prior")),
     pathvars:
         stage="segmentation",
     resources:

@@ -7,7 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from iif_core.objects.felzenszwalb import segment_mesh, smooth_over_faces
-from workflow.segmentations.surface import FOLDS, Objects, Surface
+from workflow.artifacts.store import StageReader
+from workflow.scene.normal_form import FOLDS
+from workflow.segmentations.surface import Objects, Surface
 
 PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"
 
@@ -40,9 +42,12 @@ def pieces(surface: Surface, own: SimpleNamespace, fold: int | None = None) -> n
 def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colour (m, 3) of the pixels that see each face, roughly in [0, 1], and their number (m,).
 
-    Sensor values are divided by exposure^0.45, as a usual response suggests; radiance L becomes L / (L + mean of its view).
+    It is the square root of the predicted albedo, in which shadows have no edges. Without predictions it is what the photographs
+    show: sensor values are divided by exposure^0.45, as a usual response suggests; radiance L becomes L / (L + mean of its view).
     Both are rough, because colour has little weight in the segmentation.
     """
+    if surface.prior is not None:
+        return _mean_face_albedo(surface, surface.prior, fold)
     capture, count = surface.capture, len(surface.faces)
     total, pixels = np.zeros((count, 3)), np.zeros(count)
     for view in surface.views(fold):
@@ -60,3 +65,15 @@ def mean_face_colour(surface: Surface, fold: int | None = None) -> tuple[np.ndar
         for c in range(3):
             total[:, c] += np.bincount(face, values[:, c], count)
     return total / np.maximum(pixels, 1)[:, None], pixels
+
+
+def _mean_face_albedo(surface: Surface, prior: StageReader, fold: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """Square root of the mean predicted albedo of each face (m, 3), and its pixels (m,)."""
+    table = prior.table("faces.parquet")
+    kept = np.ones(len(table["fold"]), bool) if fold is None else table["fold"] != fold
+    if not kept.any():  # the only photographs are those of the fold
+        kept[:] = True
+    face, weight = table["face_id"][kept], table["pixels"][kept].astype(np.float64)
+    pixels = np.bincount(face, weight, len(surface.faces))
+    total = [np.bincount(face, weight * table[f"albedo_{c}"][kept], len(surface.faces)) for c in "rgb"]
+    return np.sqrt(np.stack(total, 1) / np.maximum(pixels, 1)[:, None]), pixels

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from iif_core.surface.segments import face_adjacency
-from workflow.scene.normal_form import CaptureReader, View
-
-FOLDS = 3  # perturbed runs; each leaves out every third photograph
+from workflow.artifacts.store import StageReader
+from workflow.scene.normal_form import FOLDS, CaptureReader, View
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,13 @@ class Stability:
 
 
 class Surface:
-    """Mesh and photographs of a scene. Costly properties are cached; plug-ins may cache results in `kept`."""
+    """Mesh, photographs and, if they are there, predictions of a scene.
 
-    def __init__(self, capture: CaptureReader):
-        self.capture = capture
+    Costly properties are cached; plug-ins may cache results in `kept`.
+    """
+
+    def __init__(self, capture: CaptureReader, prior: StageReader | None = None):
+        self.capture, self.prior = capture, prior
         self.kept: dict[str, Any] = {}
         self.vertices, self.faces = capture.mesh()
 

@@ -15,8 +15,8 @@ from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import ids_to_disk
 from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import CaptureReader
-from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface
+from workflow.scene.normal_form import FOLDS, CaptureReader
+from workflow.segmentations.surface import Objects, Stability, Surface
 
 
 def run(job: Job) -> None:
@@ -26,7 +26,7 @@ def run(job: Job) -> None:
         InputError: the input that the kind needs is missing.
     """
     capture = CaptureReader(job.read("capture"))
-    surface = Surface(capture)
+    surface = Surface(capture, job.read("prior"))
     kind = importlib.import_module(f"workflow.segmentations.{job.settings.segmentation.kind}")
     if hasattr(kind, "prepare"):
         with job.timed("masks"):
