@@ -283,6 +283,7 @@ class Trainer:
             "parameters": sum(p.numel() for p in self.average.parameters()),
             "training": {
                 **{name: round(value, 1) if isinstance(value, float) else value for name, value in asdict(self.progress).items()},
+                "room_seeds": [min(self.read), max(self.read)] if self.read else [],
                 "plan": self.plan.facts(),
                 "device": torch.cuda.get_device_name() if self.plan.device == "cuda" else "cpu",
                 "torch": torch.__version__,

@@ -55,6 +55,7 @@ def test_training_learns_what_there_is_to_learn(folder, tmp_path, monkeypatch):
     assert (done.rooms, trainer.held_out.rooms, done.generators) == (3, 1, [2])
     recipe = json.loads((tmp_path / "out/recipe.json").read_text())
     assert recipe["outputs"][-1] == "weight" and recipe["channels"] == list(CHANNELS) and recipe["training"]["steps"] == 70
+    assert recipe["training"]["room_seeds"] == [1, 4]
     assert "init" in recipe["training"]["plan"] and str(tmp_path) not in json.dumps(recipe)
     line = json.loads((tmp_path / "out/curve.jsonl").read_text().splitlines()[-1])
     assert line["steps"] == 70 and set(line["train"]) == set(losses.LOGGED)
