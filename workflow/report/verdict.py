@@ -353,7 +353,7 @@ def _materials(e: Evidence) -> Light:
     if e.prior == "retinex":
         weak = Finding(
             AMBER, "Prior retinex: 0 learned weights, so roughness and metallic are weak guesses",
-            "Bring the predictions of a learned model (docs/guide/priors.md)",
+            "Leave `prior` out of the scene file: the learned prior then predicts the materials (docs/guide/priors.md)",
         )  # fmt: skip
     return _made(
         "materials",
