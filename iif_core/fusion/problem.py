@@ -36,7 +36,7 @@ class FusionProblem:
             no surface; read by textures that are functions of space.
         tangent: view -> (N, 2, 3) float32 displacement of the surface point over one pixel to the right and down, m.
         scale: view -> (N, 3) or (H, W, 3) Laplace scales > 0 that the prior states for its albedo, roughness and metallic at each
-            pixel (Eq. F.61); None = it states none.
+            pixel (Eq. F.62); None = it states none.
         neighbours: (m, 2) int32 pairs of neighbouring cells of one object, for closing seams between its parts.
     """
 

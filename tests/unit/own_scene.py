@@ -221,12 +221,14 @@ def working_in(root):
 
 
 def run(root, *stages, scene="own"):
-    """Run stages of the scene and return a reader of the capture."""
+    """Run stages of the scene, and the prior before the segmentation, which reads it; return a reader of the capture."""
     from workflow.artifacts import StageReader
     from workflow.runtime.job import run_stage
     from workflow.scene.normal_form import CaptureReader
 
     with working_in(root):
         for stage in stages:
+            if stage == "segmentation" and not (Path("results") / scene / "prior/manifest.json").exists():
+                run_stage("prior", scene, "draft", 2)
             run_stage(stage, scene, "draft", 2)
     return CaptureReader(StageReader(Path(root) / "results" / scene / "capture", "capture", scene))

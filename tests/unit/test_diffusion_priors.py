@@ -68,6 +68,12 @@ class Capture:
     def used(self):
         return self.views
 
+    def faces(self):
+        return {"face_id": np.arange(2, dtype=np.int32)}
+
+    def gbuffer(self, view):
+        return np.ones((HEIGHT, WIDTH), np.float32), np.zeros((HEIGHT, WIDTH), np.int32)
+
     def photo(self, view):
         rng = np.random.default_rng(view.view_id)
         picture = np.kron(rng.random((5, 7, 3)), np.ones((8, 8, 1))).astype(np.float32)
@@ -323,7 +329,7 @@ def test_a_killed_job_goes_on_where_it_was(run, tmp_path):
     found, asked = run()
     assert asked == ["v2"]
     assert content(found) == content(expected) and sorted(content(found)) == [
-        "manifest.json", "maps/v0.exr", "maps/v1.exr", "maps/v2.exr", "model.json", "predictions.parquet",
+        "faces.parquet", "manifest.json", "maps/v0.exr", "maps/v1.exr", "maps/v2.exr", "model.json", "predictions.parquet",
     ]  # fmt: skip
     assert run()[1] == ["v0", "v1", "v2"]  # finished and forced again: nothing is taken over
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.unit import own_scene as own
 
-STAGES = ("capture", "segmentation", "prior", "base")
+STAGES = ("capture", "prior", "segmentation", "base")
 """The later ones read photographs through `CaptureReader.photo` alone, which refuses."""
 CAPTURE = {"views": 5, "width": 32, "height": 24, "test_every": 4, "exposure": "estimate"}
 HELD_OUT = "003"

@@ -202,7 +202,7 @@ class Capture:
         return {"instance_id": np.array([4, 7], np.int32)}
 
     def mesh(self):
-        vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+        vertices = 20 * np.array([[-1, -1, -1], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
         return vertices, np.array([[0, 1, 2], [0, 1, 3]])
 
     def directions(self, _):

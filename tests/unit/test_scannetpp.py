@@ -44,7 +44,7 @@ def copy(release, tmp_path):
 
 
 def refused(home, capture=None, **source):
-    tree = {"source": {"kind": "scannetpp", "path": str(home), **source}, "capture": capture or {}, "prior": {"kind": "retinex"}}
+    tree = {"source": {"kind": "scannetpp", "path": str(home), **source}, "capture": capture or {}, "segmentation": {"kind": "given"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
     with pytest.raises(InputError) as caught:
         scannetpp.raw_inputs(document)
@@ -188,8 +188,8 @@ def test_wrong_world_is_named_by_colmap(copy):
     [
         ("dslr/nerfstudio/transforms.json", "it is part of the release"),
         ("scans/mesh_aligned_0.05.ply", "download the scene's `scans` too"),
-        ("scans/segments.json", "segments.json: not found; `segmentation: {kind: given}`, the default, takes"),
-        ("scans/segments_anno.json", "segments_anno.json: not found; `segmentation: {kind: given}`, the default, takes"),
+        ("scans/segments.json", "segments.json: not found; `segmentation: {kind: given}` takes"),
+        ("scans/segments_anno.json", "segments_anno.json: not found; `segmentation: {kind: given}` takes"),
         ("dslr/resized_images/DSC00001.JPG", "1 image(s) not found"),
         ("dslr/resized_anon_masks/DSC00001.png", "1 mask(s) not found"),
     ],
@@ -223,7 +223,7 @@ def test_a_scene_without_annotation_needs_another_segmentation(copy, gone):
         (copy / "scans" / name).unlink()
     assert "set `segmentation: {kind: geometry}`" in refused(copy)
     source = {"kind": "scannetpp", "path": str(copy)}
-    tree = {"source": source, "prior": {"kind": "retinex"}, "segmentation": {"kind": "geometry"}}
+    tree = {"source": source, "segmentation": {"kind": "geometry"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
     assert not any("segments" in path.name for path in scannetpp.raw_inputs(document))
     found = scannetpp.find_inputs(document["source"], document["capture"])

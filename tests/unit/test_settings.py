@@ -94,7 +94,7 @@ def test_scene_over_preset_over_default(scene):
         (GOOD + "capture: {dynamic_range: mdr}\n", ["capture.dynamic_range", "'mdr'", "'ldr' or 'hdr'"]),
         ("source: {kind: builtin}\nprior: {kind: simulated, samples: 0}\n", ["prior.samples", "found 0"]),
         ("source: {kind: buildin}\nprior: {kind: simulated}\n", ["source.kind", "'buildin'", "builtin, mitsuba, folder"]),
-        ("source: {kind: builtin}\nprior: {samples: 3}\n", ["prior.kind", "missing. Add it", "simulated, files"]),
+        ("source: {kind: builtin}\nprior: {samples: 30}\n", ["prior.samples", "found 30", "16"]),
         ("source: {kind: mitsuba}\nprior: {kind: simulated}\n", ["source.path", "missing"]),
         (GOOD + "affines: {scale: {kind: prior}}\n", ["`affines.scale.kind`: unknown key", "lamp, mean_albedo, white_patch"]),
         (GOOD + "affines: {scale: x}\n", ["`affines.scale`: found 'x'", "'found' or 'prior'; it may also be `key: value` pairs"]),

@@ -11,9 +11,6 @@ import numpy as np
 from iif_core.camera.pinhole import pixel_directions
 from workflow.artifacts.store import StageReader, StageWriter, ids_from_disk, ids_to_disk, rgb, split_rgb
 
-FOLDS = 3
-"""Perturbed runs of a segmentation; each leaves out every third photograph that is not held out."""
-
 
 @dataclass(frozen=True)
 class View:

@@ -8,8 +8,7 @@ import numpy as np
 
 from iif_core.objects.felzenszwalb import segment_mesh, smooth_over_faces
 from workflow.artifacts.store import StageReader
-from workflow.scene.normal_form import FOLDS
-from workflow.segmentations.surface import Objects, Surface
+from workflow.segmentations.surface import FOLDS, Objects, Surface
 
 PERTURBED = "every third photograph's colours left out, `scale` times 1/sqrt(2), 1, sqrt(2)"
 

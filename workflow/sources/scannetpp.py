@@ -39,7 +39,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     if found.of_vertices is None and document["segmentation"]["kind"] == "given":
         missing = next(path for path in _annotation_files(found.mesh.parent) if not path.is_file())
         raise InputError(
-            f"{missing}: not found; `segmentation: {{kind: given}}`, the default, takes the objects from it. Download it, or set"
+            f"{missing}: not found; `segmentation: {{kind: given}}` takes the objects from it. Download it, or set"
             " `segmentation: {kind: geometry}` (or `masks`, docs/guide/segmentation.md), which needs no annotation"
         )
     return found.files()

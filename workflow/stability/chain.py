@@ -21,6 +21,7 @@ from workflow.runtime import device
 from workflow.runtime.job import Job
 from workflow.scene.normal_form import CaptureReader, CaptureWriter, View
 from workflow.settings.scene import SceneSettings
+from workflow.stages.prior import albedo_of_faces
 
 SOURCES = ("capture", "prior")
 FITTED = ("plan", "segmentation", "base", "emission", "shading", "affines")
@@ -212,6 +213,8 @@ def _write(capture: Capture, folder: Path) -> None:
     view_id, k = np.array(rows, np.int32).T
     used = np.ones(len(rows), bool)
     prior.table("predictions.parquet", {"view_id": view_id, "k": k, "used": used, "reason": np.array([""] * len(rows), object)})
+    reader = CaptureReader(StageReader(folder / "capture", "capture", "free"))
+    prior.table("faces.parquet", albedo_of_faces(prior, reader, set(view_id.tolist())))
     prior.finish()
 
 

@@ -13,10 +13,11 @@ from iif_core.fusion.problem import prediction_faults
 from iif_core.numerics.filters import fill_from_neighbours
 from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.scratch import Scratch
-from workflow.artifacts.store import rgb, split_rgb
+from workflow.artifacts.store import StageWriter, rgb, split_rgb
 from workflow.priors import Predicted, predictor
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import FOLDS, CaptureReader, View
+from workflow.scene.normal_form import CaptureReader, View
+from workflow.segmentations.surface import FOLDS
 
 Row = tuple[int, int, bool, str]
 """view_id, k, whether the prediction is used, reason if not (or how it was repaired)."""
@@ -34,7 +35,7 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     rows = predicted(job, capture, capture.used)
     _write_table(job, rows)
-    _write_faces(job, capture, {view_id for view_id, _, used, _ in rows if used})
+    job.writer.table("faces.parquet", albedo_of_faces(job.writer, capture, {view_id for view_id, _, used, _ in rows if used}))
     prior = importlib.import_module(f"workflow.priors.{job.settings.prior.kind}")
     if hasattr(prior, "describe"):
         job.writer.json("model.json", prior.describe(job.settings))
@@ -100,14 +101,15 @@ def _write_table(job: Job, rows: list[Row]) -> None:
     )
 
 
-def _write_faces(job: Job, capture: CaptureReader, predicted_views: set[int]) -> None:
-    """Write faces.parquet: the albedo that the predictions see on each face, for each of the FOLDS of the views by itself."""
+def albedo_of_faces(writer: StageWriter, capture: CaptureReader, predicted_views: set[int]) -> dict[str, np.ndarray]:
+    """Return the columns of faces.parquet: the albedo that the written predictions have on each face, for each of the FOLDS of
+    views by itself."""
     count = len(capture.faces()["face_id"])
     pixels, total = np.zeros((FOLDS, count), np.int64), np.zeros((FOLDS, count, 3))
     for i, view in enumerate(capture.used):
         if view.view_id not in predicted_views:
             continue
-        channels = job.writer.channels(f"maps/{view.name}.exr")
+        channels = writer.channels(f"maps/{view.name}.exr")
         layers = sorted(key.removesuffix(".albedo.R") for key in channels if key.endswith(".albedo.R"))
         albedo = np.mean([rgb(channels, f"{layer}.albedo") for layer in layers], 0, np.float32)
         face, shown = capture.gbuffer(view)[1], capture.photo(view)[1]
@@ -119,7 +121,7 @@ def _write_faces(job: Job, capture: CaptureReader, predicted_views: set[int]) ->
     mean = total[fold, seen] / pixels[fold, seen, None]
     columns = {"face_id": seen.astype(np.int32), "fold": fold.astype(np.int32), "pixels": pixels[fold, seen]}
     columns |= {f"albedo_{name}": mean[:, c].astype(np.float32) for c, name in enumerate("rgb")}
-    job.writer.table("faces.parquet", columns)
+    return columns
 
 
 def _channels(k: int, maps: np.ndarray) -> dict[str, np.ndarray]:

@@ -15,8 +15,8 @@ from iif_core.surface.triangles import face_geometry
 from workflow.artifacts.store import ids_to_disk
 from workflow.decisions import objects as decisions
 from workflow.runtime.job import Job
-from workflow.scene.normal_form import FOLDS, CaptureReader
-from workflow.segmentations.surface import Objects, Stability, Surface
+from workflow.scene.normal_form import CaptureReader
+from workflow.segmentations.surface import FOLDS, Objects, Stability, Surface
 
 
 def run(job: Job) -> None:
