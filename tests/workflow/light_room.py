@@ -139,7 +139,7 @@ class StubJob:
         self.stage, self.folder, self.seed, self.threads, self.scene = STAGES.get(stage), folder, seed, 2, "room"
         self.document = {"seed": seed}
         known = {"prior": {"kind": "simulated"}, "override": {"components": SimpleNamespace(metallic="auto")}, "overrides": {}}
-        known |= settings
+        known |= {"segmentation": {"kind": "given"}} | settings
         self.settings = SimpleNamespace(**{k: SimpleNamespace(**v) for k, v in known.items()})
         self.log = logging.getLogger(stage)
         provenance = {"scene": "room", "stage": stage, "fingerprint": "test"}

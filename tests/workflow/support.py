@@ -11,6 +11,7 @@ TINY = """\
 source: {kind: builtin, scene: tiny}
 capture: {dynamic_range: hdr, views: 4, width: 48, height: 48, samples: 32}
 prior: {kind: simulated, samples: 3, strength: 0.5}
+segmentation: {kind: given}
 emission: {rows: 2000, samples: 8}
 shading: {samples: 8, levels: 6}
 affines: {pixels: 8000, iterations: 5}

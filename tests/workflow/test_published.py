@@ -19,6 +19,7 @@ preset: published
 source: {kind: builtin, scene: tiny}
 capture: {views: 4, width: 32, height: 32, samples: 16}
 prior: {kind: simulated, samples: 2}
+segmentation: {kind: given}
 base: {solver: direct}
 emission: {iterations: 110, samples: 4}
 affines: {batch: 1024}

@@ -14,6 +14,7 @@ TINY = """\
 source: {kind: builtin, scene: tiny}
 capture: {dynamic_range: hdr, samples: 16}
 prior: {kind: simulated}
+segmentation: {kind: given}
 """
 SCENES = """\
 tiny:
