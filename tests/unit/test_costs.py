@@ -283,7 +283,7 @@ def test_many_cores_are_no_faster_than_the_longest_chain_of_a_scene(monkeypatch)
         jobs = [forecast.Planned(stage, scene, 2, "draft") for scene in scenes for stage in stages]
         return forecast.forecast(jobs, cores)[-1]
 
-    chain = forecast.START + 10 + 20 + 40 + 3 * forecast.START_OF_JOB
+    chain = forecast.START + 10 + 20 + 5 + 40 + 4 * forecast.START_OF_JOB
     assert f"expected: {forecast.duration(chain)} of wall time on 10000 cores" == told("ab", seconds, 10_000)
     without_prior = forecast.START + 10 + 40 + 2 * forecast.START_OF_JOB
     assert f"expected: {forecast.duration(without_prior)} of" in told("ab", ("capture", "base"), 10_000)

@@ -125,7 +125,7 @@ def test_photographs_are_made_once_and_predictions_once_a_seed(study):
     # `plain` changes nothing, so it lies where all studies share.
     assert made == [
         *("tiny--s0/base", "tiny--s0/base_scores", "tiny--s0/capture", "tiny--s0/prior", "tiny--s0/segmentation"),
-        *("tiny--s1/base", "tiny--s1/base_scores", "tiny--s1/prior"),
+        *("tiny--s1/base", "tiny--s1/base_scores", "tiny--s1/prior", "tiny--s1/segmentation"),
         *("tiny--two-mean-s0/base", "tiny--two-mean-s0/base_scores", "tiny--two-mean-s1/base", "tiny--two-mean-s1/base_scores"),
     ]
 
