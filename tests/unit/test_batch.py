@@ -200,7 +200,7 @@ def test_a_base_may_lack_what_the_line_gives(project, tmp_path):
         ("a\t\t\ttpl\tcapture=3", ["line 2, column overrides: `capture`: found 3"]),
         ("a\tfoldr\tx\t\tprior.kind=retinex", ["line 2, column source: `source.kind`: found 'foldr', allowed: builtin"]),
         ("a\tfolder\t\t\tprior.kind=retinex", ["line 2, column path: `source.path`: missing"]),
-        ("a\tfolder\tx\t\tprior.kind=retinx", ["line 2, column overrides: `prior.kind`: found 'retinx'", "Did you mean retinex?"]),
+        ("a\tfolder\tx\t\tprior.kind=retinx", ["column overrides: `prior.kind`: found 'retinx'", "Did you mean retinex?"]),
         ("a\tbuiltin\tx\ttpl\tprior.kind=simulated", ["line 2, column path: `source.path`: unknown key. Kind `builtin`"]),
         ("a\t\t\ttlp\t", ["line 2, column base: config/scenes/tlp.yaml not found", "Did you mean tpl?"]),
         ("a\t\t\ttpl\tviews", ["line 2, column overrides: found 'views', needed key=value"]),

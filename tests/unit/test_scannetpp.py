@@ -44,7 +44,8 @@ def copy(release, tmp_path):
 
 
 def refused(home, capture=None, **source):
-    tree = {"source": {"kind": "scannetpp", "path": str(home), **source}, "capture": capture or {}, "segmentation": {"kind": "given"}}
+    source = {"kind": "scannetpp", "path": str(home), **source}
+    tree = {"source": source, "capture": capture or {}, "segmentation": {"kind": "given"}}
     document = settings.dump(settings.SceneSettings.model_validate(tree))
     with pytest.raises(InputError) as caught:
         scannetpp.raw_inputs(document)

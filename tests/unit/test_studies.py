@@ -92,7 +92,7 @@ def test_what_agrees_is_shared_and_what_does_not_is_not(folder):
     assert set(homes("t--a-full-s0").values()) == {"t--s0"}
     assert homes("t--a-full-s1") == {
         "capture": "t--s0",
-        "segmentation": "t--s0",
+        "segmentation": "t--s1",
         "prior": "t--s1",
         "base": "t--s1",
         "base_scores": "t--s1",
@@ -102,7 +102,7 @@ def test_what_agrees_is_shared_and_what_does_not_is_not(folder):
     folder("studies/a", STUDY.replace(", capture: {views: 3}", ""))
     assert homes("t--a-mean-2-s1") == {
         "capture": "t--s0",
-        "segmentation": "t--s0",
+        "segmentation": "t--s1",
         "prior": "t--s1",
         "base": "t--a-mean-2-s1",
         "base_scores": "t--a-mean-2-s1",

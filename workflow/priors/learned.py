@@ -22,7 +22,7 @@ from workflow.priors import Keep, Predicted
 from workflow.priors.views import CaptureViews
 from workflow.scene.normal_form import CaptureReader, View
 
-FOLDER = Path(__file__).parents[1] / "models" / "weights" / "prior"
+FOLDER = Path(__file__).resolve().parents[1] / "models" / "weights" / "prior"
 EVERY = 3
 """Of so many views, one is predicted first, to know the light better."""
 WEIGHTS, RECIPE = "weights.safetensors", "recipe.json"

@@ -275,7 +275,8 @@ def measure(room: str, count: int = TRAJECTORIES) -> Iterator[Effect]:
     log = logging.getLogger("stability")
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
-        settings: dict[str, Any] = {**ROOMS[room], "prior": {"kind": "simulated", "samples": 8}}
+        own = {"prior": {"kind": "simulated", "samples": 8}, "segmentation": {"kind": "given"}}
+        settings: dict[str, Any] = {**ROOMS[room], **own}
         capture = chain.make_capture(folder / "capture", settings)
         strengths, shares = (factor.levels for factor in FACTORS if factor.name in (PRIOR, SHARED))
         predicted = {
