@@ -1,1 +1,1 @@
-"""Material priors that need no learned weights: simulated predictions and the retinex baseline."""
+"""Material priors as functions of arrays: simulated predictions, the retinex baseline, and inputs and hypotheses of the learned prior."""
