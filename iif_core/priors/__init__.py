@@ -1,1 +1,1 @@
-"""Material priors as functions of arrays: simulated predictions, the retinex baseline, and inputs and hypotheses of the learned prior."""
+"""Material priors as functions of arrays: simulated, retinex, and inputs and hypotheses of the learned one."""
