@@ -1,6 +1,7 @@
 """Lamps by themselves, edits of the room, camera ways, videos, and what is said of everything that cannot be."""
 
 import io
+import os
 import json
 import shutil
 from dataclasses import replace
@@ -611,6 +612,14 @@ def test_videos_play(codec, size):
     assert len(frames) == 5 and all(frame.shape == (-(-size[0] // 2) * 2, -(-size[1] // 2) * 2, 3) for frame in frames)
     for frame, picture in zip(frames, pictures, strict=True):
         assert np.abs(frame[: size[0], : size[1]].astype(int) - picture).mean() < 5
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="scheduling is asked for as Linux has it")
+def test_a_video_leaves_the_scheduling_of_the_thread_as_it_was():
+    """Fails as root alone: for others SVT-AV1 cannot change it."""
+    before = os.sched_getscheduler(0)
+    video.encoded([np.zeros((64, 64, 3), np.uint8)] * 2, 12, "av1")
+    assert os.sched_getscheduler(0) == before
 
 
 def test_a_codec_that_is_not_there_is_named(monkeypatch):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -49,12 +50,28 @@ def encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
     import av
 
     try:
-        return _encoded(pictures, fps, codec)
+        with _scheduled_as_before():
+            return _encoded(pictures, fps, codec)
     except av.error.FFmpegError as error:
         raise InputError(
             f"relight.video: {codec} refuses these frames ({error}); set another `codec` or size, or `video: off`. The frames"
             " that were rendered are kept"
         ) from None
+
+
+@contextmanager
+def _scheduled_as_before() -> Iterator[None]:
+    """Give this thread its scheduling back: where the user is root, SVT-AV1 makes it a real-time thread, which then takes the
+    processor from everything else on the machine, and so do all processes that it starts."""
+    if not hasattr(os, "sched_getscheduler"):  # not Linux
+        yield
+        return
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        yield
+    finally:
+        if os.sched_getscheduler(0) != policy:
+            os.sched_setscheduler(0, policy, parameter)
 
 
 def _encoded(pictures: Iterable[np.ndarray], fps: int, codec: str) -> bytes:
