@@ -15,11 +15,13 @@ PRIOR_LEVEL_ERROR = 0.35
 """Standard deviation of the logarithm of the level of the light that the mean albedo of the base texture implies."""
 SHARED_LEVEL_ERROR = 0.1
 """Systematic error of the logarithm of the level, common to all objects: light that geometry, cache and materials lose."""
-_COLOUR_STEPS = 8
+_COLOUR_STEPS = 4
 BASE_COLOUR_ERROR = 0.1
 """Standard deviation of the logarithm of a channel of the mean base albedo, relative to the mean over the channels."""
 SHARED_COLOUR_ERROR = 0.02
 """Systematic error of the logarithm of the level of a channel, relative to that of all channels, common to all objects."""
+LARGEST_COLOUR_ERROR = 0.5
+"""The logarithm of a channel of the light relative to the mean over the channels is taken to be known at least so well."""
 LOG_LEVELS = np.linspace(-2.0, 2.0, 161)
 """Logarithms of the level of all light that are tried (Eq. L.38)."""
 GAIN_BOUNDS = (0.1, 10.0)
@@ -234,18 +236,26 @@ def _find_level(moments: _Moments, owner: np.ndarray, albedo: BaseAlbedo | None)
 
 
 def _colour_shift(moments: _Moments, level: np.ndarray, base: np.ndarray, rows: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """(3,) by which log s of each channel changes if the colour of the light, of standard error `error` (3,), is weighed against
-    the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,)."""
+    """(3,) by which log s of each channel changes, relative to the mean over channels, if the colour of the light, of standard
+    error `error` (3,), is weighed against the mean colour of the base albedos (O, 3) of objects of so many `rows` (O,).
+
+    Where part of the light is given, the colour of the albedos follows that of the rest by a share q below 1. The shift d has the
+    least (d / error)^2 + ((c - q d) / BASE_COLOUR_ERROR)^2, c being the cast of the albedos without it.
+    """
 
     def cast(shift: np.ndarray | float) -> np.ndarray:
         """What the gains change of the mean colour."""
         changed = np.log((rows @ (moments.gains(level + shift)[0] * base)) / (rows @ base))
         return changed - changed.mean()
 
-    wanted = cast(0.0) / (1.0 + (error / BASE_COLOUR_ERROR) ** 2)
-    shift = np.zeros(3)
-    for _ in range(_COLOUR_STEPS):  # gains follow the light as far as it is modelled
-        shift = np.clip(shift + cast(shift) - wanted, -1.0, 1.0)
+    first = cast(0.0)
+    square = np.minimum(error, LARGEST_COLOUR_ERROR) ** 2
+    shift = first
+    for _ in range(_COLOUR_STEPS):  # the share is not the same everywhere
+        moved = np.abs(shift) > 1e-9
+        share = np.where(moved, (first - cast(shift)) / np.where(moved, shift, 1.0), 1.0).clip(0.0, 1.0)
+        shift = share * first * square / (share**2 * square + BASE_COLOUR_ERROR**2)
+        shift = shift - shift.mean()
     return shift
 
 
