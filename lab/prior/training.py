@@ -36,6 +36,8 @@ AVERAGE = 0.999
 """Share of the average of weights that a step keeps."""
 GROUPS = 256  # objects of a crop at most
 EVALUATE_EVERY, SAVE_EVERY = 20.0, 120.0  # seconds
+EVALUATION_SHARE = 0.05
+"""Largest share of the time that evaluations take; on a CPU they are then rarer than `EVALUATE_EVERY`."""
 _LOG = logging.getLogger("training")
 
 
@@ -322,6 +324,7 @@ class Trainer:
         waited = time.time() - self.born
         ring, since = torch.zeros(len(losses.LOGGED), device=self.plan.device), 0
         trained, last_evaluated, last_saved = self.progress.training_seconds, time.time(), time.time()
+        pause = EVALUATE_EVERY
         while self.fraction() < 1:
             self.load_new(2)
             ring += self.step()
@@ -329,10 +332,11 @@ class Trainer:
             now = time.time()
             self.progress.seconds = before + now - self.born
             self.progress.training_seconds = trained + now - self.born - waited
-            if now - last_evaluated > EVALUATE_EVERY or self.fraction() >= 1:
+            if now - last_evaluated > pause or self.fraction() >= 1:
                 self._report((ring / since).tolist(), since / max(now - last_evaluated, 1e-6))
                 ring.zero_()
                 since, last_evaluated = 0, time.time()
+                pause = max(EVALUATE_EVERY, (last_evaluated - now) / EVALUATION_SHARE)
             if now - last_saved > SAVE_EVERY:
                 self.save()
                 last_saved = time.time()
