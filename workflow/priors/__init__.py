@@ -6,13 +6,13 @@ A plug-in is a module `workflow/priors/<kind>.py`. Where each view is predicted 
 
 and where views share work, the class
 
-    Predictor(settings, capture, seed, keep), called with a view -> Predicted
+    Predictor(settings, capture, seed, keep, threads), called with a view -> Predicted
 
 which may have `concurrent = True` where several threads may call it at once with equal results.
 
 Predictions are linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are
-the sections that stage prior reads (`prior`, `source` and `segmentation.kind`), `capture` is the normal form, and `keep` returns
-an array that holds the same values on disk. Two functions are optional:
+the sections that stage prior reads (`prior`, `source` and `segmentation.kind`), `capture` is the normal form, `keep` returns
+an array that holds the same values on disk, and `threads` may be used before the first view. Two functions are optional:
 
     raw_inputs(document) -> list[Path]   files from outside that it reads; called while Snakemake plans, refuses missing files
     describe(settings) -> dict           facts about a learned model, written to model.json
@@ -47,9 +47,11 @@ class Predicted:
     scale: np.ndarray | None = None
 
 
-def predictor(settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep) -> Callable[[View], Predicted]:
+def predictor(
+    settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1
+) -> Callable[[View], Predicted]:
     """Return what predicts a view by the prior that the settings name."""
     module = importlib.import_module(f"workflow.priors.{settings.prior.kind}")
     if hasattr(module, "Predictor"):
-        return module.Predictor(settings, capture, seed, keep)
+        return module.Predictor(settings, capture, seed, keep, threads)
     return lambda view: Predicted(module.predict(view, settings, capture, seed))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
+from iif_core.fusion.blocks import map_in_order
 from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.upsampling import enlarged
@@ -50,7 +51,8 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 def describe(settings: SimpleNamespace) -> dict[str, Any]:
     """Return the facts about the network for model.json."""
     recipe = _recipe()
-    return {"prior": "learned", "licence": "MIT", **{name: recipe[name] for name in ("sha256", "widths", "heads", "training")}}
+    kept = ("sha256", "widths", "heads", "training", "object_errors")
+    return {"prior": "learned", "licence": "MIT", **{name: recipe[name] for name in kept}}
 
 
 def load(device: str) -> tuple[dict[str, Any], Any, Any]:
@@ -86,7 +88,7 @@ class Predictor:
 
     concurrent = True
 
-    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep):
+    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
         own = settings.prior
         longest = max((max(view.width, view.height) for view in capture.used), default=WORKING_SIDE)
         self.factor = max(1, round(longest / WORKING_SIDE))
@@ -96,7 +98,7 @@ class Predictor:
         self.views = CaptureViews(capture, given, self.factor)
         self.views.calibrate()
         self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep)
-        self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects())
+        self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects(threads))
 
     def __call__(self, view: View) -> Predicted:
         """Make K predictions of a view."""
@@ -111,13 +113,17 @@ class Predictor:
         full = self.views.full(view)
         return Predicted(*enlarged(made.maps, made.scale, small, full, self.factor))
 
-    def _albedo_of_objects(self) -> np.ndarray:
+    def _albedo_of_objects(self, threads: int) -> np.ndarray:
         """(G, 3) mean log albedo of each object in a first prediction of every third view; NaN where these show nothing of it."""
         group = self.gathering.group
         total, count = np.zeros((len(group), 3)), np.zeros(len(group))
-        for i in range(0, len(self.views), EVERY):
+        first = range(0, len(self.views), EVERY)
+
+        def albedo_of(number: int) -> np.ndarray:
+            return combined(self._heads(features(self.gathering, self.views, first[number])), 1).maps[0, ..., :3]
+
+        for i, albedo in zip(first, map_in_order(albedo_of, len(first), threads), strict=True):
             view = self.views[i]
-            albedo = combined(self._heads(features(self.gathering, self.views, i)), 1).maps[0, ..., :3]
             use = view.used & ~view.saturated
             row = np.searchsorted(group, view.group[use])
             count += np.bincount(row, minlength=len(group))

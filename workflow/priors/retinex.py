@@ -20,7 +20,7 @@ from workflow.scene.normal_form import CaptureReader, View
 class Predictor:
     """The light on the surface, estimated once from all photographs that are not held out."""
 
-    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep):
+    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
         self.settings, self.seed = settings.prior, seed
         self.views = CaptureViews(capture, settings.segmentation.kind == "given")
         self.views.calibrate()

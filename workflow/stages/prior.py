@@ -49,7 +49,7 @@ def predicted(job: Job, capture: CaptureReader, views: list[View]) -> list[Row]:
     found: Iterator[Predicted] = iter(())
     if left:
         seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
-        predict = predictor(job.settings, capture, seed, Scratch(job.writer.directory))
+        predict = predictor(job.settings, capture, seed, Scratch(job.writer.directory), job.threads)
         threads = job.threads if getattr(predict, "concurrent", False) else 1
         found = map_in_order(lambda i: predict(left[i]), len(left), threads)
     for done, (view, own) in enumerate(zip(views, kept, strict=True)):
