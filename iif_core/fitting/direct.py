@@ -239,7 +239,7 @@ def _select_kinds(
     noise = row_variance(terms, few, state.free)
     prior = population_prior(initial_population(), noise, texture.mean[:, 3], fit.metallic)
     found = profile_roughness(few, state, prior, tone.at(state.params), opt, state.free, measured & texture.mixed)
-    choice = choose_kinds(found, measured, texture.mean, px.usable, fit.given)
+    choice = choose_kinds(found, measured, texture.mean, px.usable, fit.given, opt.prediction_errors)
     metallic = KINDS[choice.kind].copy()
     affine = found.affine[np.arange(px.n_objects), choice.kind, choice.at].copy()
     affine[:, 12:] = np.concatenate([np.zeros((px.n_objects, 1)), choice.roughness[:, None], metallic], 1)

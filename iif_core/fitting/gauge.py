@@ -17,6 +17,7 @@ from iif_core.reflectance.material import unclamped_material
 
 KINDS = ("found", "prior", "mean_albedo", "white_patch", "lamp")
 _DARKEST = 1e-3
+_DARKEST_PIXEL = 0.01  # brightness below which a ratio counts as at this
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Gauge:
             `lamp`: the light is multiplied by `factor`.
         albedo: mean over the channels, in (0, 1]; patch: (n,) bool, pixels of the problem; factor: > 0.
         error: standard error of the logarithm of the level of the found light; infinite: not known.
+        prior_error: the same of the level that the base texture implies.
     """
 
     kind: str
@@ -36,6 +38,7 @@ class Gauge:
     patch: np.ndarray | None = None
     factor: float = 1.0
     error: float = 0.0
+    prior_error: float = PRIOR_LEVEL_ERROR
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -67,25 +70,40 @@ def apply_gauge(problem: FitProblem, fit: FitResult, gauge: Gauge) -> FitResult:
     return replace(fit, affine=affine, covariance=covariance, light_scale=fit.light_scale * factor, facts=facts)
 
 
-def _weigh_levels(problem: FitProblem, fit: FitResult, error: float) -> tuple[float, float]:
+def _weigh_levels(problem: FitProblem, fit: FitResult, error: float, prior_error: float) -> tuple[float, float]:
     """Return factor and error of the weighted mean of found level and prior's level (Eq. M.43)."""
     if error <= 0:
         return 1.0, 0.0
-    share = 1.0 / (1.0 + (PRIOR_LEVEL_ERROR / error) ** 2) if np.isfinite(error) else 1.0
-    factor, _ = _factor(problem, fit, Gauge("prior"))
-    return factor**share, PRIOR_LEVEL_ERROR * float(np.sqrt(share))
+    share = 1.0 / (1.0 + (prior_error / error) ** 2) if np.isfinite(error) else 1.0
+    return _median_factor(problem, fit) ** share, prior_error * float(np.sqrt(share))
+
+
+def _median_factor(problem: FitProblem, fit: FitResult) -> float:
+    """Return the median over the fitted pixels of the fitted over the base brightness. A mean would follow the few objects whose
+    base is wrong by a large factor, such as metals that were predicted as dielectrics."""
+    use = _fitted_pixels(problem, fit)
+    if not use.any():
+        return 1.0
+    base = problem.base[use].astype(np.float64)
+    fitted = np.maximum(unclamped_material(fit.affine[problem.object_id[use]], base)[:, :3], 0.0).mean(1)
+    return float(np.exp(np.median(np.log(np.maximum(fitted, _DARKEST_PIXEL) / np.maximum(base[:, :3].mean(1), _DARKEST_PIXEL)))))
+
+
+def _fitted_pixels(problem: FitProblem, fit: FitResult) -> np.ndarray:
+    """(n,) bool: the pixel belongs to an object of which something was fitted."""
+    use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)
+    return use & fit.free.any(1)[np.where(use, problem.object_id, 0)] if len(fit.free) else np.zeros(len(use), bool)
 
 
 def _factor(problem: FitProblem, fit: FitResult, gauge: Gauge) -> tuple[float, float]:
     """Return the factor on the light and its relative standard error."""
     if gauge.kind == "found":
-        return _weigh_levels(problem, fit, gauge.error)
+        return _weigh_levels(problem, fit, gauge.error, gauge.prior_error)
     if gauge.kind == "lamp":
         return float(gauge.factor), 0.0
-    use = (problem.object_id >= 0) & (problem.object_id < problem.n_objects) & np.isfinite(problem.base).all(1)
+    use = _fitted_pixels(problem, fit)
     if gauge.kind == "white_patch":
         use = use & gauge.patch
-    use &= fit.free.any(1)[np.where(use, problem.object_id, 0)] if len(fit.free) else False
     if not use.any():
         if gauge.kind == "white_patch":
             raise InputError("scale white_patch: the patch has too few pixels to be fitted; choose a larger one")

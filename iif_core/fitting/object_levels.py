@@ -21,9 +21,9 @@ _LARGEST_STEP = 1.5
 """Largest logarithm of a ratio that one linear step may report."""
 _PSEUDO_PATCHES = 4.0
 """Weight of the room's error of light in that of an object, in patches."""
-_BASE_FACTORS, _BASE_FACTOR, _BASE_FACTOR_WIDTH = np.geomspace(0.3, 6.0, 15), 1.4, 0.4
-"""Values among which the factor between the error of the base and the scatter of the predictions is sought; centre and width (of
-the logarithm) of its prior."""
+_BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15) / 1.4, 0.4
+"""The factor that is usual between the error of the base and the scatter of the predictions; values relative to it among which it
+is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _QUARTILES = 1.349
@@ -136,7 +136,8 @@ def measure_levels(
 
     Args:
         px: pixels; affine: (O, 16) current numbers; tone: curve with the current response; opt: loss and limits.
-        mean_base: (O, 3) mean base albedo; scatter: (O,) of the predictions (`prediction_scatter`).
+        mean_base: (O, 3) mean base albedo; scatter: (O,) of the predictions (`prediction_scatter`), which counts where the prior
+            does not state its errors.
         light_gain: (O,) factor on the light of each object that is in the exposure of `px`.
     """
     n = px.n_objects
@@ -163,7 +164,8 @@ def measure_levels(
     is_told = px.unsaturated() >= opt.min_pixels
     pixels = np.where(is_told, px.usable, 0.0)
     smooth = _smooth_error_of_light(np.clip(step, -_LARGEST_STEP, _LARGEST_STEP), weight, owner, pixels)
-    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels)
+    stated = None if opt.prediction_errors is None else opt.prediction_errors.brightness
+    levels = compare_levels(base, shown, scatter, smooth, pixels, opt.base_tells_levels, stated)
     return replace(levels, light_gain=np.where(is_told, levels.light_gain, 1.0))
 
 
@@ -194,6 +196,12 @@ def _smooth_error_of_light(step: np.ndarray, weight: np.ndarray, owner: np.ndarr
     return np.sqrt(np.maximum(_PSEUDO_PATCHES * room + freedom * shared, 0.0) / (_PSEUDO_PATCHES + freedom))
 
 
+def relative_error_of_base(brightness: np.ndarray) -> np.ndarray:
+    """Return the error of the logarithm of the brightness of the base, relative to that at an albedo of 0.3 (Eq. M.33)."""
+    bright = np.clip(np.maximum(np.asarray(brightness, np.float64), _DARKEST_LEVEL), 0.0, 1.0)
+    return srgb_from_linear(np.array(_MIDDLE_ALBEDO)) / srgb_from_linear(bright)
+
+
 def compare_levels(
     base: np.ndarray,
     shown: np.ndarray,
@@ -201,6 +209,7 @@ def compare_levels(
     smooth: np.ndarray,
     pixels: np.ndarray,
     base_tells_levels: bool = True,
+    stated: float | None = None,
 ) -> ObjectLevels:
     """Learn the errors of both estimates and divide each discrepancy between them (Eq. M.34 to M.36).
 
@@ -211,30 +220,34 @@ def compare_levels(
         base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
         scatter: (O,) of the logarithm of the brightness over predictions; smooth: (O,) smooth error of the light.
         pixels: (O,) by which objects count.
+        stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`); None = it is learnt by means of `scatter`.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
     base, shown, smooth = np.maximum(base, _DARKEST_LEVEL), np.maximum(shown, _DARKEST_LEVEL), np.maximum(smooth, _SMALLEST_ERROR)
-    size = srgb_from_linear(np.array(_MIDDLE_ALBEDO)) / srgb_from_linear(np.clip(base.mean(1), 0.0, 1.0))
-    order = np.argsort(scatter / size)
-    middle = (scatter / size)[order][np.searchsorted(np.cumsum(pixels[order]), 0.5 * pixels.sum())]
-    scatter = np.maximum(middle, _SMALLEST_ERROR) * size
+    size = relative_error_of_base(base.mean(1))
+    if stated is None:
+        order = np.argsort(scatter / size)
+        middle = (scatter / size)[order][np.searchsorted(np.cumsum(pixels[order]), 0.5 * pixels.sum())]
+        usual = _BASE_FACTOR * np.maximum(middle, _SMALLEST_ERROR) * size
+    else:
+        usual = stated * size
     some = np.argsort(-pixels, kind="stable")[:_MOST_OBJECTS]
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
-    best = (-np.inf, _BASE_FACTOR, _LIGHT_FACTOR, np.ones(3))
-    for of_base in _BASE_FACTORS if base_tells_levels else (_BASE_FACTOR,):
+    best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
+    for of_base in _BASE_FACTORS if base_tells_levels and stated is None else (1.0,):
         for of_light in _LIGHT_FACTORS if base_tells_levels else (_LIGHT_FACTOR,):
-            own, light = of_base * scatter[some], of_light * smooth[some]
+            own, light = of_base * usual[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
-            log_prior = -0.5 * (np.log(of_base / _BASE_FACTOR) / _BASE_FACTOR_WIDTH) ** 2
+            log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
             log_prior -= 0.5 * (np.log(of_light / _LIGHT_FACTOR) / _LIGHT_FACTOR_WIDTH) ** 2
             found = count * (share @ _divide(away, own, light)[0]) + log_prior
             if found > best[0]:
                 best = (found, float(of_base), float(of_light), gain)
     _, of_base, of_light, gain = best
     discrepancy = np.log(shown.sum(1) / (base @ gain))
-    base_error, light_error = of_base * scatter, of_light * smooth
+    base_error, light_error = of_base * usual, of_light * smooth
     if not base_tells_levels:
         found = np.ones(len(base)), _T_INTERVAL * light_error
         return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, *found, pixels, is_divided=False)

@@ -12,6 +12,7 @@ import numpy as np
 
 from iif_core.camera.response import Response
 from iif_core.errors import InputError
+from iif_core.fitting.predictions import PredictionErrors
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ class FitOptions:
             `MATTE_ROUGHNESS` where that is smoother, and nothing is metal.
         metallic_prior: see `select`.
         base_tells_levels: the base knows the brightness of objects by itself, beside the photographs.
+        prediction_errors: how the predictions err that the base was made of; None: not known, and learnt from the scene.
         texture_sigma: standard deviation of the albedo above which a direction of the texture counts.
         brightest: largest albedo in the fit. It exceeds 1 because in light that is a little too dim a white wall would otherwise
             be explained by a gloss that it does not have. Published albedos lie within [0, 1].
@@ -135,6 +137,7 @@ class FitOptions:
     lobes: bool = True
     metallic_prior: float = 0.25
     base_tells_levels: bool = True
+    prediction_errors: PredictionErrors | None = None
     texture_sigma: float = 2.0 / 255.0
     brightest: float = 1.25
     threads: int = 1

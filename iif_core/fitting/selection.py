@@ -10,6 +10,7 @@ import numpy as np
 
 from iif_core.fitting.descent import DescentState, GaussianPrior, decompose
 from iif_core.fitting.pixels import Pixels, Terms, evaluate, penalties_of, run_in_threads
+from iif_core.fitting.predictions import DEGREES_OF_FREEDOM, PredictionErrors
 from iif_core.fitting.problem import FitOptions
 from iif_core.fitting.profile_kernels import AlbedoTask, fit_albedo
 from iif_core.fitting.tone import Tone
@@ -39,7 +40,6 @@ FEWEST_OBJECTS = 4
 LEAST_SPREAD = 0.1
 """Least spread over the objects of the logarithm of their brightness relative to the base."""
 _NORMAL_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median deviation
-_DEGREES_OF_FREEDOM = 4.0  # of Student's t of that brightness, and of the roughness of the base
 _UNRELATED_OBJECTS = 2.0
 """Weight of the assumption that the roughness of the base says nothing, in objects."""
 _ROUGHNESS_SPREAD = 0.25
@@ -227,17 +227,24 @@ class Choice:
 
 
 def choose_kinds(
-    found: Profile, counts: np.ndarray, mean_base: np.ndarray, pixels: np.ndarray, given: np.ndarray | None = None
+    found: Profile,
+    counts: np.ndarray,
+    mean_base: np.ndarray,
+    pixels: np.ndarray,
+    given: np.ndarray | None = None,
+    stated: PredictionErrors | None = None,
 ) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    Which of two objects has the rougher base counts as an observation of their roughness. A metal must be as bright as its base
-    suggests, or at least no less so than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
+    Which of two objects has the rougher base counts as an observation of their roughness; where the prior states its errors, the
+    roughness and the metallic of the base themselves do. A metal must be as bright as its base suggests, or at least no less so
+    than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:
         found: the evidence; counts: (O,) bool, objects that enter the histogram.
         mean_base: (O, 5) mean base material; pixels: (O,) usable pixels.
         given: (O, 2) roughness and metallic that are known, NaN = chosen here; None: all are chosen.
+        stated: errors of the predictions; None: not known.
     """
     cost = found.cost.copy()
     scale = EVIDENCE_DISCOUNT * found.noise[:, None, None]
@@ -252,6 +259,9 @@ def choose_kinds(
     flat = _PRIOR_OF_KINDS / len(ROUGHNESS_GRID) * np.ones(len(ROUGHNESS_GRID))
     prior, brightness = flat, _log_brightness(found, mean_base[:, :3])
     of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
+    if stated is not None:
+        likelihood[:, 1] *= np.exp(stated.metal_log_odds(mean_base[:, 4]))[:, None]
+        of_base = stated.roughness_likelihood(mean_base[:, 3], ROUGHNESS_GRID)
     for _ in range(50):
         posterior = likelihood * prior * of_base[:, None]
         if counts.sum() >= FEWEST_OBJECTS:
@@ -259,7 +269,7 @@ def choose_kinds(
         posterior /= posterior.sum((1, 2), keepdims=True)
         prior = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
         prior /= prior.sum()
-        if counts.sum() >= FEWEST_OBJECTS:
+        if stated is None and counts.sum() >= FEWEST_OBJECTS:
             of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])
     probability = posterior.sum(2)
     kind = probability.argmax(1)
@@ -314,7 +324,7 @@ def _likelihood_of_base(posterior: np.ndarray, roughness: np.ndarray, pixels: np
     away = (roughness - usual)[:, None] - slope * (ROUGHNESS_GRID - middle)
     square = count * (share @ (posterior * away**2).sum(1)) + _UNRELATED_OBJECTS * (share @ (roughness - usual) ** 2)
     scatter = max(float(np.sqrt(square / (count + _UNRELATED_OBJECTS))), _LEAST_BASE_SCATTER)
-    likelihood = (1.0 + (away / scatter) ** 2 / _DEGREES_OF_FREEDOM) ** (-0.5 * (_DEGREES_OF_FREEDOM + 1.0))
+    likelihood = (1.0 + (away / scatter) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
     return likelihood / likelihood.max(1, keepdims=True)
 
 
@@ -337,7 +347,7 @@ def _agreement_with_base(posterior: np.ndarray, brightness: np.ndarray, counts: 
     of_kind = (posterior * brightness).sum(2) / np.maximum(posterior.sum(2), 1e-300)
     usual = np.median(of_object)
     width = max(_NORMAL_MEDIAN * float(np.median(np.abs(of_object - usual))), LEAST_SPREAD)
-    agreement = (1.0 + ((of_kind - usual) / width) ** 2 / _DEGREES_OF_FREEDOM) ** (-0.5 * (_DEGREES_OF_FREEDOM + 1.0))
+    agreement = (1.0 + ((of_kind - usual) / width) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
     return np.where(counts[:, None], np.minimum(agreement / agreement[:, :1], 1.0), 1.0)
 
 

@@ -236,9 +236,7 @@ def gather_views(
     return Gathering(light, cameras, tables, lights, neighbours, group, median, *pool.regression())
 
 
-def gather_again(
-    gathering: Gathering, views: Views, log_albedo: NDArray, mean_albedo: float = MEAN_ALBEDO
-) -> Gathering:
+def gather_again(gathering: Gathering, views: Views, log_albedo: NDArray, mean_albedo: float = MEAN_ALBEDO) -> Gathering:
     """Estimate the light again, now that the albedo of each object is roughly known; everything else stays.
 
     The level stays that of `mean_albedo`, with which the network was trained.

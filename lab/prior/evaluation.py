@@ -23,6 +23,7 @@ from iif_core.reflectance.material import PROPERTIES
 from lab.prior import captures, network
 from lab.prior.captures import Capture
 from lab.prior.inputs import Views
+from lab.prior.object_errors import ObjectSums
 from workflow.scene.normal_form import CaptureReader, View
 
 COVERED = 0.68
@@ -163,6 +164,7 @@ class Scores:
         ratios: errors in stated scales, for each of albedo, roughness, metallic.
         metal: numbers of pixels that are metal, that are taken for it, and that are both.
         best: for each head the number of objects that it explains best.
+        objects: what is needed for the errors of objects.
         log_weight: logarithms of the mixture weight of the best head of each object.
     """
 
@@ -170,6 +172,7 @@ class Scores:
     ratios: dict[str, list[np.ndarray]] = field(default_factory=lambda: {name: [] for name in _ERRORS})
     metal: np.ndarray = field(default_factory=lambda: np.zeros(3, np.int64))
     best: np.ndarray | None = None
+    objects: ObjectSums = field(default_factory=ObjectSums)
     log_weight: list[float] = field(default_factory=list)
 
     def add(self, case: Case, heads: np.ndarray, calibration: tuple[float, ...]) -> Hypotheses:
@@ -185,6 +188,8 @@ class Scores:
         true, found = case.truth["metallic"][counts] >= METAL, one.maps[0, ..., 4][counts] >= METAL
         self.metal += (true.sum(), found.sum(), (true & found).sum())
         self._weigh(case, heads)
+        truth = np.column_stack([case.truth[name][counts] for name in _ERRORS])
+        self.objects.add(case.group[counts], all_.maps.mean(0)[counts], truth)  # what a base of all predictions comes near to
         return one
 
     def _score(self, kind: str, case: Case, maps: np.ndarray) -> None:
@@ -236,6 +241,9 @@ class Scores:
         out["mean_ratio"] = {name: round(float(own.mean()), 4) for name, own in ratios.items()}
         true, found, both = (int(n) for n in self.metal)
         out["metal"] = {"pixels": true, "found": round(both / max(true, 1), 4), "precision": round(both / max(found, 1), 4)}
+        errors = self.objects.errors()
+        if errors is not None:
+            out["object_errors"] = errors.facts()
         if self.best is not None:
             out["best_head"] = (self.best / max(self.best.sum(), 1)).round(4).tolist()
         if self.log_weight:
@@ -260,6 +268,7 @@ def evaluate(
     factors = tuple(weights.recipe.get("scale_calibration", (1.0,) * len(PROPERTIES))) if calibrated else (1.0,) * len(PROPERTIES)
     scores, columns = Scores(), []
     for own in sources:
+        scores.objects.begin()
         for number, case in enumerate(own):
             answer = scores.add(case, weights.heads(case.inputs), factors)
             if pictures and number == 0 and len(columns) < 12:

@@ -25,7 +25,8 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
     Args:
         trained: folder that `train` wrote.
         target: folder that is written.
-        report: what `evaluate` measured on rooms that were kept back, with the scales as they are; it gives `scale_calibration`.
+        report: what `evaluate` measured on rooms that were kept back, with the scales as they are; it gives `scale_calibration`
+            and `object_errors`.
         licence: of the weights.
 
     Returns:
@@ -51,6 +52,7 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
     factors = [report["scale_factor"]["albedo"], report["scale_factor"]["roughness"], report["mean_ratio"]["metallic"]]
     recipe |= {
         "scale_calibration": factors,
+        "object_errors": report["object_errors"],
         "held_out": report,
         "licence": licence,
         "sha256": sha256_of(target / WEIGHTS),

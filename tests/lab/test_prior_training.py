@@ -147,6 +147,7 @@ def test_evaluation_counts_what_it_says(capture):
 def test_weights_are_exported_with_their_calibration(folder, tmp_path, capsys):
     training.Trainer(training.Plan(folder, tmp_path / "out", steps=2, **SMALL)).train()
     report = {"scale_factor": {"albedo": 2.0, "roughness": 1.5, "metallic": 3.0}, "mean_ratio": {"metallic": 0.7}}
+    report["object_errors"] = {"level": 0.1, "brightness": 0.2, "roughness": [0.5, 0.5, 0.2, 0.1], "metal": [3.0, 1.0]}
     (tmp_path / "report.json").write_text(json.dumps(report))
     assert command.main(["export", str(tmp_path / "out"), str(tmp_path / "made"), "--report", str(tmp_path / "report.json")]) == 0
     recipe = json.loads((tmp_path / "made/recipe.json").read_text())

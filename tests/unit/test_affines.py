@@ -13,7 +13,7 @@ from iif_core.fitting.pixels import evaluate, prepare_pixels
 from iif_core.fitting.problem import FitOptions, FitProblem, albedo_uncertainty
 from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Choice, Profile, choose_kinds
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
-from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines
+from iif_core.reflectance.material import GAINS, IDENTITY, MATTE_ROUGHNESS, apply_affines, unclamped_material
 from tests.unit.planted_fit import LEVELS, problem_of
 
 EXACT = FitOptions(
@@ -296,7 +296,8 @@ def test_scale_pins():
 def test_an_uncertain_level_is_averaged_with_the_prior():
     problem, _ = problem_of(np.random.default_rng(14))
     free = fit_affines(problem, response("identity"), EXACT)
-    prior = apply_gauge(problem, free, Gauge("prior")).light_scale
+    fitted = np.maximum(unclamped_material(free.affine[problem.object_id], problem.base)[:, :3], 0.0).mean(1)
+    prior = np.exp(np.median(np.log(fitted / problem.base[:, :3].mean(1))))
     assert abs(np.log(prior)) > 0.02
     for error, share, left in (
         (PRIOR_LEVEL_ERROR, 0.5, PRIOR_LEVEL_ERROR / np.sqrt(2)),

@@ -1,8 +1,8 @@
 """Lamps by themselves, edits of the room, camera ways, videos, and what is said of everything that cannot be."""
 
 import io
-import os
 import json
+import os
 import shutil
 from dataclasses import replace
 

@@ -15,6 +15,7 @@ from iif_core.fitting.clusters import patches
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import level_deviation, prediction_scatter
+from iif_core.fitting.predictions import PredictionErrors
 from iif_core.fitting.problem import FitOptions, FitProblem, FitResult, SgdOptions, albedo_uncertainty
 from iif_core.fitting.published import PublishedOptions, PublishedState, fit_published
 from iif_core.fitting.reference_loss import reference_loss
@@ -102,6 +103,7 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
             base_tells_levels=job.settings.prior.kind != "retinex",
             lobes=has_lobes(job),
             metals=job.settings.override.components.metallic != "off",
+            prediction_errors=_prediction_errors(job),
             threads=job.threads,
         )
         return lambda problem, start: fit_affines(problem, start, options)
@@ -118,6 +120,13 @@ def _solver(job: Job, prior: tuple[np.ndarray, np.ndarray] | None) -> Callable[[
         return lambda problem, start: fit_published(problem, start, published, at, keep)
     own = SgdOptions(settings.solver, settings.rate, settings.epochs, settings.batch, seed=job.seed)
     return lambda problem, start: fit_affines_sgd(problem, start, own)
+
+
+def _prediction_errors(job: Job) -> PredictionErrors | None:
+    """Return how the predictions err, where the prior states it."""
+    prior = job.read("prior")
+    stated = prior.json("model.json").get("object_errors") if prior.has("model.json") else None
+    return None if stated is None else PredictionErrors.from_facts(stated, str(prior.path("model.json")))
 
 
 def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Decision]) -> None:
@@ -160,7 +169,11 @@ def _gauge(job: Job, capture: CaptureReader, names: list[str]) -> Callable[[FitP
     """Check `affines.scale` and return a function that makes the gauge once the pixels of the problem are known."""
     scale = job.settings.affines.scale
     if isinstance(scale, str):
-        gauge = Gauge("found", error=_light_error(job)) if capture.is_hdr or scale == "found" else Gauge(scale)
+        gauge = Gauge(scale)
+        if capture.is_hdr or scale == "found":
+            stated = _prediction_errors(job)
+            gauge = Gauge("found", error=_light_error(job))
+            gauge = gauge if stated is None else replace(gauge, prior_error=stated.level)
         return lambda problem, places: gauge
     if getattr(scale, "mean_albedo", None) is not None:
         return lambda problem, places: Gauge("mean_albedo", scale.mean_albedo)

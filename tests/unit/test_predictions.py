@@ -1,0 +1,116 @@
+"""What predictions with known errors say about each object, and how selection, levels and gauge use it."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from iif_core.camera.response import response
+from iif_core.errors import InputError
+from iif_core.fitting.direct import fit_affines
+from iif_core.fitting.gauge import Gauge, apply_gauge
+from iif_core.fitting.object_levels import compare_levels, relative_error_of_base
+from iif_core.fitting.predictions import PredictionErrors
+from iif_core.fitting.problem import FitOptions
+from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profile, choose_kinds
+from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
+from tests.unit.planted_fit import problem_of
+
+ERRORS = PredictionErrors(0.15, 0.25, (0.57, 0.6, 0.2, 0.12), (3.4, 1.1))
+
+
+def test_odds_and_likelihood_are_those_of_the_formulas():
+    np.testing.assert_allclose(ERRORS.metal_log_odds(np.array([0.5, 0.25])), [3.4, 3.4 + 1.1 * np.log(1 / 3)])
+    grid = np.linspace(0, 1, 11)
+    expected = stats.t.pdf(0.61 - 0.57 - 0.2 * (grid - 0.6), 4, scale=0.12)
+    np.testing.assert_allclose(ERRORS.roughness_likelihood(np.array([0.61]), grid)[0], expected / expected.max(), rtol=1e-12)
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=9), st.floats(-1e3, 1e3))
+def test_any_prediction_gives_finite_odds(metallic, roughness):
+    odds = ERRORS.metal_log_odds(np.array(metallic))
+    assert np.isfinite(odds).all() and np.abs(odds).max() < 12
+    likelihood = ERRORS.roughness_likelihood(np.array([roughness]), ROUGHNESS_GRID)
+    assert np.isfinite(likelihood).all() and likelihood.max() == 1 and likelihood.min() >= 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"level": 0.0},
+        {"brightness": "much"},
+        {"roughness": [0.5, 0.5, 0.2]},
+        {"roughness": [0.5, 0.5, -0.2, 0.1]},
+        {"metal": [np.nan, 1.0]},
+        {"metal": None},
+    ],
+)
+def test_facts_survive_and_wrong_ones_are_refused(change):
+    assert PredictionErrors.from_facts(ERRORS.facts(), "recipe") == ERRORS
+    with pytest.raises(InputError, match="recipe"):
+        PredictionErrors.from_facts(ERRORS.facts() | change, "recipe")
+
+
+def kinds_of(metallic, evidence_for_metal, stated):
+    """Kind of objects that look alike but for the predicted metallic (O,) and the photographs' evidence (O,)."""
+    objects = len(metallic)
+    cost = np.full((objects, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, :2, 3] = 0.0
+    cost[:, 0, 3] = evidence_for_metal
+    base = np.full((objects, 5), 0.4)
+    base[:, 4] = metallic
+    affine = np.zeros((*cost.shape, 16))
+    affine[..., [0, 5, 10]] = 1.0
+    found = Profile(cost, affine, np.full(objects, 1.0 / EVIDENCE_DISCOUNT))
+    return choose_kinds(found, np.ones(objects, bool), base, np.full(objects, 100), None, stated).kind
+
+
+def test_the_base_decides_between_metal_and_dielectric_where_photographs_do_not():
+    """Evidence of e^3 for metal outweighs the rarity of metals (0.85 to 0.1), unless the prediction says otherwise."""
+    metallic, evidence = np.array([1e-3, 0.05, 0.6, 1e-3, 0.9]), np.array([3.0, 3.0, 3.0, 30.0, -30.0])
+    np.testing.assert_array_equal(kinds_of(metallic, evidence, None), [1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(kinds_of(metallic, evidence, ERRORS), [0, 1, 1, 1, 0])
+
+
+def test_roughness_follows_the_base_where_photographs_say_nothing():
+    cost = np.full((6, 3, len(ROUGHNESS_GRID)), np.inf)
+    cost[:, 0] = 0.0
+    base = np.full((6, 5), 0.4)
+    base[:, 3], base[:, 4] = np.linspace(0.45, 0.7, 6), 0.0
+    found = Profile(cost, np.zeros((*cost.shape, 16)), np.full(6, 1.0 / EVIDENCE_DISCOUNT))
+    rough = choose_kinds(found, np.ones(6, bool), base, np.full(6, 100), None, ERRORS).roughness
+    assert (np.diff(rough) > 0.01).all()
+    cost[:, 0] = 1e3 * (ROUGHNESS_GRID - 0.2) ** 2  # photographs that know are believed
+    rough = choose_kinds(found, np.ones(6, bool), base, np.full(6, 100), None, ERRORS).roughness
+    np.testing.assert_allclose(rough, 0.22, atol=0.02)
+
+
+def test_an_error_that_is_stated_is_not_learnt_again():
+    """The base errs by 0.3 everywhere and its predictions agree to 0.02: the light, which is right, is believed to be."""
+    rng = np.random.default_rng(3)
+    truth = rng.uniform(0.1, 0.8, (60, 1)) * np.ones((1, 3))
+    size = relative_error_of_base(truth.mean(1))
+    base = truth * np.exp(0.2 * size * rng.normal(size=60))[:, None]
+    shown = truth * np.exp(0.05 * rng.normal(size=60))[:, None]
+    levels = compare_levels(base, shown, np.full(60, 0.02), np.full(60, 0.05), np.full(60, 100.0), stated=0.2)
+    np.testing.assert_allclose(levels.base_error, 0.2 * relative_error_of_base(base.mean(1)), rtol=1e-12)
+    assert np.std(np.log(levels.light_gain)) < 0.06
+    assert relative_error_of_base(np.array([0.3]))[0] == 1 and np.isfinite(relative_error_of_base(np.array([0.0, 9.0]))).all()
+
+
+def test_a_level_that_the_prior_knows_better_counts_more():
+    problem, _ = problem_of(np.random.default_rng(14))
+    free = fit_affines(problem, response("identity"), FitOptions())
+    weak, strong = (
+        apply_gauge(problem, free, Gauge("found", error=0.1, prior_error=error)) for error in (PRIOR_LEVEL_ERROR, 0.1)
+    )
+    assert np.log(strong.light_scale) / np.log(weak.light_scale) == pytest.approx(0.5 * (1 + 3.5**2), rel=1e-9)
+    assert strong.facts["scale"]["relative_error"] == pytest.approx(0.1 / np.sqrt(2))
+
+
+def test_statements_change_nothing_where_nothing_is_open():
+    """Exact photographs decide everything by themselves."""
+    problem, truth = problem_of(np.random.default_rng(5))
+    plain, stated = (fit_affines(problem, response("identity"), FitOptions(prediction_errors=e)) for e in (None, ERRORS))
+    np.testing.assert_allclose(stated.affine[:, 13:], plain.affine[:, 13:], atol=0.05)
