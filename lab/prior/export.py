@@ -33,7 +33,8 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
         The recipe.
 
     Raises:
-        InputError: weights that are not finite in half precision, too large, or for other inputs.
+        InputError: weights that are not finite in half precision, too large, or for other inputs; or a report without errors of
+            objects.
     """
     arrays = {name: array.half().contiguous() for name, array in load_file(trained / WEIGHTS).items()}
     bad = [name for name, array in arrays.items() if not torch.isfinite(array).all()]
@@ -48,6 +49,8 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
     size = (target / WEIGHTS).stat().st_size
     if size > LARGEST:
         raise InputError(f"export: {size} bytes of weights; at most {LARGEST} are allowed, so choose smaller --widths")
+    if "object_errors" not in report:
+        raise InputError("export: the report has no object_errors, because its rooms lack metal or dielectrics; measure on more rooms")
     # Nearly all errors of metallic are nearly 0, so their 68 % quantile says nothing; the mean ratio is the most likely factor.
     factors = [report["scale_factor"]["albedo"], report["scale_factor"]["roughness"], report["mean_ratio"]["metallic"]]
     recipe |= {

@@ -153,6 +153,9 @@ def test_weights_are_exported_with_their_calibration(folder, tmp_path, capsys):
     recipe = json.loads((tmp_path / "made/recipe.json").read_text())
     assert recipe["scale_calibration"] == [2.0, 1.5, 0.7] and recipe["held_out"] == report and len(recipe["sha256"]) == 64
     assert evaluation.Weights.load(tmp_path / "made").recipe["heads"] == 2
+    assert recipe["object_errors"] == report["object_errors"]
+    with pytest.raises(InputError, match="object_errors"):
+        export.export(tmp_path / "out", tmp_path / "made", {k: v for k, v in report.items() if k != "object_errors"})
     arrays = load_file(tmp_path / "out/weights.safetensors")
     save_file({**arrays, "out.bias": torch.full_like(arrays["out.bias"], torch.nan)}, tmp_path / "out/weights.safetensors")
     with pytest.raises(InputError, match="not finite"):
