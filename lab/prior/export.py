@@ -50,7 +50,9 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
     if size > LARGEST:
         raise InputError(f"export: {size} bytes of weights; at most {LARGEST} are allowed, so choose smaller --widths")
     if "object_errors" not in report:
-        raise InputError("export: the report has no object_errors, because its rooms lack metal or dielectrics; measure on more rooms")
+        raise InputError(
+            "export: the report has no object_errors, because its rooms lack metal or dielectrics; measure on more rooms"
+        )
     # Nearly all errors of metallic are nearly 0, so their 68 % quantile says nothing; the mean ratio is the most likely factor.
     factors = [report["scale_factor"]["albedo"], report["scale_factor"]["roughness"], report["mean_ratio"]["metallic"]]
     recipe |= {
