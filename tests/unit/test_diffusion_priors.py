@@ -277,6 +277,7 @@ class Job:
 
     def __init__(self, folder, prior, seed=0, fingerprint="0123"):
         self.settings, self.seed, self.fingerprint = SimpleNamespace(prior=prior), seed, fingerprint
+        self.threads = 1
         self.writer = StageWriter(folder, {"stage": "prior", "scene": "tiny", "fingerprint": fingerprint})
         self.warnings = []
         self.log = SimpleNamespace(warning=lambda *a: self.warnings.append(a[0] % a[1:]))
