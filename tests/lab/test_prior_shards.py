@@ -10,8 +10,9 @@ import pytest
 
 from iif_core.priors.features import CHANNELS
 from lab.prior import __main__ as command
-from lab.prior import inputs, rooms, shards
+from lab.prior import inputs, photographs, rooms, shards
 from lab.prior.assets import Assets
+from workflow.priors.views import CaptureViews
 
 
 @pytest.fixture
@@ -110,3 +111,20 @@ def test_light_is_gathered_again_with_roughly_known_albedo(capture):
     counts = capture.truth.valid[0] & (capture.gbuffer(capture.used[0])[1] >= 0)
     ratio = np.log(known(once, 0)[counts] / np.maximum(capture.truth.albedo[0][counts], 1e-3))
     assert 0.02 < ratio.std() < 0.5 and np.isnan(known(once, 0)[~counts]).all()
+
+
+def test_the_response_of_photographs_that_are_read_smaller_is_that_of_their_pixels(llvm, room):
+    # Photographs much larger than those of the training are read at half or a third of their size; the last block is not full.
+    capture = photographs.photograph(room, 5, photographs.Session(4, 251, 1))
+    gains = np.tile([0.4, 1.6], 4)
+    exposed = np.clip(gains[:, None, None, None] * np.repeat(capture.truth.albedo, 2, 0).astype(np.float64), 0, 1)
+    encoded = photographs.sensor.Photographs(np.rint(255 * exposed ** (1 / 1.8)).astype(np.uint8), gains)
+    capture = replace(capture, photographs=encoded, poses=np.repeat(capture.poses, 2, 0))
+    values = np.linspace(0.2, 0.9, 100)
+    for factor in (1, 2, 3):
+        views = CaptureViews(capture, True, factor)
+        reason = views.calibrate()
+        assert views.response is not None, reason
+        linear = views._linear(np.repeat(values[:, None, None], 3, 2))[:, 0]
+        assert np.allclose(linear / values[:, None] ** 1.8, (linear / values[:, None] ** 1.8).mean(0), rtol=0.05), factor
+        assert views[0].depth.shape == (-(-251 // factor),) * 2

@@ -128,22 +128,26 @@ class CaptureViews:
 
     def _shared_surface(self) -> PatchRows:
         """Patches of surface away from borders, as all views show them."""
-        depths = [(self.capture.gbuffer(view)[0], view.fx) for view in self.views]
-        footprints = [float(np.median(depth[depth > 0])) / fx for depth, fx in depths if (depth > 0).any()]
+        footprints, pixels = [], 0
+        for i in range(len(self)):
+            own = self[i]
+            pixels += own.depth.size
+            if (hit := own.depth > 0).any():
+                footprints.append(float(np.median(own.depth[hit])) / float(own.intrinsics[0]))
         corners = self.vertices[np.unique(self.faces)]
         extent = float(np.ptp(corners, axis=0).max())
         edge = patch_edge(float(np.median(footprints)), extent) if footprints else max(extent, 1.0)
         origin = grid_origin(corners, edge)
-        pixels = sum(depth.size for depth, _ in depths)
+        share = min(1.0, PATCH_PIXELS / max(pixels, 1))
         parts = []
         for number, view in enumerate(self.views):
             own = self.of(view)
-            use = own.used & ~borders(own.group)
+            # The response is that of single sensor values, not of means: of a block, the middle pixel speaks.
+            value, valid = (_middles(array, self.factor) for array in self.capture.photo(view))
+            use = own.used & valid & ~borders(own.group)
             group = own.group[use]
             patch = patch_numbers(surface_points(own)[use], group, edge, origin)
-            value = self.capture.photo(view)[0][use]
-            share = min(1.0, PATCH_PIXELS / pixels)
-            parts.append(patch_rows(patch, own.normals[use], group, value, number, SATURATED, share=share))
+            parts.append(patch_rows(patch, own.normals[use], group, value[use], number, SATURATED, share=share))
         return join_rows(parts)
 
     def tracer(self) -> Trace:
