@@ -88,7 +88,7 @@ def is_loaded(name: str) -> bool:
 def _add_wheel(tar: tarfile.TarFile, wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as file:
         for entry in file.infolist():
-            if is_loaded(entry.filename):
+            if not entry.is_dir() and is_loaded(entry.filename):
                 own = tarfile.TarInfo(entry.filename)
                 own.size, own.mode = entry.file_size, 0o755
                 tar.addfile(own, file.open(entry))
