@@ -27,6 +27,8 @@ DARKEST = 4e-3
 """Linear sensor values below this are noise (docs/method/numerics.md#logarithm-of-zero)."""
 RAYS, SHADOW_RAYS = 64, 12
 """Directions per cell, and points per lamp."""
+RAYS_AT_ONCE = 8
+"""Directions per cell that are traced in one call: on a GPU a call costs more than its rays."""
 MAX_LAMPS, SKY_PATCHES = 16, 16  # unknown sources
 WIDTH = 0.25
 """Cauchy width of log radiance inside a group; texture beyond it hardly counts."""
@@ -175,19 +177,23 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
     tangents = _tangents(cells.normals)
     start = cells.points + 0.02 * cells.edge * cells.normals
     turn = rng.random((len(cells), 2))
-    for i in range(rays):
-        u = (np.array([(i + 0.5) / rays, (0.6180339887 * i) % 1]) + turn) % 1
-        radius, angle = np.sqrt(u[:, :1]), 2 * np.pi * u[:, 1:]
-        way = radius * (np.cos(angle) * tangents[0] + np.sin(angle) * tangents[1]) + np.sqrt(1 - u[:, :1]) * cells.normals
-        face, t = trace(start, way)
-        hit = np.flatnonzero(face >= 0)
-        row = find_voxel(cells, start[hit] + np.asarray(t, np.float64)[hit, None] * way[hit])
-        seen = row >= 0
-        plain = seen & ~shines[row]  # lamps have rays of their own
-        known[hit[plain]] += cells.voxel_radiance[row[plain]]
-        share[hit[~seen], -1] += 1
-        out = np.flatnonzero(face < 0)
-        share[out, lamps + (way[out] @ sky.T).argmax(1)] += 1
+    for first in range(0, rays, RAYS_AT_ONCE):
+        ways = []
+        for i in range(first, min(first + RAYS_AT_ONCE, rays)):
+            u = (np.array([(i + 0.5) / rays, (0.6180339887 * i) % 1]) + turn) % 1
+            radius, angle = np.sqrt(u[:, :1]), 2 * np.pi * u[:, 1:]
+            ways.append(
+                radius * (np.cos(angle) * tangents[0] + np.sin(angle) * tangents[1]) + np.sqrt(1 - u[:, :1]) * cells.normals
+            )
+        for way, (face, t) in zip(ways, _traced(trace, [start] * len(ways), ways), strict=True):
+            hit = np.flatnonzero(face >= 0)
+            row = find_voxel(cells, start[hit] + t[hit, None] * way[hit])
+            seen = row >= 0
+            plain = seen & ~shines[row]  # lamps have rays of their own
+            known[hit[plain]] += cells.voxel_radiance[row[plain]]
+            share[hit[~seen], -1] += 1
+            out = np.flatnonzero(face < 0)
+            share[out, lamps + (way[out] @ sky.T).argmax(1)] += 1
     known /= rays
     share /= rays
     for j in range(lamps):
@@ -199,6 +205,13 @@ def gather(cells: SurfaceCells, trace: Trace, seed: int = 0, rays: int | None = 
         np.concatenate([guess, np.tile(ambient, (SKY_PATCHES + 1, 1))]),
         np.r_[spread, np.full(SKY_PATCHES, SPREAD["sky"]), SPREAD["unseen"]],
     )
+
+
+def _traced(trace: Trace, origins: list[NDArray], directions: list[NDArray]) -> list[tuple[NDArray, NDArray]]:
+    """Faces and distances (float64) of several sets of rays, in one call."""
+    face, t = trace(np.concatenate(origins), np.concatenate(directions))
+    ends = np.cumsum([len(own) for own in directions])[:-1]
+    return list(zip(np.split(np.asarray(face), ends), np.split(np.asarray(t, np.float64), ends), strict=True))
 
 
 def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
@@ -228,6 +241,7 @@ def _lamps(cells: SurfaceCells) -> tuple[NDArray, NDArray, NDArray]:
 def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trace, rng: np.random.Generator) -> NDArray:
     """(n,) cosine-weighted share of the hemisphere of every cell that the cells `lamp` cover, by points on them (Eq. L.56)."""
     total, n = np.zeros(len(cells)), len(cells)
+    lit, ways, terms = [], [], []
     for _ in range(SHADOW_RAYS):
         own = lamp[rng.integers(0, len(lamp), n)]
         jitter = (rng.random((n, 3)) - 0.5) * 0.5 * cells.edge * (1 - np.abs(cells.normals[own]))
@@ -235,12 +249,13 @@ def _form_factor(cells: SurfaceCells, lamp: NDArray, start: NDArray, trace: Trac
         square = np.maximum((way**2).sum(1), 1e-12)
         here, there = (way * cells.normals).sum(1), -(way * cells.normals[own]).sum(1)
         facing = np.flatnonzero((here > 0) & (there > 0))
-        if not len(facing):
-            continue
-        _, t = trace(start[facing], way[facing])
-        near = np.asarray(t) > 1 - 0.5 * cells.edge / np.sqrt(square[facing])
-        lit = facing[near]
-        total[lit] += here[lit] * there[lit] / np.maximum(square[lit], (0.5 * cells.edge) ** 2) ** 2
+        term = here * there / np.maximum(square, (0.5 * cells.edge) ** 2) ** 2
+        lit.append(facing)
+        ways.append(way[facing])
+        terms.append((term[facing], 1 - 0.5 * cells.edge / np.sqrt(square[facing])))
+    for cell, (term, nearest), (_, t) in zip(lit, terms, _traced(trace, [start[cell] for cell in lit], ways), strict=True):
+        near = t > nearest
+        total[cell[near]] += term[near]
     return np.minimum(total / SHADOW_RAYS * len(lamp) * cells.edge**2 / np.pi, 1.0)
 
 
