@@ -14,7 +14,7 @@ import torch
 DARKEST = 0.01  # albedo whose logarithm is the lowest that counts
 LOG_LIMIT, GRADIENT_LIMIT = 2.5, 1.5
 """Errors of log albedo, and of its gradient, beyond which no pixel pulls harder."""
-ALBEDO_LOG, ALBEDO_LINEAR, ALBEDO_FREE, ROUGHNESS, METALLIC = 0.5, 2.0, 0.4, 1.2, 0.25
+ALBEDO_LOG, ALBEDO_LINEAR, ALBEDO_OF_VIEW, ALBEDO_OF_OBJECT, ROUGHNESS, METALLIC = 0.5, 2.0, 0.2, 0.4, 1.2, 0.5
 GRADIENT, SCALE, MIXTURE = 0.5, 0.05, 0.02
 """Weights of the terms. They balance typical sizes: log albedo .3, linear albedo .08, roughness .1, cross-entropy of metal .1."""
 AT_BORDER = 0.5
@@ -88,7 +88,7 @@ def loss_of(predicted: torch.Tensor, batch: Batch, heat: float) -> tuple[torch.T
         won = lambda term: (best * term * batch.counts).sum() / count  # noqa: E731
         every = lambda term: (term.mean(1, keepdim=True) * batch.counts).sum() / count  # noqa: E731
         used = torch.bincount(mean.argmin(1)[size > 0], minlength=mean.shape[1]) > 0
-        log, linear, _, rough, entropy = (term for _, term in errors.weighted)
+        log, linear, _, _, rough, entropy = (term for _, term in errors.weighted)
         numbers = [total, won(log), every(log), won(linear), won(rough), every(rough), won(errors.metal), won(entropy)]
         return total, torch.stack([*numbers, gradient, scales, mixture, used.sum().float()])
 
@@ -109,19 +109,23 @@ class _Errors:
 
 
 def _errors(predicted: torch.Tensor, batch: Batch) -> _Errors:
-    """Absolute errors of albedo in log, linear, and up to the scale of the view, and of roughness; cross-entropy of metal."""
+    """Absolute errors of albedo in log, linear, and in log up to a factor of the view and of the object, and of roughness;
+    cross-entropy of metal."""
     albedo = batch.truth[:, None, :3]
     difference = predicted[:, :, :3] - torch.log(albedo.clamp(min=DARKEST))
     log = difference.abs().clamp(max=LOG_LIMIT).mean(2)
     linear = (torch.exp(predicted[:, :, :3]) - albedo).abs().mean(2)
     counts = batch.counts[:, None]
     scale = (difference * counts).sum((-2, -1), keepdim=True) / counts.sum((-2, -1), keepdim=True).clamp(min=1)
-    free = (difference - scale.detach()).abs().clamp(max=LOG_LIMIT).mean(2)
+    of_view = (difference - scale.detach()).abs().clamp(max=LOG_LIMIT).mean(2)
+    # The fit finds the brightness of each object; what it cannot mend is what varies inside of one.
+    level = at_pixels(by_object(difference.detach().mean(2), batch)[0], batch)
+    of_object = (difference - level[:, :, None]).abs().clamp(max=LOG_LIMIT).mean(2)
     rough = (predicted[:, :, 3] - batch.truth[:, None, 3]).abs()
     metal, true_metal = predicted[:, :, 4].clamp(1e-4, 1 - 1e-4), batch.truth[:, None, 4].expand_as(predicted[:, :, 4])
     entropy = -(true_metal * torch.log(metal) + (1 - true_metal) * torch.log1p(-metal))
-    terms = (ALBEDO_LOG, log), (ALBEDO_LINEAR, linear), (ALBEDO_FREE, free), (ROUGHNESS, rough), (METALLIC, entropy)
-    return _Errors(terms, difference, (metal - true_metal).abs())
+    albedo_terms = (ALBEDO_LOG, log), (ALBEDO_LINEAR, linear), (ALBEDO_OF_VIEW, of_view), (ALBEDO_OF_OBJECT, of_object)
+    return _Errors((*albedo_terms, (ROUGHNESS, rough), (METALLIC, entropy)), difference, (metal - true_metal).abs())
 
 
 def by_object(values: torch.Tensor, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
@@ -177,7 +181,7 @@ def _scale_likelihood(scale: torch.Tensor, errors: _Errors, batch: Batch) -> tor
     All heads count alike, also where they are not the best: the mean of the heads is weighted by these scales, and nobody knows
     then which head is right.
     """
-    (_, log), _, _, (_, rough), _ = errors.weighted
+    (_, log), _, _, _, (_, rough), _ = errors.weighted
     error = torch.stack([log, rough, errors.metal], 2).detach()
     width = torch.exp(scale) + SCALE_FLOOR
     return ((error / width + torch.log(width)).mean((1, 2)) * batch.counts[:, 0]).sum()

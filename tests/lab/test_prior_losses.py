@@ -54,15 +54,19 @@ def test_the_loss_is_what_loops_compute(batch, predicted):
         for k in range(m):
             d = p[b, k, :3] - np.log(np.maximum(truth[b, :3], losses.DARKEST))
             shift = d[:, counts[b]].mean(1)
+            group = batch.group.numpy()[b]
             for y in range(h):
                 for x in range(w):
                     log = np.minimum(np.abs(d[:, y, x]), 2.5).mean()
                     linear = np.abs(np.exp(p[b, k, :3, y, x]) - truth[b, :3, y, x]).mean()
-                    free = np.minimum(np.abs(d[:, y, x] - shift), 2.5).mean()
+                    of_view = np.minimum(np.abs(d[:, y, x] - shift), 2.5).mean()
+                    same = counts[b] & (group == group[y, x])
+                    level = d[:, same].mean() if same.any() else 0.0
+                    of_object = np.minimum(np.abs(d[:, y, x] - level), 2.5).mean()
                     q, t = np.clip(p[b, k, 4, y, x], 1e-4, 1 - 1e-4), truth[b, 4, y, x]
                     entropy = -(t * np.log(q) + (1 - t) * np.log(1 - q))
                     rough = abs(p[b, k, 3, y, x] - truth[b, 3, y, x])
-                    pixel[b, k, y, x] = 0.5 * log + 2 * linear + 0.4 * free + 1.2 * rough + 0.25 * entropy
+                    pixel[b, k, y, x] = 0.5 * log + 2 * linear + 0.2 * of_view + 0.4 * of_object + 1.2 * rough + 0.5 * entropy
     ours = sum(weight * term for weight, term in errors.weighted).numpy()
     assert np.allclose(ours, pixel)
     total = 0.0
