@@ -25,8 +25,8 @@ class PredictionErrors:
         level: standard deviation of the logarithm of the mean predicted over the mean true albedo of a room.
         brightness: scale of Student's t (four degrees of freedom) of the logarithm of an object's brightness over the true one,
             relative to the room, for an albedo of 0.3.
-        roughness: (x, r, b, tau): an object of roughness r' is predicted to have x + b (r' - r), with an error of root mean
-            square tau, which is taken for the scale of Student's t: such an error may be a large one.
+        roughness: (x, r, b, tau): an object that is predicted to have roughness x' has r + b (x' - x), with an error of root
+            mean square tau, which is taken for the scale of Student's t: such an error may be a large one.
         metal: (a, b): the logarithm of the likelihood ratio of metal to dielectric is a + b logit(m), m the mean predicted
             metallic of an object.
     """
@@ -69,9 +69,9 @@ class PredictionErrors:
         m = np.clip(np.asarray(metallic, np.float64), _RAREST, 1.0 - _RAREST)
         return self.metal[0] + self.metal[1] * np.log(m / (1.0 - m))
 
-    def roughness_likelihood(self, predicted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """Return how likely the predicted roughness (O,) of objects is at each true roughness (R,), relative to the likeliest."""
+    def roughness_prior(self, predicted: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        """Return how probable each true roughness (R,) of objects is by the predicted one (O,), relative to the most probable."""
         middle, true, slope, scatter = self.roughness
-        away = np.asarray(predicted, np.float64)[:, None] - middle - slope * (roughness - true)
-        likelihood = (1.0 + (away / scatter) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
-        return likelihood / likelihood.max(1, keepdims=True)
+        expected = true + slope * (np.asarray(predicted, np.float64)[:, None] - middle)
+        density = (1.0 + ((roughness - expected) / scatter) ** 2 / DEGREES_OF_FREEDOM) ** (-0.5 * (DEGREES_OF_FREEDOM + 1.0))
+        return density / density.max(1, keepdims=True)

@@ -236,8 +236,8 @@ def choose_kinds(
 ) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    Which of two objects has the rougher base counts as an observation of their roughness; where the prior states its errors, the
-    roughness and the metallic of the base themselves do. A metal must be as bright as its base suggests, or at least no less so
+    Which of two objects has the rougher base counts as an observation of their roughness; where the prior of the predictions states
+    its errors, the metallic of the base does, and its roughness takes the place of the histogram's. A metal must be as bright as its base suggests, or at least no less so
     than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:
@@ -261,14 +261,16 @@ def choose_kinds(
     of_base = np.ones((len(counts), len(ROUGHNESS_GRID)))
     if stated is not None:
         likelihood[:, 1] *= np.exp(stated.metal_log_odds(mean_base[:, 4]))[:, None]
-        of_base = stated.roughness_likelihood(mean_base[:, 3], ROUGHNESS_GRID)
+        of_base = stated.roughness_prior(mean_base[:, 3], ROUGHNESS_GRID)
     for _ in range(50):
         posterior = likelihood * prior * of_base[:, None]
         if counts.sum() >= FEWEST_OBJECTS:
             posterior *= _agreement_with_base(posterior, brightness, counts)[:, :, None]
         posterior /= posterior.sum((1, 2), keepdims=True)
-        prior = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
-        prior /= prior.sum()
+        histogram = _smoothed(posterior[counts].sum(0)) + _PSEUDO_OBJECTS * flat * flat.size
+        histogram /= histogram.sum()
+        # A stated roughness is a prior of its own; the histogram then tells the kinds alone.
+        prior = histogram if stated is None else np.broadcast_to(histogram.mean(1, keepdims=True), histogram.shape)
         if stated is None and counts.sum() >= FEWEST_OBJECTS:
             of_base[counts] = _likelihood_of_base(posterior[counts].sum(1), mean_base[counts, 3], pixels[counts])
     probability = posterior.sum(2)
@@ -278,8 +280,8 @@ def choose_kinds(
     mean = given @ ROUGHNESS_GRID
     deviation = np.sqrt(np.maximum(given @ ROUGHNESS_GRID**2 - mean**2, 0.0))
     at = np.abs(ROUGHNESS_GRID[None] - mean[:, None]).argmin(1)
-    level = float(prior.sum(0) @ ROUGHNESS_GRID)
-    width = float(np.sqrt(max(prior.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
+    level = float(histogram.sum(0) @ ROUGHNESS_GRID)
+    width = float(np.sqrt(max(histogram.sum(0) @ ROUGHNESS_GRID**2 - level**2, 0.0)))
     return Choice(kind, probability, mean, deviation, at, (level, width), np.where(counts, allowed_share, 1.0))
 
 

@@ -102,7 +102,6 @@ def _add_train(commands: argparse._SubParsersAction) -> None:
     )
     p.add_argument("--widths", type=_widths, default=(40, 80, 128, 192, 224), help="features by level, default 40,80,128,192,224")
     p.add_argument("--heads", type=int, default=8, help="hypotheses, default 8")
-    p.add_argument("--no-weights", action="store_true", help="without a mixture weight for each hypothesis")
     p.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
     p.add_argument("--state", type=Path, help="where the state goes that a run continues from; default: OUT/state.pt")
     p.add_argument("--edge", type=int, default=128, help="pixels along a crop, as the folder has them; default 128")
@@ -125,7 +124,7 @@ def _train(options: argparse.Namespace) -> None:
     names = ("out", "steps", "seconds", "start", "batch", "capacity", "rate", "heat", "widths", "heads", "init", "state", "seed")
     names += ("consume", "compile", "device", "edge")
     own = {name: getattr(options, name) for name in names}
-    plan = training.Plan(options.folder, **own, weighted=not options.no_weights)
+    plan = training.Plan(options.folder, **own)
     workers = [_worker(options, i) for i in range(options.workers)]
     try:
         done = training.Trainer(plan).train(workers)

@@ -24,6 +24,7 @@ from lab.prior import captures, network
 from lab.prior.captures import Capture
 from lab.prior.inputs import Views
 from lab.prior.object_errors import ObjectSums
+from workflow.priors.network import PriorNetwork
 from workflow.scene.normal_form import CaptureReader, View
 
 COVERED = 0.68
@@ -63,12 +64,12 @@ class Weights:
         recipe = json.loads((folder / "recipe.json").read_text())
         if tuple(recipe["channels"]) != CHANNELS:
             raise ValueError(f"{folder}: weights for other inputs than the product computes now; train them again")
-        model = network.build(len(CHANNELS), recipe["widths"], recipe["heads"], recipe.get("outputs", network.HEAD))
+        model = PriorNetwork(len(CHANNELS), recipe["widths"], recipe["heads"])
         network.load_weights(model, load_file(folder / "weights.safetensors"))
         return cls(model.to(device).eval().requires_grad_(False), recipe, device)
 
     def heads(self, inputs: np.ndarray) -> np.ndarray:
-        """Predict (M, H, W, 8 or 9) from the inputs (C, H, W) of a view."""
+        """Predict (M, H, W, 8) from the inputs (C, H, W) of a view."""
         with torch.no_grad():
             out = self.model(torch.from_numpy(np.ascontiguousarray(inputs))[None].to(self.device))[0]
         return out.permute(0, 2, 3, 1).cpu().numpy()
@@ -165,7 +166,6 @@ class Scores:
         metal: numbers of pixels that are metal, that are taken for it, and that are both.
         best: for each head the number of objects that it explains best.
         objects: what is needed for the errors of objects.
-        log_weight: logarithms of the mixture weight of the best head of each object.
     """
 
     rows: dict[str, list[dict[str, float]]] = field(default_factory=dict)
@@ -173,7 +173,6 @@ class Scores:
     metal: np.ndarray = field(default_factory=lambda: np.zeros(3, np.int64))
     best: np.ndarray | None = None
     objects: ObjectSums = field(default_factory=ObjectSums)
-    log_weight: list[float] = field(default_factory=list)
 
     def add(self, case: Case, heads: np.ndarray, calibration: tuple[float, ...]) -> Hypotheses:
         """Score a view; return the network's one answer."""
@@ -224,11 +223,6 @@ class Scores:
         best = np.stack([np.bincount(group, own, len(rows)) / size for own in error]).argmin(0)
         count = np.bincount(best, minlength=len(heads))
         self.best = count if self.best is None else self.best + count
-        if heads.shape[-1] > 8:
-            logit = np.stack([np.bincount(group, own, len(rows)) / size for own in heads[..., 8][:, counts]])
-            logit -= logit.max(0)
-            log = logit - np.log(np.exp(logit).sum(0))
-            self.log_weight += log[best, np.arange(len(rows))].tolist()
 
     def report(self) -> dict[str, Any]:
         """Return means over views, coverage, the factors on the scales that would make it 68 %, metal found, and use of heads."""
@@ -246,8 +240,6 @@ class Scores:
             out["object_errors"] = errors.facts()
         if self.best is not None:
             out["best_head"] = (self.best / max(self.best.sum(), 1)).round(4).tolist()
-        if self.log_weight:
-            out["weight_of_best_head"] = round(float(np.exp(np.mean(self.log_weight))), 4)
         return out
 
 

@@ -13,6 +13,7 @@ from iif_core.errors import InputError
 from iif_core.priors.features import CHANNELS
 from lab.prior import network
 from workflow.artifacts.files import sha256_of
+from workflow.priors.network import PriorNetwork
 
 LARGEST = 10_000_000
 """Bytes of weights that the repository may hold."""
@@ -43,7 +44,7 @@ def export(trained: Path, target: Path, report: dict[str, Any], licence: str = "
     recipe = json.loads((trained / RECIPE).read_text())
     if tuple(recipe["channels"]) != CHANNELS:
         raise InputError(f"export: {trained} was trained on other inputs than the product computes now")
-    network.load_weights(network.build(len(CHANNELS), recipe["widths"], recipe["heads"], recipe["outputs"]), arrays)
+    network.load_weights(PriorNetwork(len(CHANNELS), recipe["widths"], recipe["heads"]), arrays)
     target.mkdir(parents=True, exist_ok=True)
     save_file(arrays, target / WEIGHTS)
     size = (target / WEIGHTS).stat().st_size

@@ -15,7 +15,7 @@ DARKEST = 0.01  # albedo whose logarithm is the lowest that counts
 LOG_LIMIT, GRADIENT_LIMIT = 2.5, 1.5
 """Errors of log albedo, and of its gradient, beyond which no pixel pulls harder."""
 ALBEDO_LOG, ALBEDO_LINEAR, ALBEDO_OF_VIEW, ALBEDO_OF_OBJECT, ROUGHNESS, METALLIC = 0.5, 2.0, 0.2, 0.4, 1.2, 0.5
-GRADIENT, SCALE, MIXTURE = 0.5, 0.05, 0.02
+GRADIENT, SCALE = 0.5, 0.05
 """Weights of the terms. They balance typical sizes: log albedo .3, linear albedo .08, roughness .1, cross-entropy of metal .1."""
 AT_BORDER = 0.5
 """Weight of the gradient loss at borders of objects, where the mesh may be wrong."""
@@ -28,7 +28,7 @@ FLOOR = 0.04
 """Share of the loss that all heads bear together to the end."""
 LOGGED = (
     *("loss", "log_albedo_best", "log_albedo_all", "albedo_best", "roughness_best", "roughness_all"),
-    *("metallic_best", "metal_entropy", "gradient", "scales", "mixture", "heads_used"),
+    *("metallic_best", "metal_entropy", "gradient", "scales", "heads_used"),
 )
 
 
@@ -62,7 +62,7 @@ def loss_of(predicted: torch.Tensor, batch: Batch, heat: float) -> tuple[torch.T
     """Compute the loss of a batch.
 
     Args:
-        predicted: (B, M, 8 or 9, H, W), as `network.outputs_of` names them.
+        predicted: (B, M, 8, H, W), as `network.HEAD` names them.
         batch: inputs and truth.
         heat: temperature of the shares.
 
@@ -79,10 +79,6 @@ def loss_of(predicted: torch.Tensor, batch: Batch, heat: float) -> tuple[torch.T
     gradient = _gradient(errors.difference, weight, batch) / count
     scales = _scale_likelihood(predicted[:, :, 5:8], errors, batch) / count
     total = main + GRADIENT * gradient + SCALE * scales
-    mixture = torch.zeros((), device=predicted.device)
-    if predicted.shape[2] > 8:
-        mixture = mixture_likelihood(predicted[:, :, 8], mean, size, batch)
-        total = total + MIXTURE * mixture
     with torch.no_grad():
         best = at_pixels(torch.nn.functional.one_hot(mean.argmin(1), mean.shape[1]).float(), batch)
         won = lambda term: (best * term * batch.counts).sum() / count  # noqa: E731
@@ -90,7 +86,7 @@ def loss_of(predicted: torch.Tensor, batch: Batch, heat: float) -> tuple[torch.T
         used = torch.bincount(mean.argmin(1)[size > 0], minlength=mean.shape[1]) > 0
         log, linear, _, _, rough, entropy = (term for _, term in errors.weighted)
         numbers = [total, won(log), every(log), won(linear), won(rough), every(rough), won(errors.metal), won(entropy)]
-        return total, torch.stack([*numbers, gradient, scales, mixture, used.sum().float()])
+        return total, torch.stack([*numbers, gradient, scales, used.sum().float()])
 
 
 @dataclass(frozen=True)
@@ -140,26 +136,6 @@ def by_object(values: torch.Tensor, batch: Batch) -> tuple[torch.Tensor, torch.T
 def at_pixels(values: torch.Tensor, batch: Batch) -> torch.Tensor:
     """Return values (G, M) of objects at their pixels, (B, M, H, W)."""
     return values[batch.group.reshape(-1)].reshape(*batch.group.shape, -1).permute(0, 3, 1, 2)
-
-
-def mixture_likelihood(logits: torch.Tensor, error: torch.Tensor, size: torch.Tensor, batch: Batch) -> torch.Tensor:
-    """Negative log-likelihood of the mixture weights pi of each object, with the heads held fixed:
-
-        - log sum_m pi_m exp(-error_m / t),    pi = softmax of the mean logit over the object's pixels.
-
-    The temperature t has its value at the end of training. At the optimum a weight is the probability that its head is right.
-
-    Args:
-        logits: (B, M, H, W).
-        error: (G, M) mean loss of each head on each object, detached.
-        size: (G,) pixels; objects weigh as the root of their size.
-        batch: the batch.
-    """
-    mean, _ = by_object(logits, batch)
-    log_weight = torch.log_softmax(mean, 1)
-    each = -torch.logsumexp(log_weight - error / TEMPERATURE[1], 1) - error.min(1).values / TEMPERATURE[1]
-    importance = size.sqrt()
-    return (importance * each).sum() / importance.sum().clamp(min=1)
 
 
 def _gradient(difference: torch.Tensor, weight: torch.Tensor, batch: Batch) -> torch.Tensor:

@@ -85,15 +85,12 @@ def _scale_of_t(x: np.ndarray, weight: np.ndarray) -> float:
 
 
 def _line(predicted: np.ndarray, true: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, float]:
-    """(x, r, b, tau): predicted = x + b (true - r) with residuals of root mean square tau, r the mean truth.
-
-    Least squares, because the residuals are skewed: most objects are predicted as rough, and a few as smooth, so that the
-    likeliest line under Student's t would be that of the rough ones alone.
-    """
+    """(x, r, b, tau): true = r + b (predicted - x) with residuals of root mean square tau, x the mean prediction. Least squares
+    give the mean truth at each prediction."""
     share = weight / weight.sum()
     x, r = share @ predicted, share @ true
-    b = max(float(share @ ((predicted - x) * (true - r)) / max(share @ (true - r) ** 2, 1e-12)), 0.0)
-    return float(x), float(r), b, float(np.sqrt(share @ (predicted - x - b * (true - r)) ** 2))
+    b = max(float(share @ ((predicted - x) * (true - r)) / max(share @ (predicted - x) ** 2, 1e-12)), 0.0)
+    return float(x), float(r), b, float(np.sqrt(share @ (true - r - b * (predicted - x)) ** 2))
 
 
 def _odds(predicted: np.ndarray, is_metal: np.ndarray, weight: np.ndarray) -> tuple[float, float]:

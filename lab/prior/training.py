@@ -26,6 +26,7 @@ from iif_core.priors.features import CHANNELS
 from lab.prior import losses, network, rooms, shards
 from lab.prior.inputs import EDGE, Crops
 from lab.prior.losses import Batch
+from workflow.priors.network import PriorNetwork
 
 TRIPLES = tuple(i for i, name in enumerate(CHANNELS) if name.endswith("_r") and CHANNELS[i + 1 : i + 2] == (name[:-1] + "g",))
 """First channels of the colours among the inputs."""
@@ -51,7 +52,7 @@ class Plan:
         start: seconds to wait for rooms before the first step, from the start of the process.
         batch: crops of a step. capacity: crops in memory, at most; later rooms replace earlier ones.
         rate: highest step size. heat: temperature of the shares at the start (`losses.temperature`).
-        widths, heads: of the network. weighted: with mixture weights.
+        widths, heads: of the network.
         init: weights to start from, or None. seed: of the network, the batches and the order of the crops.
         state: file that a run continues from; None = state.pt in `out`.
         consume: delete a file of crops once it is read. compile: torch.compile. device: cpu or cuda. edge: pixels along a crop.
@@ -68,7 +69,6 @@ class Plan:
     heat: float = losses.TEMPERATURE[0]
     widths: tuple[int, ...] = (40, 80, 128, 192, 224)
     heads: int = 8
-    weighted: bool = True
     init: Path | None = None
     state: Path | None = None
     seed: int = 0
@@ -165,11 +165,10 @@ class Trainer:
     def __init__(self, plan: Plan):
         self.plan, self.progress = plan, Progress()
         torch.manual_seed(plan.seed)
-        outputs = (*network.HEAD, network.WEIGHT) if plan.weighted else network.HEAD
-        self.model = network.build(len(CHANNELS), plan.widths, plan.heads, outputs).to(plan.device)
+        self.model = PriorNetwork(len(CHANNELS), plan.widths, plan.heads).to(plan.device)
         if plan.init:
-            fresh = network.load_weights(self.model, load_file(plan.init))
-            _LOG.info("starts from %s%s", plan.init, f"; new: {', '.join(fresh)}" if fresh else "")
+            network.load_weights(self.model, load_file(plan.init))
+            _LOG.info("starts from %s", plan.init)
         self.average = copy.deepcopy(self.model).eval().requires_grad_(False)
         settings = {"lr": plan.rate, "weight_decay": 0.01, "betas": (0.9, 0.98), "fused": plan.device == "cuda"}
         self.optimiser = torch.optim.AdamW(self.model.parameters(), **settings)
@@ -281,7 +280,7 @@ class Trainer:
             "channels": list(CHANNELS),
             "widths": list(self.plan.widths),
             "heads": self.plan.heads,
-            "outputs": list(network.outputs_of(self.average)),
+            "outputs": list(network.HEAD),
             "parameters": sum(p.numel() for p in self.average.parameters()),
             "training": {
                 **{name: round(value, 1) if isinstance(value, float) else value for name, value in asdict(self.progress).items()},

@@ -8,6 +8,7 @@ import torch
 
 from iif_core.priors.features import CHANNELS
 from lab.prior import losses, network
+from workflow.priors.network import PriorNetwork
 
 HEADS = 3
 
@@ -131,31 +132,13 @@ def test_scales_learn_the_mean_error_of_every_head(batch, predicted):
     assert not scale.grad[(batch.counts[:, None] == 0).expand_as(scale)].any()
 
 
-def test_mixture_weights_are_the_chances_of_the_heads(batch):
-    """Objects of one look, of which head 0 explains 3 in 4 and head 1 the rest: the best logits give weights of 3/4 and 1/4."""
-    group = torch.arange(8).reshape(2, 2, 2)
-    flat = losses.Batch(torch.zeros(1), torch.zeros(1), torch.ones(2, 1, 2, 2), group, torch.zeros(1), 8)
-    error = torch.where(torch.arange(8)[:, None] % 4 < 3, torch.tensor([0.0, 5.0]), torch.tensor([5.0, 0.0]))
-    logit = torch.zeros(2, requires_grad=True)
-    optimiser = torch.optim.Adam([logit], 0.1)
-    for _ in range(150):
-        optimiser.zero_grad()
-        losses.mixture_likelihood(logit[None, :, None, None].expand(2, 2, 2, 2), error, torch.ones(8), flat).backward()
-        optimiser.step()
-    assert torch.softmax(logit, 0).tolist() == pytest.approx([0.75, 0.25], abs=0.01)
-
-
-def test_networks_with_and_without_mixture_weights_share_their_weights():
-    plain = network.build(len(CHANNELS), (8, 16), 2, network.HEAD)
-    weighted = network.build(len(CHANNELS), (8, 16), 2)
-    assert network.load_weights(weighted, plain.state_dict()) == ["mixture.bias", "mixture.weight"]
-    x = torch.randn(1, len(CHANNELS), 12, 10)
-    with torch.no_grad():
-        a, b = plain(x), weighted(x)
-    assert a.shape == (1, 2, 8, 12, 10) and b.shape == (1, 2, 9, 12, 10)
-    assert torch.equal(a, b[:, :, :8]) and not b[:, :, 8].any()
-    assert network.outputs_of(plain) == network.HEAD and network.outputs_of(weighted)[-1] == "weight"
+def test_weights_of_other_layers_are_refused():
+    own = PriorNetwork(len(CHANNELS), (8, 16), 2)
+    for other in (PriorNetwork(len(CHANNELS), (8, 16, 16), 2), PriorNetwork(len(CHANNELS), (8, 8), 2)):
+        with pytest.raises(ValueError, match="another network"):
+            network.load_weights(own, other.state_dict())
     with pytest.raises(ValueError, match="another network"):
-        network.load_weights(plain, weighted.state_dict())
-    with pytest.raises(ValueError, match="known"):
-        network.build(40, (8, 16), 2, ["depth"])
+        network.load_weights(own, {name: array for name, array in own.state_dict().items() if name != "out.bias"})
+    other = PriorNetwork(len(CHANNELS), (8, 16), 2)
+    network.load_weights(other, {name: array.half() for name, array in own.state_dict().items()})
+    assert torch.allclose(other.out.weight, own.out.weight, atol=1e-3)

@@ -14,17 +14,19 @@ def test_planted_errors_are_found_again():
         room = 0.15 * rng.normal()
         for group in range(30):
             pixels = 60
-            bright, rough = rng.uniform(0.1, 0.7), rng.uniform(0, 1)
+            bright = rng.uniform(0.1, 0.7)
             is_metal = rng.uniform() < 0.2
             logit = rng.normal(-1.0 if is_metal else -4.0, np.sqrt(3.0))  # log likelihood ratio: x + 2.5
             shown = bright * np.exp(room + 0.2 * relative_error_of_base(np.array([bright]))[0] * rng.standard_t(4))
-            predicted = [shown, shown, shown, 0.55 + 0.2 * (rough - 0.5) + 0.1 * rng.standard_t(4), 1 / (1 + np.exp(-logit))]
+            guess = rng.uniform(0.2, 0.8)
+            rough = 0.45 + 0.9 * (guess - 0.5) + 0.1 * rng.standard_t(4)
+            predicted = [shown, shown, shown, guess, 1 / (1 + np.exp(-logit))]
             true = [bright, bright, bright, rough, float(is_metal)]
             sums.add(np.full(pixels, group), np.tile(predicted, (pixels, 1)), np.tile(true, (pixels, 1)))
     found = sums.errors()
     assert found.level == pytest.approx(0.15, rel=0.3) and found.brightness == pytest.approx(0.2, rel=0.15)
-    x, middle, slope, scatter = found.roughness
-    assert x + slope * (0.5 - middle) == pytest.approx(0.55, abs=0.02) and slope == pytest.approx(0.2, abs=0.04)
+    middle, true, slope, scatter = found.roughness
+    assert true + slope * (0.5 - middle) == pytest.approx(0.45, abs=0.02) and slope == pytest.approx(0.9, abs=0.05)
     assert scatter == pytest.approx(0.1 * np.sqrt(2), rel=0.15), "the root mean square of Student's t of scale 0.1"
     assert found.metal[0] == pytest.approx(2.5, abs=0.5) and found.metal[1] == pytest.approx(1.0, abs=0.2)
 

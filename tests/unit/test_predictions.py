@@ -17,22 +17,22 @@ from iif_core.fitting.selection import EVIDENCE_DISCOUNT, ROUGHNESS_GRID, Profil
 from iif_core.light.emission.gains import PRIOR_LEVEL_ERROR
 from tests.unit.planted_fit import problem_of
 
-ERRORS = PredictionErrors(0.15, 0.25, (0.57, 0.6, 0.2, 0.12), (3.4, 1.1))
+ERRORS = PredictionErrors(0.15, 0.25, (0.57, 0.6, 0.9, 0.2), (3.4, 1.1))
 
 
-def test_odds_and_likelihood_are_those_of_the_formulas():
+def test_odds_and_roughness_are_those_of_the_formulas():
     np.testing.assert_allclose(ERRORS.metal_log_odds(np.array([0.5, 0.25])), [3.4, 3.4 + 1.1 * np.log(1 / 3)])
     grid = np.linspace(0, 1, 11)
-    expected = stats.t.pdf(0.61 - 0.57 - 0.2 * (grid - 0.6), 4, scale=0.12)
-    np.testing.assert_allclose(ERRORS.roughness_likelihood(np.array([0.61]), grid)[0], expected / expected.max(), rtol=1e-12)
+    expected = stats.t.pdf(grid - 0.6 - 0.9 * (0.61 - 0.57), 4, scale=0.2)
+    np.testing.assert_allclose(ERRORS.roughness_prior(np.array([0.61]), grid)[0], expected / expected.max(), rtol=1e-12)
 
 
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=9), st.floats(-1e3, 1e3))
 def test_any_prediction_gives_finite_odds(metallic, roughness):
     odds = ERRORS.metal_log_odds(np.array(metallic))
     assert np.isfinite(odds).all() and np.abs(odds).max() < 12
-    likelihood = ERRORS.roughness_likelihood(np.array([roughness]), ROUGHNESS_GRID)
-    assert np.isfinite(likelihood).all() and likelihood.max() == 1 and likelihood.min() >= 0
+    density = ERRORS.roughness_prior(np.array([roughness]), ROUGHNESS_GRID)
+    assert np.isfinite(density).all() and density.max() == 1 and density.min() >= 0
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,8 @@ def test_roughness_follows_the_base_where_photographs_say_nothing():
     base[:, 3], base[:, 4] = np.linspace(0.45, 0.7, 6), 0.0
     found = Profile(cost, np.zeros((*cost.shape, 16)), np.full(6, 1.0 / EVIDENCE_DISCOUNT))
     rough = choose_kinds(found, np.ones(6, bool), base, np.full(6, 100), None, ERRORS).roughness
-    assert (np.diff(rough) > 0.01).all()
+    density = ERRORS.roughness_prior(base[:, 3], ROUGHNESS_GRID)
+    np.testing.assert_allclose(rough, density @ ROUGHNESS_GRID / density.sum(1), rtol=1e-9)  # whatever the others are
     cost[:, 0] = 1e3 * (ROUGHNESS_GRID - 0.2) ** 2  # photographs that know are believed
     rough = choose_kinds(found, np.ones(6, bool), base, np.full(6, 100), None, ERRORS).roughness
     np.testing.assert_allclose(rough, 0.22, atol=0.02)
