@@ -95,6 +95,24 @@ def test_unrelated_comment_in_scene_file_changes_nothing(checkout):
     assert changed(before, fingerprints(code, run)) == set()
 
 
+@pytest.mark.parametrize("prior", ["learned", "retinex"])
+def test_a_plan_loads_no_compiler(checkout, prior):
+    """Snakemake asks for the fingerprints of all stages whenever it is called, so plug-ins must not load what only jobs need."""
+    code, run = checkout
+    (run / "config/scenes/t.yaml").write_text(f"source: {{kind: builtin, scene: kitchen}}\nprior: {{kind: {prior}}}\n")
+    probe = """
+import sys
+from workflow.runtime import fingerprint
+for stage in ("capture", "prior", "segmentation", "base", "affines"):
+    fingerprint.fingerprint(stage, "t", "draft")
+print([name for name in ("numba", "torch", "mitsuba", "scipy", "open3d") if name in sys.modules])
+"""
+    found = subprocess.run(
+        [sys.executable, "-c", probe], cwd=run, env=os.environ | {"PYTHONPATH": str(code)}, capture_output=True, text=True
+    )
+    assert found.returncode == 0 and found.stdout.strip() == "[]", found.stdout + found.stderr
+
+
 def test_closure_covers_what_a_stage_really_imports(repository):
     """Import every stage (with every plug-in) in a process of its own; nothing of ours may be loaded that the digest misses."""
     # The processes are forks of one that holds the libraries, which take most of the time.
@@ -124,7 +142,7 @@ def test_closure_covers_what_a_stage_really_imports(repository):
     )
     plugins = {
         "capture": ("source", ("builtin", "mitsuba", "folder", "scannetpp", "fipt")),
-        "prior": ("prior", ("simulated", "files", "retinex", "rgbx", "marigold")),
+        "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
     }
     cases, roots = [], []

@@ -235,7 +235,7 @@ def test_simulated_spoils_the_truth():
 
 def test_retinex_uses_objects_and_gamma():
     chosen = SimpleNamespace(prior=SimpleNamespace(samples=2, mean_albedo=0.3), segmentation=SimpleNamespace(kind="given"))
-    maps = retinex.Predictor(chosen, Capture(), 0, lambda array: array)(view()).maps
+    maps = retinex.prepare(chosen, Capture(), 0, lambda array: array)(view()).maps
     ratio = maps[0, 2, 2, 0] / maps[0, 9, 2, 0]
     # a step between objects is material; the floor and the wall need not get the same light
     assert ratio == pytest.approx((0.8 / 0.3) ** 2.2, rel=0.1)

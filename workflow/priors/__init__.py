@@ -4,11 +4,11 @@ A plug-in is a module `workflow/priors/<kind>.py`. Where each view is predicted 
 
     predict(view, settings, capture, seed) -> (K, H, W, 5) float32
 
-and where views share work, the class
+and where views share work, the function or class
 
-    Predictor(settings, capture, seed, keep, threads), called with a view -> Predicted
+    prepare(settings, capture, seed, keep, threads), whose result is called with a view -> Predicted
 
-which may have `concurrent = True` where several threads may call it at once with equal results.
+and may have `concurrent = True` where several threads may call it at once with equal results.
 
 Predictions are linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are
 the sections that stage prior reads (`prior`, `source` and `segmentation.kind`), `capture` is the normal form, `keep` returns
@@ -52,6 +52,6 @@ def predictor(
 ) -> Callable[[View], Predicted]:
     """Return what predicts a view by the prior that the settings name."""
     module = importlib.import_module(f"workflow.priors.{settings.prior.kind}")
-    if hasattr(module, "Predictor"):
-        return module.Predictor(settings, capture, seed, keep, threads)
+    if hasattr(module, "prepare"):
+        return module.prepare(settings, capture, seed, keep, threads)
     return lambda view: Predicted(module.predict(view, settings, capture, seed))

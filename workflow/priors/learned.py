@@ -1,6 +1,7 @@
 """Prior `learned`: a small network corrects the photograph divided by the light (docs/method/priors.md#learned).
 
-The weights are part of the repository (`workflow/models/weights/prior/`).
+The weights are part of the repository (`workflow/models/weights/prior/`). Snakemake imports this module when it plans, so what
+takes long to import stands in `workflow/priors/correction.py`.
 """
 
 from __future__ import annotations
@@ -9,26 +10,18 @@ import json
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from iif_core.errors import InputError
-from iif_core.fusion.blocks import map_in_order
-from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored
-from iif_core.priors.hypotheses import combined
-from iif_core.priors.upsampling import enlarged
 from workflow.artifacts.files import sha256_of
-from workflow.priors import Keep, Predicted
-from workflow.priors.views import CaptureViews
-from workflow.scene.normal_form import CaptureReader, View
+from workflow.priors import Keep
+
+if TYPE_CHECKING:
+    from workflow.priors.correction import Correction
+    from workflow.scene.normal_form import CaptureReader
 
 FOLDER = Path(__file__).resolve().parents[1] / "models" / "weights" / "prior"
-EVERY = 3
-"""Of so many views, one is predicted first, to know the light better."""
 WEIGHTS, RECIPE = "weights.safetensors", "recipe.json"
-WORKING_SIDE = 240
-"""Longest side in pixels near which the network works: it was trained on pictures of 128 to 192 pixels."""
 
 
 def raw_inputs(document: dict[str, Any]) -> list[Path]:
@@ -37,7 +30,7 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
     Raises:
         InputError: a file is missing, or was changed.
     """
-    recipe = _recipe()
+    recipe = recipe_of_weights()
     weights = FOLDER / WEIGHTS
     cure = f"it belongs to the repository: git checkout {FOLDER.relative_to(FOLDER.parents[3])}"
     if not weights.is_file():
@@ -50,94 +43,23 @@ def raw_inputs(document: dict[str, Any]) -> list[Path]:
 
 def describe(settings: SimpleNamespace) -> dict[str, Any]:
     """Return the facts about the network for model.json."""
-    recipe = _recipe()
+    recipe = recipe_of_weights()
     kept = ("sha256", "widths", "heads", "training", "object_errors")
     return {"prior": "learned", "licence": "MIT", **{name: recipe[name] for name in kept}}
 
 
-def load(device: str) -> tuple[dict[str, Any], Any, Any]:
-    """Return recipe, network and torch device; raises InputError."""
-    from safetensors.torch import load_file
-
-    from workflow.models.checkpoint import Origin
-    from workflow.models.loading import named_device
-    from workflow.priors.network import PriorNetwork
-
-    _, weights = raw_inputs({})
-    recipe = _recipe()
-    network = PriorNetwork(len(CHANNELS), recipe["widths"], recipe["heads"])
-    network.load_state_dict({name: array.float() for name, array in load_file(weights).items()})
-    where = named_device(device, Origin(repository="this repository", licence="MIT"))
-    return recipe, network.to(where).eval().requires_grad_(False), where
-
-
 @lru_cache(1)
-def _recipe() -> dict[str, Any]:
+def recipe_of_weights() -> dict[str, Any]:
+    """Read what is known about the weights."""
     path = FOLDER / RECIPE
     try:
-        recipe = json.loads(path.read_text())
+        return json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: {error}; it belongs to the repository: git checkout {path}") from error
-    if tuple(recipe["channels"]) != CHANNELS:
-        raise InputError(f"{path}: the weights are for other inputs than `iif_core.priors.features` computes; train them again")
-    return recipe
 
 
-class Predictor:
-    """The network, and what it needs of all photographs of a capture."""
+def prepare(settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1) -> Correction:
+    """Read all photographs of a capture, and return what predicts a view."""
+    from workflow.priors.correction import Correction
 
-    concurrent = True
-
-    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
-        own = settings.prior
-        longest = max((max(view.width, view.height) for view in capture.used), default=WORKING_SIDE)
-        self.factor = max(1, round(longest / WORKING_SIDE))
-        self.samples = own.samples
-        self.recipe, self.network, self.device = load(own.device)
-        given = settings.segmentation.kind == "given"
-        self.views = CaptureViews(capture, given, self.factor)
-        self.views.calibrate()
-        self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep)
-        self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects(threads))
-
-    def __call__(self, view: View) -> Predicted:
-        """Make K predictions of a view."""
-        small = self.views.of(view)
-        inputs = features(self.gathering, self.views, self.views.number[view.view_id])
-        heads = self._heads(inputs)
-        if self.samples > len(heads):  # the mirrored picture gives as many again
-            heads = np.concatenate([heads, self._heads(mirrored(inputs))[:, :, ::-1]])
-        made = combined(heads, self.samples, calibration=tuple(self.recipe["scale_calibration"]))
-        if self.factor == 1:
-            return Predicted(made.maps, made.scale)
-        full = self.views.full(view)
-        return Predicted(*enlarged(made.maps, made.scale, small, full, self.factor))
-
-    def _albedo_of_objects(self, threads: int) -> np.ndarray:
-        """(G, 3) mean log albedo of each object in a first prediction of every third view; NaN where these show nothing of it."""
-        group = self.gathering.group
-        total, count = np.zeros((len(group), 3)), np.zeros(len(group))
-        first = range(0, len(self.views), EVERY)
-
-        def albedo_of(number: int) -> np.ndarray:
-            return combined(self._heads(features(self.gathering, self.views, first[number])), 1).maps[0, ..., :3]
-
-        for i, albedo in zip(first, map_in_order(albedo_of, len(first), threads), strict=True):
-            view = self.views[i]
-            use = view.used & ~view.saturated
-            row = np.searchsorted(group, view.group[use])
-            count += np.bincount(row, minlength=len(group))
-            for c in range(3):
-                total[:, c] += np.bincount(row, np.log(albedo[use][:, c]), len(group))
-        with np.errstate(invalid="ignore"):
-            return total / count[:, None]
-
-    def _heads(self, inputs: np.ndarray) -> np.ndarray:
-        """(M, H, W, 8) of the network."""
-        import torch
-
-        from workflow.models.loading import deterministic
-
-        with deterministic(self.device):
-            out = self.network(torch.from_numpy(np.ascontiguousarray(inputs))[None].to(self.device))[0]
-        return out.permute(0, 2, 3, 1).cpu().numpy()
+    return Correction(settings, capture, seed, keep, threads)

@@ -17,7 +17,7 @@ from workflow.priors.views import CaptureViews
 from workflow.scene.normal_form import CaptureReader, View
 
 
-class Predictor:
+class Retinex:
     """The light on the surface, estimated once from all photographs that are not held out."""
 
     def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
@@ -51,3 +51,6 @@ class Predictor:
             self.seed,
         )
         return Predicted(maps)
+
+
+prepare = Retinex

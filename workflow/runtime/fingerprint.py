@@ -254,7 +254,11 @@ def _raw_inputs(stage: str, document: dict[str, Any]) -> list[Path]:
         entries = document["relight"] if stage == "relight" else [entry for entry in document["relight"] if recombines(entry)]
         out.extend(settings_module.relight_files(entries))
     for section, key, pattern in PLUGINS.get(stage, ()):
-        module = importlib.import_module(pattern.format(document[section][key]))
+        name = pattern.format(document[section][key])
+        path = module_file(name)
+        if path is not None and "raw_inputs" not in path.read_text():
+            continue  # importing it may take as long as all of the plan: some load compilers
+        module = importlib.import_module(name)
         if hasattr(module, "raw_inputs"):
             out.extend(module.raw_inputs(document))
     for name in FILE_MODULES.get(stage, ()):
