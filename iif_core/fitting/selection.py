@@ -236,8 +236,9 @@ def choose_kinds(
 ) -> Choice:
     """Learn the histogram of kind and roughness by EM (Eq. M.21, M.23) and return the posterior of each object.
 
-    Which of two objects has the rougher base counts as an observation of their roughness; where the prior of the predictions states
-    its errors, the metallic of the base does, and its roughness takes the place of the histogram's. A metal must be as bright as its base suggests, or at least no less so
+    Which of two objects has the rougher base counts as an observation of their roughness. Where the prior of the predictions
+    states its errors, the metallic of the base is an observation, and its roughness takes the place of the histogram's. A metal
+    must be as bright as its base suggests, or at least no less so
     than as a dielectric (docs/method/fitting.md#selection-of-kind-and-roughness).
 
     Args:

@@ -12,8 +12,8 @@ from iif_core.fusion.blocks import map_in_order
 from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.upsampling import enlarged
+from workflow.models import prior_weights
 from workflow.priors import Keep, Predicted
-from workflow.priors.learned import FOLDER, RECIPE, raw_inputs, recipe_of_weights
 from workflow.priors.views import CaptureViews
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -31,11 +31,11 @@ def load(device: str) -> tuple[dict[str, Any], Any, Any]:
     from workflow.models.loading import named_device
     from workflow.priors.network import PriorNetwork
 
-    _, weights = raw_inputs({})
-    recipe = recipe_of_weights()
+    _, weights = prior_weights.checked_files()
+    recipe = prior_weights.recipe()
     if tuple(recipe["channels"]) != CHANNELS:
-        found = f"{FOLDER / RECIPE}: the weights are for other inputs than `iif_core.priors.features` computes"
-        raise InputError(f"{found}; train them again")
+        path = prior_weights.FOLDER / prior_weights.RECIPE
+        raise InputError(f"{path}: the weights are for other inputs than `iif_core.priors.features` computes; train them again")
     network = PriorNetwork(len(CHANNELS), recipe["widths"], recipe["heads"])
     network.load_state_dict({name: array.float() for name, array in load_file(weights).items()})
     where = named_device(device, Origin(repository="this repository", licence="MIT"))
