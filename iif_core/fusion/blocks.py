@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iif_core.fusion import kernels
 from iif_core.fusion.problem import Dropped, FusionProblem, usable_pixels
-
-_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -92,13 +88,3 @@ class Blocks:
             self._kept[view] = block
         elif self._spill is not None:
             self._kept[view] = replace(block, values=self._spill(block.values), inside=self._spill(block.inside))
-
-
-def map_in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T]:
-    """Yield work(0), ..., work(n - 1) in this order while `threads` of them are computed at a time."""
-    if threads <= 1:
-        yield from map(work, range(n))
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        for first in range(0, n, threads):  # in rounds, so that no more results wait than there are threads
-            yield from pool.map(work, range(first, min(first + threads, n)))

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from iif_core.errors import InputError
 from iif_core.fusion import kernels
-from iif_core.fusion.blocks import Block, Blocks, covisibility_weight, make_block, map_in_order
+from iif_core.fusion.blocks import Block, Blocks, covisibility_weight, make_block
 from iif_core.fusion.gauge import Parts, covisible_parts
 from iif_core.fusion.options import FusionOptions
 from iif_core.fusion.problem import LOWEST, NEUTRAL, Dropped, FusionProblem
 from iif_core.fusion.sums import CellCounts, CellSums, SegmentState, SegmentSums
+from iif_core.numerics.parallel import map_in_order
 from iif_core.reflectance.material import IDENTITY
 
 _T = TypeVar("_T")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Protocol
 
 import numpy as np
@@ -29,6 +30,7 @@ from iif_core.light.irradiance import (
     find_voxel,
     gather,
 )
+from iif_core.numerics.parallel import map_in_order
 from iif_core.priors.reprojection import NORMAL_STEPS, Camera, ViewTable, add_samples, as_steps, from_steps, quantiles
 from iif_core.priors.retinex import albedo_level
 
@@ -203,7 +205,12 @@ def _levelled(cells: SurfaceCells, log_light: NDArray, mean_albedo: float) -> ND
 
 
 def gather_views(
-    views: Views, trace: Trace, mean_albedo: float = MEAN_ALBEDO, seed: int = 0, keep: Keep = lambda array: array
+    views: Views,
+    trace: Trace,
+    mean_albedo: float = MEAN_ALBEDO,
+    seed: int = 0,
+    keep: Keep = lambda array: array,
+    threads: int = 1,
 ) -> Gathering:
     """Estimate the light from all views, and prepare what they look up in each other.
 
@@ -213,26 +220,39 @@ def gather_views(
         mean_albedo: prior mean of the albedos of objects, to which the light is scaled.
         seed: of the rays.
         keep: returns an array that holds the same values, perhaps on disk; it is given all arrays that grow with the views.
+        threads: views that are worked on at a time; the result does not depend on it.
 
     Raises:
         InputError: no view shows any surface.
     """
     light = scene_light(views, trace, mean_albedo, seed)
     tables, lights, cameras = [], [], []
-    for i in range(len(views)):
+
+    one_at_a_time = Lock()
+
+    def locked(origins: NDArray, directions: NDArray) -> tuple[NDArray, NDArray]:
+        with one_at_a_time:  # it may have threads of its own
+            return trace(origins, directions)
+
+    def prepared(i: int) -> tuple[ViewTable, ViewLight, Camera]:
         view = views[i]
-        table, own = _prepared(view, light, trace)
+        return *_prepared(view, light, locked), camera_of(view)
+
+    for table, own, camera in map_in_order(prepared, len(views), threads):
         tables.append(ViewTable(*(keep(array) for array in table)))
         lights.append(ViewLight(keep(own.row), keep(own.weight), keep(own.mirrored), keep(own.distance)))
-        cameras.append(camera_of(view))
+        cameras.append(camera)
     neighbours = _neighbours(light.seen)
     group, median = _medians(views, light, lights)
     pool = _Pool(group)
-    for i in range(len(views)):
+
+    def sums_of(i: int) -> tuple[NDArray, NDArray]:
         view = views[i]
         index = _spread(view.depth)
-        sums = _reprojected(view, index, tables, cameras, neighbours[i])[2]
-        pool.add(view.group.ravel()[index], sums)
+        return view.group.ravel()[index], _reprojected(view, index, tables, cameras, neighbours[i])[2]
+
+    for objects, sums in map_in_order(sums_of, len(views), threads):
+        pool.add(objects, sums)
     return Gathering(light, cameras, tables, lights, neighbours, group, median, *pool.regression())
 
 

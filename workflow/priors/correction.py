@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.fusion.blocks import map_in_order
+from iif_core.numerics.parallel import map_in_order
 from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.upsampling import enlarged
@@ -56,7 +56,7 @@ class Correction:
         given = settings.segmentation.kind == "given"
         self.views = CaptureViews(capture, given, self.factor)
         self.views.calibrate()
-        self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep)
+        self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep, threads=threads)
         self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects(threads))
 
     def __call__(self, view: View) -> Predicted:

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from iif_core.errors import InputError
-from iif_core.fusion.blocks import map_in_order
 from iif_core.fusion.problem import prediction_faults
 from iif_core.numerics.filters import fill_from_neighbours
+from iif_core.numerics.parallel import map_in_order
 from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.scratch import Scratch
 from workflow.artifacts.store import StageWriter, rgb, split_rgb
