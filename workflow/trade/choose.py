@@ -26,6 +26,8 @@ OTHERS = ("events", "inputs", "maps", "colour")
 `score/<scene>` reads."""
 
 
+LABORATORY = "with simulated predictions and given objects (from photographs alone, expect several dB less)"
+"""How the points were measured: told beside every number that comes from them."""
 MOST_SCENES = 5
 """As many scenes are told one by one how they differ from a quality."""
 
@@ -268,7 +270,7 @@ def _shifts(scene: str, score: str) -> tuple[dict[str, float], str]:
     found, names = bench.measured(scene, score), list(points())
     if found is None:
         rooms = sorted({room for point in points().values() for room in point.rooms})
-        said = f"the mean of {', '.join(rooms)}; `snakemake --cores 2 bench/{scene}` measures it in this room"
+        said = f"the mean of {', '.join(rooms)}, {LABORATORY}; `snakemake --cores 2 bench/{scene}` measures it in this room"
         return dict.fromkeys(names, 0.0), said
     known = [(place, found[name] - points()[name].expected(score).mean) for place, name in enumerate(names) if name in found]
     if not known:
@@ -297,6 +299,6 @@ def _expectation(quality: str, point: Point) -> str:
     parts = []
     for score in SCORES:
         expected = point.expected(score)
-        words = "held-out photographs, re-rendered" if score == "held_out" else score
+        words = "held-out photographs, re-rendered" if score == "held_out" else f"{score} up to scale"
         parts.append(f"{words} {expected.mean:.1f} dB ({expected.low:.1f} to {expected.high:.1f})")
-    return f"quality {quality}, {photographs(quality)}: PSNR in {len(point.rooms)} measured rooms: {', '.join(parts)}"
+    return f"quality {quality}, {photographs(quality)}: PSNR in {len(point.rooms)} rooms {LABORATORY}: {', '.join(parts)}"
