@@ -22,12 +22,10 @@ def map_in_order(work: Callable[[int], _T], n: int, threads: int) -> Iterator[_T
     with ThreadPoolExecutor(threads) as pool:
         waiting = deque(pool.submit(work, i) for i in range(min(threads, n)))
         try:
-            for i in range(threads, n + threads):
-                if not waiting:
-                    break
+            for i in range(n):
                 result = waiting.popleft().result()
-                if i < n:
-                    waiting.append(pool.submit(work, i))
+                if i + threads < n:
+                    waiting.append(pool.submit(work, i + threads))
                 yield result
         finally:  # the caller may have stopped asking
             for left in waiting:
