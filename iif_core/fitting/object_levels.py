@@ -26,6 +26,10 @@ _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15
 is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
+_LIGHT_FACTOR_MEASURED = 2.2
+"""That factor as rooms of known materials have it (docs/results/fitting.md#error-of-the-light-on-an-object). It counts where the
+error of the base is stated: such a base was predicted under light that errs as that of the fit does, so that their difference
+does not show it."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -236,8 +240,9 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
-    for of_base in _BASE_FACTORS if base_tells_levels and stated is None else (1.0,):
-        for of_light in _LIGHT_FACTORS if base_tells_levels else (_LIGHT_FACTOR,):
+    is_learnt = base_tells_levels and stated is None
+    for of_base in _BASE_FACTORS if is_learnt else (1.0,):
+        for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR_MEASURED,):
             own, light = of_base * usual[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
             log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any, get_origin
 
+from workflow.settings.explain import BOUNDS
 from workflow.settings.relight import RelightPlan
 from workflow.settings.scene import UNIONS, SceneSettings, section_in
 from workflow.settings.section import Section
@@ -25,7 +26,7 @@ def _schema(model: type[Section]) -> str:
     return json.dumps({"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}, indent=1) + "\n"
 
 
-_BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below", "min_length": "at least"}
+_BOUNDS = {**BOUNDS, "min_length": "at least"}
 
 
 def _bound(rule: Any) -> str:

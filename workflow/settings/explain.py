@@ -28,6 +28,9 @@ NEEDED = {
     **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "Needed: true or false"),
 }
+"""What a value of the wrong type should have been, by the type of pydantic's error."""
+BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+"""Words for the limits of a number, by their names in pydantic's errors."""
 EXAMPLES = {"relight": "config/relight/kitchen.yaml"}
 """Files that show all of a section that config/scenes/kitchen.yaml does not have."""
 TWINS = {
@@ -35,7 +38,6 @@ TWINS = {
     "overrides": " Did you mean `override`, where parts of the model are forced in or out?",
 }
 """Sections whose names are alike: what is said about a key that they do not know."""
-"""What a value of the wrong type should have been, by the type of pydantic's error."""
 
 
 def _section_of(where: tuple[str | int, ...]) -> type[Section] | None:
@@ -87,8 +89,8 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
     for group in groups.values():
         inside = [p for p, cut in group if cut is None or len(p["loc"]) > cut + 1 or p["type"] == "value_error"]
         if not inside:
-            said = dict.fromkeys("it may also be `key: value` pairs" if p["type"] == "model_type" else p["msg"] for p, _ in group)
-            inside = [{**group[0][0], "msg": "; ".join(said)}]
+            said = dict.fromkeys("it may also be `key: value` pairs" if p["type"] == "model_type" else needed(p) for p, _ in group)
+            inside = [{**group[0][0], "type": "any_of", "ctx": {}, "msg": "; ".join(said)}]
         kept.extend(inside)
     return kept
 
@@ -96,6 +98,19 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
 def _is_section(found: Any) -> bool:
     """Return whether a value is a mapping or a list of mappings, too long to be shown."""
     return isinstance(found, dict) or (isinstance(found, list) and any(isinstance(entry, dict) for entry in found))
+
+
+def needed(problem: Any) -> str:
+    """Return what a value should have been, in words of our own where pydantic's error is about a type, a limit or a choice."""
+    limits = problem.get("ctx", {})
+    bound = next((f"{words} {limits[name]}" for name, words in BOUNDS.items() if name in limits), None)
+    if problem["type"] in NEEDED:
+        return NEEDED[problem["type"]]
+    if bound is not None:
+        return f"Needed: {bound}"
+    if problem["type"] == "literal_error":
+        return f"Allowed: {limits['expected']}"
+    return problem["msg"].removeprefix("Value error, ")
 
 
 def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
@@ -130,13 +145,13 @@ def explain(error: ValidationError, origin: Callable[[str], str]) -> str:
             lines.append(f"{path}: `{dotted}`: {problem['ctx']['error']}.")
         else:
             said = shown(found, 200) if not isinstance(found, dict) else "'a mapping'"
-            needed = NEEDED.get(kind) or problem["msg"].removeprefix("Value error, ")
+            what = needed(problem)
             if kind == "string_type" and isinstance(found, int | float):
-                needed = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
+                what = f'Needed: text; YAML reads it as a number, so write it in quotes, such as "{found:03}"'
             elif kind == "string_pattern_mismatch" and where[-1] == "name":
-                needed = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
-            hint = did_you_mean(found, re.findall(r"'([^']*)'", needed)) if isinstance(found, str) else ""
-            lines.append(f"{path}: `{dotted}`: found {said}. {needed}.{hint}")
+                what = "Needed: letters, digits, _ and -, beginning with a letter or a digit"
+            hint = did_you_mean(found, re.findall(r"'([^']*)'", what)) if isinstance(found, str) else ""
+            lines.append(f"{path}: `{dotted}`: found {said}. {what}.{hint}")
     if len(problems) > SHOWN:
         lines.append(f"... and {len(problems) - SHOWN} more")
     return "\n".join(lines)

@@ -19,6 +19,7 @@ from iif_core.errors import InputError
 from iif_core.evaluation import catalogue
 from workflow.registry import STAGES
 from workflow.settings import relight_plans
+from workflow.settings.explain import needed
 from workflow.settings.names import configuration, did_you_mean, scene_names, scene_path
 from workflow.settings.section import Section
 from workflow.settings.yaml_file import read_yaml
@@ -468,5 +469,5 @@ def _explain(error: ValidationError, path: Path) -> str:
             lines.append(f"{path}: `{dotted}`: missing. Add it; config/studies/aggregation.yaml is a complete example.")
         else:
             shown = found if not isinstance(found, dict) else "a mapping"
-            lines.append(f"{path}: `{dotted}`: found {shown!r}. {problem['msg']}.")
+            lines.append(f"{path}: `{dotted}`: found {shown!r}. {needed(problem)}.")
     return "\n".join(lines)

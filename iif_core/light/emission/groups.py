@@ -193,6 +193,7 @@ def _merge(
     n = len(areas)
     parent = np.arange(n)
     normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()
+    area_sum = areas.astype(np.float64).copy()
 
     def root(i: int) -> int:
         while parent[i] != i:
@@ -211,7 +212,9 @@ def _merge(
         i, j = root(int(pair[e, 0])), root(int(pair[e, 1]))
         if i == j or ratio(i, j) >= max_ratio:
             continue
-        if not small[i]:
+        # The rim of a lamp that is saturated in all photographs, as the lamp is.
+        is_rim = weight_sum[i] == weight_sum[j] == 0 and min(area_sum[i], area_sum[j]) < SMALL_AREA
+        if not (small[i] or is_rim):
             a, b = normal_sum[i], normal_sum[j]
             if a @ b < min_cosine * np.sqrt((a @ a) * (b @ b)):
                 continue
@@ -220,4 +223,5 @@ def _merge(
         normal_sum[i] += normal_sum[j]
         colour_sum[i] += colour_sum[j]
         weight_sum[i] += weight_sum[j]
+        area_sum[i] += area_sum[j]
     return np.array([root(i) for i in range(n)])
