@@ -184,6 +184,22 @@ def test_groups_by_plane_colour_and_side():
     assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
 
 
+def test_the_rim_of_a_saturated_panel_is_part_of_it():
+    """A box of 0.6 x 0.6 x 0.03 m. Where it is seen unsaturated its sides are lamps of their own; where nothing but bounds is
+    known, one lamp. Surface that is as large as the panel stays apart all the same."""
+    trimesh = pytest.importorskip("trimesh")
+    for size, lamps, half_seen in (((0.6, 0.6, 0.03), 1, 3), ((3.0, 3.0, 3.0), 6, 6)):
+        box = trimesh.creation.box(size)
+        faces, everything = np.asarray(box.faces), np.ones(12, bool)
+        normals, areas = face_geometry(np.asarray(box.vertices), faces)
+        clear = _statistics([50] * 12, [1.0] * 12)
+        assert group_emitters(everything, clear, face_adjacency(faces), normals, areas).size == 6
+        bounds = replace(clear, bounded=everything, clear=np.zeros(12, np.int32))
+        assert group_emitters(everything, bounds, face_adjacency(faces), normals, areas).size == lamps
+        half = replace(bounds, clear=np.where(np.abs(normals[:, 2]) > 0.5, 50, 0).astype(np.int32))  # of top and bottom
+        assert group_emitters(everything, half, face_adjacency(faces), normals, areas).size == half_seen
+
+
 def test_gradient_is_cut_into_steps():
     vertices, faces = _strip(20)
     normals, areas = face_geometry(vertices, faces)

@@ -62,7 +62,8 @@ class GroupingOptions:
     Attributes:
         max_angle: degrees between the normals of two groups that are merged.
         max_ratio: of any channel between the colours of two groups that are merged.
-        small_area: m^2; a connected piece below it is one group whatever its normals (bulbs, shades).
+        small_area: m^2; a connected piece below it is one group whatever its normals (bulbs, shades), and a group below it that
+            was never seen unsaturated joins a neighbour that was not either (the rim of a panel).
         min_faces, min_area (m^2): a group needs one of the two.
         min_observations: pixels that must have seen a group; nothing bounds the radiance of a highlight on one face.
         max_groups: the strongest groups (area x radiance) are kept.
@@ -117,7 +118,8 @@ def group_emitters(
     weight = statistics.clear[ids].astype(np.float64)
     colour = statistics.mean[ids] * weight[:, None]
     small, min_cosine = piece_area < options.small_area, np.cos(np.radians(options.max_angle))
-    parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, min_cosine, options.max_ratio)
+    limits = min_cosine, options.max_ratio, options.small_area
+    parent = _merge(local[pair], normals[ids], areas[ids], colour, weight, small, *limits)
     label = np.unique(parent, return_inverse=True)[1] if len(ids) else np.zeros(0, np.int64)
     if glowing is not None and (glowing[ids] >= 0).any():
         label = _joined(label, np.where(glowing[ids] >= 0, 3 * glowing[ids].astype(np.int64) + side[ids] + 1, -1))
@@ -188,8 +190,10 @@ def _merge(
     small: np.ndarray,
     min_cosine: float,
     max_ratio: float,
+    rim_area: float,
 ) -> np.ndarray:
-    """Union-find over neighbouring faces (Eq. L.5); returns the root of each."""
+    """Union-find over neighbouring faces (Eq. L.5); returns the root of each. Groups below `rim_area` that were never seen
+    unsaturated join neighbours that were not either, whatever the normals."""
     n = len(areas)
     parent = np.arange(n)
     normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()
@@ -212,8 +216,8 @@ def _merge(
         i, j = root(int(pair[e, 0])), root(int(pair[e, 1]))
         if i == j or ratio(i, j) >= max_ratio:
             continue
-        # The rim of a lamp that is saturated in all photographs, as the lamp is.
-        is_rim = weight_sum[i] == weight_sum[j] == 0 and min(area_sum[i], area_sum[j]) < SMALL_AREA
+        # A photograph that is saturated on lamp and rim alike cannot say that the rim only reflects.
+        is_rim = weight_sum[i] == weight_sum[j] == 0 and min(area_sum[i], area_sum[j]) < rim_area
         if not (small[i] or is_rim):
             a, b = normal_sum[i], normal_sum[j]
             if a @ b < min_cosine * np.sqrt((a @ a) * (b @ b)):
