@@ -27,9 +27,9 @@ is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _LIGHT_FACTOR_MEASURED = 2.2
-"""That factor as rooms of known materials have it (docs/results/fitting.md#error-of-the-light-on-an-object). It counts where the
+"""That factor in rooms of known materials (docs/results/fitting.md#constants-and-what-they-were-chosen-on). It counts where the
 error of the base is stated: such a base was predicted under light that errs as that of the fit does, so that their difference
-does not show it."""
+does not show the error."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3

@@ -4,11 +4,13 @@ do, without a run: from what the fits of finished rooms knew, and the truth.
     python tests/benchmarks/level_factors.py [--try CENTRE_BASE WIDTH_BASE CENTRE_LIGHT WIDTH_LIGHT] [--table FILE.csv]
     python tests/benchmarks/level_factors.py --from FOLDER SCENE... --table FILE.csv
 
-The first form reads `docs/results/data/object_levels.csv`, whose rows are objects: what the last comparison of a fit was given
-(mean base albedo, level that the photographs ask for, scatter of the predictions, smooth error of the light, pixels), the true
-mean albedo, and the pixels that show it. It prints the true factors, the scale of Student's t of the real errors over what Eq.
-M.32 and M.33 say, and PSNR in dB of the objects' levels, up to scale and as they are. The second form adds rows: it makes stage
-affines of finished rooms again, such as `sky--rooms-ours-s0`, and FOLDER is the working folder of runs of this very code.
+The first form reads `docs/results/data/object_levels.csv` (simulated predictions) or another table, such as
+`object_levels_learned.csv`, whose rows are objects: what the last comparison of a fit was given (mean base albedo, level that the
+photographs ask for, scatter of the predictions, smooth error of the light, pixels, the error of the base that the prior states),
+the true mean albedo, and the pixels that show it. It prints the true factors, the scale of Student's t of the real errors over
+what Eq. M.32 and M.33 say, and PSNR in dB of the objects' levels, up to scale and as they are. Where the error of the base is
+stated, only CENTRE_LIGHT is tried. The second form adds rows: it makes stage affines of finished rooms again, such as
+`sky--rooms-ours-s0`, and FOLDER is the working folder of runs of this very code.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -28,7 +31,7 @@ from iif_core.fitting.object_levels import ObjectLevels, compare_levels
 
 TABLE = Path(__file__).resolve().parents[2] / "docs" / "results" / "data" / "object_levels.csv"
 COLOURS = ("base", "shown", "true")
-COLUMNS = ("room", "object", *(f"{n}_{c}" for n in COLOURS for c in "rgb"), "scatter", "smooth", "pixels", "count")
+COLUMNS = ("room", "object", *(f"{n}_{c}" for n in COLOURS for c in "rgb"), "scatter", "smooth", "pixels", "count", "stated")
 LEAST_OBJECTS = 3
 """A room of fewer objects tells nothing about its factors."""
 
@@ -41,12 +44,13 @@ def measured(folder: Path, scene: str) -> pd.DataFrame:
     from workflow.scene.normal_form import CaptureReader
     from workflow.stages import affines
 
-    asked, objects = [], []
+    asked, stated, objects = [], [], []
     compare, fit = object_levels.compare_levels, affines.fit_affines
 
-    def compared(*arrays: np.ndarray) -> ObjectLevels:
-        asked.append([np.array(a) for a in arrays])
-        return compare(*arrays)
+    def compared(*arguments: Any) -> ObjectLevels:
+        asked.append([np.array(a) for a in arguments[:5]])
+        stated.append(arguments[6])
+        return compare(*arguments)
 
     def fitted(problem, start, options):
         pixels = np.bincount(problem.object_id[problem.object_id >= 0])
@@ -73,7 +77,7 @@ def measured(folder: Path, scene: str) -> pd.DataFrame:
         np.add.at(total, number[counts], truth.albedo[counts])
         np.add.at(count, number[counts], 1)
     true, room = (total / np.maximum(count, 1)[:, None])[own], np.full(len(own), scene.split("--")[0], object)
-    parts = [room, own, *base.T, *shown.T, *true.T, scatter, smooth, pixels, count[own]]
+    parts = [room, own, *base.T, *shown.T, *true.T, scatter, smooth, pixels, count[own], stated[-1]]
     return pd.DataFrame(dict(zip(COLUMNS, parts, strict=True)))
 
 
@@ -83,7 +87,13 @@ def columns(rows: pd.DataFrame, name: str) -> np.ndarray:
 
 def levels(rows: pd.DataFrame) -> ObjectLevels:
     numbers = (rows[name].to_numpy(np.float64) for name in ("scatter", "smooth", "pixels"))
-    return compare_levels(columns(rows, "base"), columns(rows, "shown"), *numbers)
+    return compare_levels(columns(rows, "base"), columns(rows, "shown"), *numbers, stated=stated_error(rows))
+
+
+def stated_error(rows: pd.DataFrame) -> float | None:
+    """What the prior of a room states (`PredictionErrors.brightness`)."""
+    stated = rows["stated"].iloc[0] if "stated" in rows else None
+    return None if pd.isna(stated) else float(stated)
 
 
 def weight(rows: pd.DataFrame) -> np.ndarray:
@@ -119,7 +129,10 @@ def true_factors(rows: pd.DataFrame) -> tuple[float, float]:
 
 
 def base_factor(rows: pd.DataFrame, found: ObjectLevels) -> float:
-    """The factor of the base that a fit has learnt: its claim over that with the factor held at 1."""
+    """The factor of the base that a fit has learnt: its claim over that with the factor held at 1. Nothing is learnt where the
+    error is stated."""
+    if stated_error(rows) is not None:
+        return 1.0
     kept = object_levels._BASE_FACTORS
     object_levels._BASE_FACTORS = np.ones(1)
     try:
@@ -131,7 +144,7 @@ def base_factor(rows: pd.DataFrame, found: ObjectLevels) -> float:
 def with_priors(centre_base: float, width_base: float, centre_light: float, width_light: float) -> None:
     object_levels._BASE_FACTOR, object_levels._BASE_FACTOR_WIDTH = centre_base, width_base
     object_levels._LIGHT_FACTOR, object_levels._LIGHT_FACTOR_WIDTH = centre_light, width_light
-    object_levels._LIGHT_FACTORS = np.geomspace(0.2, 5.0, 17)
+    object_levels._LIGHT_FACTORS, object_levels._LIGHT_FACTOR_MEASURED = np.geomspace(0.2, 5.0, 17), centre_light
 
 
 def main() -> None:
