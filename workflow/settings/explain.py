@@ -89,7 +89,9 @@ def _one_of_each_choice(problems: Sequence[Any]) -> list[Any]:
     for group in groups.values():
         inside = [p for p, cut in group if cut is None or len(p["loc"]) > cut + 1 or p["type"] == "value_error"]
         if not inside:
-            said = dict.fromkeys("it may also be `key: value` pairs" if p["type"] == "model_type" else needed(p) for p, _ in group)
+            said = dict.fromkeys(
+                "it may also be `key: value` pairs" if p["type"] == "model_type" else needed(p) for p, _ in group
+            )
             inside = [{**group[0][0], "type": "any_of", "ctx": {}, "msg": "; ".join(said)}]
         kept.extend(inside)
     return kept
