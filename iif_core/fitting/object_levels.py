@@ -27,9 +27,8 @@ is sought; width (of the logarithm) of its prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _LIGHT_FACTOR_MEASURED = 2.2
-"""That factor in rooms of known materials (docs/results/fitting.md#constants-and-what-they-were-chosen-on). It counts where the
-error of the base is stated: such a base was predicted under light that errs as that of the fit does, so that their difference
-does not show the error."""
+"""That factor in rooms of known materials (docs/results/fitting.md#constants-and-what-they-were-chosen-on), which is claimed
+where it is not learnt."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -224,7 +223,8 @@ def compare_levels(
         base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
         scatter: (O,) of the logarithm of the brightness over predictions; smooth: (O,) smooth error of the light.
         pixels: (O,) by which objects count.
-        stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`); None = it is learnt by means of `scatter`.
+        stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), and neither error is learnt; None = both
+            are, by means of `scatter` and `smooth`.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
@@ -242,7 +242,7 @@ def compare_levels(
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
     is_learnt = base_tells_levels and stated is None
     for of_base in _BASE_FACTORS if is_learnt else (1.0,):
-        for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR_MEASURED,):
+        for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
             own, light = of_base * usual[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
             log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
@@ -253,11 +253,16 @@ def compare_levels(
     _, of_base, of_light, gain = best
     discrepancy = np.log(shown.sum(1) / (base @ gain))
     base_error, light_error = of_base * usual, of_light * smooth
+    claimed = light_error if is_learnt else _LIGHT_FACTOR_MEASURED * smooth
     if not base_tells_levels:
-        found = np.ones(len(base)), _T_INTERVAL * light_error
-        return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, *found, pixels, is_divided=False)
+        found = np.ones(len(base)), _T_INTERVAL * claimed
+        return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, *found, pixels, is_divided=False)
     _, mean, deviation = _divide(discrepancy, base_error, light_error)
-    return ObjectLevels(base, shown, discrepancy, light_error, base_error, gain, np.exp(mean), deviation, pixels)
+    if not is_learnt:
+        # A base that was predicted under light that errs as the fit's does errs with it. Less of their discrepancy then belongs
+        # to the light than its error alone would have it, and more of that error remains.
+        deviation = _divide(discrepancy, base_error, claimed)[2]
+    return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, np.exp(mean), deviation, pixels)
 
 
 def _mean_gain(base: np.ndarray, shown: np.ndarray, share: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -144,7 +144,7 @@ def base_factor(rows: pd.DataFrame, found: ObjectLevels) -> float:
 def with_priors(centre_base: float, width_base: float, centre_light: float, width_light: float) -> None:
     object_levels._BASE_FACTOR, object_levels._BASE_FACTOR_WIDTH = centre_base, width_base
     object_levels._LIGHT_FACTOR, object_levels._LIGHT_FACTOR_WIDTH = centre_light, width_light
-    object_levels._LIGHT_FACTORS, object_levels._LIGHT_FACTOR_MEASURED = np.geomspace(0.2, 5.0, 17), centre_light
+    object_levels._LIGHT_FACTORS = np.geomspace(0.2, 5.0, 17)
 
 
 def main() -> None:

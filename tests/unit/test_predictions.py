@@ -8,6 +8,7 @@ from scipy import stats
 
 from iif_core.camera.response import response
 from iif_core.errors import InputError
+from iif_core.fitting import object_levels
 from iif_core.fitting.direct import fit_affines
 from iif_core.fitting.gauge import Gauge, apply_gauge
 from iif_core.fitting.object_levels import compare_levels, relative_error_of_base
@@ -112,6 +113,11 @@ def test_an_error_that_base_and_light_share_is_claimed_nevertheless():
         for stated, found in inside.items():
             levels = compare_levels(base, shown, np.full(40, 0.1), smooth, np.full(40, 100.0), stated=stated)
             found.append(np.abs(shared) < 1.142 * levels.light_error)  # the central 68 % of Student's t
+            if stated is not None:  # less of a discrepancy is the light's than errors that are independent would have it
+                part = object_levels._divide(levels.discrepancy, levels.base_error, 1.5 * smooth)[1]
+                left = object_levels._divide(levels.discrepancy, levels.base_error, 2.2 * smooth)[2]
+                np.testing.assert_allclose(levels.light_gain, np.exp(part), rtol=1e-12)
+                np.testing.assert_allclose(levels.deviation, left, rtol=1e-12)
     assert 0.6 < np.mean(inside[0.2]) < 0.76 and np.mean(inside[None]) < 0.5
 
 
