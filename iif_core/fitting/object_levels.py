@@ -2,7 +2,8 @@
 (docs/method/fitting.md#two-estimates-of-a-level).
 
 The photographs know the brightness of an object up to the error of the light there, the base up to the error of the predictions.
-Both errors are learnt from the scene. What the light is believed to err by is taken out of it before the last descent.
+Both errors are learnt from the scene, unless the prior states that of the base. What the light is believed to err by is taken out
+of it before the last descent.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13),
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _LIGHT_FACTOR_MEASURED = 2.2
 """That factor in rooms of known materials (docs/results/fitting.md#constants-and-what-they-were-chosen-on), which is claimed
-where it is not learnt."""
+where the prior states its errors."""
 _QUARTILES = 1.349
 """Distance of the quartiles of a normal distribution, in standard deviations."""
 _MIDDLE_ALBEDO = 0.3
@@ -253,14 +254,14 @@ def compare_levels(
     _, of_base, of_light, gain = best
     discrepancy = np.log(shown.sum(1) / (base @ gain))
     base_error, light_error = of_base * usual, of_light * smooth
-    claimed = light_error if is_learnt else _LIGHT_FACTOR_MEASURED * smooth
+    claimed = light_error if stated is None else _LIGHT_FACTOR_MEASURED * smooth
     if not base_tells_levels:
         found = np.ones(len(base)), _T_INTERVAL * claimed
         return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, *found, pixels, is_divided=False)
     _, mean, deviation = _divide(discrepancy, base_error, light_error)
-    if not is_learnt:
-        # A base that was predicted under light that errs as the fit's does errs with it. Less of their discrepancy then belongs
-        # to the light than its error alone would have it, and more of that error remains.
+    if stated is not None:
+        # A base that was predicted under light that errs as the fit's does errs with it. Where the base errs by more than the
+        # light, as in most rooms, less of their discrepancy then belongs to the light, and more of its error remains.
         deviation = _divide(discrepancy, base_error, claimed)[2]
     return ObjectLevels(base, shown, discrepancy, claimed, base_error, gain, np.exp(mean), deviation, pixels)
 

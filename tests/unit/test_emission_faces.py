@@ -184,20 +184,28 @@ def test_groups_by_plane_colour_and_side():
     assert out.size == 3 and out.side[[0, 4, 8]].tolist() == [1, -1, 0]
 
 
-def test_the_rim_of_a_saturated_panel_is_part_of_it():
-    """A box of 0.6 x 0.6 x 0.03 m. Where it is seen unsaturated its sides are lamps of their own; where nothing but bounds is
-    known, one lamp. Surface that is as large as the panel stays apart all the same."""
+@pytest.mark.parametrize("subdivisions", [0, 1, 2])
+def test_the_rim_of_a_saturated_panel_is_part_of_it(subdivisions):
+    """A panel of 2 x 1 x 0.05 m: where it is seen unsaturated its sides are lamps of their own, where nothing but bounds is known
+    each joins top or bottom, and where only top and bottom were seen unsaturated they are a ring. Surface that is no smaller than
+    a lamp stays apart, however fine the mesh is and however its edges are ordered."""
     trimesh = pytest.importorskip("trimesh")
-    for size, lamps, half_seen in (((0.6, 0.6, 0.03), 1, 3), ((3.0, 3.0, 3.0), 6, 6)):
+    for size, lamps, half_seen in (((2.0, 1.0, 0.05), 2, 3), ((1.0, 1.0, 1.0), 6, 6), ((3.0, 3.0, 3.0), 6, 6)):
         box = trimesh.creation.box(size)
-        faces, everything = np.asarray(box.faces), np.ones(12, bool)
+        for _ in range(subdivisions):
+            box = box.subdivide()
+        faces = np.asarray(box.faces)
+        everything = np.ones(len(faces), bool)
         normals, areas = face_geometry(np.asarray(box.vertices), faces)
-        clear = _statistics([50] * 12, [1.0] * 12)
-        assert group_emitters(everything, clear, face_adjacency(faces), normals, areas).size == 6
-        bounds = replace(clear, bounded=everything, clear=np.zeros(12, np.int32))
-        assert group_emitters(everything, bounds, face_adjacency(faces), normals, areas).size == lamps
-        half = replace(bounds, clear=np.where(np.abs(normals[:, 2]) > 0.5, 50, 0).astype(np.int32))  # of top and bottom
-        assert group_emitters(everything, half, face_adjacency(faces), normals, areas).size == half_seen
+        adjacency = face_adjacency(faces)
+        adjacency = adjacency[np.random.default_rng(1).permutation(len(adjacency))]
+        clear = _statistics([50] * len(faces), [1.0] * len(faces))
+        assert group_emitters(everything, clear, adjacency, normals, areas).size == 6
+        bounds = replace(clear, bounded=everything, clear=np.zeros(len(faces), np.int32))
+        found = group_emitters(everything, bounds, adjacency, normals, areas)
+        assert found.size == lamps and found.area.sum() == pytest.approx(areas.sum())
+        half = replace(bounds, clear=np.where(np.abs(normals[:, 2]) > 0.5, 50, 0).astype(np.int32))
+        assert group_emitters(everything, half, adjacency, normals, areas).size == half_seen
 
 
 def test_gradient_is_cut_into_steps():

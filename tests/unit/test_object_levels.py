@@ -60,7 +60,7 @@ def test_where_the_base_tells_no_levels_the_photographs_do():
     inside = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        _, base, shown, smooth, log_light, _ = _room(rng, 40, 0.12, 0.5, kappa=2.2)
+        _, base, shown, smooth, log_light, _ = _room(rng, 40, 0.12, 0.5, kappa=1.5)
         levels = compare_levels(base, shown, np.full(40, 0.1), smooth, np.full(40, 100.0), base_tells_levels=False)
         assert (levels.light_gain == 1).all() and not levels.facts()["divided"]
         inside.append(np.abs(log_light - np.mean(log_light)) < levels.deviation)

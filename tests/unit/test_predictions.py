@@ -102,8 +102,8 @@ def test_an_error_that_is_stated_is_not_learnt_again():
 
 
 def test_an_error_that_base_and_light_share_is_claimed_nevertheless():
-    """A base that was predicted under light that errs by 0.2 agrees with the fit under the same light: no discrepancy shows the
-    error. What rooms of known materials say of it counts, and holds; what is learnt from the discrepancies is far too small."""
+    """A base that was predicted under the fit's own wrong light agrees with the fit: no discrepancy shows the error. What rooms
+    of known materials say of it is claimed; what is learnt from the discrepancies is far too small."""
     inside = {None: [], 0.2: []}
     for seed in range(20):
         rng = np.random.default_rng(seed)

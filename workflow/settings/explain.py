@@ -27,6 +27,7 @@ NEEDED = {
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "Needed: a whole number"),
     **dict.fromkeys(("float_type", "float_parsing"), "Needed: a number"),
     **dict.fromkeys(("bool_type", "bool_parsing"), "Needed: true or false"),
+    "finite_number": "Needed: a finite number",
 }
 """What a value of the wrong type should have been, by the type of pydantic's error."""
 BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
@@ -102,10 +103,15 @@ def _is_section(found: Any) -> bool:
     return isinstance(found, dict) or (isinstance(found, list) and any(isinstance(entry, dict) for entry in found))
 
 
+def _number(value: float) -> str:
+    """Return 1 for 1.0, as a person would write it."""
+    return str(int(value) if float(value).is_integer() else value)
+
+
 def needed(problem: Any) -> str:
     """Return what a value should have been, in words of our own where pydantic's error is about a type, a limit or a choice."""
     limits = problem.get("ctx", {})
-    bound = next((f"{words} {limits[name]}" for name, words in BOUNDS.items() if name in limits), None)
+    bound = next((f"{words} {_number(limits[name])}" for name, words in BOUNDS.items() if name in limits), None)
     if problem["type"] in NEEDED:
         return NEEDED[problem["type"]]
     if bound is not None:

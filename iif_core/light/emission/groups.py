@@ -192,8 +192,8 @@ def _merge(
     max_ratio: float,
     rim_area: float,
 ) -> np.ndarray:
-    """Union-find over neighbouring faces (Eq. L.5); returns the root of each. Groups below `rim_area` that were never seen
-    unsaturated join neighbours that were not either, whatever the normals."""
+    """Union-find over neighbouring faces (Eq. L.5); returns the root of each. Whole groups below `rim_area` that were never seen
+    unsaturated then join neighbours that were not either, whatever the normals."""
     n = len(areas)
     parent = np.arange(n)
     normal_sum, colour_sum, weight_sum = normals * areas[:, None], colour.copy(), weight.astype(np.float64).copy()
@@ -211,21 +211,30 @@ def _merge(
         a, b = colour_sum[i] / weight_sum[i] + 1e-6, colour_sum[j] / weight_sum[j] + 1e-6
         return float(np.max(np.maximum(a / b, b / a)))
 
+    def join(i: int, j: int) -> None:
+        i, j = min(i, j), max(i, j)
+        parent[j] = i
+        for total in (normal_sum, colour_sum, weight_sum, area_sum):
+            total[i] += total[j]
+
     first = np.array([ratio(i, j) for i, j in pair]) if len(pair) else np.zeros(0)
     for e in np.argsort(first, kind="stable"):
         i, j = root(int(pair[e, 0])), root(int(pair[e, 1]))
         if i == j or ratio(i, j) >= max_ratio:
             continue
-        # A photograph that is saturated on lamp and rim alike cannot say that the rim only reflects.
-        is_rim = weight_sum[i] == weight_sum[j] == 0 and min(area_sum[i], area_sum[j]) < rim_area
-        if not (small[i] or is_rim):
+        if not small[i]:
             a, b = normal_sum[i], normal_sum[j]
             if a @ b < min_cosine * np.sqrt((a @ a) * (b @ b)):
                 continue
-        i, j = min(i, j), max(i, j)
-        parent[j] = i
-        normal_sum[i] += normal_sum[j]
-        colour_sum[i] += colour_sum[j]
-        weight_sum[i] += weight_sum[j]
-        area_sum[i] += area_sum[j]
+        join(i, j)
+    # A photograph that is saturated on lamp and rim alike cannot say that the rim only reflects. Groups are whole by now: the
+    # smallest is joined to its largest neighbour first.
+    seen_clear, area = weight_sum > 0, area_sum.copy()
+    edge = np.array([[root(int(i)), root(int(j))] for i, j in pair], np.int64).reshape(-1, 2)
+    edge = np.unique(np.sort(edge[(edge[:, 0] != edge[:, 1]) & ~seen_clear[edge].any(1)], axis=1), axis=0)
+    small_one, large_one = area[edge].min(1), area[edge].max(1)
+    for i, j in edge[np.lexsort((-large_one, small_one))]:
+        i, j = root(int(i)), root(int(j))
+        if i != j and min(area_sum[i], area_sum[j]) < rim_area:
+            join(i, j)
     return np.array([root(i) for i in range(n)])
