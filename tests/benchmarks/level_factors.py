@@ -9,8 +9,8 @@ the last comparison of a fit was given (mean base albedo, level that the photogr
 error of the light, pixels, the error of the base that the prior states), the true mean albedo, and the pixels that show it. It
 prints the true factors, the scale of Student's t of the real errors over what Eq. M.32 and M.33 say, and PSNR in dB of the
 objects' levels, up to scale and as they are. Where the error of the base is stated, only CENTRE_LIGHT is tried. The second form
-adds rows: it makes stage affines of finished rooms again, such as
-`sky--rooms-ours-s0`, and FOLDER is the working folder of runs of this very code.
+adds rows: it makes stage affines of finished rooms again, such as `sky--rooms-ours-s0`, and FOLDER is the working folder of runs
+of this very code.
 """
 
 from __future__ import annotations
