@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,9 @@ from iif_core.errors import InputError
 
 DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of the error of roughness."""
+SECOND_LOOK = 0.75
+"""Error of the brightness of an object in a base that was predicted under the computed light, relative to the first base
+(docs/results/rooms.md#a-second-look)."""
 _RAREST = 1e-3
 """Metallic closer to 0 or 1 than this says no more than this."""
 
@@ -58,6 +61,10 @@ class PredictionErrors:
         if min(own.level, own.brightness, own.roughness[3]) <= 0 or own.roughness[2] < 0:
             raise InputError(f"{where}: object_errors {dict(facts)}: errors must be above 0, and the slope not below it")
         return own
+
+    def of_second_look(self) -> PredictionErrors:
+        """Return the errors of a base that was predicted once more, under the light that had been found."""
+        return replace(self, brightness=SECOND_LOOK * self.brightness)
 
     def facts(self) -> dict[str, Any]:
         """Return the values for `recipe.json`."""

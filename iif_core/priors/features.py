@@ -68,6 +68,8 @@ MEAN_ALBEDO = 0.4
 """Mean over the surface to which the light is scaled; the network corrects it."""
 KNOWN_SPREAD = 0.3
 """Standard deviation of an object's log albedo as a first prediction states it."""
+COMPUTED_SHARE = 0.7
+"""Share of the light that was computed from emitters, in that of a second look; the rest is the gathered light (Eq. P.29)."""
 QUOTIENT = (-5.5, 2.5)
 FARTHEST, BRIGHTEST = 10.0, 30.0
 """Largest distance in metres, and radiance in means of the scene, of what a mirrored ray meets."""
@@ -272,6 +274,42 @@ def gather_again(gathering: Gathering, views: Views, log_albedo: NDArray, mean_a
     albedo = np.exp(known[np.searchsorted(gathering.group, np.unique(light.cells.group))])
     found = estimate_log_light(light.cells, light.gathered, albedo, REACHES, KNOWN_SPREAD)
     light = replace(light, log_light=_levelled(light.cells, found, mean_albedo))
+    _, median = _medians(views, light, gathering.lights)
+    return replace(gathering, light=light, median=median)
+
+
+def with_computed_light(gathering: Gathering, views: Views, irradiance: Callable[[int], NDArray]) -> Gathering:
+    """Correct the gathered light by the one that was computed from emitters that are known meanwhile (Eq. P.29).
+
+    The gathered light knows lamps, unseen surface and the sky only roughly, but follows the photographs; the computed light has
+    shadows and lamps as they are, and the errors of the emitters. In the logarithm, cell by cell, their weighted mean is nearer
+    to the truth than either. Their medians are made equal, so the level stays that of the gathered light, as does what its two
+    versions differ by.
+
+    Args:
+        gathering: as `gather_again` returned it.
+        views: the same.
+        irradiance: number of a view -> (H, W, 3) diffuse light of each pixel, up to a factor of each channel; values that are
+            not above 0 are unknown.
+    """
+    light = gathering.light
+    cells = len(light.cells)
+    total, count = np.zeros((cells, 3)), np.zeros(cells)
+    for i, own in enumerate(gathering.lights):
+        view = views[i]
+        value = irradiance(i)[view.depth > 0].astype(np.float64)
+        known = np.isfinite(value).all(1) & (value > 0).all(1)
+        nearest = own.row[known, 0].astype(np.int64)
+        count += np.bincount(nearest, minlength=cells)
+        for c in range(3):
+            total[:, c] += np.bincount(nearest, np.log(value[known, c]), cells)
+    known = count > 0
+    if not known.any():
+        return gathering
+    change = total[known] / count[known, None] - light.log_light[0][known]
+    log_light = light.log_light.copy()
+    log_light[:, known] += COMPUTED_SHARE * (change - np.median(change, 0))
+    light = replace(light, log_light=log_light)
     _, median = _medians(views, light, gathering.lights)
     return replace(gathering, light=light, median=median)
 

@@ -22,7 +22,7 @@ from workflow.priors import diffusion, marigold, rgbx
 from workflow.scene.normal_form import View
 from workflow.scene.photograph import picture_for_model
 from workflow.stages import prior as stage
-from workflow.stages.base import _read_predictions
+from workflow.stages.base import StoredPredictions
 
 MODULES = {"rgbx": rgbx, "marigold": marigold}
 HEIGHT, WIDTH = 40, 56
@@ -362,7 +362,7 @@ def test_failed_samples_are_dropped_and_recorded(run, monkeypatch):
     assert "not finite" in table["reason"][1] and "constant" in table["reason"][3] and "filled" in table["reason"][2]
     layers = {name.split(".")[1] for name in reader.exr("maps/v0.exr")}
     assert layers == {"000", "002"}
-    read = _read_predictions(reader, Capture().views[0], 4)  # the next stage
+    read = StoredPredictions(reader).maps(Capture().views[0], 4)  # the next stage
     assert np.isnan(read[[1, 3]]).all() and np.isfinite(read[[0, 2]]).all()
 
 

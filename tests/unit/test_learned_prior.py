@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from iif_core.camera.pinhole import look_at, pixel_directions
 from iif_core.errors import InputError
 from iif_core.priors import features as inputs
-from iif_core.priors.features import CHANNELS, ViewArrays, features, gather_again, gather_views, mirrored
+from iif_core.priors.features import CHANNELS, ViewArrays, features, gather_again, gather_views, mirrored, with_computed_light
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.reprojection import NORMAL_STEPS, Camera, ViewTable, add_samples, as_steps, from_steps, quantiles
 from iif_core.priors.upsampling import enlarged
@@ -179,6 +179,91 @@ def test_light_that_falls_off_is_divided_out():
     quotient = channel(x, "y_r", 3)
     photograph = np.log(np.stack([view.linear for view in views]))
     assert quotient.std() < 0.8 * photograph.std()
+
+
+# ------------------------------------------------------------------------------------------------------------- second look
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """A room whose light changes where the albedo does not: its views, the light of their pixels, and what is gathered."""
+    places = [((1, 1, 1.2), (4, 3, 1)), ((3, 2, 1.4), (0, 0, 1)), ((2, 1.5, 1.2), (4, 0, 0.5)), ((1.2, 2.2, 1), (3, 0, 2.5))]
+    views, light = [], []
+    for position, target in places:
+        view = view_of(np.array(position, float), np.array(target, float))
+        points = inputs.surface_points(view).astype(np.float64)
+        light.append(np.exp(-0.7 * points[..., :1] + 0.5 * np.sin(3 * points[..., 1:2])) * np.array([1.0, 0.8, 0.6]))
+        views.append(replace(view, linear=(view.linear * light[-1]).astype(np.float32)))
+    return views, light, gather_views(views, trace_box)
+
+
+def error_of_light(gathering, views, light):
+    """Standard deviation of the logarithm of estimated over true light, over all cells, by channel."""
+    difference = []
+    for i, view in enumerate(views):
+        own = gathering.lights[i]
+        difference.append(gathering.light.log_at(own.row, own.weight)[0] - np.log(light[i])[view.depth > 0])
+    return np.concatenate(difference).std(0)
+
+
+def test_computed_light_takes_its_share_of_the_error_away(lit):
+    views, light, gathering = lit
+    again = with_computed_light(gathering, views, lambda i: light[i])
+    before, after = error_of_light(gathering, views, light), error_of_light(again, views, light)
+    left = 1 - inputs.COMPUTED_SHARE
+    # What is left beside that share is the size of a cell.
+    assert (before > 0.2).all() and (after < left * before + 0.06).all() and (after > 0.5 * left * before).all()
+
+
+def test_computed_light_moves_the_quotient_alone(lit):
+    views, light, gathering = lit
+    again = with_computed_light(gathering, views, lambda i: light[i])
+    first, second = (np.stack([features(g, views, i) for i in range(len(views))]) for g in (gathering, again))
+    moved = {name for c, name in enumerate(CHANNELS) if np.abs(first[:, c] - second[:, c]).max() > 1e-5}
+    assert moved == {"y_r", "y_g", "y_b", "g_r", "g_g", "g_b"}
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.lists(st.floats(1e-12, 1e12), min_size=3, max_size=3))
+def test_a_factor_of_each_channel_changes_nothing(lit, factor):
+    views, light, gathering = lit
+    plain = with_computed_light(gathering, views, lambda i: light[i])
+    scaled = with_computed_light(gathering, views, lambda i: light[i] * np.array(factor))
+    assert np.allclose(scaled.light.log_light, plain.light.log_light, atol=1e-9)
+
+
+def test_where_no_light_was_computed_it_stays_the_gathered_one(lit):
+    views, light, gathering = lit
+    for nothing in (0.0, np.nan, -1.0):
+        assert with_computed_light(gathering, views, lambda i, n=nothing: np.full_like(light[i], n)) is gathering
+    wall = 1  # x = 4 m
+
+    def partly(i):
+        return np.where((views[i].group == wall)[..., None], np.nan, light[i])
+
+    again = with_computed_light(gathering, views, partly)
+    on_wall = gathering.light.cells.group == wall
+    change = (again.light.log_light - gathering.light.log_light)[0]
+    assert not change[on_wall].any() and np.ptp(change[~on_wall], axis=0).min() > 0.1
+
+
+def test_lamps_among_the_cells_do_not_move_the_level(lit):
+    """Light on the surface of a lamp means nothing; a tenth of the cells may have any."""
+    views, light, gathering = lit
+    cells = gathering.light.cells
+    lamp = np.zeros(len(cells), bool)
+    lamp[: len(cells) // 10] = True
+
+    def spoilt(i):
+        out = light[i].copy()
+        shown = np.zeros(views[i].depth.shape, bool)
+        shown[views[i].depth > 0] = lamp[gathering.lights[i].row[:, 0].astype(int)]
+        out[shown] *= 1e-6
+        return out
+
+    plain, other = (with_computed_light(gathering, views, own).light.log_light for own in (lambda i: light[i], spoilt))
+    moved = np.median((other - plain)[0][~lamp], 0)
+    assert (np.abs(moved) < 0.15).all()  # the median of all is the 0.55 quantile of those that are right
 
 
 # ------------------------------------------------------------------------------------------------------------ reprojection

@@ -219,6 +219,10 @@ def make_scene(root, truth=True, dynamic_range="ldr"):
     job.writer.json("emission.json", {"notes": ["a note on light"], "plan": [], "escape_share": escape, **gains})
     job.writer.finish()
 
+    job = FakeJob("second_look", root)
+    job.writer.json("second_look.json", {"made": False, "reason": "planted"})
+    job.writer.finish()
+
     job = FakeJob("shading", root)
     for view, p, _, _ in seen:
         light = np.repeat(1 + 0.3 * p[:, :1], 3, 1).reshape(HEIGHT, WIDTH, 3).astype(np.float32)

@@ -228,7 +228,7 @@ def build(
                 inner &= np.roll(objects, shift, axis) == objects
         segmentation.exr(
             f"maps/{view.name}.exr",
-            {"object.id": ids_to_disk(objects), "segment.id": ids_to_disk(objects), "interior": inner},
+            {"object.id": ids_to_disk(objects), "segment.id": ids_to_disk(_segments(view, objects, room)), "interior": inner},
         )
         pixels.append(
             (
@@ -243,11 +243,18 @@ def build(
     segmentation.table("objects.parquet", capture_facts)
     faces = {"face_id": np.arange(len(room.faces), dtype=np.int32), "object_id": room.object_id}
     segmentation.table("faces.parquet", faces)
+    ids = np.arange(views * len(room.names), dtype=np.int32)
+    segmentation.table("segments.parquet", {"segment_id": ids, "object_id": ids % len(room.names)})
     segmentation.finish()
     capture.finish()
     _write_base(folder, room, pixels, size)
     write_plan(folder)
     return room
+
+
+def _segments(view: View, objects: np.ndarray, room: Room) -> np.ndarray:
+    """One segment for each object in each view."""
+    return np.where(objects >= 0, objects + view.view_id * len(room.names), -1).astype(np.int32)
 
 
 def write_plan(folder: Path, specular: str = "on", environment: str = "auto") -> None:
@@ -327,6 +334,9 @@ def _write_base(folder: Path, room: Room, pixels: list, size: int) -> None:
     facts = {"predictions": 1, "plan": [], "seen_once_share": 0.0}
     base.json("base.json", {**facts, "cell_edge_m": CELL, "origin": [float(v) for v in origin]})
     base.finish()
+    second_look = StubJob("second_look", folder, {}).writer
+    second_look.json("second_look.json", {"made": False, "reason": "planted"})
+    second_look.finish()
 
 
 EMISSION = {

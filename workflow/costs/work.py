@@ -139,6 +139,13 @@ def _shading(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, 
     }
 
 
+def _second_look(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
+    if not settings["second_look"]["enabled"] or settings["prior"]["kind"] != "learned":
+        return "none", {}
+    kind, counts = _base(settings, size)
+    return f"learned_{kind}", counts
+
+
 def _affines(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[str, float]]:
     affines, pixels, faces = settings["affines"], size.pixels / MILLION, size.faces / MILLION
     read = pixels if affines["pixels"] == "all" else min(affines["pixels"] / MILLION, pixels)
@@ -234,6 +241,7 @@ _STAGES = {
     "common_scores": _common_scores,
     "emission": _emission,
     "shading": _shading,
+    "second_look": _second_look,
     "affines": _affines,
     "render": _render,
     "lamp_images": _lamp_images,

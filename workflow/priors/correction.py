@@ -9,11 +9,11 @@ import numpy as np
 
 from iif_core.errors import InputError
 from iif_core.numerics.parallel import map_in_order
-from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored
+from iif_core.priors.features import CHANNELS, features, gather_again, gather_views, mirrored, with_computed_light
 from iif_core.priors.hypotheses import combined
 from iif_core.priors.upsampling import enlarged
 from workflow.models import prior_weights
-from workflow.priors import Keep, Predicted
+from workflow.priors import Keep, LightOf, Predicted
 from workflow.priors.views import CaptureViews
 from workflow.scene.normal_form import CaptureReader, View
 
@@ -47,7 +47,15 @@ class Correction:
 
     concurrent = True
 
-    def __init__(self, settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1):
+    def __init__(
+        self,
+        settings: SimpleNamespace,
+        capture: CaptureReader,
+        seed: int,
+        keep: Keep,
+        threads: int = 1,
+        light: LightOf | None = None,
+    ):
         own = settings.prior
         longest = max((max(view.width, view.height) for view in capture.used), default=WORKING_SIDE)
         self.factor = max(1, round(longest / WORKING_SIDE))
@@ -58,6 +66,9 @@ class Correction:
         self.views.calibrate()
         self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep, threads=threads)
         self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects(threads))
+        if light is not None:
+            small = lambda number: self.views.shrunk(light(self.views.views[number]))  # noqa: E731
+            self.gathering = with_computed_light(self.gathering, self.views, small)
 
     def __call__(self, view: View) -> Predicted:
         """Make K predictions of a view."""

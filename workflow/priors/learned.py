@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from workflow.models import prior_weights
-from workflow.priors import Keep
+from workflow.priors import Keep, LightOf
 
 if TYPE_CHECKING:
     from workflow.priors.correction import Correction
@@ -29,8 +29,10 @@ def describe(settings: SimpleNamespace) -> dict[str, Any]:
     return {"prior": "learned", "licence": "MIT", **{name: recipe[name] for name in kept}}
 
 
-def prepare(settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1) -> Correction:
-    """Read all photographs of a capture, and return what predicts a view."""
+def prepare(
+    settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1, light: LightOf | None = None
+) -> Correction:
+    """Read all photographs of a capture, and return what predicts a view; `light` is that of a second look."""
     from workflow.priors.correction import Correction
 
-    return Correction(settings, capture, seed, keep, threads)
+    return Correction(settings, capture, seed, keep, threads, light)

@@ -112,6 +112,10 @@ class CaptureViews:
         assert self.response is not None
         return self.response.inverse(np.repeat(np.linspace(0, 1, 16 * 255 + 1)[:, None], 3, 1))
 
+    def shrunk(self, picture: np.ndarray) -> np.ndarray:
+        """Return what the middle pixel of every block of factor x factor pixels shows."""
+        return _middles(picture, self.factor) if self.factor > 1 else picture
+
     def calibrate(self) -> str:
         """Estimate the response, and exposures that are not given, from surface that several photographs show (Eq. C.17 to C.28);
         returns why this response. Radiance needs none."""

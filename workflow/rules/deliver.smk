@@ -13,6 +13,7 @@ rule publish:
                 "base",
                 "emission",
                 "shading",
+                "second_look",
                 "affines",
                 "render",
                 "metrics",

@@ -137,6 +137,21 @@ use rule stage as shading with:
         "{wildcards.scene}: cached incident shading"
 
 
+use rule stage as second_look with:
+    input:
+        unpack(
+            reads("second_look", "capture", "prior", "segmentation", "base", "shading")
+        ),
+    pathvars:
+        stage="second_look",
+    resources:
+        **needs("second_look"),
+    params:
+        job=job("second_look"),
+    message:
+        "{wildcards.scene}: predicting and fusing once more, under the light that was found"
+
+
 use rule stage as affines with:
     input:
         unpack(
@@ -148,6 +163,7 @@ use rule stage as affines with:
                 "base",
                 "emission",
                 "shading",
+                "second_look",
             )
         ),
     pathvars:
@@ -170,6 +186,7 @@ use rule stage as render with:
                 "base",
                 "emission",
                 "shading",
+                "second_look",
                 "affines",
             )
         ),
@@ -194,6 +211,7 @@ use rule stage as metrics with:
                 "base",
                 "emission",
                 "shading",
+                "second_look",
                 "affines",
                 "render",
             )
@@ -230,6 +248,7 @@ use rule stage as export with:
                 "segmentation",
                 "base",
                 "emission",
+                "second_look",
                 "affines",
                 "unwrap",
             )
@@ -254,6 +273,7 @@ use rule stage as room with:
                 "segmentation",
                 "base",
                 "emission",
+                "second_look",
                 "affines",
                 "unwrap",
             )
@@ -280,6 +300,7 @@ use rule stage as report with:
                 "base",
                 "emission",
                 "shading",
+                "second_look",
                 "affines",
                 "render",
                 "metrics",
@@ -302,7 +323,13 @@ use rule stage as lamp_images with:
     input:
         unpack(
             reads(
-                "lamp_images", "capture", "segmentation", "base", "emission", "affines"
+                "lamp_images",
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "second_look",
+                "affines",
             )
         ),
     pathvars:
@@ -319,7 +346,13 @@ use rule stage as relight with:
     input:
         unpack(
             relight_inputs(
-                "capture", "segmentation", "base", "emission", "affines", "lamp_images"
+                "capture",
+                "segmentation",
+                "base",
+                "emission",
+                "second_look",
+                "affines",
+                "lamp_images",
             )
         ),
     pathvars:
@@ -356,6 +389,7 @@ use rule stage as common_scores with:
                 "segmentation",
                 "base",
                 "emission",
+                "second_look",
                 "affines",
                 "shared_capture",
                 "shared_segmentation",
@@ -394,6 +428,7 @@ use rule stage as relit_scores with:
                 "segmentation",
                 "base",
                 "emission",
+                "second_look",
                 "affines",
                 "relit_truth",
             )
@@ -417,6 +452,7 @@ descriptions = {
     "base": "Fuse the predictions of all views into one base texture.",
     "emission": "Find the emitters and solve for their radiance.",
     "shading": "Trace the light that arrives at every pixel, once for all later fits.",
+    "second_look": "Predict and fuse once more, under the light that was found.",
     "affines": "Fit one affine map per object, and the camera response, to the photographs.",
     "render": "Render every view again with the recovered materials and lights.",
     "metrics": "Score the result against ground truth, where there is any, and against the photographs.",

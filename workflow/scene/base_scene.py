@@ -23,6 +23,19 @@ if TYPE_CHECKING:
     from iif_core.light.transport.materials import CellMaterials
 
 
+SECOND_LOOK = "second_look.json"
+"""Says whether stage second_look made a base of its own."""
+
+
+def read_base(job: Job) -> StageReader:
+    """Return the base texture that a stage starts from: that of the second look, if one was made before the stage."""
+    if "second_look" in job.stage.upstream:
+        again = job.read("second_look")
+        if again.json(SECOND_LOOK)["made"]:
+            return again
+    return job.read("base")
+
+
 @dataclass(frozen=True)
 class BaseScene:
     """The mesh with the base texture; ids are int32 with -1 = none, lengths metres, colours linear.
@@ -103,8 +116,8 @@ class BaseScene:
 
 
 def read_base_scene(job: Job) -> BaseScene:
-    """Read the scene that stage base wrote; the job needs capture, segmentation and base upstream."""
-    capture, segmentation, base = CaptureReader(job.read("capture")), job.read("segmentation"), job.read("base")
+    """Read the mesh with its base texture (`read_base`); the job needs capture, segmentation and base upstream."""
+    capture, segmentation, base = CaptureReader(job.read("capture")), job.read("segmentation"), read_base(job)
     vertices, faces = capture.mesh()
     object_id = segmentation.table("faces.parquet")["object_id"].astype(np.int32)
     known = segmentation.table("objects.parquet")["object_id"]
@@ -247,7 +260,7 @@ def view_pixels(
 
 def base_maps(job: Job, view: View) -> np.ndarray:
     """Read the base albedo, roughness and metallic of a view, (H * W, 5) float32."""
-    maps = job.read("base").exr(f"maps/{view.name}.exr")
+    maps = read_base(job).exr(f"maps/{view.name}.exr")
     parts = [rgb(maps, "albedo"), maps["roughness"][..., None], maps["metallic"][..., None]]
     return np.concatenate(parts, -1).reshape(-1, 5).astype(np.float32)
 

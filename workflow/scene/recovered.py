@@ -11,7 +11,7 @@ from iif_core.errors import InputError
 from iif_core.reflectance.material import CHANNELS, IDENTITY, apply_affines
 from workflow.artifacts.store import StageReader
 from workflow.runtime.job import Job
-from workflow.scene.base_scene import BaseScene, Light, read_lit_scene
+from workflow.scene.base_scene import BaseScene, Light, read_base, read_lit_scene
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def read_recovered(job: Job) -> Recovered:
     base, light = read_lit_scene(job)
     affines, emission = job.read("affines"), job.read("emission")
     names = object_names(job, base.n_objects)
-    cells = job.read("base").table("cells.parquet", ("cell_id", *"xyz"))
+    cells = read_base(job).table("cells.parquet", ("cell_id", *"xyz"))
     fitted = affines.table("cells.parquet", ("cell_id", *CHANNELS))
     if not np.array_equal(cells["cell_id"], fitted["cell_id"]):
         raise InputError(

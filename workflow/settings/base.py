@@ -77,3 +77,11 @@ class Base(Section):
         if self.objective == "distribution" and self.variant not in ("full", "image_affine"):
             raise ValueError(f"`objective: distribution` needs a selection; `variant: {self.variant}` makes none")
         return self
+
+
+class SecondLook(Section):
+    """Predictions and their fusion once more, under the light that was found (prior `learned` alone)."""
+
+    enabled: bool = True
+    """`false`: the fit starts from the first base texture, which saves about a quarter of the time of a draft
+    (docs/results/rooms.md#a-second-look)."""

@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from workflow.settings.affines import FREE_CELLS, Affines, textures_cells
-from workflow.settings.base import Base
+from workflow.settings.base import Base, SecondLook
 from workflow.settings.light import NOISE_OF_OBJECTS, NOISE_OF_TEXTURES, PUBLISHED, Emission, Shading
 from workflow.settings.limits import Limits
 from workflow.settings.outputs import Export, Metrics, Relit, Render, Report, Room
@@ -37,6 +37,8 @@ class SceneSettings(Section):
     base: Base = Base()
     emission: Emission = Emission()
     shading: Shading = Shading()
+    second_look: SecondLook = SecondLook()
+    """Whether the photographs are looked at again once their light is known."""
     affines: Affines = Affines()
     render: Render = Render()
     metrics: Metrics = Metrics()

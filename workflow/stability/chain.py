@@ -24,7 +24,7 @@ from workflow.settings.scene import SceneSettings
 from workflow.stages.prior import albedo_of_faces
 
 SOURCES = ("capture", "prior")
-FITTED = ("plan", "segmentation", "base", "emission", "shading", "affines")
+FITTED = ("plan", "segmentation", "base", "emission", "shading", "second_look", "affines")
 """The stages that are run on a changed capture, in order."""
 _CHANNELS = ("albedo.R", "albedo.G", "albedo.B", "roughness", "metallic")
 

@@ -33,6 +33,7 @@ from workflow.runtime.job import Job
 from workflow.scene.base_scene import (
     BaseScene,
     base_maps,
+    read_base,
     read_gains,
     read_lit_scene,
     sensor_bounds,
@@ -126,7 +127,10 @@ def _prediction_errors(job: Job) -> PredictionErrors | None:
     """Return how the predictions err, where the prior states it."""
     prior = job.read("prior")
     stated = prior.json("model.json").get("object_errors") if prior.has("model.json") else None
-    return None if stated is None else PredictionErrors.from_facts(stated, str(prior.path("model.json")))
+    if stated is None:
+        return None
+    errors = PredictionErrors.from_facts(stated, str(prior.path("model.json")))
+    return errors.of_second_look() if read_base(job).stage == "second_look" else errors
 
 
 def _write_facts(job: Job, fit: FitResult, loss: dict[str, float], plan: list[Decision]) -> None:
@@ -327,7 +331,7 @@ def _patches(scene: BaseScene, object_id: np.ndarray, cell: np.ndarray) -> np.nd
 
 def _scatter(job: Job, n_objects: int) -> np.ndarray:
     """Return how far the predictions of each object are apart, (O,)."""
-    base = job.read("base")
+    base = read_base(job)
     chosen, means = base.table("selection.parquet"), base.table("objects.parquet")
     owner = base.table("segments.parquet")["object_id"].astype(np.int64)
     affine = np.stack(chosen["affine_albedo"]) if len(chosen["k"]) else np.zeros((0, 12))
@@ -351,7 +355,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray
     }
     columns |= {f"T_{name}": fit.affine[:, part] for name, part in NUMBERS_OF.items()}
     columns |= {f"std_{name}": spread[:, part] for name, part in NUMBERS_OF.items()}
-    means = job.read("base").table("objects.parquet")
+    means = read_base(job).table("objects.parquet")
     mean = np.stack([means[f"albedo_{c}"] for c in "rgb"], 1)[: len(names)]
     columns |= {
         "std_level": level_deviation(fit.affine, fit.covariance, mean),
@@ -367,7 +371,7 @@ def _write_objects(job: Job, names: list[str], fit: FitResult, given: np.ndarray
 def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
     """Write cells.parquet: corrected materials, with the given albedo (C, 3) instead if there is one."""
     deviations = [f"uncertainty_albedo_{c}" for c in "rgb"]
-    cells = job.read("base").table("cells.parquet", ("cell_id", "object_id", *CHANNELS, *deviations))
+    cells = read_base(job).table("cells.parquet", ("cell_id", "object_id", *CHANNELS, *deviations))
     base = np.stack([cells[name] for name in CHANNELS], 1)
     deviation = np.stack([cells[name] for name in deviations], 1)
     object_id = cells["object_id"].astype(np.int64)
@@ -384,7 +388,7 @@ def _write_cells(job: Job, fit: FitResult, albedo: np.ndarray | None) -> None:
 
 def _write_maps(job: Job, capture: CaptureReader, fit: FitResult, albedo: np.ndarray | None) -> None:
     """Write the corrected materials of every view."""
-    base, segmentation = job.read("base"), job.read("segmentation")
+    base, segmentation = read_base(job), job.read("segmentation")
     for done, view in enumerate(capture.views):
         file = f"maps/{view.name}.exr"
         object_id = ids_from_disk(segmentation.exr(file)["object.id"]).ravel().astype(np.int64)

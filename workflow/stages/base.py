@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
@@ -35,21 +36,70 @@ KEPT_EVERY = 30.0
 """Seconds between two states of a descent that are written; each has 335 MB with the paper's hash grid."""
 
 
+class Predictions(Protocol):
+    """The predictions of a capture, view by view."""
+
+    samples: int
+    """K."""
+
+    def has(self, view: View) -> bool:
+        """Return whether there are predictions of a view."""
+        ...
+
+    def maps(self, view: View, samples: int) -> np.ndarray:
+        """Return the first `samples` predictions of a view, (K, H, W, 5) float16 in [0, 1], NaN where one is missing."""
+        ...
+
+    def scale(self, view: View) -> np.ndarray | None:
+        """Return the Laplace scales (H, W, 3) that the prior states for a view, or None."""
+        ...
+
+
+class StoredPredictions:
+    """Predictions as stage prior wrote them."""
+
+    def __init__(self, prior: StageReader):
+        self._prior = prior
+        self.samples = int(prior.table("predictions.parquet")["k"].max(initial=0)) + 1
+
+    def has(self, view: View) -> bool:
+        return self._prior.has(f"maps/{view.name}.exr")
+
+    def maps(self, view: View, samples: int) -> np.ndarray:
+        channels = self._prior.exr(f"maps/{view.name}.exr")
+        out = np.full((samples, view.height, view.width, 5), np.nan, np.float16)
+        for k in range(samples):
+            layer = f"prior.{k:03d}"
+            if f"{layer}.roughness" in channels:
+                out[k, ..., :3] = rgb(channels, f"{layer}.albedo")
+                out[k, ..., 3], out[k, ..., 4] = channels[f"{layer}.roughness"], channels[f"{layer}.metallic"]
+        return np.clip(out, 0, 1, out=out)  # every solver reads the same values; NaN stays
+
+    def scale(self, view: View) -> np.ndarray | None:
+        channels = self._prior.exr(f"maps/{view.name}.exr")
+        names = [f"scale.{name}" for name in PROPERTIES]
+        return np.stack([channels[name] for name in names], -1) if names[0] in channels else None
+
+
 def run(job: Job) -> None:
     """Write cells, object means, segments, selection, maps of every view and base.json."""
+    fuse(job, StoredPredictions(job.read("prior")))
+
+
+def fuse(job: Job, prior: Predictions) -> None:
+    """Fuse predictions, and write what stage base writes; the job has the settings `base` and `seed`, and capture and
+    segmentation upstream."""
     capture = CaptureReader(job.read("capture"))
-    prior, segmentation = job.read("prior"), job.read("segmentation")
-    settings = job.settings.base
-    views = [view for view in capture.used if prior.has(f"maps/{view.name}.exr")]
+    segmentation, settings = job.read("segmentation"), job.settings.base
+    views = [view for view in capture.used if prior.has(view)]
     surface = _Surface(capture, segmentation)
     grid, cell_maps = _cells(job, capture, surface, views)
     weights, segment_maps = _pixels(job, capture, segmentation, views)
     segments = segmentation.table("segments.parquet")
     n_objects = int(segmentation.table("objects.parquet")["object_id"].max(initial=-1)) + 1
-    samples = int(prior.table("predictions.parquet")["k"].max(initial=0)) + 1
-    used = 1 if settings.variant == "raw" else min(samples, settings.predictions or samples)
+    used = 1 if settings.variant == "raw" else min(prior.samples, settings.predictions or prior.samples)
     problem = FusionProblem(
-        lambda position: _read_predictions(prior, views[position], used),
+        lambda position: prior.maps(views[position], used),
         cell_maps,
         segment_maps,
         len(grid),
@@ -59,7 +109,7 @@ def run(job: Job) -> None:
         point=_points(capture, views),
         tangent=_tangents(capture, views),
         neighbours=neighbour_pairs(grid.keys) if settings.seams else None,
-        scale=lambda position: _read_scale(prior, views[position]),
+        scale=lambda position: prior.scale(views[position]),
     )
     if settings.variant == "image_affine":
         problem = one_segment_per_view(problem)
@@ -77,7 +127,7 @@ def run(job: Job) -> None:
     for done, view in enumerate(capture.views):
         maps = _maps(surface, values, unseen, result, view)
         if settings.variant == "raw" and view in views:
-            maps |= _raw_maps(prior, view, samples, ids_from_disk(maps["cell.id"]) >= 0)
+            maps |= _raw_maps(prior, view, ids_from_disk(maps["cell.id"]) >= 0)
         job.writer.exr(f"maps/{view.name}.exr", maps)
         job.progress(done + 1, len(capture.views), "maps")
     _write_facts(job, grid, problem, result, fit, used)
@@ -287,28 +337,9 @@ def _pixel_geometry(capture: CaptureReader, views: list[View]) -> Callable[[int]
     return of_view
 
 
-def _read_predictions(prior: StageReader, view: View, samples: int) -> np.ndarray:
-    """(K, H, W, 5) float16 predictions of a view within [0, 1], NaN where one is missing or not finite."""
-    channels = prior.exr(f"maps/{view.name}.exr")
-    out = np.full((samples, view.height, view.width, 5), np.nan, np.float16)
-    for k in range(samples):
-        layer = f"prior.{k:03d}"
-        if f"{layer}.roughness" in channels:
-            out[k, ..., :3] = rgb(channels, f"{layer}.albedo")
-            out[k, ..., 3], out[k, ..., 4] = channels[f"{layer}.roughness"], channels[f"{layer}.metallic"]
-    return np.clip(out, 0, 1, out=out)  # every solver reads the same values; NaN stays
-
-
-def _read_scale(prior: StageReader, view: View) -> np.ndarray | None:
-    """(H, W, 3) Laplace scales that the prior states for a view, or None."""
-    channels = prior.exr(f"maps/{view.name}.exr")
-    names = [f"scale.{name}" for name in PROPERTIES]
-    return np.stack([channels[name] for name in names], -1) if names[0] in channels else None
-
-
-def _raw_maps(prior: StageReader, view: View, samples: int, surface: np.ndarray) -> dict[str, np.ndarray]:
+def _raw_maps(prior: Predictions, view: View, surface: np.ndarray) -> dict[str, np.ndarray]:
     """Channels of the first usable prediction of a view, unchanged, where there is surface."""
-    maps = _read_predictions(prior, view, samples)
+    maps = prior.maps(view, prior.samples)
     good = np.isfinite(maps).mean((1, 2, 3)) > 0.99
     first = np.where(surface[..., None], maps[int(np.argmax(good))], 0).astype(np.float32)
     return {**split_rgb(first[..., :3], "albedo"), "roughness": first[..., 3], "metallic": first[..., 4]}

@@ -19,6 +19,7 @@ from workflow.exporters.surface import up_axis
 from workflow.exporters.usd import BASE_COLOR, SURFACE, usd_bytes
 from workflow.relighting.inventory import Inventory
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader
 from workflow.scene.picture_facts import view_attributes
 from workflow.scene.recovered import Recovered, read_recovered, read_response
@@ -128,7 +129,7 @@ def _object_table(job: Job, recovered: Recovered) -> bytes:
     surface, affines, base = (
         recovered.surface,
         job.read("affines").table("objects.parquet"),
-        job.read("base").table("objects.parquet"),
+        read_base(job).table("objects.parquet"),
     )
     before = surface.object_values.astype(np.float64).copy()
     before[base["object_id"]] = np.stack([base[name] for name in CHANNELS], 1)

@@ -15,6 +15,7 @@ from iif_core.reflectance.material import PROPERTIES
 from workflow.artifacts.store import StageReader, ids_from_disk, material_maps, prediction_numbers, rgb
 from workflow.models.lpips import FETCH_VGG
 from workflow.runtime.job import Job
+from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scoring.light_error import light_error
 from workflow.scoring.no_reference import EVERY_VIEW, truth_free_scores
@@ -113,9 +114,9 @@ def _view_scores(
         metrics.score_map("emission", rgb(rendered, "emission"), truth.emission, materials.masks["emission"]),
     )
     cell_id = None
-    for variant, stage in (("base", "base"), ("result", "affines")):
-        if job.read(stage).has(file):
-            channels = job.read(stage).exr(file)
+    for variant, reader in (("base", read_base(job)), ("result", job.read("affines"))):
+        if reader.has(file):
+            channels = reader.exr(file)
             cell_id = ids_from_disk(channels["cell.id"]) if variant == "base" else cell_id
             for quantity in PROPERTIES:
                 yield variant, view.name, quantity, _scores(materials, variant, material_maps(channels), quantity)
@@ -170,7 +171,7 @@ class _PredictionMeans:
     """The two baselines that average predictions over objects and over surface cells, from one pass over the views."""
 
     def __init__(self, job: Job, views: list[View]):
-        base: StageReader = job.read("base")
+        base: StageReader = read_base(job)
         n_objects = int(job.read("segmentation").table("objects.parquet")["object_id"].max(initial=-1)) + 1
         sums = {"object_mean": np.zeros((n_objects, 6)), "texel_mean": np.zeros((base.rows("cells.parquet"), 6))}
         for done, view in enumerate(views):

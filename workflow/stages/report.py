@@ -36,6 +36,7 @@ from workflow.report.verdict import LIMITS, Evidence, judge
 from workflow.report.wording import fit_words, percent, reason_words, significant
 from workflow.runtime.job import Job
 from workflow.runtime.timings import read_timings
+from workflow.scene.base_scene import read_base
 from workflow.scene.normal_form import CaptureReader, View
 from workflow.scene.recovered import Recovered, read_recovered, response_samples
 from workflow.settings import active_plan
@@ -243,7 +244,7 @@ def collect_plan(job: Job) -> list[dict[str, Any]]:
 
 
 def _document(job: Job, stage: str, name: str) -> dict[str, Any]:
-    reader = job.read(stage)
+    reader = read_base(job) if stage == "base" else job.read(stage)
     return reader.json(name) if reader.has(name) else {}
 
 
@@ -581,7 +582,7 @@ def _checks(job: Job, file: str, sensor: np.ndarray, depth: np.ndarray, counted:
         out.append(_ids("alignment", pic.alignment(sensor, object_id, depth)))
         objects = pic.data_uri(pic.overlay(sensor, object_id), longest=WIDTH)
         out.append(Picture("objects", objects, "one colour for each object, over the photograph"))
-        table = job.read("base").table("selection.parquet")
+        table = read_base(job).table("selection.parquet")
         if len(table["k"]):
             k = pic.selected_prediction(segment_id, table["segment_id"], table["k"], table["weight_albedo"])
             out.append(_ids("selected prediction", pic.ids(k), "one colour for each number k"))
@@ -590,8 +591,8 @@ def _checks(job: Job, file: str, sensor: np.ndarray, depth: np.ndarray, counted:
         note = "claimed standard error; errors that all predictions share are not in it"
         shown = pic.scalar(uncertainty, 0, UNCERTAINTY_RANGE, mask=counted)
         out.append(_false("uncertainty", shown, "value", UNCERTAINTY_RANGE, "albedo", note))
-    if job.read("base").has(file):
-        base = job.read("base").exr(file)
+    if read_base(job).has(file):
+        base = read_base(job).exr(file)
         out.append(_linear("base albedo", rgb(base, "albedo"), "albedo, linear", "before the fit"))
         shown = pic.scalar(base["coverage"], 0, COVERAGE_RANGE, mask=counted)
         out.append(_false("coverage", shown, "value", COVERAGE_RANGE, "pixels", "weighted, of the surface cell; 0: filled in"))
