@@ -13,7 +13,7 @@ from iif_core.errors import InputError
 
 DEGREES_OF_FREEDOM = 4.0
 """Of Student's t of the error of roughness."""
-SECOND_LOOK = 0.75
+SECOND_LOOK = 0.85
 """Error of the brightness of an object in a base that was predicted under the computed light, relative to the first base
 (docs/results/rooms.md#a-second-look)."""
 _RAREST = 1e-3

@@ -92,7 +92,7 @@ def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
 def test_faces_between_the_chosen_pixels_are_seen(hdr):
     """No lamp may hide in a face that a photograph shows, though none of the pixels that are looked at lies on it."""
     folder, _ = hdr
-    job = StubJob("reader", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
+    job = StubJob("emission", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     records = emission_pixels.ViewRecords(job, capture, scene)
     of_pixels, seen = set(), set()
@@ -108,7 +108,7 @@ def test_faces_between_the_chosen_pixels_are_seen(hdr):
 def test_without_lobes_no_path_is_traced_for_a_pixel(hdr, tmp_path):
     """The light of a pixel is that of its cell, as if it came from everywhere; albedo is fitted alone, nearly as well."""
     folder, room = hdr
-    for stage in ("capture", "prior", "segmentation", "base", "emission"):
+    for stage in ("capture", "prior", "segmentation", "base", "emission", "second_look"):
         shutil.copytree(folder / stage, tmp_path / stage)
     write_plan(tmp_path, specular="off")
     common = {"capture": {"dynamic_range": "hdr"}, "emission": EMISSION, "affines": AFFINES}
@@ -134,7 +134,7 @@ def test_without_lobes_no_path_is_traced_for_a_pixel(hdr, tmp_path):
 @pytest.mark.parametrize(("roughness", "included"), [(0.95, False), (0.4, True)])
 def test_predictions_settle_the_lobes_where_the_photographs_left_them_open(hdr, tmp_path, roughness, included):
     folder, _ = hdr
-    for stage in ("capture", "prior", "segmentation", "base", "emission"):
+    for stage in ("capture", "prior", "segmentation", "base", "emission", "second_look"):
         shutil.copytree(folder / stage, tmp_path / stage)
     write_plan(tmp_path, specular="auto")
     job = StubJob("shading", tmp_path, {"shading": SHADING})
