@@ -25,9 +25,6 @@ _PSEUDO_PATCHES = 4.0
 _BASE_FACTOR, _BASE_FACTORS, _BASE_FACTOR_WIDTH = 1.4, np.geomspace(0.3, 6.0, 15) / 1.4, 0.4
 """The factor that is usual between the error of the base and the scatter of the predictions; values relative to it among which it
 is sought; width (of the logarithm) of its prior."""
-_STATED_FACTORS, _STATED_FACTOR_WIDTH = np.geomspace(0.15, 3.0, 17), 0.8
-"""Factors on the error of the base that the prior states among which that of the scene is sought; width (of the logarithm) of
-their prior."""
 _LIGHT_FACTORS, _LIGHT_FACTOR, _LIGHT_FACTOR_WIDTH = np.geomspace(0.5, 4.0, 13), 1.5, 0.35
 """The same for the factor between the error that all pixels of an object share and its smooth part within the object."""
 _LIGHT_FACTOR_MEASURED = 2.2
@@ -227,9 +224,8 @@ def compare_levels(
         base: (O, 3) mean base albedo; shown: (O, 3) level that the photographs ask for.
         scatter: (O,) of the logarithm of the brightness over predictions; smooth: (O,) smooth error of the light.
         pixels: (O,) by which objects count.
-        stated: usual error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), around which that of the scene is
-            sought, while the light keeps the factor that is usual; None = both errors are learnt, by means of `scatter` and
-            `smooth`.
+        stated: error of the base for an albedo of 0.3 (`PredictionErrors.brightness`), and neither error is learnt; None = both
+            are, by means of `scatter` and `smooth`.
         base_tells_levels: False = both errors are what is usual, no discrepancy is divided, and the light keeps its whole error.
     """
     pixels = pixels if pixels.any() else np.ones(len(pixels))
@@ -245,18 +241,12 @@ def compare_levels(
     share = pixels[some] / max(pixels[some].sum(), 1e-100)
     count = 1.0 / max(float((share**2).sum()), 1e-100)
     best = (-np.inf, 1.0, _LIGHT_FACTOR, np.ones(3))
-    if not base_tells_levels:
-        factors, width, light_factors = np.ones(1), 1.0, np.full(1, _LIGHT_FACTOR)
-    elif stated is None:
-        factors, width, light_factors = _BASE_FACTORS, _BASE_FACTOR_WIDTH, _LIGHT_FACTORS
-    else:
-        # Errors of this base and of the light are correlated, so discrepancies do not tell them apart: one of the two is held.
-        factors, width, light_factors = _STATED_FACTORS, _STATED_FACTOR_WIDTH, np.full(1, _LIGHT_FACTOR)
-    for of_base in factors:
-        for of_light in light_factors:
+    is_learnt = base_tells_levels and stated is None
+    for of_base in _BASE_FACTORS if is_learnt else (1.0,):
+        for of_light in _LIGHT_FACTORS if is_learnt else (_LIGHT_FACTOR,):
             own, light = of_base * usual[some], of_light * smooth[some]
             gain, away = _mean_gain(base[some], shown[some], share, np.hypot(own, light))
-            log_prior = -0.5 * (np.log(of_base) / width) ** 2
+            log_prior = -0.5 * (np.log(of_base) / _BASE_FACTOR_WIDTH) ** 2
             log_prior -= 0.5 * (np.log(of_light / _LIGHT_FACTOR) / _LIGHT_FACTOR_WIDTH) ** 2
             found = count * (share @ _divide(away, own, light)[0]) + log_prior
             if found > best[0]:

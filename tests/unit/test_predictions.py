@@ -88,33 +88,15 @@ def test_roughness_follows_the_base_where_photographs_say_nothing():
     np.testing.assert_allclose(rough, 0.22, atol=0.02)
 
 
-@pytest.mark.parametrize("factor", [0.4, 1.0, 2.0])
-def test_the_error_of_a_scene_is_sought_around_the_stated_one(factor):
-    """Predictions agree to 0.02, whatever they err by: the base is believed as far as its discrepancies from the light say."""
-    stated, found, gained = 0.2, [], {"by the fit": [], "by the light": []}
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        truth = rng.uniform(0.1, 0.8, (60, 1)) * np.ones((1, 3))
-        light = 1.5 * 0.08 * rng.standard_t(4, 60)
-        base = truth * np.exp(factor * stated * relative_error_of_base(truth.mean(1)) * rng.standard_t(4, 60))[:, None]
-        shown = truth * np.exp(light)[:, None]
-        levels = compare_levels(base, shown, np.full(60, 0.02), np.full(60, 0.08), np.full(60, 100.0), stated=stated)
-        found.append(np.median(levels.base_error / (stated * relative_error_of_base(base.mean(1)))))
-        rest = light - np.log(levels.light_gain)
-        gained["by the fit"].append(np.mean((rest - rest.mean()) ** 2))
-        gained["by the light"].append(np.var(light))
-    assert factor / 1.5 < np.median(found) < 1.5 * factor, found
-    assert np.mean(gained["by the fit"]) < np.mean(gained["by the light"])
-
-
-def test_the_light_keeps_its_usual_factor_where_the_prior_states_its_error():
-    """Discrepancies twice as large as stated are put down to the base, not to the light."""
+def test_an_error_that_is_stated_is_not_learnt_again():
+    """The base errs by 0.3 everywhere and its predictions agree to 0.02: the light, which is right, is believed to be."""
     rng = np.random.default_rng(3)
-    truth, smooth = rng.uniform(0.1, 0.8, (60, 1)) * np.ones((1, 3)), np.full(60, 0.05)
-    base = truth * np.exp(0.5 * rng.normal(size=60))[:, None]
-    levels = compare_levels(base, truth, np.full(60, 0.02), smooth, np.full(60, 100.0), stated=0.2)
-    np.testing.assert_allclose(levels.light_error, 2.2 * smooth, rtol=1e-12)
-    assert (levels.base_error > 1.3 * 0.2 * relative_error_of_base(base.mean(1))).all()
+    truth = rng.uniform(0.1, 0.8, (60, 1)) * np.ones((1, 3))
+    size = relative_error_of_base(truth.mean(1))
+    base = truth * np.exp(0.2 * size * rng.normal(size=60))[:, None]
+    shown = truth * np.exp(0.05 * rng.normal(size=60))[:, None]
+    levels = compare_levels(base, shown, np.full(60, 0.02), np.full(60, 0.05), np.full(60, 100.0), stated=0.2)
+    np.testing.assert_allclose(levels.base_error, 0.2 * relative_error_of_base(base.mean(1)), rtol=1e-12)
     assert np.std(np.log(levels.light_gain)) < 0.06
     assert relative_error_of_base(np.array([0.3]))[0] == 1 and np.isfinite(relative_error_of_base(np.array([0.0, 9.0]))).all()
 

@@ -72,7 +72,7 @@ def _row(path: Path, manifest: dict[str, Any], known: dict[tuple[str, str], dict
         "cpu_seconds": job["cpu_seconds"],
         "seconds": job["seconds"],
         "memory_mb": job["max_rss_mb"],
-        "disk_mb": round(disk_mb(manifest), 3),
+        "disk_mb": round(disk_mb(manifest), 6),
         **{name: float(f"{value:.6g}") for name, value in work.counts.items()},
     }
 
