@@ -12,6 +12,7 @@ from light_room import AFFINES, BULB, EMISSION, LAMP, SHADING, Room, StubJob, bu
 
 from iif_core.camera.simulation import response_curve
 from workflow.artifacts import files
+from workflow.registry import STAGES
 from workflow.scene import emission_pixels
 from workflow.scene.base_scene import read_base_scene
 from workflow.scene.cached_light import read_diffuse, read_specular
@@ -92,7 +93,8 @@ def test_a_third_of_the_pixels_finds_the_same_light(hdr, tmp_path):
 def test_faces_between_the_chosen_pixels_are_seen(hdr):
     """No lamp may hide in a face that a photograph shows, though none of the pixels that are looked at lies on it."""
     folder, _ = hdr
-    job = StubJob("emission", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
+    job = StubJob("reader", folder, {"emission": {**EMISSION, "pixels": 1000}, "capture": {}, "affines": AFFINES})
+    job.stage = STAGES["emission"]
     capture, scene = CaptureReader(job.read("capture")), read_base_scene(job)
     records = emission_pixels.ViewRecords(job, capture, scene)
     of_pixels, seen = set(), set()

@@ -43,7 +43,7 @@ def finished(llvm, tmp_path_factory):
     """Folder and readers of a run to the end of stage affines."""
     folder = tmp_path_factory.mktemp("published")
     with pytest.MonkeyPatch.context() as patch:
-        yield folder, run(folder, (*FIRST, "emission", "shading", "affines"), patch)
+        yield folder, run(folder, (*FIRST, "emission", "shading", "second_look", "affines"), patch)
 
 
 def digests(reader):
