@@ -32,6 +32,22 @@ class Stage:
         return f"workflow.stages.{self.name}"
 
 
+_REPORTED = (
+    "capture",
+    "plan",
+    "prior",
+    "segmentation",
+    "base",
+    "emission",
+    "shading",
+    "second_look",
+    "affines",
+    "render",
+    "metrics",
+    "export",
+)
+"""Stages that the report shows."""
+
 SHARED = "shared_"
 """Begins the name of an input that is a stage of the shared scene, in rules and manifests."""
 
@@ -65,9 +81,8 @@ STAGES: dict[str, Stage] = {
         Stage("shading", ("capture", "plan", "segmentation", "base", "emission"), ("shading", "seed")),
         Stage(
             "second_look",
-            ("capture", "prior", "segmentation", "base", "shading"),
-            ("second_look", "prior", "source", "segmentation.kind", "base", "seed"),
-            reads_raw=True,
+            ("capture", "segmentation", "shading"),
+            ("second_look", "prior", "segmentation.kind", "base", "seed"),
         ),
         Stage(
             "affines",
@@ -127,41 +142,13 @@ STAGES: dict[str, Stage] = {
         ),
         Stage(
             "report",
-            (
-                "capture",
-                "plan",
-                "prior",
-                "segmentation",
-                "base",
-                "emission",
-                "shading",
-                "second_look",
-                "affines",
-                "render",
-                "metrics",
-                "export",
-            ),
+            _REPORTED,
             ("report",),
             reads_raw=True,
         ),
         Stage(
             "publish",
-            (
-                "capture",
-                "plan",
-                "prior",
-                "segmentation",
-                "base",
-                "emission",
-                "shading",
-                "second_look",
-                "affines",
-                "render",
-                "metrics",
-                "export",
-                "report",
-                "room",
-            ),
+            (*_REPORTED, "report", "room"),
             (),
         ),
     )

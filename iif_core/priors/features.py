@@ -9,7 +9,7 @@ Views are read one at a time. What other views look up is kept in 62 bytes a pix
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Protocol
@@ -69,7 +69,7 @@ MEAN_ALBEDO = 0.4
 KNOWN_SPREAD = 0.3
 """Standard deviation of an object's log albedo as a first prediction states it."""
 COMPUTED_SHARE = 0.7
-"""Share of the light that was computed from emitters, in that of a second look; the rest is the gathered light (Eq. P.29)."""
+"""Weight of the computed light in a second look; the gathered light has the rest (Eq. P.29)."""
 QUOTIENT = (-5.5, 2.5)
 FARTHEST, BRIGHTEST = 10.0, 30.0
 """Largest distance in metres, and radiance in means of the scene, of what a mirrored ray meets."""
@@ -278,26 +278,27 @@ def gather_again(gathering: Gathering, views: Views, log_albedo: NDArray, mean_a
     return replace(gathering, light=light, median=median)
 
 
-def with_computed_light(gathering: Gathering, views: Views, irradiance: Callable[[int], NDArray]) -> Gathering:
-    """Correct the gathered light by the one that was computed from emitters that are known meanwhile (Eq. P.29).
+def with_computed_light(gathering: Gathering, views: Views, irradiance: Iterable[NDArray]) -> Gathering:
+    """Mix the gathered light with light that was computed from known emitters (Eq. P.29).
 
-    The gathered light knows lamps, unseen surface and the sky only roughly, but follows the photographs; the computed light has
-    shadows and lamps as they are, and the errors of the emitters. In the logarithm, cell by cell, their weighted mean is nearer
-    to the truth than either. Their medians are made equal, so the level stays that of the gathered light, as does what its two
-    versions differ by.
+    Gathered light knows lamps, sky and unseen surface only roughly. Computed light has the errors of the emitters,
+    so the gathered light keeps some weight. The level stays, and so does the difference between the two reaches.
 
     Args:
-        gathering: as `gather_again` returned it.
-        views: the same.
-        irradiance: number of a view -> (H, W, 3) diffuse light of each pixel, up to a factor of each channel; values that are
-            not above 0 are unknown.
+        gathering: from `gather_again`.
+        views: the same as there.
+        irradiance: for each view in turn, (H, W, 3) diffuse light of its pixels, up to one factor for each channel. A pixel
+            without three positive values is unknown.
+
+    Returns:
+        A new gathering, or the same one if all of the light is unknown.
     """
     light = gathering.light
     cells = len(light.cells)
+    # --- mean log light of each cell, over the pixels that are nearest to it
     total, count = np.zeros((cells, 3)), np.zeros(cells)
-    for i, own in enumerate(gathering.lights):
-        view = views[i]
-        value = irradiance(i)[view.depth > 0].astype(np.float64)
+    for i, (own, picture) in enumerate(zip(gathering.lights, irradiance, strict=True)):
+        value = picture[views[i].depth > 0].astype(np.float64)
         known = np.isfinite(value).all(1) & (value > 0).all(1)
         nearest = own.row[known, 0].astype(np.int64)
         count += np.bincount(nearest, minlength=cells)
@@ -306,6 +307,7 @@ def with_computed_light(gathering: Gathering, views: Views, irradiance: Callable
     known = count > 0
     if not known.any():
         return gathering
+    # --- mix; the median of the change is the unknown factor, and lamps, whose own light means nothing, hardly move a median
     change = total[known] / count[known, None] - light.log_light[0][known]
     log_light = light.log_light.copy()
     log_light[:, known] += COMPUTED_SHARE * (change - np.median(change, 0))

@@ -144,7 +144,6 @@ def test_closure_covers_what_a_stage_really_imports(repository):
         "capture": ("source", ("builtin", "mitsuba", "folder", "scannetpp", "fipt")),
         "prior": ("prior", ("learned", "simulated", "files", "retinex", "rgbx", "marigold")),
         "segmentation": ("segmentation", ("given", "masks", "geometry")),
-        "second_look": ("prior", ("learned", "simulated")),
     }
     cases, roots = [], []
     for stage in STAGES:

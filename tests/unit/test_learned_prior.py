@@ -208,7 +208,7 @@ def error_of_light(gathering, views, light):
 
 def test_computed_light_takes_its_share_of_the_error_away(lit):
     views, light, gathering = lit
-    again = with_computed_light(gathering, views, lambda i: light[i])
+    again = with_computed_light(gathering, views, light)
     before, after = error_of_light(gathering, views, light), error_of_light(again, views, light)
     left = 1 - inputs.COMPUTED_SHARE
     # What is left beside that share is the size of a cell.
@@ -217,7 +217,7 @@ def test_computed_light_takes_its_share_of_the_error_away(lit):
 
 def test_computed_light_moves_the_quotient_alone(lit):
     views, light, gathering = lit
-    again = with_computed_light(gathering, views, lambda i: light[i])
+    again = with_computed_light(gathering, views, light)
     first, second = (np.stack([features(g, views, i) for i in range(len(views))]) for g in (gathering, again))
     moved = {name for c, name in enumerate(CHANNELS) if np.abs(first[:, c] - second[:, c]).max() > 1e-5}
     assert moved == {"y_r", "y_g", "y_b", "g_r", "g_g", "g_b"}
@@ -227,21 +227,21 @@ def test_computed_light_moves_the_quotient_alone(lit):
 @given(st.lists(st.floats(1e-12, 1e12), min_size=3, max_size=3))
 def test_a_factor_of_each_channel_changes_nothing(lit, factor):
     views, light, gathering = lit
-    plain = with_computed_light(gathering, views, lambda i: light[i])
-    scaled = with_computed_light(gathering, views, lambda i: light[i] * np.array(factor))
+    plain = with_computed_light(gathering, views, light)
+    scaled = with_computed_light(gathering, views, [own * np.array(factor) for own in light])
     assert np.allclose(scaled.light.log_light, plain.light.log_light, atol=1e-9)
 
 
 def test_where_no_light_was_computed_it_stays_the_gathered_one(lit):
     views, light, gathering = lit
     for nothing in (0.0, np.nan, -1.0):
-        assert with_computed_light(gathering, views, lambda i, n=nothing: np.full_like(light[i], n)) is gathering
+        assert with_computed_light(gathering, views, [np.full_like(own, nothing) for own in light]) is gathering
     wall = 1  # x = 4 m
 
     def partly(i):
         return np.where((views[i].group == wall)[..., None], np.nan, light[i])
 
-    again = with_computed_light(gathering, views, partly)
+    again = with_computed_light(gathering, views, map(partly, range(len(views))))
     on_wall = gathering.light.cells.group == wall
     change = (again.light.log_light - gathering.light.log_light)[0]
     assert not change[on_wall].any() and np.ptp(change[~on_wall], axis=0).min() > 0.1
@@ -261,7 +261,7 @@ def test_lamps_among_the_cells_do_not_move_the_level(lit):
         out[shown] *= 1e-6
         return out
 
-    plain, other = (with_computed_light(gathering, views, own).light.log_light for own in (lambda i: light[i], spoilt))
+    plain, other = (with_computed_light(gathering, views, own).light.log_light for own in (light, map(spoilt, range(len(views)))))
     moved = np.median((other - plain)[0][~lamp], 0)
     assert (np.abs(moved) < 0.15).all()  # the median of all is the 0.55 quantile of those that are right
 

@@ -60,7 +60,6 @@ def test_without_a_second_look_the_first_base_is_read(lit, tmp_path, prior, enab
 def test_a_second_look_makes_a_base_of_the_same_cells_that_the_fit_and_all_after_it_read(lit, tmp_path):
     folder, room = copied(lit, tmp_path), lit[1]
     first = StubJob("base", folder, {"prior": LEARNED, "base": Base().model_dump()})
-    first.writer = StageWriter(folder / "base", {"scene": "room", "stage": "base", "fingerprint": "test"})
     base.fuse(first, _learned_without_light(folder))
     first.writer.finish()
     job = look(folder)

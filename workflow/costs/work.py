@@ -143,7 +143,7 @@ def _second_look(settings: dict[str, Any], size: SceneSize) -> tuple[str, dict[s
     if not settings["second_look"]["enabled"] or settings["prior"]["kind"] != "learned":
         return "none", {}
     kind, counts = _base(settings, size)
-    del counts["predictions"]  # they lie on disk, and as many are asked of the network whatever K is
+    del counts["predictions"]  # they lie on disk, and the network makes all of them whatever K is
     return f"learned_{kind}", counts
 
 

@@ -12,9 +12,7 @@ and may have `concurrent = True` where several threads may call it at once with 
 
 Predictions are linear albedo R G B, perceptual roughness and metallic in [0, 1], and NaN where there is no value. `settings` are
 the sections that stage prior reads (`prior`, `source` and `segmentation.kind`), `capture` is the normal form, `keep` returns
-an array that holds the same values on disk, and `threads` may be used before the first view. A kind that
-`workflow.settings.prior.looks_again` names also takes `light`, which returns the light of the pixels of a view that stage shading
-computed. Two functions are optional:
+an array that holds the same values on disk, and `threads` may be used before the first view. Two functions are optional:
 
     raw_inputs(document) -> list[Path]   files from outside that it reads; called while Snakemake plans, refuses missing files
     describe(settings) -> dict           facts about a learned model, written to model.json
@@ -35,7 +33,7 @@ if TYPE_CHECKING:
 
 Keep = Callable[[np.ndarray], np.ndarray]
 LightOf = Callable[["View"], np.ndarray]
-"""Diffuse light (H, W, 3) of every pixel of a view, up to a factor; 0 where there is no surface."""
+"""Returns the diffuse light (H, W, 3) of a view that stage shading computed; 0 where there is no surface."""
 
 
 @dataclass(frozen=True)

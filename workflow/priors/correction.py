@@ -67,8 +67,8 @@ class Correction:
         self.gathering = gather_views(self.views, self.views.tracer(), seed=seed, keep=keep, threads=threads)
         self.gathering = gather_again(self.gathering, self.views, self._albedo_of_objects(threads))
         if light is not None:
-            small = lambda number: self.views.shrunk(light(self.views.views[number]))  # noqa: E731
-            self.gathering = with_computed_light(self.gathering, self.views, small)
+            computed = (self.views.shrunk(light(view)) for view in self.views.views)
+            self.gathering = with_computed_light(self.gathering, self.views, computed)
 
     def __call__(self, view: View) -> Predicted:
         """Make K predictions of a view."""

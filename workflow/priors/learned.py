@@ -32,7 +32,7 @@ def describe(settings: SimpleNamespace) -> dict[str, Any]:
 def prepare(
     settings: SimpleNamespace, capture: CaptureReader, seed: int, keep: Keep, threads: int = 1, light: LightOf | None = None
 ) -> Correction:
-    """Read all photographs of a capture, and return what predicts a view; `light` is that of a second look."""
+    """Read all photographs of a capture, and return what predicts a view; `light` is given in a second look alone."""
     from workflow.priors.correction import Correction
 
     return Correction(settings, capture, seed, keep, threads, light)

@@ -139,9 +139,7 @@ use rule stage as shading with:
 
 use rule stage as second_look with:
     input:
-        unpack(
-            reads("second_look", "capture", "prior", "segmentation", "base", "shading")
-        ),
+        unpack(reads("second_look", "capture", "segmentation", "shading")),
     pathvars:
         stage="second_look",
     resources:

@@ -46,7 +46,6 @@ INFRASTRUCTURE = (
 PLUGINS = {
     "capture": (("source", "kind", "workflow.sources.{}"),),
     "prior": (("prior", "kind", "workflow.priors.{}"),),
-    "second_look": (("prior", "kind", "workflow.priors.{}"),),
     "segmentation": (("segmentation", "kind", "workflow.segmentations.{}"),),
 }
 # Stage -> modules that know (and check) further input files.

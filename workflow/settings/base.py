@@ -80,8 +80,8 @@ class Base(Section):
 
 
 class SecondLook(Section):
-    """Predictions and their fusion once more, under the light that was found (prior `learned` alone)."""
+    """Predicting and fusing once more, under the light that was found (prior `learned` alone)."""
 
     enabled: bool = True
-    """`false`: the fit starts from the first base texture, which saves about a quarter of the time of a draft
+    """`false`: the fit starts from the first base texture, which saves a sixth of the CPU time from `prior` to `affines`
     (docs/results/rooms.md#a-second-look)."""

@@ -14,8 +14,6 @@ class PriorBase(Section):
     BY_VIEW: ClassVar[bool] = True
     """Whether a prediction of a view takes no work that would be repeated for each part of the views, so that
     `--set-scatter prior=8` pays."""
-    LOOKS_AGAIN: ClassVar[bool] = False
-    """Whether it predicts better where the light is known, so that a second look pays."""
     samples: int = Field(8, ge=1, le=256)
     """Predictions per photograph, K."""
     seed: int | None = Field(None, ge=0, lt=2**31)
@@ -59,7 +57,6 @@ class LearnedPrior(PriorBase):
     repository (docs/method/priors.md#learned)."""
 
     BY_VIEW: ClassVar[bool] = False
-    LOOKS_AGAIN: ClassVar[bool] = True
     kind: Literal["learned"] = "learned"
     samples: int = Field(8, ge=1, le=16)
     """Predictions per photograph, K: the 8 hypotheses of the network, and 8 more from the mirrored photograph."""
@@ -117,13 +114,4 @@ Prior = Annotated[
 
 def by_view(kind: str) -> bool:
     """Return whether a kind of prior predicts each view by itself, without work that all views share."""
-    return _of(kind).BY_VIEW
-
-
-def looks_again(kind: str) -> bool:
-    """Return whether a kind of prior predicts better where the light is known."""
-    return _of(kind).LOOKS_AGAIN
-
-
-def _of(kind: str) -> type[PriorBase]:
-    return next(one for one in get_args(get_args(Prior)[0]) if get_args(one.model_fields["kind"].annotation) == (kind,))
+    return next(one.BY_VIEW for one in get_args(get_args(Prior)[0]) if get_args(one.model_fields["kind"].annotation) == (kind,))
