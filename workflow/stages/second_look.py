@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 
 from iif_core.numerics.parallel import map_in_order
@@ -25,6 +27,7 @@ def run(job: Job) -> None:
     capture = CaptureReader(job.read("capture"))
     with job.timed("predict"):
         predictions = _Predictions(job, capture)
+    gc.collect()  # the views that the network read hold themselves, by their cache
     fuse(job, predictions)
     job.writer.json(SECOND_LOOK, {"made": True, "reason": "prior learned divides the photographs by their light"})
 
@@ -34,12 +37,14 @@ class _Predictions:
 
     def __init__(self, job: Job, capture: CaptureReader):
         self.samples = job.settings.prior.samples
-        keep = Scratch(job.writer.directory)
         seed = job.seed if job.settings.prior.seed is None else job.settings.prior.seed
         views = capture.used
+        # What the network needs of the views goes to a file of its own, which ends with the network.
+        gathered = Scratch(job.writer.directory)
         predict = learned.prepare(
-            job.settings, capture, seed, keep, job.threads, light=lambda view: read_diffuse(job, view).mean(0)
+            job.settings, capture, seed, gathered, job.threads, light=lambda view: read_diffuse(job, view).mean(0)
         )
+        keep = Scratch(job.writer.directory)
         self._of: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         predicted = map_in_order(lambda i: predict(views[i]), len(views), job.threads)
         for done, (view, made) in enumerate(zip(views, predicted, strict=True), 1):
